@@ -1,0 +1,198 @@
+"""What the parts of the framework promise each other. Rooms meet only here; the config puts them together.
+
+`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of extensions.
+Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe a target.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    import torch
+
+    from brokk_rl.history import History
+    from brokk_rl.machine import Machine
+    from brokk_rl.signals import Borehole, Command, Frame, JointState
+
+
+class Mode(Protocol):
+    """What `brokk mode=…` runs."""
+
+    def run(self) -> float | None:
+        """Does the work; returns the objective of a sweep, or `None`."""
+        ...
+
+
+class ActuatorModel(Protocol):
+    """From the last `H` positions and commands to the next joint position, for all environments at once.
+
+    A model with a state of its own (spool position, pressure) keeps it in tensors of fixed shape listed by `state`. `step` works
+    without a host synchronisation and without data-dependent shapes, so that it can be captured in a CUDA graph.
+    """
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Internal state by name, each of shape `(N, …)`; written in place. Empty for a model without memory."""
+        ...
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Puts the environments of `mask`, shape `(N,)` bool, into the state of a machine at rest."""
+        ...
+
+    def step(self, history: History) -> torch.Tensor:
+        """Returns the joint positions one control period later, shape `(N, J)` in rad or m.
+
+        `history.u[:, -1]` is the command that has just come into force, `history.q[:, -1]` the position at this moment.
+        """
+        ...
+
+
+class Actuator(Protocol):
+    """A spec in `conf/actuator`: builds an actuator model."""
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
+        """Returns a model for `num_envs` environments on `device`."""
+        ...
+
+
+class Effect(Protocol):
+    """A spec in `conf/effect`: something a simulator leaves out; wraps an actuator model and is again one."""
+
+    def wrap(self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
+        """Returns `model` with the effect added; with the effect's neutral value nothing changes."""
+        ...
+
+
+class World(Protocol):
+    """Parallel physics: the machine, pushed along by its drive, beside a block with a borehole.
+
+    All tensors are float32 on `device`, of fixed address, and refreshed in place by `step` and `reset`.
+    """
+
+    num_worlds: int
+    device: torch.device
+    q: torch.Tensor
+    """Joint positions, `(N, J)`, rad or m."""
+    contact_force_n: torch.Tensor
+    """Peak force between tool and surroundings over the last control period, `(N,)`."""
+    faults: torch.Tensor
+    """Worlds that diverged, lost contacts to a full buffer, or became NaN since their last reset, `(N,)` bool."""
+    supports_graphs: bool
+    """True when `step` and `reset` may be captured in a CUDA graph."""
+
+    def step(self, increment: torch.Tensor) -> None:
+        """Advances one control period, in which the drive moves each joint by `increment`, shape `(N, J)`, unless something blocks it."""
+        ...
+
+    def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
+        """Puts the worlds of `mask`, `(N,)` bool, at rest at `q`, `(N, J)`, in the scenes of `scene`, `(N, S)`; see `sim.scene`."""
+        ...
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Returns copies of everything that must be stored to go on exactly."""
+        ...
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Restores what `state_dict` returned."""
+        ...
+
+
+@dataclass
+class Transition:
+    """What a task says about one control step; all of shape `(N,)`.
+
+    Attributes:
+        reward: Reward of the step.
+        terminated: The episode ended by what happened (success, joint limit, …).
+        timed_out: The episode ended by its time limit only.
+        reason: Index into `TaskProcess.reasons` where the episode ended, else -1.
+    """
+
+    reward: torch.Tensor
+    terminated: torch.Tensor
+    timed_out: torch.Tensor
+    reason: torch.Tensor
+
+
+class TaskProcess(Protocol):
+    """A task at work in `N` environments. No method synchronises with the host; all shapes are fixed."""
+
+    num_actions: int
+    max_episode_steps: int
+    reasons: tuple[str, ...]
+    """Names of the ways in which an episode can end."""
+    state: dict[str, torch.Tensor]
+    """Everything needed to go on exactly, by name, each `(N, …)`; written in place."""
+    episode: dict[str, torch.Tensor]
+    """Figures of the running episode, each `(N,)`; those that stand in `evaluation.json` have the names given there."""
+
+    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
+        """Draws `count` valid starts: `q` `(count, J)`, `scene` `(count, S)` and whatever else `reset` needs."""
+        ...
+
+    def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor], history: History) -> None:
+        """Begins a new episode in the environments of `mask` with the given starts, each entry `(N, …)`."""
+        ...
+
+    def command(self, action: torch.Tensor) -> torch.Tensor:
+        """Turns the policy's action, `(N, num_actions)`, into valve commands `(N, J)`: bounds and the masks of exclusive joints."""
+        ...
+
+    def step(self, history: History, world: World) -> Transition:
+        """Judges the control step that has just been simulated."""
+        ...
+
+    def observe(self) -> dict[str, torch.Tensor]:
+        """Returns the observation groups after the last `step` or `reset`; `policy` is the vector of `brokk_rl.observation`."""
+        ...
+
+
+class Task(Protocol):
+    """A spec in `conf/task`: builds a task process."""
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
+        """Returns the task for `num_envs` environments on `device`."""
+        ...
+
+
+class Policy(Protocol):
+    """Anything that acts: a trained network, the classical controller, an untrained network."""
+
+    def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Returns the action for the observation groups, shape `(N, num_actions)`."""
+        ...
+
+
+class BoreholeFinder(Protocol):
+    """Finds the borehole in a frame."""
+
+    def find(self, frame: Frame) -> Borehole | None:
+        """Returns the borehole in the base frame, or `None` when there is none to be sure of."""
+        ...
+
+
+class PerceptionBackend(Protocol):
+    """A spec in `conf/perception`: builds a finder."""
+
+    def build(self) -> BoreholeFinder:
+        """Returns a finder."""
+        ...
+
+
+@runtime_checkable
+class Link(Protocol):
+    """The connection to a machine, real or simulated; a context manager."""
+
+    def read(self) -> JointState:
+        """Returns the newest measured state."""
+        ...
+
+    def send(self, command: Command) -> Command:
+        """Sends a command and returns the command that was really sent."""
+        ...
+
+    def __enter__(self) -> Link: ...
+
+    def __exit__(self, *exc: Any) -> None: ...

@@ -1,0 +1,202 @@
+"""The machine: joints, limits, geometry, control rate and levers, read from one YAML file.
+
+Everything that must agree between training, recordings and the machine's own computer comes from here, and `fingerprint` stamps it
+onto every file, so that a policy of one machine cannot be loaded on another unnoticed. This module needs neither torch nor MuJoCo.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict
+from typing import Literal
+
+import numpy as np
+
+from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.spec import spec
+
+
+@spec
+class Dimension:
+    """A number about the machine together with where it comes from.
+
+    Attributes:
+        value: The number, in the unit that its key names.
+        source: Data sheet, measurement, paper, or how it was estimated.
+        confidence: How far to trust it; the randomisation of a low-confidence dimension should be wide.
+    """
+
+    value: float
+    source: str
+    confidence: Literal["low", "medium", "high"]
+
+
+@spec
+class Joint:
+    """One actuated joint and the link behind it.
+
+    Attributes:
+        name: `q1`, `q2`, …; names the columns of recordings and the joint of the MJCF.
+        kind: `hinge` (rad) or `slide` (m).
+        axis: Unit axis in the frame of the parent link, right-handed.
+        origin_m: Position of the joint in the frame of the parent link.
+        lower: Lower end of travel (rad or m).
+        upper: Upper end of travel.
+        home: Position to which data collection returns.
+        max_speed: Speed at full command (rad/s or m/s), the slower of both directions.
+        mass_kg: Mass of the link behind the joint.
+        com_m: Centre of mass of that link in its own frame.
+        yield_force: Largest force (N) or torque (Nm) beyond the weight with which the joint pushes before its relief valve opens.
+        stiffness: Stiffness of the closed cylinder seen at the joint (Nm/rad or N/m).
+    """
+
+    name: str
+    kind: Literal["hinge", "slide"]
+    axis: tuple[float, float, float]
+    origin_m: tuple[Dimension, Dimension, Dimension]
+    lower: Dimension
+    upper: Dimension
+    home: float
+    max_speed: Dimension
+    mass_kg: Dimension
+    com_m: tuple[float, float, float]
+    yield_force: Dimension
+    stiffness: Dimension
+
+    @property
+    def unit(self) -> str:
+        """`rad` or `m`."""
+        return "rad" if self.kind == "hinge" else "m"
+
+    def check(self) -> None:
+        if not self.lower.value <= self.home <= self.upper.value:
+            raise ConfigError(f"joint {self.name}: home {self.home} lies outside [{self.lower.value}, {self.upper.value}]")
+        if abs(float(np.linalg.norm(self.axis)) - 1.0) > 1e-6:
+            raise ConfigError(f"joint {self.name}: axis {self.axis} is not a unit vector")
+
+
+@spec
+class Lever:
+    """One axis of a lever and the joint it commands (paper, equations 2 and 3).
+
+    Attributes:
+        joint: The joint.
+        side: Which lever.
+        axis: `theta` (fore and aft) or `psi` (sideways).
+        max_angle_rad: Lever angle at full command, `alpha_max` of equation 2.
+    """
+
+    joint: str
+    side: Literal["left", "right"]
+    axis: Literal["theta", "psi"]
+    max_angle_rad: float
+
+
+@spec
+class Machine:
+    """A hydraulic machine with any number of joints.
+
+    Attributes:
+        name: Config name, written into recordings and checkpoints.
+        title: What it is, for people.
+        mjcf: File name of the model under `brokk_rl/sim/assets`, or an absolute path.
+        period_s: Control period.
+        dead_time_s: Nominal time from command to first motion.
+        num_history: Samples of commands and positions that actuator models and policies see.
+        joints: In machine order, from the base to the tool.
+        tool_m: Tool point (chisel tip) in the frame of the last link.
+        exclusive: Joints that never move together with any other joint.
+        levers: Lever axis of each joint.
+    """
+
+    name: str
+    title: str
+    mjcf: str
+    period_s: float
+    dead_time_s: float
+    num_history: int
+    joints: tuple[Joint, ...]
+    tool_m: tuple[Dimension, Dimension, Dimension]
+    exclusive: tuple[str, ...]
+    levers: tuple[Lever, ...]
+
+    def check(self) -> None:
+        names = self.joint_names
+        if len(set(names)) != len(names):
+            raise ConfigError(f"machine {self.name}: joint names repeat: {', '.join(names)}")
+        for other in (*self.exclusive, *(lever.joint for lever in self.levers)):
+            if other not in names:
+                raise ConfigError(f"machine {self.name}: '{other}' is none of its joints ({', '.join(names)})")
+        if self.dead_time_s > (self.num_history - 1) * self.period_s + 1e-9:
+            raise ConfigError(
+                f"machine {self.name}: {self.num_history} samples of {self.period_s} s do not span the dead time of {self.dead_time_s} s; "
+                "raise num_history"
+            )
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joint names in machine order."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints, `J`."""
+        return len(self.joints)
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Lower joint limits, shape `(J,)`, rad or m."""
+        return np.array([joint.lower.value for joint in self.joints])
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Upper joint limits, shape `(J,)`, rad or m."""
+        return np.array([joint.upper.value for joint in self.joints])
+
+    @property
+    def home(self) -> np.ndarray:
+        """Home position, shape `(J,)`, rad or m."""
+        return np.array([joint.home for joint in self.joints])
+
+    @property
+    def max_speed(self) -> np.ndarray:
+        """Speed at full command, shape `(J,)`, rad/s or m/s."""
+        return np.array([joint.max_speed.value for joint in self.joints])
+
+    @property
+    def is_exclusive(self) -> np.ndarray:
+        """True for joints that never move together with others, shape `(J,)`."""
+        return np.array([name in self.exclusive for name in self.joint_names])
+
+    def fingerprint(self) -> dict[str, str]:
+        """Returns what another file must agree with to be used on this machine: a short hash of each group of fields.
+
+        Sources, confidences, titles and home positions do not matter; names, order, limits, geometry, rate and masks do.
+        """
+        geometry = [[d.value for d in joint.origin_m] + [*joint.axis] for joint in self.joints]
+        groups = {
+            "name": self.name,
+            "joints": [[joint.name, joint.kind] for joint in self.joints],
+            "limits": [self.lower.tolist(), self.upper.tolist()],
+            "geometry": [geometry, [d.value for d in self.tool_m]],
+            "control": [self.period_s, self.num_history, list(self.exclusive)],
+            "levers": [asdict(lever) for lever in self.levers],
+        }
+        return {key: hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12] for key, value in groups.items()}
+
+    def check_fingerprint(self, other: dict[str, str], what: str) -> None:
+        """Raises a `CheckpointError` that names the groups of fields in which `other`, the stamp on `what`, differs."""
+        mine = self.fingerprint()
+        differing = [key for key in mine if other.get(key) != mine[key]]
+        if differing:
+            raise CheckpointError(
+                f"{what} was made for another machine: {', '.join(differing)} differ from machine '{self.name}'. "
+                "Choose the machine it was made for (machine=…) or make it again for this one."
+            )
+
+
+def exclusive_mask(machine: Machine, positioning: bool) -> np.ndarray:
+    """Returns which joints may be commanded, shape `(J,)`: the exclusive ones while positioning, else all the others.
+
+    These are the paper's masks [0, 1, 0, 0, 0] and [1, 0, 1, 1, 1]; task, guard and levers all use this function.
+    """
+    return machine.is_exclusive if positioning else ~machine.is_exclusive

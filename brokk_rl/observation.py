@@ -1,0 +1,72 @@
+"""The policy's observation vector (paper, Table I), the same code in training and on the machine.
+
+Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first (H x J); 133 numbers for five joints
+and 13 samples. Each part is normalised with an approximate mean and standard deviation that follow from the configuration, so that a
+policy carries no hidden statistics.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+@spec
+class Scaling:
+    """Approximate mean and standard deviation of the target point in the base frame (m)."""
+
+    target_mean_m: tuple[float, float, float]
+    target_std_m: tuple[float, float, float]
+
+
+def size(machine: Machine) -> int:
+    """Returns the length of the observation vector."""
+    return 3 + 2 * machine.num_history * machine.num_joints
+
+
+class Encoder:
+    """Turns a history and a target into the policy's vector, and back.
+
+    Args:
+        machine: Gives the normalisation of joint positions (middle and quarter of the travel), rate and order.
+        scaling: Normalisation of the target point.
+        constant: Makes an array of the kind and on the device of the inputs; `numpy.asarray` on the machine.
+        concat: `numpy.concatenate` or `torch.cat`, called as `concat(parts, 1)`.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        scaling: Scaling,
+        constant: Callable[[np.ndarray], Any] = np.asarray,
+        concat: Callable[[tuple[Any, ...], int], Any] = np.concatenate,
+    ) -> None:
+        self.shape = (machine.num_history, machine.num_joints)
+        self.size = size(machine)
+        self._concat = concat
+        self._target_mean_m = constant(np.float32(scaling.target_mean_m))
+        self._target_std_m = constant(np.float32(scaling.target_std_m))
+        self._q_mean = constant(np.float32((machine.lower + machine.upper) / 2))
+        self._q_std = constant(np.float32((machine.upper - machine.lower) / 4))
+
+    def encode(self, target_in_base_m: Any, q: Any, u: Any) -> Any:
+        """Returns the vector, shape `(N, 3 + 2 H J)`.
+
+        Args:
+            target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N, 3)`.
+            q: Measured joint positions, oldest first, shape `(N, H, J)`, rad or m.
+            u: Commands in force, oldest first, shape `(N, H, J)`, in [-1, 1].
+        """
+        target = (target_in_base_m - self._target_mean_m) / self._target_std_m
+        joints = ((q - self._q_mean) / self._q_std).reshape(len(q), -1)
+        return self._concat((target, joints, u.reshape(len(u), -1)), 1)
+
+    def decode(self, vector: Any) -> tuple[Any, Any, Any]:
+        """Inverts `encode`: returns target `(N, 3)` in m, positions and commands `(N, H, J)`."""
+        num = self.shape[0] * self.shape[1]
+        target = vector[:, :3] * self._target_std_m + self._target_mean_m
+        q = vector[:, 3 : 3 + num].reshape(-1, *self.shape) * self._q_std + self._q_mean
+        return target, q, vector[:, 3 + num :].reshape(-1, *self.shape)

@@ -1,0 +1,53 @@
+"""The words that simulation, policy and machine share.
+
+Shapes: `N` environments (absent on the machine), `J` joints. Arrays are numpy on the machine and torch in the simulator.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Measured joint positions, shape `(…, J)` in rad or m, at `t_s`."""
+
+    t_s: float
+    q: Any
+
+
+@dataclass(frozen=True)
+class Command:
+    """Valve commands, shape `(…, J)`, each in [-1, 1]; + extends (moves the joint in its positive direction)."""
+
+    u: Any
+
+
+@dataclass(frozen=True)
+class LeverPose:
+    """Angles of one lever in rad: `theta` fore and aft, `psi` sideways."""
+
+    theta_rad: float
+    psi_rad: float
+
+
+@dataclass(frozen=True)
+class Borehole:
+    """An estimated borehole: centre of the rim and axis (pointing out of the hole) in the base frame, radius in m."""
+
+    center_in_base_m: np.ndarray
+    axis_in_base: np.ndarray
+    radius_m: float
+    cov_m2: np.ndarray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One RGB-D frame: colour `(h, w, 3)` uint8, depth `(h, w)` float32 in m with NaN where unknown, and the camera."""
+
+    color: np.ndarray
+    depth_m: np.ndarray
+    camera_matrix: np.ndarray
+    base_from_camera: np.ndarray
+    t_s: float

@@ -1,0 +1,73 @@
+"""Specs: the typed, frozen data that every config node becomes."""
+
+import types
+import typing
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar, Union, dataclass_transform
+
+from brokk_rl.errors import ConfigError
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def spec(cls: type[T]) -> type[T]:
+    """Makes `cls` a spec: a frozen, keyword-only dataclass whose fields are checked against their annotations.
+
+    A YAML list becomes a tuple, an integer given for a float becomes a float; any other mismatch is a `ConfigError` that names the
+    field, what was expected and what came. A spec may define `check(self)` for rules between fields. Specs are pure data: a number
+    lives in one YAML file, so fields have no defaults here.
+    """
+    cls.__post_init__ = _post_init  # type: ignore[attr-defined]
+    return dataclass(frozen=True, kw_only=True)(cls)
+
+
+def _post_init(self: Any) -> None:
+    hints = typing.get_type_hints(type(self))
+    for field in fields(self):
+        where = f"{type(self).__name__}.{field.name}"
+        object.__setattr__(self, field.name, _fitted(getattr(self, field.name), hints[field.name], where))
+    if check := getattr(self, "check", None):
+        check()
+
+
+def _fitted(value: Any, hint: Any, where: str) -> Any:
+    """Returns `value` as `hint` wants it, or raises a `ConfigError`."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return value
+    if origin in (Union, types.UnionType):
+        return _first_fit(value, args, where, hint)
+    if origin is typing.Literal:
+        if value not in args:
+            raise ConfigError(f"{where}: expected one of {', '.join(map(repr, args))}, got {value!r}")
+        return value
+    if origin is tuple and isinstance(value, (list, tuple)):
+        inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+        if len(inner) != len(value):
+            raise ConfigError(f"{where}: expected {len(inner)} values, got {len(value)}: {list(value)}")
+        return tuple(_fitted(v, h, f"{where}[{i}]") for i, (v, h) in enumerate(zip(value, inner, strict=True)))
+    if origin is dict and isinstance(value, dict):
+        return {_fitted(k, args[0], where): _fitted(v, args[1], f"{where}.{k}") for k, v in value.items()}
+    plain = origin or hint
+    if plain is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    protocol = getattr(plain, "_is_protocol", False)
+    wrong_bool = isinstance(value, bool) and plain in (int, float)
+    if not protocol and (wrong_bool or not isinstance(value, plain)):
+        name = getattr(hint, "__name__", hint)
+        raise ConfigError(f"{where}: expected {name}, got {type(value).__name__} {value!r}")
+    return value
+
+
+def _first_fit(value: Any, hints: tuple[Any, ...], where: str, whole: Any) -> Any:
+    for hint in hints:
+        if hint is type(None):
+            if value is None:
+                return None
+            continue
+        try:
+            return _fitted(value, hint, where)
+        except ConfigError:
+            continue
+    raise ConfigError(f"{where}: expected {whole}, got {type(value).__name__} {value!r}")

@@ -1,0 +1,1 @@
+"""Perception: from camera frames to the borehole in the base frame."""
