@@ -1,0 +1,219 @@
+"""A session: one run's folder, seed and device, and the record of how it went."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError, DeviceError, StorageError
+from brokk_rl.spec import spec
+
+if TYPE_CHECKING:
+    import torch
+
+RECORD = "session.json"
+RESOLVED = "resolved.yaml"
+STAMPED = (
+    "brokk-rl", "hydra-core", "torch", "numpy", "rsl-rl-lib", "mujoco", "mujoco-warp", "warp-lang", "opencv-python-headless", "onnxruntime",
+)  # fmt: skip
+
+
+@spec
+class Session:
+    """One run: where it writes, its seed and its device.
+
+    Attributes:
+        out: Run folder.
+        seed: The one seed from which every stream of random numbers is derived.
+        device: `auto` (a GPU if there is one), `cpu`, `cuda` or `cuda:<index>`.
+    """
+
+    out: str
+    seed: int
+    device: str
+
+    def check(self) -> None:
+        if self.seed < 0:
+            raise ConfigError(f"session.seed: expected 0 or more, got {self.seed}")
+        kind, _, index = self.device.partition(":")
+        if kind not in ("auto", "cpu", "cuda") or (index and (kind != "cuda" or not index.isdigit())):
+            raise ConfigError(f"session.device: expected auto, cpu, cuda or cuda:<index>, got '{self.device}'")
+
+    @property
+    def folder(self) -> Path:
+        """The run folder; exists from `start` on."""
+        return Path(self.out)
+
+    def torch_device(self) -> torch.device:
+        """Returns the device to compute on.
+
+        Raises:
+            DeviceError: A GPU was asked for and is not there. `auto` never raises.
+        """
+        import torch
+
+        kind, _, index = self.device.partition(":")
+        if kind == "cpu" or (kind == "auto" and not torch.cuda.is_available()):
+            return torch.device("cpu")
+        number = int(index or 0)
+        if not torch.cuda.is_available():
+            raise DeviceError(
+                f"session.device={self.device} asks for a GPU, but torch {torch.__version__} sees none. Use session.device=cpu or "
+                "session.device=auto; `brokk mode=doctor` says what is missing."
+            )
+        if number >= torch.cuda.device_count():
+            raise DeviceError(f"session.device={self.device}: there are {torch.cuda.device_count()} GPUs, numbered from 0.")
+        return torch.device("cuda", number)
+
+    def stream(self, name: str) -> int:
+        """Returns the seed of the stream `name`, below 2**32: the same for the same session seed and name, unrelated otherwise."""
+        return int.from_bytes(hashlib.sha256(f"{self.seed}/{name}".encode()).digest()[:4], "little")
+
+    def generator(self, name: str) -> np.random.Generator:
+        """Returns a numpy generator for the stream `name`, independent of how often any other stream is used."""
+        return np.random.default_rng(self.stream(name))
+
+    def torch_generator(self, name: str, device: torch.device | str = "cpu") -> torch.Generator:
+        """Returns a torch generator on `device` for the stream `name`."""
+        import torch
+
+        return torch.Generator(device=device).manual_seed(self.stream(name))
+
+    def seed_all(self) -> None:
+        """Seeds the global generators of Python, numpy and torch (all devices)."""
+        random.seed(self.stream("python"))
+        np.random.seed(self.stream("numpy"))
+        try:
+            import torch
+        except ImportError:  # the machine's own computer has no torch
+            return
+        torch.manual_seed(self.stream("torch"))
+
+    @contextmanager
+    def start(self, resolved: str, facts: dict[str, Any], resume: bool = False) -> Iterator[Record]:
+        """Makes the run folder, writes `resolved.yaml` and keeps `session.json` up to date until the block ends.
+
+        Args:
+            resolved: Text of `resolved.yaml`.
+            facts: Further fields of `session.json`: mode, choices, overrides, machine, fingerprint.
+            resume: The folder may already hold a run, which goes on.
+
+        Raises:
+            StorageError: The folder holds a run already and `resume` is false, or cannot be written.
+        """
+        before = read_record(self.folder)
+        if before and not resume:
+            raise StorageError(
+                f"{self.folder} already holds a run ({before.get('mode', '?')}, {before.get('outcome', '?')}). "
+                "Give another folder with session.out=<folder>, or delete this one."
+            )
+        fields = {
+            "schema": 1, "outcome": "running", "objective": None, "started": _now(), "ended": None,
+            "command": [Path(sys.argv[0]).name, *sys.argv[1:]], **facts,
+            "seed": self.seed, "device": self.device, "commit": commit(), "versions": versions(), "pid": os.getpid(),
+        }  # fmt: skip
+        if before:
+            fields["started"] = before.get("started", fields["started"])
+            fields["resumed"] = [*before.get("resumed", []), _now()]
+        record = Record(self.folder, fields)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_text(self.folder / RESOLVED, resolved)
+            record.write()
+        except OSError as error:
+            raise StorageError(f"cannot write into {self.folder}: {error.strerror}. Choose session.out=<folder>.") from error
+        outcome = "failed"
+        try:
+            yield record
+            outcome = "finished"
+        except KeyboardInterrupt:
+            outcome = "interrupted"
+            raise
+        except BaseException as error:
+            record.fields["error"] = f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            record.fields |= {"outcome": outcome, "ended": _now()}
+            record.write()
+
+
+@dataclass
+class Record:
+    """`session.json` of a running session.
+
+    Attributes:
+        folder: Run folder.
+        fields: What stands in the file.
+    """
+
+    folder: Path
+    fields: dict[str, Any] = field(default_factory=dict)
+
+    def write(self) -> None:
+        """Writes the file in one step."""
+        write_json(self.folder / RECORD, self.fields)
+
+
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """Returns what `session.json` of a run folder says, `None` where there is none."""
+    try:
+        return json.loads((folder / RECORD).read_text())
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        raise StorageError(f"{folder / RECORD} is not readable as JSON: {error}") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes `value` as JSON in one step: readers see the old file or the whole new one, never a part."""
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file in one step; a full disk leaves the old file as it was."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        part.write_text(text)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def versions() -> dict[str, str]:
+    """Returns the installed versions of Python and of the packages that decide the result."""
+    found = {"python": ".".join(map(str, sys.version_info[:3]))}
+    for name in STAMPED:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def commit() -> str | None:
+    """Returns the commit of the checkout that this code runs from, `-dirty` after it when files differ; `None` outside one."""
+    root = Path(__file__).parents[1]
+    if not (root / ".git").exists():  # an installed wheel may lie inside someone else's checkout
+        return None
+    try:
+        git = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
+        return subprocess.run(git, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _now() -> str:
+    return datetime.now().astimezone().isoformat(timespec="seconds")
