@@ -1,0 +1,46 @@
+"""Dead time: which commands of the history act during the coming control period, to the fraction of a sample."""
+
+import torch
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+
+
+def check_dead_time(longest_s: float, machine: Machine, where: str) -> None:
+    """Raises a `ConfigError` when the machine's history does not reach back `longest_s`."""
+    reach_s = (machine.num_history - 1) * machine.period_s
+    if not 0.0 <= longest_s <= reach_s + 1e-6:
+        raise ConfigError(
+            f"{where}: a dead time of {longest_s:.3f} s (spread included) does not fit the {reach_s:.3f} s that the history of machine "
+            f"'{machine.name}' reaches back; shorten it or raise machine.num_history"
+        )
+
+
+def commands_in_force(u: torch.Tensor, delay_periods: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Splits the coming control period at the moment when the delayed command changes.
+
+    A command is held for one period, so with a dead time of `n + f` periods the valve sees the command of `n + 1` periods ago for
+    the first part `f` of the period and that of `n` periods ago for the rest. Nothing is interpolated: this is exact.
+
+    Args:
+        u: Command history, shape `(N, H, J)`, newest last.
+        delay_periods: Dead time in control periods, shape `(N, J)`, in [0, H - 1].
+
+    Returns:
+        The earlier command, the later command, and the part of the period in which the earlier one acts, each `(N, J)`.
+    """
+    last = u.shape[1] - 1
+    # half a millionth of a period forgives 0.55 / 0.05 = 11.000000000000002
+    whole = torch.floor(delay_periods + 5e-7)
+    part = (delay_periods - whole).clamp(0.0, 1.0)
+    newest = last - whole.to(torch.int64)
+    later = u.gather(1, newest.clamp(0, last)[:, None]).squeeze(1)
+    earlier = u.gather(1, (newest - 1).clamp(0, last)[:, None]).squeeze(1)
+    return earlier, later, part
+
+
+def opened(u: torch.Tensor, dead_band_extend: torch.Tensor, dead_band_retract: torch.Tensor) -> torch.Tensor:
+    """Returns how far the valve is open, shape of `u`, in [-1, 1]: zero inside the dead band, one at full command on either side."""
+    extend = torch.relu(u - dead_band_extend) / (1.0 - dead_band_extend)
+    retract = torch.relu(-u - dead_band_retract) / (1.0 - dead_band_retract)
+    return extend - retract
