@@ -1,0 +1,205 @@
+"""The classical controller: resolved-rate control of the tool with dead-time compensation, under the masks of the machine.
+
+It is what a user would pick instead of a learned policy, and it is the base on which the default policy learns a residual. It sees only
+what the policy sees: the measured history and the estimated target. Torch, batched, without a host synchronisation, and made of
+operations that ONNX knows, so that an exported policy carries it inside.
+
+Dead-time compensation is the idea of the Smith predictor (O. J. M. Smith, 1957): commands that were sent but have not acted yet are added
+to the measured position through a static map of the valve, and the controller acts on where the machine is going to be.
+Resolved-rate control with damped least squares follows Nakamura and Hanafusa (1986).
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+from brokk_rl.kinematics import Kinematics, ToolPose
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+@spec
+class Classical:
+    """Resolved-rate control of the tool with dead-time compensation.
+
+    Attributes:
+        in_flight_samples: Past commands that have not yet fully acted: dead time and lag, in control periods (may be fractional).
+        dead_band: Command below which the static valve map gives no motion.
+        gain_1_s: Speed of approach per distance left.
+        top_speed_m_s: Bound on the speed of the tool point.
+        top_rate_rad_s: Bound on the rate of its pitch.
+        damping: Damping of the least squares, in the same unit as the Jacobian times joint speed (m/s at full command).
+        rest: Share of full speed below which a joint is left alone.
+        creep: Smallest share of full speed that is commanded at all, large enough to be beyond the dead band of every valve.
+        hover_m: Height above the target at which the tool waits until it is aligned.
+        funnel_m: Lateral error at which the descent begins and at which it is free, (outer, inner).
+        margin_rad: Distance to a joint limit within which the joint is no longer driven towards it.
+    """
+
+    in_flight_samples: float
+    dead_band: float
+    gain_1_s: float
+    top_speed_m_s: float
+    top_rate_rad_s: float
+    damping: float
+    rest: float
+    creep: float
+    hover_m: float
+    funnel_m: tuple[float, float]
+    margin_rad: float
+
+    def build(self, machine: Machine, device: torch.device) -> "ClassicalController":
+        """Returns the controller for `machine` on `device`."""
+        return ClassicalController(self, machine, device)
+
+
+@dataclass
+class Guidance:
+    """What the controller makes of a history and a target; `N` environments.
+
+    Attributes:
+        command: Valve commands before the masks, `(N, J)` in [-1, 1]: exclusive joints as for positioning, the others as for the approach.
+        error_m: Target minus predicted tool point, in the frame of the arm's plane (radial, tangential, up), `(N, 3)`.
+        pitch_error_rad: Wanted minus predicted pitch, `(N,)`.
+        goal_error_m: Waypoint minus predicted tool point, up, `(N,)`: hover height while not aligned, the final depth after.
+        reach_m: Measured distance from the first joint behind the exclusive ones to the target, turned into the arm's plane, `(N,)`.
+        reach_3d_m: The same measured in space.
+        tip_z_m: Measured height of the tool point, `(N,)`.
+    """
+
+    command: torch.Tensor
+    error_m: torch.Tensor
+    pitch_error_rad: torch.Tensor
+    goal_error_m: torch.Tensor
+    reach_m: torch.Tensor
+    reach_3d_m: torch.Tensor
+    tip_z_m: torch.Tensor
+
+
+class ClassicalController:
+    """See `Classical`; stateless, so that it can stand inside a policy."""
+
+    def __init__(self, config: Classical, machine: Machine, device: torch.device) -> None:
+        def constant(values: object) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=device)
+
+        self.config = config
+        self.kinematics = Kinematics(machine, device)
+        self.speed = constant(machine.max_speed)
+        self._lower = constant(machine.lower) + config.margin_rad
+        self._upper = constant(machine.upper) - config.margin_rad
+        self._exclusive = constant(machine.is_exclusive)
+        # the joint whose distance to the target decides about reach: the first one behind the exclusive joints (the paper's q3)
+        exclusive = [i for i, e in enumerate(machine.is_exclusive) if e]
+        self._reach_joint = min(exclusive[-1] + 1, machine.num_joints - 1) if exclusive else 0
+        age = torch.arange(machine.num_history - 1, -1, -1, dtype=torch.float32, device=device)
+        self._in_flight = (config.in_flight_samples - age).clamp(0.0, 1.0)[:, None] * machine.period_s
+        self._damping = config.damping**2 * torch.eye(4, device=device)
+
+    def rate(self, u: torch.Tensor) -> torch.Tensor:
+        """Returns the joint speed that the static valve map gives to commands `u`, `(…, J)`, rad/s or m/s."""
+        band = self.config.dead_band
+        return self.speed * u.sign() * (u.abs() - band).clamp(min=0.0) / (1.0 - band)
+
+    def valve(self, rate: torch.Tensor) -> torch.Tensor:
+        """Inverts `rate`: returns the commands for joint speeds given as a share of the full speed, clipped to [-1, 1].
+
+        Speeds too small for the valve are given as pulses of `creep`: the prediction counts a pulse as soon as it is sent, so that no
+        more of them are sent than are needed.
+        """
+        band = self.config.dead_band
+        size = rate.abs()
+        return rate.sign() * (band + (1.0 - band) * size.clamp(min=self.config.creep)).clamp(max=1.0) * (size > self.config.rest)
+
+    def guide(
+        self, q: torch.Tensor, u: torch.Tensor, target_m: torch.Tensor, pitch_rad: torch.Tensor, reach_m: tuple[float, float]
+    ) -> Guidance:
+        """Returns commands and errors.
+
+        Args:
+            q: Measured positions, oldest first, `(N, H, J)`.
+            u: Commands sent, oldest first, `(N, H, J)`.
+            target_m: Where the tool point shall end up in the base frame, `(N, 3)`.
+            pitch_rad: Wanted pitch, `(N,)`.
+            reach_m: Good working range (nearest, farthest); positioning aims at its middle.
+        """
+        config = self.config
+        now = q[:, -1]
+        ahead = now + (self.rate(u) * self._in_flight).sum(1)
+        # one pass for both: small operations cost their launch, not their size
+        both, jacobian = self.kinematics.pose_and_jacobian(torch.stack((ahead, now)))
+        tip, pitch = both.tip_in_base_m[0], both.pitch_rad[0]
+
+        error = target_m - tip
+        outer, inner = config.funnel_m
+        lateral = error[:, :2].norm(dim=1)
+        goal_up = error[:, 2] + ((lateral - inner) / (outer - inner)).clamp(0.0, 1.0) * config.hover_m
+        pitch_error = pitch_rad - pitch
+        share = self.approach(jacobian.tip[0], jacobian.pitch[0], error, goal_up, pitch_error)
+
+        reach, reach_slope, reach_3d = self._reach(both, target_m)
+        left = (sum(reach_m) / 2 - reach[0])[:, None] * reach_slope / (reach_slope.square() + 0.05)
+        share = share + (config.gain_1_s * left * self._exclusive / self.speed).clamp(-1.0, 1.0)
+        share = share * ((ahead > self._lower) | (share > 0)) * ((ahead < self._upper) | (share < 0))
+
+        bearing = tip[:, :2] / tip[:, :2].norm(dim=1, keepdim=True).clamp(min=1e-3)
+        radial = (error[:, :2] * bearing).sum(1)
+        tangential = bearing[:, 0] * error[:, 1] - bearing[:, 1] * error[:, 0]
+        return Guidance(
+            command=self.valve(share),
+            error_m=torch.stack((radial, tangential, error[:, 2]), 1),
+            pitch_error_rad=pitch_error,
+            goal_error_m=goal_up,
+            reach_m=reach[1],
+            reach_3d_m=reach_3d[1],
+            tip_z_m=both.tip_in_base_m[1, :, 2],
+        )
+
+    def reach(self, q: torch.Tensor, target_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the reach at `q`, `(N, J)`, and its slope over joint positions: `(N,)` and `(N, J)`."""
+        reach, slope, _ = self._reach(self.kinematics.pose(q[None]), target_m)
+        return reach[0], slope
+
+    def approach(
+        self, tip_jacobian: torch.Tensor, pitch_jacobian: torch.Tensor, error: torch.Tensor, up: torch.Tensor, turn: torch.Tensor
+    ) -> torch.Tensor:
+        """Returns joint speeds as a share of full speed that bring the tool closer, `(N, J)` in [-1, 1]; exclusive joints rest."""
+        config = self.config
+        wanted = torch.cat((error[:, :2], up[:, None]), 1) * config.gain_1_s
+        wanted = wanted * (config.top_speed_m_s / wanted.norm(dim=1, keepdim=True).clamp(min=config.top_speed_m_s))
+        turn = (turn * config.gain_1_s).clamp(-config.top_rate_rad_s, config.top_rate_rad_s)
+        jacobian = torch.cat((tip_jacobian, pitch_jacobian[:, None]), 1) * (self.speed * (1.0 - self._exclusive))
+        square = jacobian @ jacobian.transpose(1, 2) + self._damping
+        share = (jacobian.transpose(1, 2) @ _solve_4(square, torch.cat((wanted, turn[:, None]), 1)[..., None]))[..., 0]
+        # what one joint cannot do slows all of them alike, so that the tool keeps its direction
+        return share / share.abs().amax(1, keepdim=True).clamp(min=1.0)
+
+    def _reach(self, pose: ToolPose, target_m: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Returns reach `(M, N)`, the slope of its first row over joint positions `(N, J)`, and the distance in space `(M, N)`."""
+        origins = pose.joints_in_base_m
+        joint = origins[:, :, self._reach_joint]
+        radius = joint[..., :2].norm(dim=-1).clamp(min=1e-3)
+        out = target_m[:, :2].norm(dim=1) - radius
+        up = target_m[:, 2] - joint[..., 2]
+        reach = torch.sqrt(out.square() + up.square()).clamp(min=1e-3)
+        motion = torch.linalg.cross(pose.axes_in_base[0], joint[0, :, None] - origins[0], dim=-1)
+        outward = (motion[..., :2] * (joint[0, :, :2] / radius[0, :, None])[:, None]).sum(-1)
+        slope = -(out[0, :, None] * outward + up[0, :, None] * motion[..., 2]) / reach[0, :, None]
+        return reach, slope, (target_m - joint).norm(dim=-1)
+
+
+def _solve_4(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Solves symmetric positive definite 4 x 4 systems, `(N, 4, 4)` and `(N, 4, 1)`, by 2 x 2 blocks (Schur complement).
+
+    Own code because LAPACK calls neither export to ONNX nor fit into a captured CUDA graph.
+    """
+    p, q, s = a[:, :2, :2], a[:, :2, 2:], a[:, 2:, 2:]
+    p_inverse = _inverse_2(p)
+    down = q.transpose(1, 2) @ p_inverse
+    low = _inverse_2(s - down @ q) @ (b[:, 2:] - down @ b[:, :2])
+    return torch.cat((p_inverse @ (b[:, :2] - q @ low), low), 1)
+
+
+def _inverse_2(m: torch.Tensor) -> torch.Tensor:
+    a, b, c, d = m[:, 0, 0], m[:, 0, 1], m[:, 1, 0], m[:, 1, 1]
+    return torch.stack((d, -b, -c, a), 1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]

@@ -1,0 +1,177 @@
+"""Inserting the chisel into a vertical borehole in a concrete block (the paper's task)."""
+
+import math
+
+import torch
+
+from brokk_rl.classical import Classical
+from brokk_rl.contracts import TaskProcess
+from brokk_rl.machine import Machine
+from brokk_rl.observation import Scaling
+from brokk_rl.sim import scene
+from brokk_rl.spec import spec
+from tasks.process import Options, ToolPoseProcess
+from tasks.reward import Term
+from tasks.starts import Arms, keep, random_arms, reachable
+from tasks.tool_pose import Action, Noise, Switch
+
+DOWN_RAD = math.pi / 2
+
+
+@spec
+class Hole:
+    """Where the borehole may be; uniform ranges (lowest, highest).
+
+    Attributes:
+        distance_m: Horizontal distance of the rim's centre from the slew axis.
+        bearing_rad: Bearing of the hole from straight ahead.
+        rim_z_m: Height of the rim above the ground.
+        yaw_rad: Orientation of the block.
+        block_scale: Scale of the block's footprint.
+        radius_m: Radius of the hole.
+    """
+
+    distance_m: tuple[float, float]
+    bearing_rad: tuple[float, float]
+    rim_z_m: tuple[float, float]
+    yaw_rad: tuple[float, float]
+    block_scale: tuple[float, float]
+    radius_m: float
+
+
+@spec
+class Success:
+    """When the chisel counts as inserted.
+
+    Attributes:
+        strict_depth_m: Depth of the tip below the rim, inside the hole.
+        chisel_radius_m: Radius of the chisel; the tip is inside when it is off axis by no more than the clearance.
+        slack_m: Softness of contacts and the corners of the polygon that stands for the round hole.
+        paper_alignment: Both r^d and r^o at least this.
+        paper_height_m: Height of the tip below the rim at the paper's limit (0.7 m with a nominal rim of 0.75 m).
+    """
+
+    strict_depth_m: float
+    chisel_radius_m: float
+    slack_m: float
+    paper_alignment: float
+    paper_height_m: float
+
+
+@spec
+class BoreholeInsertion:
+    """Insert the 8 cm chisel into the 10 cm borehole of a concrete block.
+
+    Attributes:
+        episode_s: Time limit.
+        end_on_success: Whether strict success ends the episode.
+        limit_margin: Distance to a joint limit (rad or m) at which the episode ends.
+        depth_m: Depth below the rim of the target point (paper: 0.1 m; a little more makes the controller pass the strict depth).
+        hole: Where the hole may be.
+        arms: Where the arm may begin.
+        success: Criteria.
+        noise: What the policy is told is wrong by.
+        switch: When only q2 moves.
+        action: How the policy's output becomes commands.
+        scaling: Normalisation of the hole position.
+        classical: The classical controller, baseline and base of residual actions.
+        reward: Reward terms by name.
+    """
+
+    episode_s: float
+    end_on_success: bool
+    limit_margin: float
+    depth_m: float
+    hole: Hole
+    arms: Arms
+    success: Success
+    noise: Noise
+    switch: Switch
+    action: Action
+    scaling: Scaling
+    classical: Classical
+    reward: dict[str, Term]
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
+        """Returns the task for `num_envs` environments on `device`."""
+        options = Options(
+            episode_s=self.episode_s,
+            end_on_success=self.end_on_success,
+            limit_margin=self.limit_margin,
+            depth_m=self.depth_m,
+            noise=self.noise,
+            switch=self.switch,
+            action=self.action,
+            scaling=self.scaling,
+            classical=self.classical,
+            reward=self.reward,
+        )
+        return ToolPoseProcess(Insertion(self, machine), options, machine, num_envs, device)
+
+
+class Insertion:
+    """Starts and criteria of the borehole task; fulfils `tasks.process.Goal`."""
+
+    def __init__(self, task: BoreholeInsertion, machine: Machine) -> None:
+        self._task = task
+        self._machine = machine
+
+    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
+        """See `tasks.process.Goal`."""
+        task, hole = self._task, self._task.hole
+        generator = torch.Generator().manual_seed(seed)
+        controller = task.classical.build(self._machine, torch.device("cpu"))
+        batch = max(4 * count, 256)
+
+        def uniform(bounds: tuple[float, float]) -> torch.Tensor:
+            return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
+
+        drawn = []
+        for _ in range(64):
+            distance, bearing = uniform(hole.distance_m), uniform(hole.bearing_rad)
+            rim = torch.stack((distance * bearing.cos(), distance * bearing.sin(), uniform(hole.rim_z_m)), 1)
+            scenes = scene.stack(
+                hole_x_m=rim[:, 0],
+                hole_y_m=rim[:, 1],
+                rim_z_m=rim[:, 2],
+                yaw_rad=bearing + uniform(hole.yaw_rad),
+                block_scale=uniform(hole.block_scale),
+                hole_radius_m=torch.full((batch,), hole.radius_m),
+            )
+            q, good = random_arms(task.arms, self._machine, controller, rim[:, 2], generator)
+            down = torch.full((batch,), DOWN_RAD)
+            deep = rim - torch.tensor([0.0, 0.0, task.depth_m])
+            q, rim, scenes, deep, down = q[good], rim[good], scenes[good], deep[good], down[good]
+            done = reachable(controller, self._machine, q, deep, down, task.switch.reach_m, task.arms.margin_rad)
+            drawn.append({"q": q[done], "scene": scenes[done], "target_m": rim[done], "target_pitch_rad": down[done]})
+            if sum(len(rows["q"]) for rows in drawn) >= count:
+                break
+        return keep(count, drawn, "borehole_insertion")
+
+    def judge(self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """See `tasks.process.Goal`."""
+        rules, rim = self._task.success, start["target_m"]
+        lateral = (tip_m - rim)[:, :2].norm(dim=1)
+        below = rim[:, 2] - tip_m[:, 2]
+        clearance = self._task.hole.radius_m - rules.chisel_radius_m + rules.slack_m
+        inside = lateral <= clearance
+        target = rim.clone()
+        target[:, 2] -= self._task.depth_m
+        distance = (target - tip_m).norm(dim=1)
+        turn = (start["target_pitch_rad"] - pitch_rad).abs()
+        aligned = (1 / (1 + distance) >= rules.paper_alignment) & (1 / (1 + turn) >= rules.paper_alignment)
+        return {
+            "success": inside & (below >= rules.strict_depth_m),
+            "paper_success": aligned & (below >= rules.paper_height_m),
+            "closeness": _closeness(distance, lateral, turn, below * inside, rules.strict_depth_m),
+        }
+
+
+def _closeness(
+    distance_m: torch.Tensor, lateral_m: torch.Tensor, turn_rad: torch.Tensor, inside_m: torch.Tensor, depth_m: float
+) -> torch.Tensor:
+    """Returns how near an insertion is to done, 0 to 1: distance at three scales, alignment at three, depth inside the hole."""
+    approach = sum(1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.1)) / 3
+    aligned = sum(1 / (1 + lateral_m / scale) for scale in (0.1, 0.03, 0.01)) / 3
+    upright = 1 / (1 + turn_rad / 0.2)
+    return 0.3 * approach + 0.3 * aligned * approach + 0.1 * upright + 0.3 * (inside_m / depth_m).clamp(0.0, 1.0)

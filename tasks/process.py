@@ -1,0 +1,243 @@
+"""A tool-pose task at work: episodes, observations, masks and judgement for `N` environments at once.
+
+What differs between tasks (which target, what success means) is in the `Goal` that a task hands in; everything here is the same for all of
+them. No method synchronises with the host, and every tensor of `state` and `episode` keeps its address, so that the whole control step can
+be captured in one CUDA graph.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pkgutil import resolve_name
+from typing import Protocol
+
+import torch
+
+from brokk_rl.classical import Classical, ClassicalController, Guidance
+from brokk_rl.contracts import Transition, World
+from brokk_rl.history import History
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.observation import Encoder, Scaling
+from tasks.reward import Term
+from tasks.state import ToolState
+from tasks.tool_pose import Action, Noise, Switch
+
+REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
+
+
+class Goal(Protocol):
+    """What a tool-pose task must say about itself."""
+
+    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
+        """Draws valid starts; `q`, `scene`, `target_m` `(count, 3)` and `target_pitch_rad` `(count,)` at least."""
+        ...
+
+    def judge(self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Returns `success`, `paper_success` (bool) and `closeness`, each `(N,)`."""
+        ...
+
+
+@dataclass
+class Options:
+    """The parts of a task's configuration that the process itself uses; see `tasks.tool_pose` and the task's spec."""
+
+    episode_s: float
+    end_on_success: bool
+    limit_margin: float
+    depth_m: float
+    noise: Noise
+    switch: Switch
+    action: Action
+    scaling: Scaling
+    classical: Classical
+    reward: dict[str, Term]
+
+
+class ToolPoseProcess:
+    """See the module; fulfils `brokk_rl.contracts.TaskProcess`."""
+
+    reasons = REASONS
+
+    def __init__(self, goal: Goal, options: Options, machine: Machine, num_envs: int, device: torch.device) -> None:
+        def constant(values: object) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=device)
+
+        self.goal, self.options = goal, options
+        self.num_actions = machine.num_joints
+        self.max_episode_steps = round(options.episode_s / machine.period_s)
+        self._machine = machine
+        self._kinematics = Kinematics(machine, device)
+        self._controller: ClassicalController = options.classical.build(machine, device)
+        self._encoder = Encoder(machine, options.scaling, constant, torch.cat)
+        self._exclusive = constant(machine.is_exclusive).bool()
+        self._lower = constant(machine.lower) + options.limit_margin
+        self._upper = constant(machine.upper) - options.limit_margin
+        self._down = constant([0.0, 0.0, options.depth_m])
+        self._terms: list[tuple[Callable[[ToolState], torch.Tensor], float]] = [
+            (resolve_name(term.function), term.weight) for term in options.reward.values()
+        ]
+        num_joints = machine.num_joints
+        start = goal.starts(1, 0)
+        shapes = {f"start.{key}": tuple(value.shape[1:]) for key, value in start.items()}
+        shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "estimate_m": (3,), "q_scale": (), "u_scale": (), "steps": ()}
+        shapes |= {"u": (num_joints,), "u_before": (num_joints,), "closeness": (), "contact_force_n": ()}
+        shapes |= {"command": (num_joints,), "features": (self.num_features,), "policy": (self._encoder.size,), "privileged": (9,)}
+        shapes |= {"positioning": (), "rule_reach_m": ()}
+        self.state = {name: torch.zeros((num_envs, *shape), device=device) for name, shape in shapes.items()}
+        figures = ("success_strict", "success_paper", "time_to_insert_s", "lateral_error_m", "peak_force_n", "valve_travel")
+        self.episode = {name: torch.zeros(num_envs, device=device) for name in (*figures, "return", "length")}
+
+    @property
+    def num_features(self) -> int:
+        """Size of the `guide` group: commands of the classical controller, errors at three scales, pitch errors, reach, phase."""
+        return 2 * self.num_actions + 4 * 3 + 2 + 2
+
+    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
+        """See `TaskProcess.starts`."""
+        return self.goal.starts(count, seed)
+
+    def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor], history: History) -> None:
+        """See `TaskProcess.reset`."""
+        noise, state = self.options.noise, self.state
+        uniform = torch.rand(len(mask), 6, device=mask.device)
+        turn, lift = uniform[:, 0] * (2 * math.pi), uniform[:, 1] * 2 - 1
+        flat = torch.sqrt(1 - lift.square())
+        bias = torch.stack((flat * turn.cos(), flat * turn.sin(), lift), 1) * uniform[:, 2:3] * noise.target_bias_m
+        fresh = {f"start.{key}": value for key, value in start.items()}
+        fresh |= {"bias_m": bias, "q_scale": 1 + noise.q_scale * (2 * uniform[:, 3] - 1), "u_scale": 1 + noise.u_scale * (2 * uniform[:, 4] - 1)}
+        zero = torch.zeros((), device=mask.device)
+        for name, value in state.items():
+            rows = mask.reshape(-1, *[1] * (value.dim() - 1))
+            value.copy_(torch.where(rows, fresh.get(name, zero), value))
+        for value in self.episode.values():
+            value.masked_fill_(mask, 0.0)
+        self._perceive(history)
+        pose = self._kinematics.pose(history.q[:, -1])
+        closeness = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, self._start())["closeness"]
+        state["closeness"].copy_(torch.where(mask, closeness, state["closeness"]))
+
+    def command(self, action: torch.Tensor) -> torch.Tensor:
+        """See `TaskProcess.command`."""
+        kind, scale = self.options.action.kind, self.options.action.scale
+        u = scale * action + (self.state["command"] if kind == "residual" else 0.0)
+        u = torch.where(self._exclusive == self.state["positioning"][:, None].bool(), u, 0.0).clamp(-1.0, 1.0)
+        self.state["u_before"].copy_(self.state["u"])
+        self.state["u"].copy_(u)
+        return u
+
+    def step(self, history: History, world: World) -> Transition:
+        """See `TaskProcess.step`."""
+        state, options = self.state, self.options
+        q = history.q[:, -1]
+        pose = self._kinematics.pose(q)
+        start = self._start()
+        verdict = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)
+        state["steps"] += 1
+        first = state["steps"] == 1
+        failed = ((q < self._lower) | (q > self._upper)).any(1)
+        touching = first & (world.contact_force_n > 0)
+        fault = world.faults
+        success = verdict["success"] & ~fault & ~touching
+        seen = ToolState(
+            tip_m=pose.tip_in_base_m,
+            pitch_rad=pose.pitch_rad,
+            target_m=start["target_m"] - self._down,
+            target_pitch_rad=start["target_pitch_rad"],
+            reach_m=state["rule_reach_m"],
+            reach_range_m=options.switch.reach_m,
+            positioning=state["positioning"].bool(),
+            contact_force_n=world.contact_force_n,
+            u=state["u"],
+            u_before=state["u_before"],
+            lateral_m=(start["target_m"] - pose.tip_in_base_m)[:, :2].norm(dim=1),
+            success=success,
+            paper_success=verdict["paper_success"],
+            failed=failed,
+            closeness=verdict["closeness"],
+            closeness_before=state["closeness"],
+        )
+        reward = sum(weight * term(seen) for term, weight in self._terms)
+        reward = torch.where(fault | touching, 0.0, reward)
+        timed_out = state["steps"] >= self.max_episode_steps
+        ended = failed | touching | fault
+        if options.end_on_success:
+            ended = ended | success
+        # the order of REASONS decides when several hold; -1 while the episode goes on
+        reason = torch.full_like(state["steps"], -1.0)
+        endings = (success if options.end_on_success else torch.zeros_like(success), failed, touching, fault, timed_out)
+        for index in reversed(range(len(REASONS))):
+            reason = torch.where(endings[index], float(index), reason)
+        self._count(seen, reward, success)
+        state["closeness"].copy_(verdict["closeness"])
+        state["contact_force_n"].copy_(world.contact_force_n)
+        self._perceive(history)
+        return Transition(reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason)
+
+    def observe(self) -> dict[str, torch.Tensor]:
+        """See `TaskProcess.observe`: `policy`, `guide` (what the classical controller makes of it), `privileged` (for the critic)."""
+        return {"policy": self.state["policy"], "guide": self.state["features"], "privileged": self.state["privileged"]}
+
+    def _start(self) -> dict[str, torch.Tensor]:
+        return {name.removeprefix("start."): value for name, value in self.state.items() if name.startswith("start.")}
+
+    def _count(self, seen: ToolState, reward: torch.Tensor, success: torch.Tensor) -> None:
+        """Updates the figures of the running episode."""
+        episode, period_s = self.episode, self._machine.period_s
+        new = success & (episode["success_strict"] == 0)
+        episode["length"] += 1
+        episode["return"] += reward
+        episode["time_to_insert_s"].copy_(torch.where(new, episode["length"] * period_s, episode["time_to_insert_s"]))
+        open_ = episode["success_strict"] == 0
+        episode["lateral_error_m"].copy_(torch.where(open_, seen.lateral_m, episode["lateral_error_m"]))
+        episode["success_strict"].copy_(torch.where(success, 1.0, episode["success_strict"]))
+        episode["success_paper"].copy_(torch.where(seen.paper_success, 1.0, episode["success_paper"]))
+        episode["peak_force_n"].copy_(torch.maximum(episode["peak_force_n"], seen.contact_force_n))
+        travel = (seen.u - seen.u_before).abs().sum(1) / period_s
+        episode["valve_travel"] += (travel - episode["valve_travel"]) / episode["length"]
+
+    def _perceive(self, history: History) -> None:
+        """Writes what the policy is told after this step: estimates, guidance, phase and the observation groups."""
+        noise, state = self.options.noise, self.state
+        true_m = state["start.target_m"]
+        error = (2 * torch.rand_like(true_m) - 1) * noise.target_sample_m
+        if noise.target_relative:
+            error = error + (2 * torch.rand_like(true_m) - 1) * noise.target_relative * true_m
+        sample = true_m + state["bias_m"] + error
+        state["estimate_sum_m"] += sample
+        if noise.filter == "mean":
+            # a reset counts as the first sample, so that `steps` + 1 samples have been seen
+            sample = state["estimate_sum_m"] / (state["steps"] + 1)[:, None]
+        state["estimate_m"].copy_(sample)
+        q = history.q * state["q_scale"][:, None, None]
+        u = history.u * state["u_scale"][:, None, None]
+        guidance = self._controller.guide(q, u, sample - self._down, state["start.target_pitch_rad"], self.options.switch.reach_m)
+        positioning = self.options.switch.positioning(guidance)
+        state["positioning"].copy_(positioning)
+        state["rule_reach_m"].copy_(guidance.reach_m if self.options.switch.rule == "planar" else guidance.reach_3d_m)
+        state["command"].copy_(guidance.command)
+        state["policy"].copy_(self._encoder.encode(sample, q, u))
+        state["features"].copy_(features(guidance, positioning, u[:, -1]))
+        state["privileged"].copy_(self._privileged(sample))
+
+    def _privileged(self, sample: torch.Tensor) -> torch.Tensor:
+        """Returns what only the critic sees: error of the estimate, scales, contact, time left, closeness."""
+        state = self.state
+        rest = (
+            (state["q_scale"] - 1) * 100,
+            (state["u_scale"] - 1) * 10,
+            (state["contact_force_n"] / 2000).clamp(max=5.0),
+            state["steps"] / self.max_episode_steps,
+            state["closeness"],
+            state["positioning"],
+        )
+        return torch.cat(((sample - state["start.target_m"]) * 100, torch.stack(rest, 1)), 1)
+
+
+def features(guidance: Guidance, positioning: torch.Tensor, u_last: torch.Tensor) -> torch.Tensor:
+    """Returns what the default policy is told beside the paper's observation, all of it computed from that observation."""
+    errors = torch.cat((guidance.error_m, guidance.goal_error_m[:, None]), 1)
+    scales = (errors, (errors / 0.1).tanh(), (errors / 0.02).tanh())
+    turn = guidance.pitch_error_rad[:, None]
+    reach = (guidance.reach_m - 2.0)[:, None]
+    return torch.cat((guidance.command, u_last, *scales, turn, (turn / 0.1).tanh(), reach, positioning[:, None].float()), 1)

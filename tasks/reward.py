@@ -1,0 +1,100 @@
+"""Reward terms: free functions from the state after a control step to one number per environment, shape `(N,)`.
+
+A task lists the terms it uses with their weights in its YAML (`task.reward.<name>.weight=…`); an extension names its own functions there
+by `package.module:function`. The six terms of the paper's equation 1 carry the symbol of their term in the docstring.
+"""
+
+from pkgutil import resolve_name
+
+import torch
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import spec
+from tasks.state import ToolState
+
+
+@spec
+class Term:
+    """A weighted reward term.
+
+    Attributes:
+        function: `package.module:function` from `ToolState` to `(N,)`.
+        weight: Factor; negative for a penalty.
+    """
+
+    function: str
+    weight: float
+
+    def check(self) -> None:
+        try:
+            resolve_name(self.function)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ConfigError(f"reward term '{self.function}' cannot be found ({error}); expected package.module:function") from error
+
+    def __call__(self, state: ToolState) -> torch.Tensor:
+        """Returns the weighted term, `(N,)`."""
+        return self.weight * resolve_name(self.function)(state)
+
+
+# the paper's equation 1
+
+
+def working_distance(state: ToolState) -> torch.Tensor:
+    """r^m: while positioning, 0.25 at the edge of the good working range, less outside."""
+    near, far = state.reach_range_m
+    outside = (state.reach_m - far).clamp(min=0.0) + (near - state.reach_m).clamp(min=0.0)
+    return state.positioning * 0.25 / (1.0 + outside)
+
+
+def distance(state: ToolState) -> torch.Tensor:
+    """r^d: 1 / (1 + distance of the tool to the target in m), once not positioning."""
+    return ~state.positioning / (1.0 + state.distance_m)
+
+
+def pitch(state: ToolState) -> torch.Tensor:
+    """r^o: 1 / (1 + pitch error in rad), once not positioning."""
+    return ~state.positioning / (1.0 + state.pitch_error_rad)
+
+
+def insertion(state: ToolState) -> torch.Tensor:
+    """r^i: r^d + r^o (weighted five times in the paper) while the paper's criterion of success holds."""
+    return state.paper_success * (1.0 / (1.0 + state.distance_m) + 1.0 / (1.0 + state.pitch_error_rad))
+
+
+def far_contact(state: ToolState) -> torch.Tensor:
+    """r^c: contact force in N while the tool is far from the hole (r^d <= 0.7, that is beyond 0.43 m)."""
+    far = 1.0 / (1.0 + state.distance_m) <= 0.7
+    return (far & ~state.positioning) * state.contact_force_n
+
+
+def command_change(state: ToolState) -> torch.Tensor:
+    """r^a: sum over joints of the change of command since the last step."""
+    return (state.u - state.u_before).abs().sum(1)
+
+
+# beyond the paper
+
+
+def progress(state: ToolState) -> torch.Tensor:
+    """Gain of closeness in this step: a potential, so that it changes what is learned first but not what is best (Ng et al. 1999)."""
+    return state.closeness - state.closeness_before
+
+
+def success(state: ToolState) -> torch.Tensor:
+    """One when the strict criterion is fulfilled."""
+    return state.success.float()
+
+
+def failure(state: ToolState) -> torch.Tensor:
+    """One plus the closeness that is given up when the episode ends by a joint limit."""
+    return state.failed * (1.0 + state.closeness)
+
+
+def contact(state: ToolState) -> torch.Tensor:
+    """Contact force in kN, saturating at 10 kN: a hydraulic arm can break what it leans on."""
+    return (state.contact_force_n / 1000.0).clamp(max=10.0)
+
+
+def duration(state: ToolState) -> torch.Tensor:
+    """One each step: time is money."""
+    return torch.ones_like(state.reach_m)

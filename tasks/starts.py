@@ -1,0 +1,93 @@
+"""Random starts from which a tool-pose task can be done.
+
+A start is kept only if the tool begins in the open and if, after the exclusive joints have brought the target into reach, the other joints
+reach the wanted pose within their limits. Checked once with the kinematics when a task is built, so that resets only pick rows.
+"""
+
+import torch
+
+from brokk_rl.classical import ClassicalController
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+@spec
+class Arms:
+    """Where the arm may begin.
+
+    Attributes:
+        margin_rad: Distance from joint limits.
+        floor_m: Height above the ground that no joint behind the second and no tool point starts below.
+        clearance_m: Height above the object that the tool point does not start below.
+        nearest_m: Horizontal distance from the slew axis that the tool point does not start within.
+    """
+
+    margin_rad: float
+    floor_m: float
+    clearance_m: float
+    nearest_m: float
+
+
+def random_arms(
+    arms: Arms, machine: Machine, controller: ClassicalController, object_z_m: torch.Tensor, generator: torch.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Draws one arm configuration per row of `object_z_m`: returns `q` `(M, J)` and whether it is in the open `(M,)` bool."""
+    lower = torch.as_tensor(machine.lower, dtype=torch.float32) + arms.margin_rad
+    upper = torch.as_tensor(machine.upper, dtype=torch.float32) - arms.margin_rad
+    q = lower + (upper - lower) * torch.rand(len(object_z_m), machine.num_joints, generator=generator)
+    pose = controller.kinematics.pose(q)
+    tip = pose.tip_in_base_m
+    free = (tip[:, 2] > object_z_m + arms.clearance_m) & (tip[:, 2] > arms.floor_m)
+    free &= tip[:, :2].norm(dim=1) > arms.nearest_m
+    free &= (pose.joints_in_base_m[:, 2:, 2] > arms.floor_m).all(1)
+    return q, free
+
+
+def reachable(
+    controller: ClassicalController,
+    machine: Machine,
+    q: torch.Tensor,
+    target_m: torch.Tensor,
+    pitch_rad: torch.Tensor,
+    reach_m: tuple[float, float],
+    margin_rad: float,
+) -> torch.Tensor:
+    """Returns from which `q`, `(M, J)`, the target pose can be reached under the masks, `(M,)` bool.
+
+    First the exclusive joints move until the reach lies well inside the good working range, then the others by damped least squares.
+    """
+    exclusive = torch.as_tensor(machine.is_exclusive)
+    lower = torch.as_tensor(machine.lower, dtype=torch.float32) + margin_rad
+    upper = torch.as_tensor(machine.upper, dtype=torch.float32) - margin_rad
+    inner = 0.25 * (reach_m[1] - reach_m[0])
+    q = q.clone()
+    for _ in range(40):
+        reach, slope = controller.reach(q, target_m)
+        wanted = reach.clamp(reach_m[0] + inner, reach_m[1] - inner)
+        inside = (reach >= reach_m[0]) & (reach <= reach_m[1])
+        step = ((wanted - reach)[:, None] * slope / (slope.square() + 0.05)).clamp(-0.1, 0.1)
+        q = torch.where(exclusive & ~inside[:, None], (q + step).clamp(lower, upper), q)
+    reach, _ = controller.reach(q, target_m)
+    good = (reach > reach_m[0]) & (reach < reach_m[1])
+    for _ in range(120):
+        pose, jacobian = controller.kinematics.pose_and_jacobian(q)
+        error = target_m - pose.tip_in_base_m
+        share = controller.approach(jacobian.tip, jacobian.pitch, error, error[:, 2], pitch_rad - pose.pitch_rad)
+        q = (q + 0.2 * share * controller.speed).clamp(lower, upper)
+    pose = controller.kinematics.pose(q)
+    near = (target_m - pose.tip_in_base_m).norm(dim=1) < 0.01
+    return good & near & ((pitch_rad - pose.pitch_rad).abs() < 0.03)
+
+
+def keep(count: int, drawn: list[dict[str, torch.Tensor]], what: str) -> dict[str, torch.Tensor]:
+    """Joins batches of accepted starts and cuts them to `count`.
+
+    Raises:
+        ConfigError: If too few were accepted.
+    """
+    joined = {key: torch.cat([batch[key] for batch in drawn]) for key in drawn[0]}
+    found = len(joined["q"])
+    if found < count:
+        raise ConfigError(f"{what}: only {found} of {count} starts were reachable; widen the joint limits or narrow the ranges of the task")
+    return {key: value[:count] for key, value in joined.items()}

@@ -1,0 +1,80 @@
+"""Bringing the tool to a pose: what the tasks of this package share.
+
+A task of this family has a target point and a wanted pitch. The policy sees an estimate of the target that is wrong in the way a camera is
+wrong, positions and commands through a scale that is slightly off, and acts under the masks of the machine: the exclusive joints alone
+while positioning, all others afterwards.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from brokk_rl.classical import Classical, Guidance
+from brokk_rl.contracts import World
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.observation import Encoder, Scaling
+from brokk_rl.spec import spec
+
+
+@spec
+class Noise:
+    """What the policy is told is wrong by; drawn anew each episode unless said otherwise.
+
+    Attributes:
+        target_sample_m: Uniform error of the target in each sample and axis (±).
+        target_bias_m: Length of the constant error of the target, uniform from 0, in a random direction.
+        target_relative: Uniform error of each sample as a share of each coordinate (±); the paper's 5 %.
+        filter: `mean` gives the policy the mean of all estimates of the episode, as a tracker of a fixed hole does; `none` each sample.
+        q_scale: Scale error of all measured positions (±).
+        u_scale: Scale error of all recorded commands (±).
+    """
+
+    target_sample_m: float
+    target_bias_m: float
+    target_relative: float
+    filter: Literal["none", "mean"]
+    q_scale: float
+    u_scale: float
+
+
+@spec
+class Switch:
+    """When only the exclusive joints move (paper, section III-B).
+
+    Attributes:
+        rule: `planar`: while the reach, with the target turned into the arm's plane, is out of range and the tool is not low; it does not
+            depend on where q1 points and always lets the episode proceed. `text`: the same with the distance in space, as the paper's text
+            says. `equation`: while that distance is out of range or the tool is above the height, as the paper's equation 1 says.
+        reach_m: The good working range (nearest, farthest).
+        height_m: Height of the tool below which the exclusive joints rest, to keep it off the ground.
+    """
+
+    rule: Literal["planar", "text", "equation"]
+    reach_m: tuple[float, float]
+    height_m: float
+
+    def positioning(self, guidance: Guidance) -> torch.Tensor:
+        """Returns which environments are positioning, `(N,)` bool."""
+        near, far = self.reach_m
+        distance = guidance.reach_m if self.rule == "planar" else guidance.reach_3d_m
+        out = (distance < near) | (distance > far)
+        if self.rule == "equation":
+            return out | (guidance.tip_z_m >= self.height_m)
+        return out & (guidance.tip_z_m >= self.height_m)
+
+
+@spec
+class Action:
+    """How the policy's output becomes valve commands.
+
+    Attributes:
+        kind: `direct`: the output is the command. `residual`: it is added to the classical controller's command.
+        scale: Factor on the output.
+    """
+
+    kind: Literal["direct", "residual"]
+    scale: float
