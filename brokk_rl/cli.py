@@ -1,59 +1,90 @@
-"""The command `brokk`: compose the configuration, instantiate the mode, run it."""
+"""The command `brokk`: compose the configuration, instantiate the mode, run it, and say plainly what went wrong."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import errno
 import logging
 import os
+import re
 import sys
+import traceback
+from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import ConfigCompositionException, HydraException, InstantiationException, MissingConfigException
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 from rich.logging import RichHandler
 
-from brokk_rl import extensions
-from brokk_rl.errors import BrokkError
+from brokk_rl import extensions, registry
+from brokk_rl.errors import BrokkError, choices
+
+log = logging.getLogger(__name__)
+
+
+class Stopped(BaseException):
+    """A failed job on its way to `main`; no `Exception`, so that Hydra passes it on without a line of its own."""
 
 
 def main() -> int:
-    """Runs the command and returns its exit code: 0, 1 failed, 2 something the user can mend, 130 interrupted."""
+    """Runs the command and returns its exit code: 0 done, 1 our own fault, 2 something the user can mend, 130 interrupted."""
     trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands its errors to us instead of printing them
+    set_up_logging()
     try:
-        extensions.register()
-        hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")(job)()
+        with _hydra_raises():
+            extensions.register()
+            hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")(job)()
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         return 130
-    except (BrokkError, HydraException, OmegaConfBaseException) as error:
-        if trace:
-            raise
-        sys.stderr.write(f"error: {error}\n")
-        return 2
+    except (Stopped, Exception) as error:
+        SweepFolder.drop_if_unused()
+        cause = error.args[0] if isinstance(error, Stopped) else error
+        message = explain(cause)
+        if trace or message is None:
+            traceback.print_exception(cause)
+        if message is not None:
+            sys.stderr.write(f"error: {message}\n")
+        return 1 if message is None else 2
     return 0
 
 
 def job(cfg: DictConfig) -> float | None:
     """Runs one composed configuration: all of `brokk`, or one job of a sweep."""
-    set_up_logging()
-    settings = HydraConfig.get()
+    set_up_logging()  # a launcher may run the job in a process of its own
+    try:
+        return _run(cfg)
+    except Exception as error:
+        if HydraConfig.get().mode is not RunMode.MULTIRUN:
+            raise Stopped(error) from error
+        if message := explain(error):  # the other jobs go on and Hydra repeats only the first error at the end
+            log.error("job %s failed: %s", HydraConfig.get().job.num, message)
+        raise
+
+
+def _run(cfg: DictConfig) -> float | None:
+    """Instantiates the mode and runs it within its session, where it has one."""
     if "session" not in cfg:
         return instantiate(cfg, _convert_="all").run()
+    settings = HydraConfig.get()
     folder = run_folder(cfg)
-    mode = instantiate(cfg, session={"out": str(folder)}, _convert_="all")
-    choices = {str(key): value for key, value in settings.runtime.choices.items() if value and not str(key).startswith("hydra")}
-    facts: dict[str, Any] = {"mode": _mode_name(cfg), "choices": choices, "overrides": list(settings.overrides.task)}
+    try:
+        mode = instantiate(cfg, session={"out": str(folder)}, _convert_="all")
+    except Exception:
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # made by Hydra for a job of a sweep; stays if it holds anything
+        raise
+    chosen = {str(key): value for key, value in settings.runtime.choices.items() if value and str(key).split("/")[0] != "hydra"}
+    facts: dict[str, Any] = {"mode": _mode_name(cfg), "choices": chosen, "overrides": list(settings.overrides.task)}
     if machine := getattr(mode, "machine", None):
         facts |= {"machine": machine.name, "fingerprint": machine.fingerprint()}
     with mode.session.start(_resolved(cfg), facts, resume=bool(getattr(mode, "resume", None))) as record:
@@ -67,7 +98,11 @@ def run_folder(cfg: DictConfig) -> Path:
     if settings.mode is RunMode.MULTIRUN:
         return Path(settings.runtime.output_dir)
     out = OmegaConf.select(cfg, "session.out", default=None)
-    return Path(out) if out else Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{_mode_name(cfg)}"
+    if out:
+        return Path(out)
+    name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
+    stem = "_".join(filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", _mode_name(cfg), name)))
+    return Path("runs") / stem
 
 
 def set_up_logging() -> None:
@@ -76,14 +111,135 @@ def set_up_logging() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
 
 
+class SweepFolder(Callback):
+    """Remembers the folder that Hydra makes for a sweep before it has composed a single job."""
+
+    path: Path | None = None
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Called by Hydra before it makes the folder."""
+        path = Path(str(config.hydra.sweep.dir))
+        type(self).path = None if path.exists() else path
+
+    @classmethod
+    def drop_if_unused(cls) -> None:
+        """Removes the folder when no job has written into it."""
+        if cls.path and cls.path.is_dir() and {p.name for p in cls.path.iterdir()} <= {"multirun.yaml"}:
+            (cls.path / "multirun.yaml").unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                cls.path.rmdir()
+                cls.path.parent.rmdir()  # `multirun`, if this was the only sweep
+
+
+def explain(error: BaseException) -> str | None:
+    """Returns what to tell a person about `error`, `None` when it is our own fault and deserves its traceback."""
+    chain = list(_causes(error))
+    ours = next((e for e in chain if isinstance(e, BrokkError)), None)
+    full = next((e for e in chain if isinstance(e, OSError) and e.errno == errno.ENOSPC), None)
+    missing = next((e for e in chain if isinstance(e, MissingMandatoryValue)), None)
+    if full:
+        return f"the disk is full{f' ({full.filename})' if full.filename else ''}. Free some space or choose another disk with session.out=<folder>."
+    if ours:
+        return f"{ours}{_node(error)}"
+    if missing:
+        key = str(missing.full_key or missing)
+        return f"{key} has no default and must be given: {key}=<value>"
+    if isinstance(error, MissingConfigException):
+        return _no_such_option(error)
+    if isinstance(error, InstantiationException):
+        return _bad_node(error)
+    if isinstance(error, ConfigCompositionException):
+        return _bad_override(error)
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return str(error)
+    return None
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__
+
+
+def _no_such_option(error: MissingConfigException) -> str:
+    group, _, name = str(error.missing_cfg_file).rpartition("/")
+    if not group:
+        return str(error).split("\nConfig search path")[0]
+    if not error.options:
+        return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
+    return f"there is no {group}={name}; {choices(name, error.options)}"
+
+
+def _bad_node(error: InstantiationException) -> str:
+    """Explains a node that cannot be built: a field that its spec does not have, one that it lacks, a target that is not there."""
+    cause = error.__cause__
+    called = re.search(r"call to target '([\w.]+)'", str(error))
+    if called and isinstance(cause, TypeError):
+        known = list(getattr(get_class(called[1]), "__dataclass_fields__", ()))
+        name = called[1].rpartition(".")[2]
+        if unknown := re.search(r"unexpected keyword argument '(\w+)'", str(cause)):
+            return f"{name} has no field '{unknown[1]}'; {choices(unknown[1], known)}{_node(error)}"
+        if lacking := re.search(r"missing \d+ required keyword-only arguments?: (.+)", str(cause)):
+            return f"{name} lacks {lacking[1]}{_node(error)}"
+    return str(error)
+
+
+def _node(error: BaseException) -> str:
+    """Returns where in the configuration an object could not be built, as the tail of a message."""
+    found = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, InstantiationException) else None
+    return f" (in '{found[1]}': change {found[1]}.<field>=… or its file)" if found else ""
+
+
+def _bad_override(error: ConfigCompositionException) -> str:
+    """Explains an override of something that the configuration does not hold."""
+    text = str(error)
+    found = re.search(r"(?:In '([^']+)': )?Could not override '([^']+)'", text)
+    if not found:
+        return "\n".join(filter(None, (text, str(error.__cause__ or ""))))
+    where, key = found[1], found[2].split("@")[0]
+    source = f"{where} changes" if where and where != "config" else "you gave"
+    with contextlib.suppress(Exception):  # the mode itself may not compose; then the short answer must do
+        cfg = _mode_alone()
+        if "No match in the defaults list" in text or key in {option.group for option in registry.options()}:
+            groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra")]
+            return f"{source} '{key}', but mode={_mode_name(cfg)} does not use such a group; {choices(key, groups)}"
+        parent, _, leaf = key.rpartition(".")
+        while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:
+            parent, _, leaf = parent.rpartition(".")
+        names = [str(k) for k in node if str(k) not in ("hydra", "_target_")] if isinstance(node, DictConfig) else []
+        return f"{source} '{key}', but '{parent or f'mode={_mode_name(cfg)}'}' has no '{leaf}'; {choices(leaf, names)}"
+    return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --cfg job` shows what it has"
+
+
+def _mode_alone() -> DictConfig:
+    """Composes the mode of the command line without any other override, to see what it offers."""
+    modes = [arg for arg in sys.argv[1:] if arg.startswith("mode=")]
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        return hydra.compose("config", overrides=modes[-1:], return_hydra_config=True)
+
+
 def _mode_name(cfg: DictConfig) -> str:
     return str(cfg._target_).split(".")[-2]
 
 
 def _resolved(cfg: DictConfig) -> str:
-    """Returns the text of `resolved.yaml`, which runs again under a new folder."""
+    """Returns the text of `resolved.yaml`, which runs again in a new folder."""
     values = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
     values.session.out = "???"
-    return "# Runs again: brokk --config-dir <this folder> --config-name resolved\n" + OmegaConf.to_yaml(
-        OmegaConf.merge({"defaults": [{"hydra": "brokk"}, "_self_"]}, values)
-    )
+    settings = {"defaults": [{"hydra": "brokk"}, "_self_"]}
+    return "# Runs again: brokk --config-dir <this folder> --config-name resolved\n" + OmegaConf.to_yaml(OmegaConf.merge(settings, values))
+
+
+@contextlib.contextmanager
+def _hydra_raises() -> Iterator[None]:
+    """Makes Hydra raise its errors instead of printing them and leaving."""
+    name = "HYDRA_FULL_ERROR"
+    before = os.environ.get(name)
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
