@@ -1,0 +1,29 @@
+# Everything a person needs, on a machine with Python 3.11, git and make. uv comes into .venv when there is none.
+PYTHON ?= python3
+BIN := .venv/bin
+UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
+
+.PHONY: train test check setup clean
+
+train: setup            ## train the main job on whatever is there and leave a run folder
+	$(BIN)/brokk mode=train
+
+test: setup             ## all tests that run without a GPU
+	$(BIN)/python -m pytest -q -m "not gpu"
+
+check: setup            ## format, lint, types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+setup: .venv/.synced    ## the environment of uv.lock in .venv
+
+.venv/.synced: uv.lock pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	command -v $(UV) >/dev/null || $(BIN)/python -m pip install --quiet uv
+	UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact
+	touch $@
+
+clean:                  ## everything that can be made again; runs and recordings stay
+	rm -rf .venv dist .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
