@@ -1,0 +1,84 @@
+"""The drive: makes the joints follow what the actuator model predicts, holds the arm, and yields where something blocks it.
+
+Each joint has a servo of its own inside MuJoCo, force = stiffness (act - q) - damping q', cut off at the yield force (the relief valve).
+Its reference is accumulated from the predicted increments. "Present position + increment" would be wrong: any sag under load becomes the
+next starting point, and the arm sinks. Within a control period the reference moves on at constant speed v (MuJoCo integrates ctrl = v into
+act), led by v damping / stiffness, so that damping does not cost a lag.
+
+Gravity is compensated in the links: the actuator model was learned on a machine that has its weight, so what gravity does to the motion is
+already in its increments and must not be counted twice.
+"""
+
+import mujoco
+import numpy as np
+import torch
+
+from brokk_rl.machine import Machine
+
+DAMPING_RATIO = 0.7
+"""Of the servo against the inertia seen at the joint at home; a heavier pose is damped less."""
+
+
+def add_drive(spec: mujoco.MjSpec, machine: Machine, inertia: np.ndarray) -> None:
+    """Adds one servo per joint, in machine order.
+
+    Args:
+        spec: Model with the joints.
+        machine: Gives stiffness and yield force.
+        inertia: Inertia seen at each joint, `(J,)`, kg m² or kg.
+    """
+    for joint, seen in zip(machine.joints, inertia, strict=True):
+        stiffness = joint.stiffness.value
+        damping = 2.0 * DAMPING_RATIO * float(np.sqrt(stiffness * seen))
+        actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_intvelocity(kp=stiffness, kv=damping)
+        actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        actuator.forcerange = (-joint.yield_force.value, joint.yield_force.value)
+
+
+class Drive:
+    """References of all drives of all worlds; every update is in place.
+
+    Args:
+        model: Compiled model with the servos.
+        machine: Gives the control period and yield forces.
+        num_worlds: `N`.
+        device: Where the worlds live.
+        dtype: Type in which the reference accumulates.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, machine: Machine, num_worlds: int, device: torch.device | str, dtype: torch.dtype
+    ) -> None:
+        stiffness, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+
+        def constant(values: np.ndarray) -> torch.Tensor:
+            return torch.tensor(values, dtype=dtype, device=device)
+
+        self.reference = torch.zeros(num_worlds, machine.num_joints, dtype=dtype, device=device)
+        self._rate = 1.0 / machine.period_s
+        self._lead = constant(damping / stiffness)
+        self._leash = constant(np.array([joint.yield_force.value for joint in machine.joints]) / stiffness)
+
+    def step(self, q: torch.Tensor, increment: torch.Tensor, act: torch.Tensor, ctrl: torch.Tensor) -> None:
+        """Moves the references on by one control period.
+
+        The reference never leads the joint by more than what opens the relief valve, so a blocked joint does not wind up.
+
+        Args:
+            q: Present positions, `(N, J)`.
+            increment: Predicted motion over the coming period, `(N, J)`.
+            act: Written: activations at the start of the period, `(N, J)`.
+            ctrl: Written: reference speeds, `(N, J)`.
+        """
+        reference = self.reference
+        torch.clamp(reference, q - self._leash, q + self._leash, out=reference)
+        ctrl.copy_(increment).mul_(self._rate)
+        torch.addcmul(reference, self._lead, ctrl, out=act)
+        reference.add_(increment)
+
+    def reset(self, mask: torch.Tensor, q: torch.Tensor) -> None:
+        """Puts the references of the worlds of `mask`, `(N,)` bool, to `q`, `(N, J)`."""
+        torch.where(mask[:, None], q.to(self.reference.dtype), self.reference, out=self.reference)

@@ -1,0 +1,149 @@
+"""From a machine and its MJCF to a compiled MuJoCo model.
+
+The MJCF says what the links look like and how their mass is distributed; every number about the machine is written into it from the
+machine's YAML, so that simulation, policy and the machine's own computer cannot disagree.
+"""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.sim.drive import add_drive
+from brokk_rl.sim.scene import add_block
+
+ASSETS = Path(__file__).parent / "assets"
+VISUAL_GROUP = 2
+"""Geoms of this group are for the eye only."""
+
+
+def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> mujoco.MjModel:
+    """Returns the model of `machine` at a work site with a block.
+
+    Args:
+        machine: The machine.
+        timestep_s: Length of a substep.
+        visual: Keeps what only pictures need; the physics is the same without, and faster.
+
+    Raises:
+        ConfigError: The MJCF is missing or its joints are not those of the machine.
+    """
+    spec = _read(machine)
+    _write_machine(spec, machine)
+    add_block(spec, visual)
+    _write_options(spec, timestep_s)
+    if not visual:
+        _strip(spec)
+    model = spec.compile()
+    add_drive(spec, machine, _inertia_seen(model, machine))
+    return spec.compile()
+
+
+def contact_sensors(model: mujoco.MjModel) -> np.ndarray:
+    """Returns 1 for the touch sensors among `sensordata` and 0 for all others; the touch sensors' sum is the contact force."""
+    chosen = np.zeros(model.nsensordata)
+    chosen[model.sensor_adr[model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH]] = 1.0
+    return chosen
+
+
+def _read(machine: Machine) -> mujoco.MjSpec:
+    path = ASSETS / machine.mjcf
+    if not path.exists():
+        raise ConfigError(f"machine {machine.name}: no MJCF at {path}; set `mjcf` to a file under {ASSETS} or to an absolute path")
+    try:  # included rather than attached, so that names stay as the MJCF gives them
+        includes = "".join(f'<include file="{file}"/>' for file in (ASSETS / "worksite.xml", path))
+        spec = mujoco.MjSpec.from_string(f"<mujoco>{includes}</mujoco>")
+    except ValueError as error:
+        raise ConfigError(f"machine {machine.name}: {path} is not a valid MJCF: {error}") from error
+    spec.modelfiledir = str(path.parent)
+    found = [joint.name for joint in spec.joints]
+    if found != list(machine.joint_names):
+        missing = [name for name in machine.joint_names if name not in found]
+        extra = [name for name in found if name not in machine.joint_names]
+        raise ConfigError(
+            f"machine {machine.name}: the joints of {path.name} ({', '.join(found)}) are not those of the machine "
+            f"({', '.join(machine.joint_names)}); missing: {', '.join(missing) or 'none'}, unknown: {', '.join(extra) or 'none'}"
+        )
+    if spec.site("tip") is None:
+        raise ConfigError(f"machine {machine.name}: {path.name} has no site 'tip' for the tool point")
+    return spec
+
+
+def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
+    """Writes origins, axes, limits, masses and the tool point into `spec`."""
+    drawn = spec.copy().compile()
+    links = [spec.joint(name).parent for name in machine.joint_names]
+    ends = [np.array([d.value for d in joint.origin_m]) for joint in machine.joints[1:]] + [_values(machine.tool_m)]
+    for joint, link, end, drawn_end in zip(machine.joints, links, ends, [*(b.pos for b in links[1:]), spec.site("tip").pos], strict=True):
+        _stretch(link, np.array(drawn_end), end)
+        _write_inertia(link, drawn, joint.mass_kg.value, joint.com_m)
+        link.pos = _values(joint.origin_m)
+        link.gravcomp = 1.0
+        hinge = spec.joint(joint.name)
+        hinge.type = mujoco.mjtJoint.mjJNT_HINGE if joint.kind == "hinge" else mujoco.mjtJoint.mjJNT_SLIDE
+        hinge.axis, hinge.pos = joint.axis, (0.0, 0.0, 0.0)
+        hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_TRUE, (joint.lower.value, joint.upper.value)
+    spec.site("tip").pos = _values(machine.tool_m)
+
+
+def _values(dimensions: tuple) -> np.ndarray:
+    return np.array([d.value for d in dimensions])
+
+
+def _stretch(link: mujoco.MjsBody, drawn_end: np.ndarray, end: np.ndarray) -> None:
+    """Scales the geoms of a link along it when its length differs from the one drawn in the MJCF."""
+    drawn_length, length = np.linalg.norm(drawn_end), np.linalg.norm(end)
+    if drawn_length < 1e-9 or abs(length - drawn_length) < 1e-9:
+        return
+    along, factor = drawn_end / drawn_length, length / drawn_length
+
+    def scaled(point: np.ndarray) -> np.ndarray:
+        return point + (factor - 1.0) * along * (along @ point)
+
+    for geom in link.geoms:
+        if np.isfinite(geom.fromto[0]):
+            geom.fromto = np.concatenate([scaled(geom.fromto[:3]), scaled(geom.fromto[3:])])
+            continue
+        geom.pos = scaled(geom.pos)
+        if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
+            axes = np.zeros(9)
+            mujoco.mju_quat2Mat(axes, geom.quat)
+            geom.size = geom.size * (1.0 + (factor - 1.0) * np.abs(along @ axes.reshape(3, 3)) ** 2)
+
+
+def _write_inertia(link: mujoco.MjsBody, drawn: mujoco.MjModel, mass_kg: float, com_m: tuple[float, float, float]) -> None:
+    """Gives the link its mass and centre of mass; its inertia is that of the MJCF, scaled with the mass."""
+    body = drawn.body(link.name)
+    if body.mass[0] <= 0.0:
+        raise ConfigError(f"link '{link.name}' of the MJCF has no mass: give it an <inertial> or a geom with density")
+    link.explicitinertial = True
+    link.mass, link.ipos, link.iquat = mass_kg, com_m, body.iquat
+    link.inertia = body.inertia * (mass_kg / body.mass[0])
+
+
+def _write_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
+    option = spec.option
+    option.timestep = timestep_s
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+
+
+def _strip(spec: mujoco.MjSpec) -> None:
+    """Removes what only pictures need."""
+    for geom in [g for g in spec.geoms if g.group == VISUAL_GROUP]:
+        spec.delete(geom)
+    for thing in [*spec.cameras, *spec.lights]:
+        spec.delete(thing)
+
+
+def _inertia_seen(model: mujoco.MjModel, machine: Machine) -> np.ndarray:
+    """Returns the diagonal of the mass matrix at home, `(J,)`."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = machine.home
+    mujoco.mj_forward(model, data)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    return np.diag(full).copy()

@@ -1,0 +1,125 @@
+"""The concrete block with the borehole: what may differ from world to world, and what that means for MuJoCo's geoms.
+
+A scene is a vector of `COLUMNS`. The block is a mocap body whose origin is the centre of the borehole's rim, z along the hole's axis out
+of the block. The borehole is a regular octagon around the drilled circle: four slabs whose inner faces make a square, four posts that cut
+its corners. A slab that serves as block and wall of the hole saves half of the geom pairs that a closed ring would need.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import torch
+
+COLUMNS = ("hole_x_m", "hole_y_m", "rim_z_m", "yaw_rad", "block_scale", "hole_radius_m")
+"""Columns of a scene, `S` of them: centre of the rim in the base frame, turn of the block about the vertical, factor on its footprint,
+radius of the circle that the borehole's walls inscribe."""
+SIZE = len(COLUMNS)
+
+HALF_LENGTH_M, HALF_WIDTH_M, HEIGHT_M = 0.5, 0.4, 0.75
+"""Nominal block: 1.0 x 0.8 m and 0.75 m high; it goes into the ground where the rim is lower."""
+HOLE_RADIUS_M = 0.05
+"""Paper: a borehole of 10 cm."""
+HOLE_DEPTH_M = 0.40
+MAX_SCALE, MAX_HOLE_RADIUS_M = 1.25, 0.08
+"""Bounds of a scene; MuJoCo's bounding volumes are compiled for the largest block and stay valid for every smaller one."""
+POST_M = 0.02
+"""Half the thickness of the posts; more than `MAX_HOLE_RADIUS_M * (sqrt(2) - 1) / 2`, so that they reach the corners of the square."""
+
+_TOOL, _ARM = 1, 2  # contact bits: the chisel meets the real hole, everything else the block as if it had none
+_FRICTION = (0.4, 0.005, 0.0001)  # steel on concrete
+_DIAGONAL = float(np.sqrt(0.5))
+
+
+@dataclass(frozen=True)
+class Block:
+    """Geoms of the block in its own frame.
+
+    Attributes:
+        names: Geom names.
+        size: Half sizes (or radius, half height), `(G, 3)`, m.
+        pos: Centres, `(G, 3)`, m.
+        yaw_rad: Turn of each geom about the hole's axis, `(G,)`.
+    """
+
+    names: tuple[str, ...]
+    size: np.ndarray
+    pos: np.ndarray
+    yaw_rad: np.ndarray
+
+
+def nominal(num_worlds: int, device: torch.device | str = "cpu") -> torch.Tensor:
+    """Returns scenes with the nominal block in front of the machine, `(N, S)`."""
+    return torch.tensor([2.6, 0.0, HEIGHT_M, 0.0, 1.0, HOLE_RADIUS_M], device=device).repeat(num_worlds, 1)
+
+
+def collision_block(scale: float, radius_m: float) -> Block:
+    """Returns the colliding geoms of a block; sizes and positions are affine in both arguments."""
+    length, width, middle = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale, -HEIGHT_M / 2
+    parts: list[tuple[str, tuple[float, float, float], tuple[float, float, float], float]] = []
+    for sign, name in ((1, "front"), (-1, "back")):
+        parts.append((f"slab_{name}", ((length - radius_m) / 2, width, -middle), (sign * (length + radius_m) / 2, 0, middle), 0.0))
+    for sign, name in ((1, "left"), (-1, "right")):
+        parts.append((f"slab_{name}", (radius_m, (width - radius_m) / 2, -middle), (0, sign * (width + radius_m) / 2, middle), 0.0))
+    for i in range(4):
+        angle = np.pi / 4 + i * np.pi / 2
+        x, y = (radius_m + POST_M) * np.cos(angle), (radius_m + POST_M) * np.sin(angle)
+        parts.append((f"post_{i}", (POST_M, radius_m * np.tan(np.pi / 8) + POST_M, -middle), (x, y, middle), angle))
+    plug = (HEIGHT_M - HOLE_DEPTH_M) / 2
+    parts.append(("plug", (radius_m, radius_m, plug), (0, 0, -HOLE_DEPTH_M - plug), 0.0))
+    parts.append(("block_envelope", (length, width, -middle), (0, 0, middle), 0.0))
+    names, size, pos, yaw = zip(*parts, strict=True)
+    return Block(names, np.array(size, float), np.array(pos, float), np.array(yaw, float))
+
+
+def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
+    """Adds the mocap body `block` with its geoms, as large as a scene may make it; `visual` adds what only the eye needs."""
+    body = spec.worldbody.add_body(name="block", mocap=True, pos=nominal(1)[0, :3].numpy())
+    block = collision_block(MAX_SCALE, MAX_HOLE_RADIUS_M)
+    for name, size, pos, yaw in zip(block.names, block.size, block.pos, block.yaw_rad, strict=True):
+        is_envelope = name == "block_envelope"
+        body.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn(yaw), contype=0,
+            conaffinity=_ARM if is_envelope else _TOOL, friction=_FRICTION, group=3 if is_envelope else 1,
+            material="hole_bottom" if name == "plug" else "concrete",
+        )  # fmt: skip
+    if visual:
+        body.add_camera(
+            name="close", pos=(-0.75, -1.15, 0.75), fovy=38, mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY, targetbody="block"
+        )
+
+
+def _turn(yaw_rad: float) -> tuple[float, float, float, float]:
+    return (float(np.cos(yaw_rad / 2)), 0.0, 0.0, float(np.sin(yaw_rad / 2)))
+
+
+class Placement:
+    """Turns scenes into MuJoCo's numbers, batched in torch.
+
+    Args:
+        model: Compiled model; gives the ids of the geoms.
+        device: Where the scenes lie.
+        dtype: Type of the results.
+    """
+
+    def __init__(self, model: mujoco.MjModel, device: torch.device | str, dtype: torch.dtype) -> None:
+        nominal, wider, larger = collision_block(0.0, 0.0), collision_block(0.0, 1.0), collision_block(1.0, 0.0)
+        # affine in scale and radius, hence three evaluations give the whole map
+        stack = [np.concatenate([b.size, b.pos], axis=1) for b in (nominal, larger, wider)]
+        table = np.stack([stack[0], stack[1] - stack[0], stack[2] - stack[0]])
+        self._table = torch.tensor(table.reshape(3, -1), dtype=dtype, device=device)
+        self.geom_ids = torch.tensor([model.geom(name).id for name in nominal.names], device=device)
+        self._lower = torch.tensor([0.5, 0.01], dtype=dtype, device=device)
+        self._upper = torch.tensor([MAX_SCALE, MAX_HOLE_RADIUS_M], dtype=dtype, device=device)
+
+    def geoms(self, scene: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns sizes and positions of the block's geoms, `(N, G, 3)` each, for scenes `(N, S)`; out-of-bounds sizes are clamped."""
+        shape = torch.minimum(torch.maximum(scene[:, 4:6].to(self._table.dtype), self._lower), self._upper)
+        both = torch.addmm(self._table[:1], shape, self._table[1:]).unflatten(1, (-1, 6))
+        return both[..., :3], both[..., 3:]
+
+    def pose(self, scene: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns position `(N, 3)` and quaternion `(N, 4)` of the block for scenes `(N, S)`."""
+        half = scene[:, 3:4].to(self._table.dtype) / 2
+        zero = torch.zeros_like(half)
+        return scene[:, :3].to(self._table.dtype), torch.cat((half.cos(), zero, zero, half.sin()), 1)
