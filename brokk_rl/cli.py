@@ -227,7 +227,9 @@ def _resolved(cfg: DictConfig) -> str:
     values = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
     values.session.out = "???"
     settings = {"defaults": [{"hydra": "brokk"}, "_self_"]}
-    return "# Runs again: brokk --config-dir <this folder> --config-name resolved\n" + OmegaConf.to_yaml(OmegaConf.merge(settings, values))
+    return "# Runs again: brokk --config-dir <this folder> --config-name resolved\n" + OmegaConf.to_yaml(
+        OmegaConf.merge(settings, values)
+    )
 
 
 @contextlib.contextmanager

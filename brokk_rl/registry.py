@@ -69,7 +69,9 @@ def options() -> list[Option]:
             if group == "." or group.split("/")[0] in SETTINGS:
                 continue
             if other := found.get((group, name)):
-                raise ConfigError(f"{group}={name} is offered twice, by {other.package} ({other.path}) and by {package} ({path}): rename one")
+                raise ConfigError(
+                    f"{group}={name} is offered twice, by {other.package} ({other.path}) and by {package} ({path}): rename one"
+                )
             found[group, name] = Option(group, name, package, path)
     return [found[key] for key in sorted(found)]
 

@@ -1,0 +1,271 @@
+"""`brokk mode=doctor`: what works on this computer, and what to do about the rest."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata, util
+from pathlib import Path
+from typing import Literal
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from rich.console import Console
+from rich.table import Table
+
+import brokk_rl
+from brokk_rl import registry
+from brokk_rl.errors import BrokkError
+from brokk_rl.sim import probe
+from brokk_rl.spec import spec
+
+DISTRIBUTION = "brokk-rl"
+IMPORT_NAMES = ("brokk_rl", "conf", "tasks", "actuators", "perception", "deploy")
+COLORS = {"ok": "green", "warn": "yellow", "fail": "red"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        level: `fail` where something essential does not work, `warn` where something optional does not.
+        text: What was found.
+        advice: What to do about it.
+    """
+
+    level: Literal["ok", "warn", "fail"]
+    text: str
+    advice: str = ""
+
+
+@spec
+class Limits:
+    """Where the doctor looks and what it finds too little.
+
+    Attributes:
+        folder: Folder in which runs will be written.
+        min_free_gib: Free disk space below which it warns.
+    """
+
+    folder: str
+    min_free_gib: float
+
+
+@spec
+class Doctor:
+    """Says what works here: versions, GPU, CUDA graphs, kernel cache, rendering, disk, owners of the import names."""
+
+    doctor: Limits
+
+    def run(self) -> None:
+        """Prints the report.
+
+        Raises:
+            SystemExit: With code 1, when something essential does not work.
+        """
+        table = Table(box=None, show_header=False, padding=(0, 1, 0, 0))
+        failed = False
+        for topic, finding in self.findings():
+            advice = f"\n[dim]→ {finding.advice}[/dim]" if finding.advice else ""
+            table.add_row(f"[{COLORS[finding.level]}]{finding.level}[/]", topic, finding.text + advice)
+            failed |= finding.level == "fail"
+        Console().print(table)
+        if failed:
+            raise SystemExit(1)
+
+    def findings(self) -> Iterator[tuple[str, Finding]]:
+        """Yields topic and finding, the most basic first; a probe that breaks becomes a warning."""
+        probes: tuple[tuple[str, Callable[[], Iterator[Finding]]], ...] = (
+            ("Python", python),
+            ("packages", packages),
+            ("processor", processor),
+            ("torch", torch_devices),
+            ("CUDA graphs", cuda_graphs),
+            ("Warp", warp),
+            ("rendering", rendering),
+            ("disk", lambda: disk(Path(self.doctor.folder), self.doctor.min_free_gib)),
+            ("import names", import_names),
+            ("extensions", extensions),
+        )
+        for topic, examine in probes:
+            try:
+                for finding in examine():
+                    yield topic, finding
+            except Exception as error:  # whatever breaks in a foreign package must not hide the rest of the report
+                yield topic, Finding("warn", f"cannot tell: {type(error).__name__}: {error}")
+
+
+def python() -> Iterator[Finding]:
+    """The interpreter against what the project asks for."""
+    text = f"{platform.python_version()} on {platform.platform(terse=True)}"
+    wanted = SpecifierSet((_metadata().get("Requires-Python") or "") if _metadata() else "")
+    if wanted.contains(platform.python_version()):
+        yield Finding("ok", text)
+    else:
+        yield Finding(
+            "fail", f"{text}, but the project wants {wanted}", "make again the environment with such a Python: make clean setup"
+        )
+
+
+def packages() -> Iterator[Finding]:
+    """Installed packages against what the project asks for."""
+    about = _metadata()
+    if about is None:
+        yield Finding("warn", f"{DISTRIBUTION} runs from its sources and is not installed; versions are not checked", "make setup")
+        return
+    wanted = [Requirement(line) for line in metadata.requires(DISTRIBUTION) or ()]
+    wanted = [requirement for requirement in wanted if requirement.marker is None or requirement.marker.evaluate()]
+    fit = 0
+    for requirement in wanted:
+        try:
+            version = metadata.version(requirement.name)
+        except metadata.PackageNotFoundError:
+            yield Finding("fail", f"{requirement.name} is missing", "make setup")
+            continue
+        if requirement.specifier.contains(version, prereleases=True):
+            fit += 1
+        else:
+            yield Finding(
+                "warn", f"{requirement.name} {version} is installed, the project wants {requirement.specifier}", "make setup"
+            )
+    yield Finding("ok", f"{fit} of {len(wanted)} as wanted; {DISTRIBUTION} {about['Version']}")
+
+
+def processor() -> Iterator[Finding]:
+    """Cores that this process may use, and threads that torch does use."""
+    import torch
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    text = f"{cores} cores ({os.cpu_count()} in all), torch uses {torch.get_num_threads()} threads"
+    if torch.get_num_threads() > cores:
+        yield Finding("warn", text, f"more threads than cores slow each other down: OMP_NUM_THREADS={cores}")
+    else:
+        yield Finding("ok", text)
+
+
+def torch_devices() -> Iterator[Finding]:
+    """GPUs that torch can use, and the driver behind them."""
+    import torch
+
+    built = f"{torch.__version__}, built for CUDA {torch.version.cuda or 'none'}"
+    driver = driver_version()
+    if torch.cuda.is_available():
+        names = ", ".join(torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count()))
+        yield Finding("ok", f"{built}, driver {driver or 'unknown'}: {names}")
+    elif driver:
+        advice = "the driver may be too old for this CUDA, or CUDA_VISIBLE_DEVICES hides the GPU"
+        yield Finding("warn", f"{built}: there is a driver {driver}, but torch sees no GPU", advice)
+    else:
+        yield Finding("ok", f"{built}; no NVIDIA GPU here, everything runs on the CPU")
+
+
+def driver_version() -> str | None:
+    """Returns the version of the NVIDIA driver, `None` when there is none."""
+    query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        lines = subprocess.run(query, capture_output=True, text=True, check=True, timeout=20).stdout.split()
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return lines[0] if lines else None
+
+
+def cuda_graphs() -> Iterator[Finding]:
+    """Whether a control step can be captured in a CUDA graph; without that a GPU is several times slower."""
+    import torch
+
+    if not torch.cuda.is_available():
+        yield Finding("ok", "not needed without a GPU")
+        return
+    try:
+        yield Finding("ok", f"captured and replayed one on {probe.capture_graph()}")
+    except Exception as error:
+        advice = "training works, several times slower; a newer driver usually mends it"
+        yield Finding("warn", f"cannot capture: {error}", advice)
+
+
+def warp() -> Iterator[Finding]:
+    """Version of Warp, and its kernel cache, which saves a minute or two of compiling at each start."""
+    cache = probe.kernel_cache()
+    size = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) if cache.exists() else 0
+    yield Finding("ok", f"{probe.warp_version()}, kernel cache {cache} ({size / 2**20:.1f} MiB)")
+
+
+def rendering() -> Iterator[Finding]:
+    """Whether MuJoCo can draw pictures, which only videos need."""
+    name = probe.working_renderer()
+    if name:
+        yield Finding("ok", f"MuJoCo draws with MUJOCO_GL={name}")
+    else:
+        asked = os.environ.get("MUJOCO_GL")
+        tried = f"MUJOCO_GL={asked}" if asked else f"any of {', '.join(probe.RENDERERS)}"
+        yield Finding("warn", f"MuJoCo cannot draw with {tried}: no videos", "install libegl1 and libgl1, or libosmesa6")
+
+
+def disk(folder: Path, min_free_gib: float) -> Iterator[Finding]:
+    """Whether runs can be written, and how much room there is."""
+    place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as error:
+        yield Finding(
+            "fail", f"cannot write into {place}: {error.strerror}", "work in a folder of your own, or give session.out=<folder>"
+        )
+        return
+    free_gib = shutil.disk_usage(place).free / 2**30
+    text = f"{free_gib:.1f} GiB free for {folder}"
+    yield (
+        Finding("ok", text)
+        if free_gib >= min_free_gib
+        else Finding("warn", text, "checkpoints and recordings need more; free some space")
+    )
+
+
+def import_names() -> Iterator[Finding]:
+    """Whether our import names are ours: names such as `tasks` or `conf` are taken by other packages as well."""
+    home = Path(brokk_rl.__file__).parents[1]
+    owned = 0
+    for name in IMPORT_NAMES:
+        found = util.find_spec(name)
+        folder = Path(next(iter(found.submodule_search_locations))) if found and found.submodule_search_locations else None
+        if folder != home / name:
+            place = folder or (found.origin if found else None)
+            yield Finding(
+                "fail", f"'{name}' is {place or 'missing'}, not {home / name}", "install the project in an environment of its own"
+            )
+        else:
+            owned += 1
+    for distribution in metadata.distributions():
+        name = distribution.metadata["Name"]
+        tops = {path.parts[0].removesuffix(".py") for path in distribution.files or () if path.parts}
+        if name != DISTRIBUTION and (clash := sorted(tops.intersection(IMPORT_NAMES))):
+            yield Finding(
+                "warn",
+                f"the package {name} also installs {', '.join(clash)}",
+                f"pip uninstall {name}, or use separate environments",
+            )
+    yield Finding("ok", f"{owned} of {len(IMPORT_NAMES)} come from {home}")
+
+
+def extensions() -> Iterator[Finding]:
+    """Installed packages that add options by entry point."""
+    try:
+        others = [package for package in registry.packages() if package != registry.CORE]
+        registry.options()
+    except BrokkError as error:
+        yield Finding("fail", str(error))
+        return
+    yield Finding("ok", ", ".join(others) or "none installed")
+
+
+def _metadata() -> metadata.PackageMetadata | None:
+    try:
+        return metadata.metadata(DISTRIBUTION)
+    except metadata.PackageNotFoundError:
+        return None

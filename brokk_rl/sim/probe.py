@@ -1,0 +1,88 @@
+"""What of MuJoCo and Warp works on this computer; each probe returns text or raises whatever went wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+RENDERERS = ("egl", "osmesa", "glfw")
+"""Values of MUJOCO_GL, in the order in which they are worth trying without a screen."""
+
+
+def warp_version() -> str:
+    """Returns the version of Warp."""
+    import warp as wp
+
+    return str(wp.config.version)
+
+
+def kernel_cache() -> Path:
+    """Returns the folder in which Warp keeps its compiled kernels."""
+    wp = _quiet_warp()
+    return Path(wp.config.kernel_cache_dir)
+
+
+def capture_graph() -> str:
+    """Captures a small Warp kernel launch on the first GPU in a CUDA graph and replays it; needs no compiled kernel.
+
+    Raises:
+        RuntimeError: The graph cannot be captured or does not do its work.
+    """
+    wp = _quiet_warp()
+    source, copy = (wp.full(8, value, dtype=float, device="cuda:0") for value in (1.0, 0.0))
+    with wp.ScopedCapture(device="cuda:0") as capture:
+        wp.copy(copy, source)
+    source.fill_(2.0)
+    wp.capture_launch(capture.graph)
+    if float(copy.numpy()[0]) != 2.0:
+        raise RuntimeError("a captured graph replays, but the copy in it did not happen")
+    return str(wp.get_device("cuda:0").name)
+
+
+def working_renderer() -> str | None:
+    """Returns the first value of MUJOCO_GL with which a picture can be drawn here, `None` when there is none.
+
+    MuJoCo settles on one library at import and a broken driver may end the process, so each try has a process of its own.
+    """
+    chosen = os.environ.get("MUJOCO_GL")
+    program = "from brokk_rl.sim.probe import render; render()"
+    for name in (chosen,) if chosen else RENDERERS:
+        environment = os.environ | {"MUJOCO_GL": name, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+        try:
+            with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes its log where it runs
+                done = subprocess.run([sys.executable, "-c", program], env=environment, cwd=folder, capture_output=True, timeout=60)
+        except subprocess.TimeoutExpired:
+            continue
+        if done.returncode == 0:
+            return name
+    return None
+
+
+def render() -> None:
+    """Draws a ball in a picture of 32 x 32 pixels.
+
+    Raises:
+        RuntimeError: The picture is black.
+    """
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, 32, 32) as renderer:
+        renderer.update_scene(data)
+        if renderer.render().max() == 0:
+            raise RuntimeError("the picture is black")
+
+
+def _quiet_warp() -> Any:
+    """Starts Warp without its banner; what it would say about the GPU, the doctor says itself."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    return wp
