@@ -17,6 +17,8 @@ from brokk_rl.sim.scene import add_block
 ASSETS = Path(__file__).parent / "assets"
 VISUAL_GROUP = 2
 """Geoms of this group are for the eye only."""
+MAX_SPEED = 20.0
+"""Joint speed (rad/s or m/s) beyond which a world counts as diverged; forty times what such a machine can do."""
 
 
 def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> mujoco.MjModel:

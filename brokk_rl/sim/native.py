@@ -8,12 +8,9 @@ from mujoco.batch import Batch, SimulationError
 from brokk_rl.errors import ConfigError, DeviceError
 from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import Drive
-from brokk_rl.sim.model import compile_model, contact_sensors
+from brokk_rl.sim.model import MAX_SPEED, compile_model, contact_sensors
 from brokk_rl.sim.scene import Placement, nominal
 from brokk_rl.spec import spec
-
-MAX_SPEED = 20.0
-"""Joint speed (rad/s or m/s) beyond which a world counts as diverged; forty times what such a machine can do."""
 
 
 @spec
