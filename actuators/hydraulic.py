@@ -160,14 +160,19 @@ class HydraulicModel:
 
         supply = p["supply_ratio"] * self._yield_force
         inertia = self._stiffness / (2.0 * math.pi * p["mode_hz"]) ** 2
-        pull = (dt * (2.0 * math.pi * p["spool_hz"] * warm) ** 2, dt * 2.0 * p["spool_damping"] * 2.0 * math.pi * p["spool_hz"] * warm)
+        pull = (
+            dt * (2.0 * math.pi * p["spool_hz"] * warm) ** 2,
+            dt * 2.0 * p["spool_damping"] * 2.0 * math.pi * p["spool_hz"] * warm,
+        )
         extend_speed = p["speed_scale"] * self._full_speed * warm
         retract_speed = extend_speed * p["retract_ratio"]
         play = 0.5 * p["hysteresis"]
         excess = p["breakaway"] - p["coulomb"]
         knee = p["stribeck_speed"] * self._full_speed
         viscous = p["viscous"] / self._full_speed
-        still = 0.01 * self._full_speed  # below 1 % of full speed friction grows with speed: no stick-slip chatter at this time step
+        still = (
+            0.01 * self._full_speed
+        )  # below 1 % of full speed friction grows with speed: no stick-slip chatter at this time step
         rub = dt * supply / inertia
 
         pilot, spool, spool_rate, speed = state["pilot"], state["spool"], state["spool_rate"], state["speed"]
@@ -204,13 +209,24 @@ class HydraulicModel:
 
 def _check(nominal: dict[str, np.ndarray]) -> None:
     """Raises a `ConfigError` for numbers outside the range in which the equations mean something."""
-    positive = ("spool_hz", "spool_damping", "speed_scale", "retract_ratio", "flow_share", "supply_ratio", "mode_hz", "stribeck_speed")
+    positive = (
+        "spool_hz",
+        "spool_damping",
+        "speed_scale",
+        "retract_ratio",
+        "flow_share",
+        "supply_ratio",
+        "mode_hz",
+        "stribeck_speed",
+    )
     for name, value in nominal.items():
         low = 1e-6 if name in positive else 0.0
         if (value < low).any():
             raise ConfigError(f"actuator.{name}: expected {'more than 0' if low else '0 or more'}, got {value.tolist()}")
     for name in ("overlap_extend", "overlap_retract", "hysteresis", "notch", "load_sensitivity"):
         if (nominal[name] > (0.9 if name.startswith("overlap") else 1.0)).any():
-            raise ConfigError(f"actuator.{name}: expected at most {0.9 if name.startswith('overlap') else 1.0}, got {nominal[name].tolist()}")
+            raise ConfigError(
+                f"actuator.{name}: expected at most {0.9 if name.startswith('overlap') else 1.0}, got {nominal[name].tolist()}"
+            )
     if (nominal["breakaway"] < nominal["coulomb"]).any():
         raise ConfigError("actuator.breakaway: expected at least actuator.coulomb (friction at rest is no smaller than in motion)")

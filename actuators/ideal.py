@@ -26,7 +26,9 @@ class IdealModel:
     """`q' = q + period * speed_scale * max_speed * u`, held at the ends of travel. Has no memory."""
 
     def __init__(self, config: Ideal, machine: Machine, device: torch.device) -> None:
-        self._step_at_full = torch.as_tensor(machine.max_speed * machine.period_s * config.speed_scale, dtype=torch.float32, device=device)
+        self._step_at_full = torch.as_tensor(
+            machine.max_speed * machine.period_s * config.speed_scale, dtype=torch.float32, device=device
+        )
         self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
         self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
 

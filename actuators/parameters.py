@@ -63,7 +63,8 @@ class Parameters:
             if not 0 <= width < 1:
                 raise ConfigError(f"{where}.{name}: expected a relative half width in [0, 1), got {width}")
         self.value = {
-            name: torch.as_tensor(value, dtype=torch.float32, device=device).expand(num_envs, -1).clone() for name, value in nominal.items()
+            name: torch.as_tensor(value, dtype=torch.float32, device=device).expand(num_envs, -1).clone()
+            for name, value in nominal.items()
         }
         self.state: dict[str, torch.Tensor] = {}
         self._width = dict(spread)

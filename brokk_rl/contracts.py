@@ -10,10 +10,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    import numpy as np
     import torch
 
     from brokk_rl.history import History
     from brokk_rl.machine import Machine
+    from brokk_rl.record import Recording
     from brokk_rl.signals import Borehole, Command, Frame, JointState
 
 
@@ -54,6 +59,40 @@ class Actuator(Protocol):
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
         """Returns a model for `num_envs` environments on `device`."""
+        ...
+
+
+class ExcitationProcess(Protocol):
+    """An excitation at work in `N` runs at once. Arrays are numpy: it also runs on the machine's computer."""
+
+    names: tuple[str, ...]
+    """What each run is, for its file name, e.g. `sine_q1_00`."""
+    start: np.ndarray
+    """Joint positions from which the runs start, `(N, J)`, rad or m."""
+
+    def command(self, q: np.ndarray) -> np.ndarray:
+        """Returns the commands for the coming control period, `(N, J)` in [-1, 1], at the measured positions `q`, `(N, J)`."""
+        ...
+
+
+class Excitation(Protocol):
+    """A spec in `conf/excitation`: commands that show what an actuator does."""
+
+    def build(self, machine: Machine, num_runs: int, generator: np.random.Generator) -> ExcitationProcess:
+        """Returns the excitation for `num_runs` runs; never moves exclusive joints together with others."""
+        ...
+
+
+class ActuatorFit(Protocol):
+    """A spec in `conf/fit`: learns an actuator model from recordings."""
+
+    name: str
+    """Name of the model in tables and files."""
+
+    def fit(
+        self, machine: Machine, train: Sequence[Recording], validation: Sequence[Recording], folder: Path, seed: int, device: torch.device
+    ) -> Actuator:
+        """Fits to `train`, stops or chooses by `validation`, leaves what it learned in `folder`, and returns the fitted actuator."""
         ...
 
 
@@ -99,6 +138,14 @@ class World(Protocol):
         ...
 
 
+class Simulator(Protocol):
+    """A spec in `conf/sim`: builds a world."""
+
+    def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> World:
+        """Returns a world on `device`; `num_worlds` overrides the configured number."""
+        ...
+
+
 @dataclass
 class Transition:
     """What a task says about one control step; all of shape `(N,)`.
@@ -132,7 +179,7 @@ class TaskProcess(Protocol):
         """Draws `count` valid starts: `q` `(count, J)`, `scene` `(count, S)` and whatever else `reset` needs."""
         ...
 
-    def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor], history: History) -> None:
+    def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor]) -> None:
         """Begins a new episode in the environments of `mask` with the given starts, each entry `(N, …)`."""
         ...
 
@@ -144,8 +191,26 @@ class TaskProcess(Protocol):
         """Judges the control step that has just been simulated."""
         ...
 
-    def observe(self) -> dict[str, torch.Tensor]:
-        """Returns the observation groups after the last `step` or `reset`; `policy` is the vector of `brokk_rl.observation`."""
+    def observe(self, history: History) -> dict[str, torch.Tensor]:
+        """Returns the observation groups, called once a control step after `step` and `reset`.
+
+        `policy` is the vector of `brokk_rl.observation`; the tensors are the task's own and are overwritten by the next call.
+        """
+        ...
+
+    def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Returns the action, `(N, num_actions)`, with which the classical controller alone would act on these groups."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """Returns order, scale and filters of the `policy` vector for the policy's contract, as plain JSON data."""
+        ...
+
+    def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
+        """Returns the policy as it runs on the machine: a module from the `policy` vector, `(B, …)`, to masked commands, `(B, J)`.
+
+        `network` takes a dictionary of observation groups and returns the action.
+        """
         ...
 
 
