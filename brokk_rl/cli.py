@@ -138,7 +138,8 @@ def explain(error: BaseException) -> str | None:
     full = next((e for e in chain if isinstance(e, OSError) and e.errno == errno.ENOSPC), None)
     missing = next((e for e in chain if isinstance(e, MissingMandatoryValue)), None)
     if full:
-        return f"the disk is full{f' ({full.filename})' if full.filename else ''}. Free some space or choose another disk with session.out=<folder>."
+        where = f" ({full.filename})" if full.filename else ""
+        return f"the disk is full{where}. Free some space, or choose another disk with session.out=<folder>."
     if ours:
         return f"{ours}{_node(error)}"
     if missing:

@@ -7,6 +7,7 @@ the source of its spec, so that listing costs nothing and a broken option can be
 from __future__ import annotations
 
 import ast
+import re
 from dataclasses import dataclass
 from importlib import metadata, util
 from pathlib import Path
@@ -19,6 +20,8 @@ ENTRY_POINTS = "brokk_rl.conf"
 CORE = "conf"
 SETTINGS = ("hydra",)
 """Groups of Hydra's own settings: no registry of ours."""
+SAME_SPEC = ("machine", "session")
+"""Groups whose options differ in their numbers only, so that the spec says nothing about one of them."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +41,11 @@ class Option:
     path: Path
 
     def summary(self) -> str:
-        """Returns one line about the option: of its spec, or of the comment on top for a file of overrides."""
+        """Returns one line about the option: of its spec, or the comment on top where the spec says nothing about it."""
         text = self.path.read_text()
         target = (yaml.safe_load(text) or {}).get("_target_")
-        return (_docstring_line(target) if target else "") or _comment_line(text)
+        shared = self.group in SAME_SPEC
+        return (_docstring_line(target) if target and not shared else "") or _comment(text)
 
 
 def packages() -> dict[str, Path]:
@@ -101,11 +105,12 @@ def _docstring_line(target: str) -> str:
     return ""
 
 
-def _comment_line(text: str) -> str:
+def _comment(text: str) -> str:
+    """Returns the first sentence of the comment on top of a file, '' where there is none."""
+    lines = []
     for line in text.splitlines():
         if not line.startswith("#"):
-            return ""
-        if comment := line.lstrip("#").strip():
-            if not comment.startswith("@package"):
-                return comment
-    return ""
+            break
+        if not line.lstrip("# ").startswith("@package"):
+            lines.append(line.lstrip("#").strip())
+    return re.split(r"(?<=\.) ", " ".join(lines).strip())[0]

@@ -6,10 +6,11 @@ import hashlib
 import json
 import os
 import random
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import metadata
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, DeviceError, StorageError
+from brokk_rl.errors import BrokkError, ConfigError, DeviceError, StorageError
 from brokk_rl.spec import spec
 
 if TYPE_CHECKING:
@@ -26,9 +27,8 @@ if TYPE_CHECKING:
 
 RECORD = "session.json"
 RESOLVED = "resolved.yaml"
-STAMPED = (
-    "brokk-rl", "hydra-core", "torch", "numpy", "rsl-rl-lib", "mujoco", "mujoco-warp", "warp-lang", "opencv-python-headless", "onnxruntime",
-)  # fmt: skip
+STAMPED = ("brokk-rl", "hydra-core", "torch", "numpy", "rsl-rl-lib", "mujoco", "mujoco-warp", "warp-lang", "onnxruntime")
+"""Packages whose versions stand in `session.json`."""
 
 
 @spec
@@ -144,10 +144,22 @@ class Session:
             raise
         except BaseException as error:
             record.fields["error"] = f"{type(error).__name__}: {error}"
+            if isinstance(error, BrokkError) and not before and self._drop_if_unused():
+                record = None  # refused before anything was done: nothing stays behind
             raise
         finally:
-            record.fields |= {"outcome": outcome, "ended": _now()}
-            record.write()
+            if record:
+                record.fields |= {"outcome": outcome, "ended": _now()}
+                record.write()
+
+    def _drop_if_unused(self) -> bool:
+        """Removes the run folder if nothing but the files of `start` is in it; says whether it did."""
+        if {path.name for path in self.folder.iterdir()} - {RECORD, RESOLVED}:
+            return False
+        shutil.rmtree(self.folder)
+        with suppress(OSError):
+            self.folder.parent.rmdir()  # `runs`, if this was the only run
+        return True
 
 
 @dataclass

@@ -104,7 +104,8 @@ class Doctor:
 def python() -> Iterator[Finding]:
     """The interpreter against what the project asks for."""
     text = f"{platform.python_version()} on {platform.platform(terse=True)}"
-    wanted = SpecifierSet((_metadata().get("Requires-Python") or "") if _metadata() else "")
+    about = _metadata()
+    wanted = SpecifierSet(about["Requires-Python"] if about else "")
     if wanted.contains(platform.python_version()):
         yield Finding("ok", text)
     else:

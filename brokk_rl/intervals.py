@@ -1,0 +1,35 @@
+"""95 % intervals of what was counted or measured."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+CONFIDENCE = 0.95
+
+
+def wilson(successes: float, trials: int) -> tuple[float, float]:
+    """Returns the Wilson score interval of a rate; right also at 0 and 1, where the usual formula gives an interval of width 0.
+
+    Source: Wilson 1927, equation (10), without continuity correction.
+    """
+    if trials < 1:
+        return 0.0, 1.0
+    z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2))
+    rate = successes / trials
+    middle = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2)) / (1 + z**2 / trials)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def student(values: Sequence[float]) -> tuple[float, float] | None:
+    """Returns Student's interval of the mean of independent values, such as one per seed; `None` for fewer than two."""
+    count = len(values)
+    if count < 2:
+        return None
+    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, count - 1) * np.std(values, ddof=1) / math.sqrt(count))
+    mean = float(np.mean(values))
+    return mean - half, mean + half
