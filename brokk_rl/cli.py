@@ -151,7 +151,7 @@ def explain(error: BaseException) -> str | None:
         return _bad_node(error)
     if isinstance(error, ConfigCompositionException):
         return _bad_override(error)
-    if isinstance(error, (HydraException, OmegaConfBaseException)):
+    if isinstance(error, (HydraException, OmegaConfBaseException)) or str(error).startswith("Config group override must"):
         return str(error)
     return None
 

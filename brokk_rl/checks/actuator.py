@@ -1,0 +1,96 @@
+"""Checkers of actuator models and of the effects around them."""
+
+from __future__ import annotations
+
+import torch
+
+from brokk_rl.checks.exercise import NUM_ENVS, addresses, copies, own_randomness, require, require_rows, rest_history, restore, same
+from brokk_rl.contracts import Actuator, ActuatorModel, Effect
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+
+NUM_STEPS = 20
+
+
+def check_actuator(actuator: Actuator, machine: Machine, device: torch.device | str = "cpu") -> None:
+    """Checks what `Actuator.build` returns against `ActuatorModel`."""
+    with own_randomness():
+        check_actuator_model(actuator.build(machine, NUM_ENVS, torch.device(device)), machine, torch.device(device))
+
+
+def check_effect(effect: Effect, machine: Machine, device: torch.device | str = "cpu") -> None:
+    """Checks that an effect around the simplest actuator model is again an actuator model."""
+    with own_randomness():
+        inner = _Proportional(machine, torch.device(device))
+        check_actuator_model(effect.wrap(inner, machine, NUM_ENVS, torch.device(device)), machine, torch.device(device))
+
+
+def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.device) -> None:
+    """Checks an actuator model for `NUM_ENVS` environments; see `ActuatorModel` for the promises."""
+    everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=device)
+    model.reset(everywhere)
+    require_rows(model.state, "state")
+    address = addresses(model.state)
+    begin = copies(model.state)
+
+    first = _drive(model, machine, device)
+    require(first.shape == (NUM_STEPS, NUM_ENVS, machine.num_joints), f"step: expected {(NUM_ENVS, machine.num_joints)} positions")
+    require(
+        first.dtype == torch.float32 and first.device.type == device.type, f"step: expected float32 on {device}, got {first.dtype}"
+    )
+    require(bool(first.isfinite().all()), "step: positions are not finite under full and random commands")
+    require(addresses(model.state) == address, "state: a tensor moved or changed its shape; write it in place")
+
+    end = copies(model.state)
+    some = everywhere.clone()
+    some[1:] = False
+    model.reset(some)
+    for name, value in model.state.items():
+        require(same(value[1:], end[name][1:]), f"reset: state '{name}' changed in environments outside the mask")
+
+    restore(model.state, begin)
+    require(
+        same(_drive(model, machine, device), first),
+        "step: from the same state the same commands lead elsewhere; all memory belongs in state",
+    )
+    restore(model.state, begin)
+    other = _drive(model, machine, device, alter_first=True)
+    require(same(other[:, 1:], first[:, 1:]), "step: what happens in environment 0 changes the others")
+
+    model.reset(everywhere)
+    history = rest_history(machine, device)
+    moved = (model.step(history) - history.q[:, -1]).abs().amax(0).cpu().numpy()
+    limit = machine.max_speed * machine.period_s
+    require(bool((moved <= limit).all()), f"reset: at rest and without a command the joints move by {moved} in one period")
+
+
+class _Proportional:
+    """The simplest actuator model: speed proportional to the command."""
+
+    def __init__(self, machine: Machine, device: torch.device) -> None:
+        self.state: dict[str, torch.Tensor] = {}
+        self._step = torch.as_tensor(machine.max_speed * machine.period_s, dtype=torch.float32, device=device)
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Has no memory."""
+
+    def step(self, history: History) -> torch.Tensor:
+        return history.q[:, -1] + history.u[:, -1] * self._step
+
+
+def _drive(model: ActuatorModel, machine: Machine, device: torch.device, alter_first: bool = False) -> torch.Tensor:
+    """Returns the positions under random and full commands, `(T, N, J)`; `alter_first` changes those of environment 0."""
+    generator = torch.Generator().manual_seed(0)
+    history, found = rest_history(machine, device), []
+    for step in range(NUM_STEPS):
+        u = torch.rand((NUM_ENVS, machine.num_joints), generator=generator) * 2 - 1
+        u = u.sign() if step % 4 == 0 else u
+        if alter_first:
+            u[0] = -u[0]
+        history.push_u(u.to(device))
+        kept = copies(vars(history))
+        q = model.step(history).clone()
+        require(all(same(value, kept[name]) for name, value in vars(history).items()), "step: changed the history")
+        history.push_q(q)
+        found.append(q)
+    return torch.stack(found)

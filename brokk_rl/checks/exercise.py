@@ -1,0 +1,62 @@
+"""What the checkers share: a handful of environments, a history at rest, and comparisons of tensors by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import torch
+
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+
+NUM_ENVS = 4
+
+
+def rest_history(machine: Machine, device: torch.device, q: torch.Tensor | None = None) -> History:
+    """Returns a history at rest at `q`, or in the middle of the travel."""
+    if q is None:
+        q = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32, device=device).repeat(NUM_ENVS, 1)
+    shape = (NUM_ENVS, machine.num_history, machine.num_joints)
+    return History(q=q[:, None, :].repeat(1, machine.num_history, 1), u=torch.zeros(shape, device=device))
+
+
+@contextmanager
+def own_randomness() -> Iterator[None]:
+    """Leaves torch's global generators as they were."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yield
+
+
+def require(condition: bool, message: str) -> None:
+    """Raises an `AssertionError` with `message` unless `condition` holds."""
+    if not condition:
+        raise AssertionError(message)
+
+
+def require_rows(tensors: Mapping[str, torch.Tensor], what: str) -> None:
+    """Checks that every tensor has one row per environment."""
+    for name, value in tensors.items():
+        require(len(value) == NUM_ENVS, f"{what} '{name}': expected {NUM_ENVS} rows, got shape {tuple(value.shape)}")
+
+
+def addresses(tensors: Mapping[str, torch.Tensor]) -> dict[str, tuple[int, tuple[int, ...]]]:
+    """Returns address and shape of each tensor."""
+    return {name: (value.data_ptr(), tuple(value.shape)) for name, value in tensors.items()}
+
+
+def copies(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Returns copies of all tensors."""
+    return {name: value.clone() for name, value in tensors.items()}
+
+
+def restore(tensors: Mapping[str, torch.Tensor], kept: Mapping[str, torch.Tensor]) -> None:
+    """Writes `kept` back in place."""
+    for name, value in tensors.items():
+        value.copy_(kept[name])
+
+
+def same(a: torch.Tensor, b: torch.Tensor, tolerance: float = 0.0) -> bool:
+    """Says whether two tensors hold the same numbers; NaN equals NaN."""
+    return bool(torch.allclose(a.float(), b.float(), rtol=0.0, atol=tolerance, equal_nan=True))

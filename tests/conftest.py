@@ -1,0 +1,58 @@
+"""What tests share: the default machine, and the command in a folder of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from composed import option
+
+from brokk_rl import cli
+from brokk_rl.machine import Machine
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if item.get_closest_marker("gpu"):
+            item.add_marker(pytest.mark.skip(reason="needs a CUDA GPU"))
+
+
+@pytest.fixture(scope="session")
+def machine() -> Machine:
+    """The default machine."""
+    return option("machine", "brokk170")
+
+
+@dataclass(frozen=True)
+class Done:
+    """What the command did: exit code and what it wrote."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def brokk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Done]:
+    """Runs the command in this process, in an empty folder that is the working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    for name in ("HYDRA_FULL_ERROR", "BROKK_TRACE"):
+        monkeypatch.delenv(name, raising=False)
+
+    def run(*arguments: str) -> Done:
+        monkeypatch.setattr("sys.argv", ["brokk", *arguments])
+        capfd.readouterr()
+        try:
+            code = cli.main()
+        except SystemExit as left:
+            code = int(left.code or 0)
+        written = capfd.readouterr()
+        return Done(code, written.out, written.err)
+
+    return run

@@ -1,0 +1,169 @@
+"""The checkers find broken promises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+
+from brokk_rl.checks import check_actuator, check_finder, check_link, check_task
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.signals import Borehole, Command, JointState
+
+
+class Filter:
+    """A first-order actuator that keeps every promise; each test breaks one."""
+
+    def __init__(self, machine: Machine, num_envs: int, device: torch.device) -> None:
+        self._scale = torch.as_tensor(machine.max_speed * machine.period_s, dtype=torch.float32, device=device)
+        self.state = {"u": torch.zeros(num_envs, machine.num_joints, device=device)}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        self.state["u"].masked_fill_(mask[:, None], 0.0)
+
+    def step(self, history: History) -> torch.Tensor:
+        self.state["u"].lerp_(history.u[:, -1], 0.5)
+        return history.q[:, -1] + self.state["u"] * self._scale
+
+
+def spec_of(kind: type[Filter]) -> Any:
+    return SimpleNamespace(build=lambda machine, num_envs, device: kind(machine, num_envs, device))
+
+
+class ResetsEverybody(Filter):
+    def reset(self, mask: torch.Tensor) -> None:
+        self.state["u"].zero_()
+
+
+class MovesItsState(Filter):
+    def step(self, history: History) -> torch.Tensor:
+        self.state["u"] = self.state["u"].lerp(history.u[:, -1], 0.5)
+        return history.q[:, -1] + self.state["u"] * self._scale
+
+
+class HasHiddenMemory(Filter):
+    count = 0
+
+    def step(self, history: History) -> torch.Tensor:
+        self.count += 1
+        return super().step(history) + 1e-4 * self.count
+
+
+class WritesHistory(Filter):
+    def step(self, history: History) -> torch.Tensor:
+        history.u[:, -1].clamp_(-0.5, 0.5)
+        return super().step(history)
+
+
+class MixesEnvironments(Filter):
+    def step(self, history: History) -> torch.Tensor:
+        return super().step(history) + 1e-3 * history.u[:, -1].mean(0)
+
+
+class IsDouble(Filter):
+    def step(self, history: History) -> torch.Tensor:
+        return super().step(history).double()
+
+
+class JumpsAtRest(Filter):
+    def step(self, history: History) -> torch.Tensor:
+        return super().step(history) + 1.0
+
+
+def test_a_proper_actuator_passes(machine: Machine) -> None:
+    check_actuator(spec_of(Filter), machine)
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (ResetsEverybody, "outside the mask"),
+        (MovesItsState, "moved"),
+        (HasHiddenMemory, "same commands lead elsewhere"),
+        (WritesHistory, "changed the history"),
+        (MixesEnvironments, "changes the others"),
+        (IsDouble, "float32"),
+        (JumpsAtRest, "at rest"),
+    ],
+)
+def test_a_broken_actuator_is_found(broken: type[Filter], message: str, machine: Machine) -> None:
+    with pytest.raises(AssertionError, match=message):
+        check_actuator(spec_of(broken), machine)
+
+
+def overriding(**methods: Callable[..., Any]) -> Any:
+    """Returns the shipped task with some methods of its process replaced; each gets the original as its first argument."""
+
+    def build(machine: Machine, num_envs: int, device: torch.device) -> Any:
+        process = option("task", "borehole_insertion").build(machine, num_envs, device)
+        for name, method in methods.items():
+            setattr(process, name, lambda *a, original=getattr(process, name), method=method: method(original, *a))
+        return process
+
+    return SimpleNamespace(build=build)
+
+
+@pytest.mark.parametrize(
+    ("methods", "message"),
+    [
+        ({"command": lambda original, action: action}, "leaves"),
+        ({"starts": lambda original, count, seed: original(count, 7)}, "another seed"),
+        (
+            {"step": lambda original, history, world: replace(original(history, world), reward=torch.full((4,), torch.nan))},
+            "not finite",
+        ),
+        (
+            {"step": lambda original, *a: replace(original(*a), timed_out=torch.zeros(4, dtype=torch.bool))},
+            "reason must be|no time-out",
+        ),
+        ({"reset": lambda original, mask, start: original(torch.ones_like(mask), start)}, "outside the mask"),
+    ],
+)
+def test_a_broken_task_is_found(methods: dict[str, Callable[..., Any]], message: str, machine: Machine) -> None:
+    with pytest.raises(AssertionError, match=message):
+        check_task(overriding(**methods), machine)
+
+
+def test_a_finder_with_an_axis_that_is_no_unit_vector_is_found() -> None:
+    hole = Borehole(np.zeros(3), np.array([0.0, 0.0, 2.0]), 0.05, np.eye(3))
+    with pytest.raises(AssertionError, match="unit vector"):
+        check_finder(SimpleNamespace(build=lambda: SimpleNamespace(find=lambda frame: hole)))
+
+
+class Loopback:
+    """A link to a machine that stands still."""
+
+    def __init__(self, num_joints: int, guarded: bool) -> None:
+        self._num_joints, self._guarded, self._t_s = num_joints, guarded, 0.0
+
+    def read(self) -> JointState:
+        self._t_s += 0.05
+        return JointState(self._t_s, np.zeros(self._num_joints))
+
+    def send(self, command: Command) -> Command:
+        return Command(np.nan_to_num(command.u)) if self._guarded else command
+
+    def __enter__(self) -> Loopback:
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        pass
+
+
+def test_a_link_must_not_send_what_is_no_number(machine: Machine) -> None:
+    check_link(Loopback(machine.num_joints, guarded=True), machine)
+    with pytest.raises(AssertionError, match="no number"):
+        check_link(Loopback(machine.num_joints, guarded=False), machine)
+
+
+def test_the_truth_needs_a_unit_axis() -> None:
+    with pytest.raises(ConfigError, match="unit vector"):
+        replace(option("perception", "truth"), axis_in_base=(0.0, 0.0, 2.0))
