@@ -5,8 +5,9 @@ Its reference is accumulated from the predicted increments. "Present position + 
 next starting point, and the arm sinks. Within a control period the reference moves on at constant speed v (MuJoCo integrates ctrl = v into
 act), led by v damping / stiffness, so that damping does not cost a lag.
 
-Gravity is compensated in the links: the actuator model was learned on a machine that has its weight, so what gravity does to the motion is
-already in its increments and must not be counted twice.
+The simulation has no gravity: the actuator model was learned on a machine that has its weight, so what gravity does to the motion is
+already in its increments and must not be counted twice. Nothing but the machine moves, so that this is the same as compensating it link by
+link, and cheaper.
 """
 
 import mujoco
@@ -17,6 +18,10 @@ from brokk_rl.machine import Machine
 
 DAMPING_RATIO = 0.7
 """Of the servo against the inertia seen at the joint at home; a heavier pose is damped less."""
+
+
+MAX_SPEED = 20.0
+"""Joint speed (rad/s or m/s) beyond which a world counts as diverged; forty times what such a machine can do."""
 
 
 def add_drive(spec: mujoco.MjSpec, machine: Machine, inertia: np.ndarray) -> None:
@@ -78,6 +83,13 @@ class Drive:
         ctrl.copy_(increment).mul_(self._rate)
         torch.addcmul(reference, self._lead, ctrl, out=act)
         reference.add_(increment)
+
+    def diverged(self, qvel: torch.Tensor) -> torch.Tensor:
+        """Returns the worlds, `(N,)` bool, whose joint speeds, `(N, J)`, are absurd or NaN, or whose references are no longer finite.
+
+        The references count because the cut-off at the yield force turns NaN into a force that looks sound.
+        """
+        return (self.reference.mul(0.0).add_(qvel).abs_().amax(1) <= MAX_SPEED).logical_not_()
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor) -> None:
         """Puts the references of the worlds of `mask`, `(N,)` bool, to `q`, `(N, J)`."""

@@ -17,8 +17,6 @@ from brokk_rl.sim.scene import add_block
 ASSETS = Path(__file__).parent / "assets"
 VISUAL_GROUP = 2
 """Geoms of this group are for the eye only."""
-MAX_SPEED = 20.0
-"""Joint speed (rad/s or m/s) beyond which a world counts as diverged; forty times what such a machine can do."""
 
 
 def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> mujoco.MjModel:
@@ -82,7 +80,6 @@ def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
         _stretch(link, np.array(drawn_end), end)
         _write_inertia(link, drawn, joint.mass_kg.value, joint.com_m)
         link.pos = _values(joint.origin_m)
-        link.gravcomp = 1.0
         hinge = spec.joint(joint.name)
         hinge.type = mujoco.mjtJoint.mjJNT_HINGE if joint.kind == "hinge" else mujoco.mjtJoint.mjJNT_SLIDE
         hinge.axis, hinge.pos = joint.axis, (0.0, 0.0, 0.0)
@@ -131,6 +128,8 @@ def _write_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    # what gravity does to the motion is in the actuator model, see `brokk_rl.sim.drive`
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
 
 
 def _strip(spec: mujoco.MjSpec) -> None:

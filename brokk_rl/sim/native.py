@@ -8,7 +8,7 @@ from mujoco.batch import Batch, SimulationError
 from brokk_rl.errors import ConfigError, DeviceError
 from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import Drive
-from brokk_rl.sim.model import MAX_SPEED, compile_model, contact_sensors
+from brokk_rl.sim.model import compile_model, contact_sensors
 from brokk_rl.sim.scene import Placement, nominal
 from brokk_rl.spec import spec
 
@@ -87,8 +87,7 @@ class NativeWorld:
             self.faults[torch.from_numpy(error.ids)] = True
         self.contact_force_n.copy_((self._sensors @ self._is_touch).amax(1))
         self.q.copy_(self._qpos)
-        diverged = (self._qvel.abs().amax(1) <= MAX_SPEED).logical_not_()  # the negation is true for NaN as well
-        self.faults.logical_or_(diverged).logical_or_(self._warning.flatten(1).any(1))
+        self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(self._warning.flatten(1).any(1))
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.World`."""

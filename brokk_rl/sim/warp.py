@@ -50,6 +50,8 @@ class Warp:
         device = torch.device(device)
         if device.type == "cuda" and not torch.cuda.is_available():
             raise DeviceError(f"device '{device}' was asked for, but torch finds no CUDA GPU here; choose sim=native (or sim=auto) and the CPU")
+        if device.type == "cuda" and device.index is None:
+            device = torch.device("cuda", torch.cuda.current_device())
         from brokk_rl.sim.warp_world import WarpWorld  # takes seconds to import, so only where it is needed
 
         return WarpWorld(self, machine, num_worlds or self.num_worlds, device)

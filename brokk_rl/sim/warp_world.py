@@ -12,7 +12,7 @@ import warp as wp
 
 from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import Drive
-from brokk_rl.sim.model import MAX_SPEED, compile_model, contact_sensors
+from brokk_rl.sim.model import compile_model, contact_sensors
 from brokk_rl.sim.scene import Placement, nominal
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class WarpWorld:
         self.supports_graphs = device.type == "cuda"
         self._substeps = spec.substeps
         self.model = compile_model(machine, machine.period_s / spec.substeps)
-        wp.config.quiet = True
+        wp.config.log_level = wp.LOG_WARNING
         wp.init()
         self._warp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._warp_device):
@@ -82,8 +82,7 @@ class WarpWorld:
                 mjw.step(self._model, self._data)
                 wp.launch(_keep_peak, self.num_worlds, [self._data.sensordata, self._is_touch, self._peak])
         self.q.copy_(view["qpos"])
-        diverged = (view["qvel"].abs().amax(1) <= MAX_SPEED).logical_not_()  # the negation is true for NaN as well
-        self.faults.logical_or_(diverged).logical_or_((view["overflow"] & _LOST) != 0)
+        self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_((view["overflow"] & _LOST) != 0)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.World`."""
@@ -134,8 +133,10 @@ class WarpWorld:
                 yield
             return
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-        with wp.ScopedStream(stream):
-            if not torch.cuda.is_current_stream_capturing():
+        capturing = torch.cuda.is_current_stream_capturing()
+        # a captured stream must not wait for work outside the capture
+        with wp.ScopedStream(stream, sync_enter=not capturing):
+            if not capturing:
                 yield
                 return
             with wp.ScopedCapture(stream=stream, external=True):

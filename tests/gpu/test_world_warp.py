@@ -1,0 +1,87 @@
+"""The Warp world on a real GPU: graphs, parity with MuJoCo C, faults."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+import conf
+from brokk_rl.sim.native import Native
+from brokk_rl.sim.scene import nominal
+from brokk_rl.sim.warp import Warp
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+
+NUM_WORLDS = 64
+SPEC = Warp(
+    num_worlds=NUM_WORLDS, substeps=5, num_contacts=16, num_constraints=48, iterations=20, linesearch_iterations=20, tolerance=1e-6
+)
+
+
+@pytest.fixture(scope="module")
+def machine():
+    return instantiate(OmegaConf.load(Path(conf.__file__).parent / "machine" / "brokk170.yaml"), _convert_="all")
+
+
+def _captured(world, increment):
+    """Returns the CUDA graph of one control step, captured with torch's own API."""
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        world.step(increment)
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream):
+        world.step(increment)
+    return graph
+
+
+def test_a_captured_control_step_does_what_the_eager_one_does(machine):
+    eager, graphed = (SPEC.build(machine, "cuda") for _ in range(2))
+    generator = torch.Generator("cuda").manual_seed(0)
+    increment = torch.zeros(NUM_WORLDS, machine.num_joints, device="cuda")
+    start = graphed.state_dict()
+    graph = _captured(graphed, increment)
+    graphed.load_state_dict(start)
+    speed = torch.tensor(machine.max_speed, device="cuda", dtype=torch.float32)
+    for _ in range(20):
+        increment.copy_(0.05 * speed * (torch.rand(increment.shape, device="cuda", generator=generator) - 0.5))
+        eager.step(increment)
+        graph.replay()
+    assert not eager.faults.any()
+    torch.testing.assert_close(graphed.q, eager.q, atol=1e-6, rtol=0)
+
+
+def test_free_motion_agrees_with_mujoco_c_for_five_seconds(machine):
+    warp = SPEC.build(machine, "cuda")
+    native = Native(num_worlds=NUM_WORLDS, substeps=5, num_threads=0).build(machine, "cpu")
+    generator = torch.Generator().manual_seed(1)
+    speed = torch.tensor(machine.max_speed, dtype=torch.float32)
+    velocity = torch.zeros(NUM_WORLDS, machine.num_joints)
+    scene = nominal(NUM_WORLDS)
+    scene[:, 0] = 6.0  # out of reach
+    everywhere = torch.ones(NUM_WORLDS, dtype=torch.bool)
+    native.reset(everywhere, native.q.clone(), scene)
+    warp.reset(everywhere.cuda(), warp.q.clone(), scene.cuda())
+    for _ in range(100):
+        velocity = 0.9 * velocity + 0.1 * speed * torch.randn(velocity.shape, generator=generator)
+        increment = velocity * machine.period_s
+        native.step(increment)
+        warp.step(increment.cuda())
+    still = (native.contact_force_n == 0.0).nonzero()[:, 0]
+    assert len(still) > NUM_WORLDS // 2
+    torch.testing.assert_close(warp.q.cpu()[still], native.q[still], atol=1e-4, rtol=0)
+
+
+def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine):
+    world = SPEC.build(machine, "cuda")
+    increment = torch.zeros(NUM_WORLDS, machine.num_joints, device="cuda")
+    increment[3, 1] = float("nan")
+    start = world.q.clone()
+    world.step(increment)
+    assert world.faults.nonzero().flatten().tolist() == [3]
+    world.reset(world.faults.clone(), start, nominal(NUM_WORLDS, "cuda"))
+    world.step(torch.zeros_like(increment))
+    assert not world.faults.any()
+    torch.testing.assert_close(world.q, start, atol=1e-6, rtol=0)
