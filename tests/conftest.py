@@ -14,6 +14,9 @@ from brokk_rl import cli
 from brokk_rl.machine import Machine
 
 
+torch.set_num_threads(1)  # small tensors: threads would only wait for each other
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if torch.cuda.is_available():
         return

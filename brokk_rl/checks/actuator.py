@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import torch
 
-from brokk_rl.checks.exercise import NUM_ENVS, addresses, copies, own_randomness, require, require_rows, rest_history, restore, same
+from brokk_rl.checks.exercise import (
+    NUM_ENVS,
+    copies,
+    in_place,
+    own_randomness,
+    places,
+    require,
+    require_rows,
+    rest_history,
+    restore,
+    same,
+)
 from brokk_rl.contracts import Actuator, ActuatorModel, Effect
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -30,7 +41,7 @@ def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.d
     everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=device)
     model.reset(everywhere)
     require_rows(model.state, "state")
-    address = addresses(model.state)
+    place = places(model.state)
     begin = copies(model.state)
 
     first = _drive(model, machine, device)
@@ -39,7 +50,7 @@ def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.d
         first.dtype == torch.float32 and first.device.type == device.type, f"step: expected float32 on {device}, got {first.dtype}"
     )
     require(bool(first.isfinite().all()), "step: positions are not finite under full and random commands")
-    require(addresses(model.state) == address, "state: a tensor moved or changed its shape; write it in place")
+    require(in_place(model.state, place), "state: a tensor moved or changed its shape; write it in place")
 
     end = copies(model.state)
     some = everywhere.clone()

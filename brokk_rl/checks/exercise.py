@@ -41,9 +41,16 @@ def require_rows(tensors: Mapping[str, torch.Tensor], what: str) -> None:
         require(len(value) == NUM_ENVS, f"{what} '{name}': expected {NUM_ENVS} rows, got shape {tuple(value.shape)}")
 
 
-def addresses(tensors: Mapping[str, torch.Tensor]) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """Returns address and shape of each tensor."""
-    return {name: (value.data_ptr(), tuple(value.shape)) for name, value in tensors.items()}
+def places(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Returns views of all tensors, which keep their memory from being given to others."""
+    return {name: value.view_as(value) for name, value in tensors.items()}
+
+
+def in_place(tensors: Mapping[str, torch.Tensor], before: Mapping[str, torch.Tensor]) -> bool:
+    """Says whether all tensors lie where `places` saw them, in the same shape."""
+    return tensors.keys() == before.keys() and all(
+        value.data_ptr() == before[name].data_ptr() and value.shape == before[name].shape for name, value in tensors.items()
+    )
 
 
 def copies(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from brokk_rl.checks.exercise import NUM_ENVS, addresses, require, same
+from brokk_rl.checks.exercise import NUM_ENVS, in_place, places, require, same
 from brokk_rl.contracts import Simulator, World
 from brokk_rl.machine import Machine
 
@@ -27,7 +27,7 @@ def check_world(simulator: Simulator, machine: Machine, scenes: torch.Tensor, de
         require(tuple(value.shape) == shapes[name], f"{name}: expected shape {shapes[name]}, got {tuple(value.shape)}")
         require(value.dtype == kind, f"{name}: expected {kind}, got {value.dtype}")
     require(world.num_worlds == NUM_ENVS, f"num_worlds: expected {NUM_ENVS}, got {world.num_worlds}")
-    address = addresses(tensors)
+    place = places(tensors)
     home = torch.as_tensor(machine.home, dtype=torch.float32, device=device).repeat(NUM_ENVS, 1)
     everywhere, scenes = torch.ones(NUM_ENVS, dtype=torch.bool, device=device), scenes.to(device)
     steps = torch.as_tensor(machine.max_speed * machine.period_s * 0.5, dtype=torch.float32, device=device).repeat(NUM_ENVS, 1)
@@ -39,8 +39,8 @@ def check_world(simulator: Simulator, machine: Machine, scenes: torch.Tensor, de
     first = _push(world, steps)
     require(bool(first.isfinite().all()), "step: q is not finite")
     require(bool((first[-1] != home).any()), "step: the arm does not move")
-    require(addresses({"q": world.q, "contact_force_n": world.contact_force_n, "faults": world.faults}) == address,
-             "step: a tensor moved; refresh it in place")  # fmt: skip
+    seen = {"q": world.q, "contact_force_n": world.contact_force_n, "faults": world.faults}
+    require(in_place(seen, place), "step: a tensor moved; refresh it in place")
     tolerance = 0.0 if device.type == "cpu" else 1e-5  # the order of additions on a GPU is not fixed
     world.load_state_dict(stored)
     require(same(_push(world, steps), first, tolerance), "load_state_dict: the same steps from the same state lead elsewhere")

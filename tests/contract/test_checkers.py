@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -105,7 +106,7 @@ def overriding(**methods: Callable[..., Any]) -> Any:
     def build(machine: Machine, num_envs: int, device: torch.device) -> Any:
         process = option("task", "borehole_insertion").build(machine, num_envs, device)
         for name, method in methods.items():
-            setattr(process, name, lambda *a, original=getattr(process, name), method=method: method(original, *a))
+            setattr(process, name, partial(method, getattr(process, name)))
         return process
 
     return SimpleNamespace(build=build)
