@@ -1,0 +1,179 @@
+"""The architecture as rules over syntax trees: each takes the sources by module name and returns what breaks it."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+ROOMS = ("tasks", "actuators", "perception", "deploy")
+FLOORS = (
+    ("brokk_rl.cli", 5),
+    ("brokk_rl.extensions", 5),
+    ("conf", 5),
+    ("brokk_rl.modes", 4),
+    ("brokk_rl.diagnosis", 3),
+    *((room, 3) for room in ROOMS),
+    ("brokk_rl.sim", 2),
+    ("brokk_rl.rl", 2),
+    ("brokk_rl.spec", 0),
+    ("brokk_rl.errors", 0),
+    ("brokk_rl", 1),
+)
+"""Floor of each package, the first that fits: roof, modes, rooms and diagnosis, sim and rl, bedrock, and ground for the rest."""
+DOORS = {
+    "hydra": ("brokk_rl.cli", "brokk_rl.extensions"),
+    "omegaconf": ("brokk_rl.cli", "brokk_rl.extensions"),
+    "mujoco": ("brokk_rl.sim",),
+    "mujoco_warp": ("brokk_rl.sim",),
+    "warp": ("brokk_rl.sim",),
+    "rsl_rl": ("brokk_rl.rl",),
+    "tensordict": ("brokk_rl.rl",),
+    "wandb": ("brokk_rl.rl",),
+    "cv2": ("perception", "deploy.picture"),
+    "can": ("deploy",),
+    "cantools": ("deploy",),
+}
+CLOSED = {
+    "deploy": ("brokk_rl.sim", "brokk_rl.rl", "mujoco", "warp", "rsl_rl"),
+    "deploy.guard": ("torch", "os", "pathlib", "socket", "io"),
+}
+"""What a package must not import, whatever its floor: the machine's own computer has neither simulator nor trainer."""
+VAGUE = {"utils", "util", "helpers", "helper", "common", "base", "manager", "misc"}
+HOOKS = {"check"}
+"""Methods that mean the same everywhere and are explained where they are called: `check` in `brokk_rl.spec`."""
+OTHER_UNITS = ("_deg", "_mm", "_cm", "_ms", "_km_h", "_bar")
+
+
+@dataclass(frozen=True)
+class Import:
+    """An import of `name` in line `line`."""
+
+    name: str
+    line: int
+
+
+def imports(tree: ast.Module) -> Iterator[Import]:
+    """Yields what a module imports when it runs; imports for the type checker alone bind nothing together."""
+    for node in _without_type_checking(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield Import(alias.name, node.lineno)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            for alias in node.names:
+                yield Import(f"{node.module}.{alias.name}", node.lineno)
+
+
+def floor(module: str) -> int | None:
+    """Returns the floor of a module of ours, `None` for a foreign one."""
+    return next((level for package, level in FLOORS if within(module, package)), None)
+
+
+def within(module: str, package: str) -> bool:
+    """Says whether `module` is `package` or lies in it."""
+    return module == package or module.startswith(f"{package}.")
+
+
+def floors(sources: Mapping[str, str]) -> list[str]:
+    """Imports go down only; `brokk_rl` imports no room, and rooms do not import each other."""
+    found = []
+    for module, tree in _trees(sources):
+        mine, room = floor(module), module.split(".")[0]
+        for entry in imports(tree):
+            other, top = floor(entry.name), entry.name.split(".")[0]
+            if other is None or mine is None:
+                continue
+            up = other > mine
+            into_room = top in (*ROOMS, "conf") and top != room
+            if up or into_room:
+                found.append(f"{module}:{entry.line} imports {entry.name}, which is {'above it' if up else 'a room of its own'}")
+    return found
+
+
+def doors(sources: Mapping[str, str]) -> list[str]:
+    """Each foreign package has one door, and some packages stay out of others altogether."""
+    found = []
+    for module, tree in _trees(sources):
+        for entry in imports(tree):
+            allowed = DOORS.get(entry.name.split(".")[0])
+            if allowed and not any(within(module, package) for package in allowed):
+                found.append(f"{module}:{entry.line} imports {entry.name}; only {' and '.join(allowed)} may")
+            for package, closed in CLOSED.items():
+                if within(module, package) and any(within(entry.name, name) for name in closed):
+                    found.append(f"{module}:{entry.line} imports {entry.name}, which {package} must do without")
+    return found
+
+
+def prints(sources: Mapping[str, str]) -> list[str]:
+    """`logging`, never `print`, outside what a mode shows the person."""
+    return [
+        f"{module}:{node.lineno} prints"
+        for module, tree in _trees(sources)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "print"
+        and not within(module, "brokk_rl.modes")
+    ]
+
+
+def vague_names(sources: Mapping[str, str]) -> list[str]:
+    """Modules and folders are nouns that say what is in them."""
+    return [f"{module}: '{part}' says nothing" for module in sources for part in module.split(".") if part in VAGUE]
+
+
+def docstrings(sources: Mapping[str, str]) -> list[str]:
+    """Every public module, class, function and method says what it is."""
+    found = []
+    for module, tree in _trees(sources):
+        if not ast.get_docstring(tree):
+            found.append(f"{module} has no docstring")
+        found += [
+            f"{module}:{node.lineno} {node.name} has no docstring" for node in _public(tree.body) if not ast.get_docstring(node)
+        ]
+    return found
+
+
+def units(sources: Mapping[str, str]) -> list[str]:
+    """Physical names carry SI units; counts are `num_…`."""
+    found = []
+    for module, tree in _trees(sources):
+        for node in ast.walk(tree):
+            name = node.target.id if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) else None
+            name = node.arg if isinstance(node, ast.arg) else name
+            if name and name.endswith(OTHER_UNITS):
+                found.append(f"{module}: {name} is not in SI units")
+            if name and name.startswith("n_"):
+                found.append(f"{module}: {name} is a count: num_{name[2:]}")
+    return found
+
+
+def lengths(sources: Mapping[str, str], limit: int, reasons: Mapping[str, str]) -> list[str]:
+    """No module is longer than `limit` lines without a reason."""
+    counts = {module: text.count("\n") for module, text in sources.items()}
+    return [
+        f"{module} has {count} lines, over {limit}" for module, count in counts.items() if count > limit and module not in reasons
+    ]
+
+
+def _trees(sources: Mapping[str, str]) -> Iterator[tuple[str, ast.Module]]:
+    for module, text in sources.items():
+        yield module, ast.parse(text)
+
+
+def _public(body: list[ast.stmt]) -> Iterator[ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef]:
+    for node in body:
+        if not isinstance(node, (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) or node.name.startswith("_"):
+            continue
+        if node.name not in HOOKS and not any(isinstance(d, ast.Attribute) and d.attr == "setter" for d in node.decorator_list):
+            yield node
+        if isinstance(node, ast.ClassDef):
+            yield from _public(node.body)
+
+
+def _without_type_checking(node: ast.AST) -> Iterator[ast.AST]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING":
+            continue
+        yield child
+        yield from _without_type_checking(child)
