@@ -29,8 +29,8 @@ def found(checkpoint: str) -> Path:
             return path
     shipped = ", ".join(sorted(path.name for path in SHIPPED.glob("*.safetensors"))) or "none"
     raise CheckpointError(
-        f"actuator.checkpoint: there is no file '{checkpoint}' (seen from {Path.cwd()}), nor does one of that name ship with the package "
-        f"({shipped}). `brokk mode=identify` makes one."
+        f"actuator.checkpoint: there is no file '{checkpoint}' (seen from {Path.cwd()}), nor does one of that name ship with the "
+        f"package ({shipped}). `brokk mode=identify` makes one."
     )
 
 

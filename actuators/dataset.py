@@ -42,8 +42,8 @@ class Windows:
         if not len(self.starts):
             longest = max((recording.num_samples for recording in recordings), default=0)
             raise RecordingError(
-                f"too little data: the longest of {len(recordings)} recordings has {longest} samples, one window needs {self._length} "
-                f"({machine.num_history} of history and {horizon} to predict)"
+                f"too little data: the longest of {len(recordings)} recordings has {longest} samples, one window needs "
+                f"{self._length} ({machine.num_history} of history and {horizon} to predict)"
             )
         self._moving = [self._active(u) for u in self.u]
         for joint, moving in zip(machine.joint_names, self._moving, strict=True):

@@ -11,11 +11,11 @@ Equations, per joint, with time step `substep_s` (symplectic Euler; friction imp
     force'   stiffness * (flow speed - joint speed) - leak
     joint'   inertia * joint speed' = force + weight(q) - Coulomb, Stribeck and viscous friction
 
-Reduced, and why: the two chamber pressures are one load force, and the oil's stiffness does not depend on the piston's position (at 20 Hz
-only the first mode of the joint is visible, and the machine's YAML knows one stiffness); inertia is constant, `stiffness /
+Reduced, and why: the two chamber pressures are one load force, and the oil's stiffness does not depend on the piston's position (at
+20 Hz only the first mode of the joint is visible, and the machine's YAML knows one stiffness); inertia is constant, `stiffness /
 (2 pi mode_hz)^2` (coupling through the arm's inertia is small against the 5 to 10 Hz of the oil column); pressure compensation is
-imperfect in one number, `load_sensitivity`; supply pressure is constant and the pump is limited by flow. Contact reaches the plant through
-the measured position only: a blocked joint keeps pushing, and the simulator's drive yields.
+imperfect in one number, `load_sensitivity`; supply pressure is constant and the pump is limited by flow. Contact reaches the plant
+through the measured position only: a blocked joint keeps pushing, and the simulator's drive yields.
 """
 
 import math
@@ -139,7 +139,7 @@ class HydraulicModel:
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
-        """`pilot`, `spool` (of full stroke), `spool_rate` (1/s), `speed` (rad/s), `force` (Nm), each `(N, J)`; `oil_c` `(N,)`; draws."""
+        """`pilot`, `spool` (of full stroke), `spool_rate` (1/s), `speed` (rad/s), `force` (Nm), each `(N, J)`; `oil_c` `(N,)`."""
         return {**self._state, **self._parameters.state}
 
     def reset(self, mask: torch.Tensor) -> None:

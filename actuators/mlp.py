@@ -1,4 +1,4 @@
-"""The paper's actuator model: one small perceptron a joint that predicts the next increment from 650 ms of commands and positions."""
+"""The paper's actuator model: a small perceptron a joint predicts the next increment from 650 ms of commands and positions."""
 
 import torch
 

@@ -1,9 +1,11 @@
 """The paper's actuator network, one per joint, all joints computed as one.
 
-The paper feeds 13 commands and 13 positions. Here the 13 positions of a joint enter as its newest position and the 12 increments between
-them: the same information in another basis, so that the network sees speeds at full resolution instead of small differences of
+The paper feeds 13 commands and 13 positions. Here the 13 positions of a joint enter as its newest position and the 12 increments
+between them: the same information in another basis, so that the network sees speeds at full resolution instead of small differences of
 large numbers, and what it learns in one place holds in another unless the data say otherwise.
 """
+
+from itertools import pairwise
 
 import torch
 from torch import nn
@@ -12,8 +14,8 @@ from torch import nn
 class JointNetworks(nn.Module):
     """For each joint a perceptron with two hidden ReLU layers, from `2 H` inputs to the next increment (paper, section III-A).
 
-    The last layer is followed by a dead zone of half width `quiet`: an increment smaller than the noise of the measurement is none. A
-    machine at rest therefore stays at rest, however long the model runs on its own predictions.
+    The last layer is followed by a dead zone of half width `quiet`: an increment smaller than the noise of the measurement is none.
+    A machine at rest therefore stays at rest, however long the model runs on its own predictions.
 
     Args:
         num_joints: Number of joints, `J`.
@@ -40,8 +42,8 @@ class JointNetworks(nn.Module):
 
         sizes = (2 * num_history, width, width, 1)
         self.num_history, self.width = num_history, width
-        self.weight = nn.ParameterList([uniform(m, n, fan_in=m) for m, n in zip(sizes[:-1], sizes[1:], strict=True)])
-        self.bias = nn.ParameterList([uniform(1, n, fan_in=m) for m, n in zip(sizes[:-1], sizes[1:], strict=True)])
+        self.weight = nn.ParameterList([uniform(m, n, fan_in=m) for m, n in pairwise(sizes)])
+        self.bias = nn.ParameterList([uniform(1, n, fan_in=m) for m, n in pairwise(sizes)])
         for name in ("command_scale", "increment_scale", "position_center", "position_scale", "quiet"):
             self.register_buffer(name, torch.zeros(num_joints) if name in ("position_center", "quiet") else torch.ones(num_joints))
 

@@ -40,8 +40,9 @@ def per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarray:
 class Parameters:
     """Numbers of an actuator for all environments: tensors `(N, J)` of fixed address, in `value` by name.
 
-    With a `spread` a number is `nominal * (1 + spread * U(-1, 1))`, drawn per environment and joint at each reset. The draws come from
-    a counter in `state` and not from a generator: no host is involved, a CUDA graph may hold them, and a resumed run goes on exactly.
+    With a `spread` a number is `nominal * (1 + spread * U(-1, 1))`, drawn per environment and joint at each reset. The draws come
+    from a counter in `state` and not from a generator: no host is involved, a CUDA graph may hold them, and a resumed run goes on
+    exactly.
 
     Args:
         nominal: Nominal values by name, each `(J,)`.

@@ -11,8 +11,8 @@ def check_dead_time(longest_s: float, machine: Machine, where: str) -> None:
     reach_s = (machine.num_history - 1) * machine.period_s
     if not 0.0 <= longest_s <= reach_s + 1e-6:
         raise ConfigError(
-            f"{where}: a dead time of {longest_s:.3f} s (spread included) does not fit the {reach_s:.3f} s that the history of machine "
-            f"'{machine.name}' reaches back; shorten it or raise machine.num_history"
+            f"{where}: a dead time of {longest_s:.3f} s (spread included) does not fit the {reach_s:.3f} s that the history of "
+            f"machine '{machine.name}' reaches back; shorten it or raise machine.num_history"
         )
 
 
@@ -40,7 +40,7 @@ def commands_in_force(u: torch.Tensor, delay_periods: torch.Tensor) -> tuple[tor
 
 
 def opened(u: torch.Tensor, dead_band_extend: torch.Tensor, dead_band_retract: torch.Tensor) -> torch.Tensor:
-    """Returns how far the valve is open, shape of `u`, in [-1, 1]: zero inside the dead band, one at full command on either side."""
+    """Returns how far the valve is open, shape of `u`, in [-1, 1]: zero inside the dead band, one at full command each way."""
     extend = torch.relu(u - dead_band_extend) / (1.0 - dead_band_extend)
     retract = torch.relu(-u - dead_band_retract) / (1.0 - dead_band_retract)
     return extend - retract

@@ -106,8 +106,8 @@ def read(path: Path, machine: Machine) -> Recording:
     """Reads the recording at `path`, made on `machine`.
 
     Raises:
-        RecordingError: the file is missing or truncated, was made on another machine, lacks a column, or breaks a rule of the format;
-            the message names file, row and column.
+        RecordingError: the file is missing or truncated, was made on another machine, lacks a column, or breaks a rule of the
+            format; the message names file, row and column.
     """
     try:
         table = pq.read_table(path)
@@ -181,12 +181,13 @@ def check(recording: Recording, where: str) -> None:
     period_s = np.diff(recording.t_s)
     if (row := _first(period_s <= 0)) is not None:
         raise RecordingError(
-            f"{where}: row {row + 1}, column 't_s': time does not increase ({recording.t_s[row]:g} s, then {recording.t_s[row + 1]:g} s)"
+            f"{where}: row {row + 1}, column 't_s': time does not increase ({recording.t_s[row]:g} s, then "
+            f"{recording.t_s[row + 1]:g} s)"
         )
     if (row := _first(np.abs(period_s * recording.rate_hz - 1.0) > RATE_TOLERANCE)) is not None:
         raise RecordingError(
-            f"{where}: row {row + 1}, column 't_s': {period_s[row]:g} s after the row before, but brokk.rate_hz = {recording.rate_hz:g} "
-            f"means {1.0 / recording.rate_hz:g} s (20 % are allowed); split the recording at the gap or state its rate"
+            f"{where}: row {row + 1}, column 't_s': {period_s[row]:g} s after the row before, but brokk.rate_hz = "
+            f"{recording.rate_hz:g} means {1.0 / recording.rate_hz:g} s (20 % are allowed); split the recording at the gap or state its rate"
         )
 
 

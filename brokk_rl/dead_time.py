@@ -1,0 +1,96 @@
+"""Dead time of each joint from recordings: the delay at which a static curve of the command explains the motion best.
+
+The lag of spool and oil counts as delay here (at 20 Hz the two can hardly be told apart), so this is the total that a controller
+has to look ahead, not the time to first motion.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+KNOTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7)
+"""Commands at which the static curve bends, on either side."""
+RESOLUTION_S = 0.01
+RESAMPLED = 200
+MIN_MOVING = 100
+"""Samples with a command, in all recordings together, below which no delay is estimated."""
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A dead time with its interval.
+
+    Attributes:
+        value_s: Best delay.
+        ci95_s: 95 % interval from resampling whole recordings.
+        explained: Part of the variance of the increments that the delayed static curve explains.
+    """
+
+    value_s: float
+    ci95_s: tuple[float, float]
+    explained: float
+
+
+def delays(recordings: Sequence[Recording], machine: Machine, generator: np.random.Generator) -> dict[str, Delay | None]:
+    """Returns the dead time of each joint; `None` for a joint that is hardly commanded.
+
+    Raises:
+        RecordingError: no recording is longer than the history.
+    """
+    usable = [recording for recording in recordings if recording.num_samples > machine.num_history + 1]
+    if not usable:
+        raise RecordingError(f"too little data: no recording is longer than the history of {machine.num_history} samples")
+    grid_s = np.arange(0.0, (machine.num_history - 1) * machine.period_s + 1e-9, RESOLUTION_S)
+    return {name: _delay(usable, joint, grid_s, machine, generator) for joint, name in enumerate(machine.joint_names)}
+
+
+def _delay(
+    recordings: Sequence[Recording], joint: int, grid_s: np.ndarray, machine: Machine, generator: np.random.Generator
+) -> Delay | None:
+    moving = [recording for recording in recordings if (np.abs(recording.u[:, joint]) > KNOTS[1]).any()]
+    if sum(int((np.abs(recording.u[:, joint]) > KNOTS[1]).sum()) for recording in moving) < MIN_MOVING:
+        return None
+    moments = np.stack([_moments(recording, joint, grid_s, machine) for recording in moving])  # (R, D, F + 1, F + 1)
+    value = _best(moments.sum(0))
+    picks = (generator.integers(len(moving), size=len(moving)) for _ in range(RESAMPLED))
+    again = grid_s[[_best(moments[pick].sum(0)) for pick in picks]]
+    low, high = np.percentile(again, (2.5, 97.5))
+    total = moments.sum(0)
+    left = _residual(total)[value] / total[value, -1, -1]
+    return Delay(float(grid_s[value]), (float(low), float(high)), float(1.0 - left))
+
+
+def _moments(recording: Recording, joint: int, grid_s: np.ndarray, machine: Machine) -> np.ndarray:
+    """Returns, for each delay, the sums of products of the curve's features and the increment, shape `(D, F + 1, F + 1)`."""
+    u, q = recording.u[:, joint].astype(np.float64), recording.q[:, joint].astype(np.float64)
+    first = machine.num_history
+    now = np.arange(first, len(u) - 1)
+    moved = (q[now + 1] - q[now])[:, None]
+    knots = np.array(KNOTS)
+    found = []
+    for delay_s in grid_s:
+        whole, part = divmod(delay_s / machine.period_s + 1e-9, 1.0)
+        extend, retract = 0.0, 0.0
+        for share, back in ((part, int(whole) + 1), (1.0 - part, int(whole))):  # the command changes inside the period
+            delayed = u[now - min(back, first)][:, None]
+            extend, retract = extend + share * np.maximum(delayed - knots, 0.0), retract + share * np.maximum(-delayed - knots, 0.0)
+        features = np.concatenate([extend, retract, moved], 1)
+        found.append(features.T @ features)
+    return np.stack(found)
+
+
+def _residual(moments: np.ndarray) -> np.ndarray:
+    """Returns the sum of squares that the best curve leaves, for each delay, shape `(D,)`."""
+    gram, cross, total = moments[:, :-1, :-1], moments[:, :-1, -1], moments[:, -1, -1]
+    ridge = 1e-6 * np.trace(gram, axis1=1, axis2=2)[:, None, None] / gram.shape[1] + 1e-12
+    weight = np.linalg.solve(gram + ridge * np.eye(gram.shape[1]), cross[..., None])[..., 0]
+    return total - 2.0 * (weight * cross).sum(1) + np.einsum("di,dij,dj->d", weight, gram, weight)
+
+
+def _best(moments: np.ndarray) -> int:
+    return int(np.argmin(_residual(moments)))
