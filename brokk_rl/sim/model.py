@@ -126,7 +126,8 @@ def _write_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     option = spec.option
     option.timestep = timestep_s
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    # a pyramid's friction depends on how its edges lie, which MuJoCo C and MuJoCo Warp choose differently
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     # what gravity does to the motion is in the actuator model, see `brokk_rl.sim.drive`
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
