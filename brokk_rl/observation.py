@@ -45,6 +45,7 @@ class Encoder:
         concat: Callable[[tuple[Any, ...], int], Any] = np.concatenate,
     ) -> None:
         self.shape = (machine.num_history, machine.num_joints)
+        self._machine, self._scaling = machine, scaling
         self.size = size(machine)
         self._concat = concat
         self._target_mean_m = constant(np.float32(scaling.target_mean_m))
@@ -70,3 +71,14 @@ class Encoder:
         target = vector[:, :3] * self._target_std_m + self._target_mean_m
         q = vector[:, 3 : 3 + num].reshape(-1, *self.shape) * self._q_std + self._q_mean
         return target, q, vector[:, 3 + num :].reshape(-1, *self.shape)
+
+    def describe(self) -> dict[str, Any]:
+        """Returns order and scale of the vector as plain JSON data, for the contract of a policy."""
+        lower, upper = self._machine.lower, self._machine.upper
+        return {
+            "size": self.size,
+            "order": ["target_in_base_m (3)", "q oldest first (H x J)", "u oldest first (H x J)"],
+            "target": {"mean_m": list(self._scaling.target_mean_m), "std_m": list(self._scaling.target_std_m)},
+            "q": {"mean": ((lower + upper) / 2).tolist(), "std": ((upper - lower) / 4).tolist()},
+            "u": {"mean": 0.0, "std": 1.0},
+        }

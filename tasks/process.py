@@ -7,9 +7,9 @@ be captured in one CUDA graph.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pkgutil import resolve_name
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 
@@ -78,9 +78,9 @@ class ToolPoseProcess:
             (resolve_name(term.function), term.weight) for term in options.reward.values()
         ]
         num_joints = machine.num_joints
-        start = goal.starts(1, 0)
+        start = self.starts(1, 0)
         shapes = {f"start.{key}": tuple(value.shape[1:]) for key, value in start.items()}
-        shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "estimate_m": (3,), "q_scale": (), "u_scale": (), "steps": ()}
+        shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "estimate_m": (3,), "q_scale": (), "u_scale": (), "steps": (), "age": ()}
         shapes |= {"u": (num_joints,), "u_before": (num_joints,), "closeness": (), "contact_force_n": ()}
         shapes |= {"command": (num_joints,), "features": (self.num_features,), "policy": (self._encoder.size,), "privileged": (9,)}
         shapes |= {"positioning": (), "rule_reach_m": ()}
@@ -95,33 +95,30 @@ class ToolPoseProcess:
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """See `TaskProcess.starts`."""
-        return self.goal.starts(count, seed)
+        start = self.goal.starts(count, seed)
+        pose = Kinematics(self._machine, "cpu").pose(start["q"])
+        return start | {"closeness": self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)["closeness"]}
 
-    def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor], history: History) -> None:
+    def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor]) -> None:
         """See `TaskProcess.reset`."""
         noise, state = self.options.noise, self.state
-        uniform = torch.rand(len(mask), 6, device=mask.device)
+        uniform = torch.rand(len(mask), 5, device=mask.device)
         turn, lift = uniform[:, 0] * (2 * math.pi), uniform[:, 1] * 2 - 1
         flat = torch.sqrt(1 - lift.square())
         bias = torch.stack((flat * turn.cos(), flat * turn.sin(), lift), 1) * uniform[:, 2:3] * noise.target_bias_m
         fresh = {f"start.{key}": value for key, value in start.items()}
         fresh |= {"bias_m": bias, "q_scale": 1 + noise.q_scale * (2 * uniform[:, 3] - 1), "u_scale": 1 + noise.u_scale * (2 * uniform[:, 4] - 1)}
+        fresh["closeness"] = start["closeness"]
         zero = torch.zeros((), device=mask.device)
         for name, value in state.items():
             rows = mask.reshape(-1, *[1] * (value.dim() - 1))
             value.copy_(torch.where(rows, fresh.get(name, zero), value))
         for value in self.episode.values():
             value.masked_fill_(mask, 0.0)
-        self._perceive(history)
-        pose = self._kinematics.pose(history.q[:, -1])
-        closeness = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, self._start())["closeness"]
-        state["closeness"].copy_(torch.where(mask, closeness, state["closeness"]))
 
     def command(self, action: torch.Tensor) -> torch.Tensor:
         """See `TaskProcess.command`."""
-        kind, scale = self.options.action.kind, self.options.action.scale
-        u = scale * action + (self.state["command"] if kind == "residual" else 0.0)
-        u = torch.where(self._exclusive == self.state["positioning"][:, None].bool(), u, 0.0).clamp(-1.0, 1.0)
+        u = self.options.action.command(action, self.state["command"], self.state["positioning"].bool(), self._exclusive)
         self.state["u_before"].copy_(self.state["u"])
         self.state["u"].copy_(u)
         return u
@@ -133,8 +130,10 @@ class ToolPoseProcess:
         pose = self._kinematics.pose(q)
         start = self._start()
         verdict = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)
+        # `steps` decides about the time limit and may be set from outside (episodes out of step); `age` counts since the reset
         state["steps"] += 1
-        first = state["steps"] == 1
+        state["age"] += 1
+        first = state["age"] == 1
         failed = ((q < self._lower) | (q > self._upper)).any(1)
         touching = first & (world.contact_force_n > 0)
         fault = world.faults
@@ -171,12 +170,26 @@ class ToolPoseProcess:
         self._count(seen, reward, success)
         state["closeness"].copy_(verdict["closeness"])
         state["contact_force_n"].copy_(world.contact_force_n)
-        self._perceive(history)
         return Transition(reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason)
 
-    def observe(self) -> dict[str, torch.Tensor]:
+    def observe(self, history: History) -> dict[str, torch.Tensor]:
         """See `TaskProcess.observe`: `policy`, `guide` (what the classical controller makes of it), `privileged` (for the critic)."""
+        self._perceive(history)
         return {"policy": self.state["policy"], "guide": self.state["features"], "privileged": self.state["privileged"]}
+
+    def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+        """See `TaskProcess.classical_action`."""
+        command, action = groups["guide"][:, : self.num_actions], self.options.action
+        return torch.zeros_like(command) if action.kind == "residual" else command / action.scale
+
+    def describe(self) -> dict[str, Any]:
+        """See `TaskProcess.describe`."""
+        options = self.options
+        return self._encoder.describe() | {"target_filter": options.noise.filter, "switch": asdict(options.switch)}
+
+    def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
+        """See `TaskProcess.deployable`."""
+        return Deployable(self, network)
 
     def _start(self) -> dict[str, torch.Tensor]:
         return {name.removeprefix("start."): value for name, value in self.state.items() if name.startswith("start.")}
@@ -197,7 +210,7 @@ class ToolPoseProcess:
         episode["valve_travel"] += (travel - episode["valve_travel"]) / episode["length"]
 
     def _perceive(self, history: History) -> None:
-        """Writes what the policy is told after this step: estimates, guidance, phase and the observation groups."""
+        """Writes what the policy is told: estimate, guidance, phase and the observation groups."""
         noise, state = self.options.noise, self.state
         true_m = state["start.target_m"]
         error = (2 * torch.rand_like(true_m) - 1) * noise.target_sample_m
@@ -206,8 +219,8 @@ class ToolPoseProcess:
         sample = true_m + state["bias_m"] + error
         state["estimate_sum_m"] += sample
         if noise.filter == "mean":
-            # a reset counts as the first sample, so that `steps` + 1 samples have been seen
-            sample = state["estimate_sum_m"] / (state["steps"] + 1)[:, None]
+            # the observation after the reset is the first sample
+            sample = state["estimate_sum_m"] / (state["age"] + 1)[:, None]
         state["estimate_m"].copy_(sample)
         q = history.q * state["q_scale"][:, None, None]
         u = history.u * state["u_scale"][:, None, None]
@@ -232,6 +245,30 @@ class ToolPoseProcess:
             state["positioning"],
         )
         return torch.cat(((sample - state["start.target_m"]) * 100, torch.stack(rest, 1)), 1)
+
+
+class Deployable(torch.nn.Module):
+    """The whole policy as it runs on the machine: from the observation vector `(B, 3 + 2 H J)` to masked commands `(B, J)`.
+
+    Everything that training computes beside the paper's observation (guidance, phase, residual, masks) is inside, so that nothing of it
+    has to be written again, in another order or scale, where the policy is deployed.
+    """
+
+    def __init__(self, process: ToolPoseProcess, network: torch.nn.Module) -> None:
+        super().__init__()
+        self.network = network
+        self._process = process
+        self._pitch_rad = float(process.starts(1, 0)["target_pitch_rad"][0])
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Returns valve commands, `(B, J)` in [-1, 1]."""
+        process, options = self._process, self._process.options
+        target_m, q, u = process._encoder.decode(observation)
+        pitch = torch.full_like(target_m[:, 0], self._pitch_rad)
+        guidance = process._controller.guide(q, u, target_m - process._down, pitch, options.switch.reach_m)
+        positioning = options.switch.positioning(guidance)
+        groups = {"policy": observation, "guide": features(guidance, positioning, u[:, -1])}
+        return options.action.command(self.network(groups), guidance.command, positioning, process._exclusive)
 
 
 def features(guidance: Guidance, positioning: torch.Tensor, u_last: torch.Tensor) -> torch.Tensor:

@@ -5,18 +5,11 @@ wrong, positions and commands through a scale that is slightly off, and acts und
 while positioning, all others afterwards.
 """
 
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
 
-from brokk_rl.classical import Classical, Guidance
-from brokk_rl.contracts import World
-from brokk_rl.errors import ConfigError
-from brokk_rl.history import History
-from brokk_rl.kinematics import Kinematics
-from brokk_rl.machine import Machine
-from brokk_rl.observation import Encoder, Scaling
+from brokk_rl.classical import Guidance
 from brokk_rl.spec import spec
 
 
@@ -74,7 +67,23 @@ class Action:
     Attributes:
         kind: `direct`: the output is the command. `residual`: it is added to the classical controller's command.
         scale: Factor on the output.
+        mask: Keep exclusive and other joints apart, as the machine does; only an ablation switches it off.
     """
 
     kind: Literal["direct", "residual"]
     scale: float
+    mask: bool
+
+    def command(self, output: torch.Tensor, base: torch.Tensor, positioning: torch.Tensor, exclusive: torch.Tensor) -> torch.Tensor:
+        """Returns valve commands in [-1, 1], `(N, J)`.
+
+        Args:
+            output: What the network says, `(N, J)`.
+            base: Command of the classical controller, `(N, J)`.
+            positioning: Whether only the exclusive joints move, `(N,)` bool.
+            exclusive: Which joints are exclusive, `(J,)` bool.
+        """
+        u = self.scale * output + (base if self.kind == "residual" else 0.0)
+        if self.mask:
+            u = torch.where(exclusive == positioning[:, None], u, 0.0)
+        return u.clamp(-1.0, 1.0)

@@ -130,14 +130,15 @@ class Insertion:
         for _ in range(64):
             distance, bearing = uniform(hole.distance_m), uniform(hole.bearing_rad)
             rim = torch.stack((distance * bearing.cos(), distance * bearing.sin(), uniform(hole.rim_z_m)), 1)
-            scenes = scene.stack(
-                hole_x_m=rim[:, 0],
-                hole_y_m=rim[:, 1],
-                rim_z_m=rim[:, 2],
-                yaw_rad=bearing + uniform(hole.yaw_rad),
-                block_scale=uniform(hole.block_scale),
-                hole_radius_m=torch.full((batch,), hole.radius_m),
-            )
+            columns = {
+                "hole_x_m": rim[:, 0],
+                "hole_y_m": rim[:, 1],
+                "rim_z_m": rim[:, 2],
+                "yaw_rad": bearing + uniform(hole.yaw_rad),
+                "block_scale": uniform(hole.block_scale),
+                "hole_radius_m": torch.full((batch,), hole.radius_m),
+            }
+            scenes = torch.stack([columns[name] for name in scene.COLUMNS], 1)
             q, good = random_arms(task.arms, self._machine, controller, rim[:, 2], generator)
             down = torch.full((batch,), DOWN_RAD)
             deep = rim - torch.tensor([0.0, 0.0, task.depth_m])

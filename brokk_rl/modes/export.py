@@ -1,0 +1,67 @@
+"""`brokk mode=export`: makes a policy bundle of a checkpoint, and proves that the ONNX file says the same as the network."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import torch
+
+from brokk_rl.contracts import Actuator, Simulator, Task
+from brokk_rl.machine import Machine
+from brokk_rl.modes.train import find_checkpoint
+from brokk_rl.rl.evaluation import evaluate
+from brokk_rl.rl.export import export_onnx
+from brokk_rl.rl.policy import Network, make_actor, write_bundle
+from brokk_rl.rl.runner import Training, check_stamp, read_checkpoint
+from brokk_rl.rl.vec_env import Plant
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class Export:
+    """Exports a checkpoint as a policy bundle: weights, contract and ONNX file.
+
+    Attributes:
+        session: Folder to write into.
+        machine: The machine.
+        sim: Physics in which the observations of the parity check arise.
+        task: The policy's task.
+        actuator: Actuator model of the same check.
+        rl: Training configuration that gives the network's shape.
+        checkpoint: A checkpoint, or a run folder for its newest one.
+        num_checked: Episodes that the parity check runs.
+    """
+
+    session: Session
+    machine: Machine
+    sim: Simulator
+    task: Task
+    actuator: Actuator
+    rl: Training
+    checkpoint: str
+    num_checked: int
+
+    def run(self) -> None:
+        """Exports.
+
+        Raises:
+            CheckpointError: The checkpoint cannot be used, or the exported file says something else than the network.
+        """
+        path = find_checkpoint(Path(self.checkpoint))
+        cpu = torch.device("cpu")
+        content = read_checkpoint(path, cpu)
+        check_stamp(content, self.machine.fingerprint(), path)
+        plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects={})
+        loop = plant.build(cpu, self.num_checked, self.num_checked, self.session.stream("starts"))
+        config = self.rl.runner_config()
+        actor = make_actor(config["actor"], config["obs_groups"], loop)
+        actor.load_state_dict(content["actor_state_dict"])
+        _, _, observations = evaluate(loop, Network(actor, loop), loop.starts, self.session.seed, 1)
+        facts = {"checkpoint": str(path), "env_steps": content["book"]["env_steps"], "seconds": content["book"]["seconds"]}
+        contract = write_bundle(self.session.folder, actor, self.rl, loop, facts)
+        largest = export_onnx(self.session.folder, actor, loop.task, contract, observations)
+        log.info("%s: onnxruntime and torch differ by at most %.1e over %d observations", self.session.folder, largest, len(observations))

@@ -1,0 +1,99 @@
+"""`brokk mode=train`: trains a policy, evaluates it beside its rivals, and leaves everything needed to use it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import torch
+
+from brokk_rl.contracts import Actuator, Effect, Simulator, Task
+from brokk_rl.errors import CheckpointError
+from brokk_rl.machine import Machine
+from brokk_rl.modes.evaluate import Evaluation, evaluate_policies
+from brokk_rl.rl.curves import draw_curves
+from brokk_rl.rl.export import export_onnx
+from brokk_rl.rl.logbook import PROGRESS, Logbook
+from brokk_rl.rl.policy import Classical, Trained, Untrained, write_bundle
+from brokk_rl.rl.runner import Runner, Training, checkpoints
+from brokk_rl.rl.tracking import Tracking
+from brokk_rl.rl.vec_env import Plant
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class Train:
+    """Trains a policy for a task through an actuator model, then evaluates and exports it.
+
+    Attributes:
+        session: Folder, seed, device.
+        machine: The machine.
+        sim: Physics.
+        task: What to do.
+        actuator: How commands become motion.
+        effect: Effects around the actuator model, by name.
+        rl: How to train.
+        tracking: Where figures go beside the run folder.
+        evaluation: How to evaluate at the end.
+        resume: Run folder, or checkpoint, from which to go on.
+    """
+
+    session: Session
+    machine: Machine
+    sim: Simulator
+    task: Task
+    actuator: Actuator
+    effect: dict[str, Effect]
+    rl: Training
+    tracking: Tracking
+    evaluation: Evaluation
+    resume: str | None
+
+    def run(self) -> float:
+        """Trains; returns the strict success of the trained policy."""
+        checkpoint = find_checkpoint(Path(self.resume)) if self.resume else None
+        device, folder = self.session.torch_device(), self.session.folder
+        self.session.seed_all()
+        plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect)
+        loop = plant.build(device, self.rl.num_envs, self.rl.num_starts, self.session.stream("starts"))
+        loop.capture()
+        state = "active" if loop.graph_active else "not used (they need sim=warp on a GPU)"
+        log.info("%d environments on %s, %s; CUDA graphs: %s", loop.num_envs, device, type(loop.world).__name__, state)
+        self.session.seed_all()  # capturing has drawn random numbers
+
+        steps = loop.num_envs * int(self.rl.runner["num_steps_per_env"])
+        tracker = self.tracking.open(folder, {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed})
+        book = Logbook(folder, tracker, loop.statistics, steps, self.rl.max_fault_rate, self.rl.budget.share_spent)
+        with book:
+            runner = Runner(loop, self.rl, folder, device, book, self.machine.fingerprint())
+            if checkpoint:
+                runner.load(str(checkpoint))
+                log.info("going on from %s: %d control steps, %.0f s", checkpoint, book.env_steps, book.seconds)
+            runner.run()
+
+        facts = {"env_steps": book.env_steps, "seconds": book.seconds, "seed": self.session.seed, "device": str(device)}
+        actor = runner.alg.get_policy()
+        contract = write_bundle(folder, actor, self.rl, loop, facts)
+        draw_curves(folder / PROGRESS, folder / "learning_curves.png")
+        policies = {"trained": Trained(folder=str(folder)), "classical": Classical(), "untrained": Untrained(training=self.rl)}
+        results, observations = evaluate_policies(plant, self.evaluation, self.session, policies)
+        export_onnx(folder, actor, self.task.build(self.machine, 1, torch.device("cpu")), contract, observations)
+        log.info("run folder: %s", folder)
+        return float(results["success_strict"]["mean"])
+
+
+def find_checkpoint(path: Path) -> Path:
+    """Returns `path` if it is a checkpoint, else the newest checkpoint of the run folder `path`.
+
+    Raises:
+        CheckpointError: There is none.
+    """
+    if path.suffix == ".pt":
+        return path
+    found = checkpoints(path) if path.is_dir() else []
+    if not found:
+        raise CheckpointError(f"resume={path}: there is no checkpoint (model_<iteration>.pt) to go on from")
+    return found[-1]

@@ -1,0 +1,1 @@
+"""Reinforcement learning: the only place that knows rsl-rl and the trackers."""

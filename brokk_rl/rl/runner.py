@@ -1,0 +1,229 @@
+"""rsl-rl's on-policy runner with exact resume, atomic checkpoints and a budget."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl.runners import OnPolicyRunner
+
+from brokk_rl.errors import CheckpointError, ConfigError, StorageError
+from brokk_rl.rl.logbook import Logbook
+from brokk_rl.rl.vec_env import ControlLoop
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class Budget:
+    """When training ends: with the first of these that is spent; `null` for no bound.
+
+    Attributes:
+        max_env_steps: Control steps over all environments.
+        max_seconds: Seconds of training, those before a resume included.
+    """
+
+    max_env_steps: int | None
+    max_seconds: float | None
+
+    def check(self) -> None:
+        if self.max_env_steps is None and self.max_seconds is None:
+            raise ConfigError("rl.budget: give max_env_steps, max_seconds or both; training without an end is not possible")
+
+    def share_spent(self, env_steps: int, seconds: float) -> float:
+        """Returns how much is spent, 1 or more when it is all."""
+        return max(env_steps / (self.max_env_steps or float("inf")), seconds / (self.max_seconds or float("inf")))
+
+
+@spec
+class Training:
+    """How a policy is trained with rsl-rl's PPO.
+
+    Attributes:
+        num_envs: Environments; `null` for what the simulator's configuration says.
+        num_starts: Number of valid starts from which resets draw.
+        budget: When training ends.
+        save_interval: Iterations between checkpoints; a killed run loses no more.
+        keep_checkpoints: Newest checkpoints kept.
+        max_fault_rate: Share of control steps that may end in a diverged or overflowing world before the run stops with an error.
+        random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at once.
+        runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`, `num_steps_per_env`, …), handed on as it is.
+    """
+
+    num_envs: int | None
+    num_starts: int
+    budget: Budget
+    save_interval: int
+    keep_checkpoints: int
+    max_fault_rate: float
+    random_episode_lengths: bool
+    runner: dict[str, Any]
+
+    def runner_config(self) -> dict[str, Any]:
+        """Returns a copy for rsl-rl, which writes into it; keys without a value are dropped, since its constructors know no `null`."""
+        return _without_nulls(copy.deepcopy(self.runner)) | {"save_interval": 10**9, "check_for_nan": False}
+
+
+class Runner(OnPolicyRunner):
+    """Trains; see `Training`.
+
+    rsl-rl's own checkpoint lacks the environment, the random generators and the step count; ours holds all of them, so that a resumed run
+    on a CPU goes on bit for bit. It is read with `weights_only=True`: a checkpoint from a stranger cannot run code.
+
+    Args:
+        env: The control loop.
+        training: Configuration.
+        folder: Checkpoints go here.
+        device: Where the networks live.
+        logbook: Takes the place of rsl-rl's logger.
+        fingerprint: The machine's; a checkpoint of another machine is refused.
+    """
+
+    env: ControlLoop
+
+    def __init__(
+        self, env: ControlLoop, training: Training, folder: Path, device: torch.device, logbook: Logbook, fingerprint: dict[str, str]
+    ) -> None:
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
+            super().__init__(env, training.runner_config(), log_dir=None, device=str(device))
+        log.debug(printed.getvalue())
+        self.training, self.folder, self.fingerprint = training, folder, fingerprint
+        self.logger = logbook  # type: ignore[assignment]
+
+    def run(self) -> None:
+        """Trains until the budget is spent, saving a checkpoint every `save_interval` iterations and at the end."""
+        book: Logbook = self.logger  # type: ignore[assignment]
+        steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
+        budget, first = self.training.budget, self.current_learning_iteration == 0
+        while budget.share_spent(book.env_steps, book.seconds) < 1.0:
+            rounds = self.training.save_interval
+            if budget.max_env_steps:
+                rounds = min(rounds, max(1, -(-(budget.max_env_steps - book.env_steps) // steps)))
+            if budget.max_seconds:
+                # the first round is short and shows how long one takes
+                left = (budget.max_seconds - book.seconds) * book.env_steps / book.seconds / steps if book.env_steps else 1
+                rounds = min(rounds, max(1, round(left)))
+            with contextlib.redirect_stdout(io.StringIO()):
+                self.learn(rounds, init_at_random_ep_len=first and self.training.random_episode_lengths)
+            first = False
+            # `learn` leaves the index of the last iteration; the next one is another
+            self.current_learning_iteration += 1
+            self.checkpoint()
+
+    def checkpoint(self) -> None:
+        """Writes a checkpoint in one step, holding all that is needed to go on exactly; drops the oldest beyond `keep_checkpoints`.
+
+        Raises:
+            StorageError: The disk is full or the folder cannot be written; older checkpoints are untouched.
+        """
+        if self.gpu_global_rank != 0:
+            return
+        book: Logbook = self.logger  # type: ignore[assignment]
+        book.flush()
+        content = self.alg.save() | {
+            "iter": self.current_learning_iteration,
+            "learning_rate": self.alg.learning_rate,
+            "env": self.env.state_dict(),
+            "book": book.state_dict(),
+            "random": random_state(self.device),
+            "fingerprint": self.fingerprint,
+        }
+        path = self.folder / f"model_{self.current_learning_iteration}.pt"
+        part = path.with_suffix(".part")
+        try:
+            torch.save(content, part)
+            with part.open("rb") as file:
+                os.fsync(file.fileno())
+            part.replace(path)
+        except (OSError, RuntimeError) as error:  # torch's writer reports a full disk as a RuntimeError
+            part.unlink(missing_ok=True)
+            raise StorageError(
+                f"cannot write the checkpoint {path}: {error}. The checkpoint before it is untouched; make room and resume."
+            ) from error
+        for old in checkpoints(self.folder)[: -self.training.keep_checkpoints]:
+            old.unlink()
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        """Does nothing: rsl-rl would save in the middle of an iteration's bookkeeping; `checkpoint` follows every call of `learn`."""
+
+    def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
+        """Restores a checkpoint so that training goes on exactly.
+
+        Raises:
+            CheckpointError: The file is missing, corrupt, holds NaN or belongs to another machine or configuration.
+        """
+        content = read_checkpoint(Path(path), self.device)
+        check_stamp(content, self.fingerprint, path)
+        try:
+            self.alg.load(content, None, strict=True)
+            self.env.load_state_dict(content["env"])
+        except (KeyError, RuntimeError) as error:
+            raise CheckpointError(
+                f"{path} does not fit this configuration: {str(error).splitlines()[0]}. Resume with the run's own resolved.yaml."
+            ) from error
+        self.alg.learning_rate = content["learning_rate"]
+        book: Logbook = self.logger  # type: ignore[assignment]
+        book.load_state_dict(content["book"])
+        self.current_learning_iteration = content["iter"]
+        set_random_state(content["random"], self.device)
+        return {}
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Returns the checkpoints of a run folder, oldest first."""
+    return sorted(folder.glob("model_*.pt"), key=lambda path: int(path.stem.removeprefix("model_")))
+
+
+def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
+    """Reads a checkpoint without running code from it.
+
+    Raises:
+        CheckpointError: The file is missing or corrupt, or a weight is NaN.
+    """
+    try:
+        content = torch.load(path, weights_only=True, map_location=device)
+        states = [content["actor_state_dict"], content["critic_state_dict"]]
+    except FileNotFoundError as error:
+        raise CheckpointError(f"there is no checkpoint {path}") from error
+    except Exception as error:  # torch raises many kinds: pickle, zip, runtime, end of file
+        raise CheckpointError(f"{path} is corrupt or not a checkpoint of ours ({type(error).__name__}); take an older one") from error
+    bad = [name for state in states for name, value in state.items() if not torch.isfinite(value).all()]
+    if bad:
+        raise CheckpointError(f"{path} holds NaN or infinite weights in {', '.join(bad[:3])}; take an older checkpoint")
+    return content
+
+
+def check_stamp(content: dict[str, Any], fingerprint: dict[str, str], path: object) -> None:
+    """Raises a `CheckpointError` naming what differs when the checkpoint belongs to another machine."""
+    differing = [key for key, value in fingerprint.items() if content.get("fingerprint", {}).get(key) != value]
+    if differing:
+        raise CheckpointError(f"{path} was made for another machine: {', '.join(differing)} differ. Choose the machine it was made for (machine=…).")
+
+
+def random_state(device: torch.device | str) -> dict[str, torch.Tensor]:
+    """Returns the state of torch's generators on the CPU and on `device`."""
+    state = {"cpu": torch.get_rng_state()}
+    if torch.device(device).type == "cuda":
+        state["cuda"] = torch.cuda.get_rng_state(device)
+    return state
+
+
+def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str) -> None:
+    """Restores what `random_state` returned."""
+    torch.set_rng_state(state["cpu"].cpu())
+    if torch.device(device).type == "cuda" and "cuda" in state:
+        torch.cuda.set_rng_state(state["cuda"].cpu(), device)
+
+
+def _without_nulls(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nulls(item) for key, item in value.items() if item is not None}
+    return value

@@ -1,0 +1,114 @@
+"""Where the figures of a training run go: always to `progress.csv` in the run folder, and to a tracker if one is chosen."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Protocol
+
+from brokk_rl.spec import spec
+
+
+class Tracker(Protocol):
+    """An open tracking run."""
+
+    def log(self, figures: dict[str, float], step: int) -> None:
+        """Stores the figures of one iteration."""
+        ...
+
+    def close(self) -> None:
+        """Ends the tracking run; called on success, failure and interruption alike."""
+        ...
+
+
+class Tracking(Protocol):
+    """A spec in `conf/tracking`: opens a tracking run."""
+
+    def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
+        """Returns an open tracking run for the run in `folder`."""
+        ...
+
+
+@spec
+class Off:
+    """No tracker: `progress.csv` and the pictures of the run folder only."""
+
+    def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
+        """Returns a tracker that does nothing."""
+        return _Silent()
+
+
+@spec
+class TensorBoard:
+    """TensorBoard event files in the run folder."""
+
+    def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
+        """Returns a tracker that writes `folder/tensorboard`."""
+        return _TensorBoard(folder)
+
+
+@spec
+class Wandb:
+    """Weights & Biases, offline first: one run per job, synchronised later with `wandb sync` or online with wandb.mode=online.
+
+    Attributes:
+        project: Project name.
+        group: Group of runs, or `null`.
+        tags: Tags.
+        mode: `offline`, `online` or `disabled`.
+    """
+
+    project: str
+    group: str | None
+    tags: tuple[str, ...]
+    mode: str
+
+    def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
+        """Returns a tracker with a run of its own, named after the run folder."""
+        return _Wandb(self, folder, config)
+
+
+class _Silent:
+    def log(self, figures: dict[str, float], step: int) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class _TensorBoard:
+    def __init__(self, folder: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(str(folder / "tensorboard"))
+
+    def log(self, figures: dict[str, float], step: int) -> None:
+        for name, value in figures.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class _Wandb:
+    def __init__(self, config: Wandb, folder: Path, run_config: dict[str, Any]) -> None:
+        os.environ.setdefault("WANDB_SILENT", "true")
+        import wandb
+
+        # reinit: a sweep with Hydra's basic launcher runs its jobs in one process, and each must get a run of its own
+        self._run = wandb.init(
+            project=config.project,
+            group=config.group,
+            tags=list(config.tags),
+            name=folder.name,
+            dir=str(folder),
+            config=run_config,
+            mode=config.mode,  # type: ignore[arg-type]
+            reinit="create_new",
+        )
+
+    def log(self, figures: dict[str, float], step: int) -> None:
+        self._run.log(figures, step=step)
+
+    def close(self) -> None:
+        self._run.finish()
