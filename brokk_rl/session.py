@@ -114,7 +114,7 @@ class Session:
         Raises:
             StorageError: The folder holds a run already and `resume` is false, or cannot be written.
         """
-        before = read_record(self.folder)
+        before = read_record(self.folder) if self.folder.is_dir() else None
         if before and not resume:
             raise StorageError(
                 f"{self.folder} already holds a run ({before.get('mode', '?')}, {before.get('outcome', '?')}). "

@@ -1,0 +1,65 @@
+"""Everything under `conf` composes."""
+
+from __future__ import annotations
+
+import hydra
+import pytest
+from composed import every, names
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from brokk_rl import registry
+
+OVERRIDES = ("experiment", "ablation", "preset")
+PARTS = [(entry.group, entry.name) for entry in registry.options() if entry.group not in (*OVERRIDES, "mode")]
+
+
+def composed(*overrides: str) -> DictConfig:
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        return hydra.compose("config", overrides=list(overrides), return_hydra_config=True)
+
+
+@pytest.mark.parametrize(("group", "name"), PARTS)
+def test_every_option_composes_and_is_what_its_spec_says(group: str, name: str) -> None:
+    cfg = composed("~mode", f"+{group}@subject={name}").subject
+    if "_target_" in cfg and not OmegaConf.missing_keys(cfg) - {"out"}:
+        instantiate(cfg, _convert_="all", **({"out": "somewhere"} if group == "session" else {}))
+
+
+@every("mode")
+def test_every_mode_composes(name: str) -> None:
+    assert composed(f"mode={name}")._target_.startswith(f"brokk_rl.modes.{name}.")
+
+
+@every("experiment")
+def test_every_experiment_composes(name: str) -> None:
+    assert composed(f"experiment={name}")._target_
+
+
+@every("preset")
+def test_every_preset_composes(name: str) -> None:
+    assert composed(f"preset={name}")._target_
+
+
+@every("ablation")
+def test_every_job_of_every_ablation_composes(name: str) -> None:
+    cfg = composed(f"ablation={name}")
+    assert cfg.hydra.mode.name == "MULTIRUN", "an ablation is a sweep: hydra.mode: MULTIRUN"
+    params = [f"{key}={value}" for key, value in cfg.hydra.sweeper.params.items()]
+    jobs = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(params), None)[0]
+    assert jobs
+    for job in jobs:
+        composed(f"ablation={name}", *job)
+
+
+@pytest.mark.parametrize("entry", registry.options(), ids=lambda entry: f"{entry.group}={entry.name}")
+def test_every_option_says_in_one_line_what_it_is(entry: registry.Option) -> None:
+    assert len(entry.summary()) > 10
+
+
+def test_the_default_is_to_train() -> None:
+    if "train" not in names("mode"):
+        pytest.skip("no mode=train")
+    assert composed()._target_ == "brokk_rl.modes.train.Train"

@@ -1,0 +1,189 @@
+"""A third-party package adds options by its entry point alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from brokk_rl import registry
+
+PARTS = '''"""Parts of another package."""
+
+import json
+
+import torch
+
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+
+
+@spec
+class Sticky:
+    """An actuator that never moves."""
+
+    share: float
+
+    def build(self, machine, num_envs, device):
+        return self
+
+
+@spec
+class Wave:
+    """Wave with the tool."""
+
+    def build(self, machine, num_envs, device):
+        return self
+
+
+@spec
+class Dowser:
+    """Finds nothing, ever."""
+
+    def build(self):
+        return self
+
+    def find(self, frame):
+        return None
+
+
+@spec
+class Show:
+    """Writes what it was given."""
+
+    session: Session
+    actuator: object
+    task: object
+    perception: object
+    fails: str
+
+    def run(self):
+        if self.fails == "by us":
+            raise RuntimeError("our own fault")
+        if self.fails == "by hand":
+            raise KeyboardInterrupt
+        names = [type(part).__name__ for part in (self.actuator, self.task, self.perception)]
+        (self.session.folder / "seen.json").write_text(json.dumps(names))
+        return self.actuator.share
+'''
+MODE = """# @package _global_
+defaults:
+  - /session: default
+  - /actuator: sticky
+  - /task: wave
+  - /perception: dowser
+  - _self_
+_target_: mine.parts.Show
+fails: not
+"""
+
+
+def install(folder: Path, name: str, files: dict[str, str]) -> None:
+    """Puts a package with an entry point where a wheel would put it."""
+    for path, text in {"__init__.py": "", "conf/__init__.py": "", **files}.items():
+        (folder / name / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name / path).write_text(text)
+    about = folder / f"{name}-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[brokk_rl.conf]\n{name} = {name}.conf\n")
+
+
+@pytest.fixture
+def mine(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder on the import path with the package `mine` in it."""
+    folder = tmp_path_factory.mktemp("site")
+    options = {
+        "parts.py": PARTS,
+        "conf/actuator/sticky.yaml": "_target_: mine.parts.Sticky\nshare: 0.25\n",
+        "conf/task/wave.yaml": "_target_: mine.parts.Wave\n",
+        "conf/perception/dowser.yaml": "_target_: mine.parts.Dowser\n",
+        "conf/mode/show.yaml": MODE,
+    }
+    install(folder, "mine", options)
+    monkeypatch.syspath_prepend(str(folder))
+    return folder
+
+
+def test_its_options_show_in_the_list(mine: Path, brokk: Callable[..., Any]) -> None:
+    done = brokk("mode=list")
+    assert done.code == 0
+    for part in ("sticky", "An actuator that never moves.", "wave", "dowser", "Finds nothing, ever.", "(mine.conf)"):
+        assert part in done.out
+
+
+def test_its_options_run_beside_ours(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    assert brokk("mode=show", "session.out=run").code == 0
+    assert (tmp_path / "run" / "seen.json").read_text() == '["Sticky", "Wave", "Dowser"]'
+    assert brokk("mode=show", "perception=truth", "session.out=ours").code == 0
+    assert (tmp_path / "ours" / "seen.json").read_text() == '["Sticky", "Wave", "Truth"]'
+
+
+def test_an_option_that_two_packages_offer_is_an_error_that_names_both(mine: Path, brokk: Callable[..., Any]) -> None:
+    install(mine, "yours", {"conf/actuator/sticky.yaml": "_target_: mine.parts.Sticky\nshare: 0.5\n"})
+    done = brokk("mode=list")
+    assert done.code == 2
+    for part in ("actuator=sticky", "mine.conf", "yours.conf"):
+        assert part in done.err
+
+
+def test_an_entry_point_without_its_package_is_named(mine: Path, brokk: Callable[..., Any]) -> None:
+    (mine / "mine-1.0.dist-info" / "entry_points.txt").write_text("[brokk_rl.conf]\nmine = mine.missing\n")
+    done = brokk("mode=list")
+    assert done.code == 2
+    assert "mine.missing" in done.err
+
+
+def test_nothing_is_ours_but_conf_without_extensions() -> None:
+    assert next(iter(registry.packages())) == registry.CORE
+
+
+def test_a_failed_run_says_so_in_its_record(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    done = brokk("mode=show", "session.out=run", "fails='by us'")
+    assert done.code == 1
+    assert "RuntimeError: our own fault" in done.err
+    record = (tmp_path / "run" / "session.json").read_text()
+    assert '"outcome": "failed"' in record
+    assert "our own fault" in record
+
+
+def test_an_interrupted_run_says_so_in_its_record(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    assert brokk("mode=show", "session.out=run", "fails='by hand'").code == 130
+    assert '"outcome": "interrupted"' in (tmp_path / "run" / "session.json").read_text()
+
+
+def test_a_sweep_has_one_folder_for_each_job_and_no_others(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    assert brokk("-m", "mode=show", "session.seed=3,4", "actuator.share=0.5,0.75", "session.out=sweep").code == 0
+    jobs = [
+        f"{i}_actuator.share={share},session.seed={seed}"
+        for i, (seed, share) in enumerate(((3, 0.5), (3, 0.75), (4, 0.5), (4, 0.75)))
+    ]
+    assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == [*jobs, "multirun.yaml"]
+    assert sorted(path.name for path in (tmp_path / "sweep" / jobs[1]).iterdir()) == ["resolved.yaml", "seen.json", "session.json"]
+    assert '"objective": 0.75' in (tmp_path / "sweep" / jobs[1] / "session.json").read_text()
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
+
+
+def test_the_jobs_of_a_sweep_go_on_when_one_fails(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    assert brokk("-m", "mode=show", "session.seed=x,4", "session.out=sweep").code == 2
+    assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == ["1_session.seed=4", "multirun.yaml"]
+
+
+def test_resolved_runs_again_in_a_new_folder(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    assert brokk("mode=show", "actuator.share=0.5", "session.out=run").code == 0
+    assert brokk("--config-dir", "run", "--config-name", "resolved", "session.out=again").code == 0
+    first, again = ((tmp_path / name / "resolved.yaml").read_text() for name in ("run", "again"))
+    assert first == again
+    assert brokk("--config-dir", "run", "--config-name", "resolved").code == 0
+    assert [path.name.split("_", 2)[2] for path in (tmp_path / "runs").iterdir()] == ["parts"]
+
+
+def test_a_folder_that_holds_a_run_is_refused(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    assert brokk("mode=show", "session.out=run").code == 0
+    before = (tmp_path / "run" / "session.json").read_text()
+    done = brokk("mode=show", "session.out=run")
+    assert done.code == 2
+    assert "already holds a run" in done.err
+    assert (tmp_path / "run" / "session.json").read_text() == before

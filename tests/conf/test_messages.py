@@ -1,0 +1,61 @@
+"""Bad input gets a message that says what to change, exit code 2, and leaves nothing behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+COMPARE = ("mode=compare", "compare.runs=nowhere")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("mode=lst",), ("there is no mode=lst", "did you mean 'list'?", "doctor")),
+        (("mode=list", "task=borehole_insertion"), ("'task'", "mode=list does not use")),
+        (("mode=list", "list.groop=task"), ("'list.groop'", "did you mean 'group'?")),
+        (("mode=list", "list.group=actuatr"), ("did you mean 'actuator'?",)),
+        (("mode=list", "session.seed=1"), ("'mode=list' has no 'session'",)),
+        (("mode=list", "mode.x=["), ("input",)),
+        (("mode=list", "list.group=a,b"), ("--multirun",)),
+        (("mode=list", "experiment=nothing"), ("there is no", "experiment")),
+        ((*COMPARE, "session.seed=abc"), ("Session.seed", "expected int", "'abc'", "session.<field>=")),
+        ((*COMPARE, "session.seed=-1"), ("session.seed", "0 or more")),
+        ((*COMPARE, "session.device=gpu"), ("session.device", "cpu", "'gpu'")),
+        ((*COMPARE, "+session.sed=1"), ("no field 'sed'", "did you mean 'seed'?")),
+        ((*COMPARE, "session=other"), ("there is no session=other", "default")),
+        (COMPARE, ("compare.runs", "nowhere")),
+        (("mode=compare",), ("compare.runs=<value>",)),
+        (("-m", "mode=lst,list"), ("there is no mode=lst",)),
+        (("-m", "mode=compare", "compare.runs=a,b"), ("compare.runs", "'a'")),
+        (("mode=null",), ("must be a string",)),
+        (("--config-dir", "nowhere", "mode=list"), ("nowhere",)),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
+)
+def test_the_message_says_what_to_change(
+    arguments: tuple[str, ...], told: tuple[str, ...], brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    done = brokk(*arguments)
+    assert done.code == 2
+    assert sum(line.startswith("error: ") for line in done.err.splitlines()) == 1
+    for part in told:
+        assert part in done.err
+    assert "Traceback" not in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_traceback_comes_on_request(brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BROKK_TRACE", "1")
+    assert "Traceback" in brokk("mode=lst").err
+
+
+def test_help_is_short_and_says_how_to_begin(brokk: Callable[..., Any]) -> None:
+    done = brokk("--help")
+    assert done.code == 0
+    for part in ("brokk mode=list", "brokk mode=doctor", "-m", "session.out"):
+        assert part in done.out
+    assert len(done.out.splitlines()) < 60

@@ -1,0 +1,119 @@
+"""Comparing runs: what differs, over seeds, with intervals."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.intervals import student, wilson
+from brokk_rl.modes.compare import differing, find, grouped, load
+
+
+def write_run(folder: Path, actuator: str, seed: int, strict: float, **more: Any) -> None:
+    folder.mkdir(parents=True)
+    figures = {
+        "episodes": 100,
+        "success_strict": {"mean": strict, "ci95": [0, 1]},
+        "success_paper": {"mean": strict / 2, "ci95": [0, 1]},
+        "time_to_insert_s": {"median": 8.0, "p95": 12.0},
+        "lateral_error_m": {"mean": 0.004},
+        "peak_force_n": 1500.0,
+        "valve_travel": 0.7,
+        "seed": seed,
+        "actuator": actuator,
+        "policy": "trained",
+    }
+    record = {
+        "seed": seed,
+        "outcome": "finished",
+        "choices": {"mode": "train", "actuator": actuator, "session": "default"},
+        "overrides": [f"actuator={actuator}", f"session.seed={seed}"],
+    }
+    (folder / "evaluation.json").write_text(json.dumps(figures | more))
+    (folder / "session.json").write_text(json.dumps(record))
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    for index, (actuator, seed, strict) in enumerate((("ideal", 0, 0.2), ("ideal", 1, 0.4), ("mlp", 0, 0.9), ("mlp", 1, 0.9))):
+        write_run(tmp_path / "sweep" / f"{index}_{actuator}", actuator, seed, strict)
+    return tmp_path / "sweep"
+
+
+def test_wilson_is_that_of_the_books() -> None:
+    # 8 of 10: centre (0.8 + 1.96²/20) / (1 + 1.96²/10) = 0.7167, half width 0.2266
+    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
+    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+def test_student_is_that_of_the_books() -> None:
+    # two values 0.2 and 0.4: mean 0.3, standard error 0.1, t(0.975, 1) = 12.706
+    assert student([0.2, 0.4]) == pytest.approx((0.3 - 1.2706, 0.3 + 1.2706), abs=1e-4)
+    assert student([0.2]) is None
+
+
+def test_runs_are_found_in_their_order_below_a_sweep(sweep: Path) -> None:
+    (sweep / "1_ideal").rename(sweep / "10_ideal")
+    assert [path.name for path in find([str(sweep)])] == ["0_ideal", "2_mlp", "3_mlp", "10_ideal"]
+    assert [path.name for path in find([str(sweep / "*_mlp"), str(sweep / "2_mlp")])] == ["2_mlp", "3_mlp"]
+
+
+def test_only_what_differs_is_a_column_and_seeds_are_not(sweep: Path) -> None:
+    assert differing([load(folder) for folder in find([str(sweep)])]) == ["actuator"]
+
+
+def test_seeds_become_one_row_with_the_interval_over_them(sweep: Path) -> None:
+    results = [result for folder in find([str(sweep)]) for result in load(folder).results(["actuator"])]
+    ideal, mlp = grouped(results)
+    assert ideal["variation"] == {"actuator": "ideal"}
+    assert ideal["seeds"] == [0, 1]
+    assert ideal["success_strict"]["mean"] == pytest.approx(0.3)
+    assert ideal["success_strict"]["ci95"] == (0.0, 1.0)  # a rate: cut off at 0 and 1
+    assert mlp["success_strict"]["ci95"] == pytest.approx((0.9, 0.9))
+
+
+def test_a_single_run_has_the_interval_of_its_episodes(sweep: Path) -> None:
+    (single,) = grouped(load(sweep / "2_mlp").results([]))
+    assert single["success_strict"]["ci95"] == wilson(90, 100)
+
+
+def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
+    figures = {
+        "episodes": 10,
+        "success_strict": {"mean": 0.5},
+        "success_paper": {"mean": None},
+        "time_to_insert_s": {"median": None},
+    }
+    write_run(tmp_path / "run", "mlp", 0, 0.9, policies={"trained": figures, "classical": figures})
+    rows = grouped(load(tmp_path / "run").results([]))
+    assert [row["policy"] for row in rows] == ["trained", "classical"]
+    assert rows[0]["success_paper"] == {"mean": None, "ci95": None}
+
+
+def test_a_broken_evaluation_is_named(sweep: Path) -> None:
+    (sweep / "0_ideal" / "evaluation.json").write_text("{}")
+    with pytest.raises(ConfigError, match=r"0_ideal.*episodes"):
+        load(sweep / "0_ideal").results([])
+    (sweep / "0_ideal" / "evaluation.json").write_text("{")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load(sweep / "0_ideal")
+
+
+def test_the_command_writes_table_csv_and_picture(sweep: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    done = brokk("mode=compare", f"compare.runs={sweep}", "session.out=compared")
+    assert done.code == 0
+    for part in ("ideal", "mlp", "0.3", "strict"):
+        assert part in done.out
+    comparison = json.loads((tmp_path / "compared" / "comparison.json").read_text())
+    assert [group["runs"] for group in comparison["groups"]] == [2, 2]
+    rows = list(csv.DictReader((tmp_path / "compared" / "comparison.csv").read_text().splitlines()))
+    assert [row["success_strict"] for row in rows] == ["0.2", "0.4", "0.9", "0.9"]
+    assert rows[2]["peak_force_n"] == "1500.0"
+    assert (tmp_path / "compared" / "comparison.png").read_bytes()[:4] == b"\x89PNG"

@@ -1,0 +1,93 @@
+"""Registries and the modes that show them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from brokk_rl.modes import doctor
+from brokk_rl.modes.doctor import Doctor, Finding, Limits
+from brokk_rl.registry import Option
+
+
+def option(folder: Path, group: str, text: str) -> Option:
+    (folder / "a.yaml").write_text(text)
+    return Option(group, "a", "conf", folder / "a.yaml")
+
+
+def test_an_option_is_described_by_its_spec(tmp_path: Path) -> None:
+    text = "# Not this.\n_target_: brokk_rl.modes.list.List\n"
+    assert (
+        option(tmp_path, "mode", text).summary() == "Prints the options of every config group, those of installed extensions too."
+    )
+
+
+def test_an_override_is_described_by_the_first_sentence_of_its_comment(tmp_path: Path) -> None:
+    text = "# @package _global_\n# What happens without\n# a mask. Sweeps 2 seeds.\n# More.\ntask: {}\n"
+    assert option(tmp_path, "ablation", text).summary() == "What happens without a mask."
+
+
+def test_a_spec_that_cannot_be_found_does_not_break_the_list(tmp_path: Path) -> None:
+    assert option(tmp_path, "task", "# A comment.\n_target_: nowhere.at.All\n").summary() == "A comment."
+
+
+def test_the_list_can_be_narrowed_to_a_group(brokk: Callable[..., Any]) -> None:
+    done = brokk("mode=list", "list.group=perception")
+    assert "truth" in done.out
+    assert "borehole_insertion" not in done.out
+
+
+def examine(monkeypatch: pytest.MonkeyPatch, **probes: Callable[..., Iterator[Finding]]) -> dict[str, Finding]:
+    """Runs the doctor with these probes, all others silent."""
+    for name in (
+        "python",
+        "packages",
+        "processor",
+        "torch_devices",
+        "cuda_graphs",
+        "warp",
+        "rendering",
+        "disk",
+        "import_names",
+        "extensions",
+    ):
+        monkeypatch.setattr(doctor, name, probes.get(name, lambda *_: iter(())))
+    return dict(Doctor(doctor=Limits(folder="runs", min_free_gib=0.0)).findings())
+
+
+def test_a_probe_that_breaks_is_a_warning_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def breaks() -> Iterator[Finding]:
+        raise OSError("no such library")
+        yield
+
+    found = examine(monkeypatch, warp=breaks, extensions=lambda: iter([Finding("ok", "none")]))
+    assert found["Warp"].level == "warn"
+    assert "no such library" in found["Warp"].text
+    assert found["extensions"].text == "none"
+
+
+def test_the_doctor_leaves_with_1_when_something_essential_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    examine(monkeypatch, python=lambda: iter([Finding("fail", "too old")]))
+    with pytest.raises(SystemExit) as left:
+        Doctor(doctor=Limits(folder="runs", min_free_gib=0.0)).run()
+    assert left.value.code == 1
+
+
+def test_the_disk_is_examined_where_runs_will_be(tmp_path: Path) -> None:
+    assert next(doctor.disk(tmp_path / "runs" / "later", 0.0)).level == "ok"
+    assert next(doctor.disk(tmp_path, 1e9)).level == "warn"
+
+
+def test_our_import_names_are_ours() -> None:
+    assert [finding.level for finding in doctor.import_names() if finding.level == "fail"] == []
+
+
+@pytest.mark.slow
+def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
+    done = brokk("mode=doctor")
+    assert done.code == 0, done.out
+    for topic in ("Python", "torch", "CUDA graphs", "Warp", "kernel cache", "rendering", "disk", "import names", "extensions"):
+        assert topic in done.out

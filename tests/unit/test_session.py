@@ -1,0 +1,131 @@
+"""A session: folder, seed, device, record."""
+
+from __future__ import annotations
+
+import errno
+import json
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from brokk_rl.cli import explain
+from brokk_rl.errors import ConfigError, DeviceError, StorageError
+from brokk_rl.session import Session, commit, read_record, write_json
+
+
+def session(folder: Path, seed: int = 0, device: str = "cpu") -> Session:
+    return Session(out=str(folder), seed=seed, device=device)
+
+
+def test_auto_takes_what_is_there(tmp_path: Path) -> None:
+    assert session(tmp_path, device="auto").torch_device().type == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def test_a_gpu_that_is_missing_is_an_error_that_says_what_to_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(DeviceError, match=r"session\.device=cpu"):
+        session(tmp_path, device="cuda").torch_device()
+
+
+def test_a_gpu_number_that_is_missing_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert session(tmp_path, device="cuda:1").torch_device() == torch.device("cuda", 1)
+    with pytest.raises(DeviceError, match="2 GPUs"):
+        session(tmp_path, device="cuda:2").torch_device()
+
+
+@pytest.mark.parametrize("device", ["gpu", "cpu:0", "cuda:one", ""])
+def test_a_device_that_is_none_is_refused(device: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"session\.device"):
+        session(tmp_path, device=device)
+
+
+def test_streams_repeat_with_the_seed_and_differ_by_name(tmp_path: Path) -> None:
+    first, again, other = session(tmp_path), session(tmp_path), session(tmp_path, seed=1)
+    assert first.generator("starts").random() == again.generator("starts").random()
+    assert len({s.stream(name) for s in (first, other) for name in ("starts", "noise")}) == 4
+    draw = torch.rand(3, generator=first.torch_generator("noise"))
+    assert torch.equal(draw, torch.rand(3, generator=again.torch_generator("noise")))
+
+
+def test_seed_all_repeats_python_numpy_and_torch(tmp_path: Path) -> None:
+    def draws() -> tuple[float, float, float]:
+        session(tmp_path).seed_all()
+        return random.random(), float(np.random.rand()), float(torch.rand(()))
+
+    assert draws() == draws()
+
+
+def test_the_record_tells_how_it_went(tmp_path: Path) -> None:
+    with session(tmp_path / "run", seed=3).start("a: 1\n", {"mode": "train"}) as record:
+        assert read_record(tmp_path / "run")["outcome"] == "running"
+        record.fields["objective"] = 0.5
+    found = read_record(tmp_path / "run")
+    assert (found["outcome"], found["objective"], found["seed"], found["mode"]) == ("finished", 0.5, 3, "train")
+    assert found["versions"]["torch"] == torch.__version__.split("+")[0]
+    assert (tmp_path / "run" / "resolved.yaml").read_text() == "a: 1\n"
+
+
+def test_resuming_keeps_the_first_start_and_adds_another(tmp_path: Path) -> None:
+    for resume in (False, True, True):
+        with session(tmp_path).start("", {}, resume=resume):
+            pass
+    assert len(read_record(tmp_path)["resumed"]) == 2
+
+
+def test_a_run_that_is_refused_before_it_wrote_anything_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError), session(tmp_path / "runs" / "a").start("", {}):
+        raise ConfigError("no")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_that_is_refused_after_it_wrote_something_keeps_it(tmp_path: Path) -> None:
+    def begin_and_fail() -> None:
+        with session(tmp_path / "a").start("", {}):
+            (tmp_path / "a" / "model_0.pt").touch()
+            raise ConfigError("no")
+
+    with pytest.raises(ConfigError):
+        begin_and_fail()
+    assert read_record(tmp_path / "a")["outcome"] == "failed"
+
+
+def test_a_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match=r"session\.out"), session(tmp_path / "file" / "run").start("", {}):
+        pass
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_json(tmp_path / "a.json", {"old": 1})
+
+    def fill_disk(path: Path, text: str) -> None:
+        with path.open("w") as file:
+            file.write(text[:3])
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_text", fill_disk)
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_json(tmp_path / "a.json", {"new": 2})
+    assert json.loads((tmp_path / "a.json").read_bytes()) == {"old": 1}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+    assert "the disk is full" in (explain(caught.value) or "")
+
+
+def test_a_broken_record_is_named(tmp_path: Path) -> None:
+    (tmp_path / "session.json").write_text("{")
+    with pytest.raises(StorageError, match=r"session\.json"):
+        read_record(tmp_path)
+
+
+def test_the_commit_is_that_of_our_checkout_or_none() -> None:
+    found = commit()
+    assert found is None or len(found.removesuffix("-dirty")) == 40
+
+
+def test_a_bug_of_ours_keeps_its_traceback() -> None:
+    assert explain(RuntimeError("bug")) is None
