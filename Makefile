@@ -1,7 +1,8 @@
 # Everything a person needs, on a machine with Python 3.11, git and make. uv comes into .venv when there is none.
-PYTHON ?= python3
+PYTHON ?= $(shell command -v python3.11 || echo python3)
 BIN := .venv/bin
 UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
+SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact
 
 .PHONY: train test check setup clean
 
@@ -21,7 +22,7 @@ setup: .venv/.synced    ## the environment of uv.lock in .venv
 .venv/.synced: uv.lock pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	command -v $(UV) >/dev/null || $(BIN)/python -m pip install --quiet uv
-	UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact
+	$(SYNC) || UV_SYSTEM_CERTS=1 $(SYNC)  # behind a company's proxy only the system knows the certificates
 	touch $@
 
 clean:                  ## everything that can be made again; runs and recordings stay
