@@ -66,9 +66,12 @@ def job(cfg: DictConfig) -> float | None:
     except Exception as error:
         if HydraConfig.get().mode is not RunMode.MULTIRUN:
             raise Stopped(error) from error
-        if message := explain(error):  # the other jobs go on and Hydra repeats only the first error at the end
-            log.error("job %s failed: %s", HydraConfig.get().job.num, message)
-        raise
+        message = explain(error)
+        if message is None:
+            raise
+        # the other jobs go on; Hydra repeats only the first error, at the end, and from another process it comes without its cause
+        log.error("job %s failed: %s", HydraConfig.get().job.num, message)
+        raise BrokkError(message) from error
 
 
 def _run(cfg: DictConfig) -> float | None:

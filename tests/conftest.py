@@ -13,7 +13,6 @@ from composed import option
 from brokk_rl import cli
 from brokk_rl.machine import Machine
 
-
 torch.set_num_threads(1)  # small tensors: threads would only wait for each other
 
 

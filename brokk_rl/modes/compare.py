@@ -32,10 +32,10 @@ MEASURES = ("time_to_insert_s", "lateral_error_m", "peak_force_n", "valve_travel
 HEADINGS = {
     "success_strict": "strict",
     "success_paper": "paper's",
-    "time_to_insert_s": "time to insert, s",
-    "lateral_error_m": "lateral error, mm",
-    "peak_force_n": "peak force, kN",
-    "valve_travel": "valve travel, 1/s",
+    "time_to_insert_s": "time, s",
+    "lateral_error_m": "lateral, mm",
+    "peak_force_n": "force, kN",
+    "valve_travel": "travel, 1/s",
 }
 SCALES = {"lateral_error_m": 1e3, "peak_force_n": 1e-3}
 NOT_COMPARED = ("session", "mode", "hydra", "ablation", "preset")
@@ -199,9 +199,9 @@ def as_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Table:
     """Returns the table for a person."""
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
     for heading in ("policy", *columns, "seeds"):
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading, no_wrap=heading == "policy", overflow="fold")
     for name in (*RATES, *MEASURES):
-        table.add_column(HEADINGS[name], justify="right", no_wrap=name in RATES)
+        table.add_column(HEADINGS[name], justify="right", min_width=7)
     for group in groups:
         setting = [str(group["variation"][column]) for column in columns]
         figures = [_text(group[name], SCALES.get(name, 1.0), name in RATES) for name in (*RATES, *MEASURES)]
@@ -268,7 +268,7 @@ def _text(figure: dict[str, Any], scale: float, with_interval: bool) -> str:
         return "–"
     text = f"{figure['mean'] * scale:.3g}"
     if figure["ci95"] and with_interval:
-        text += f" [dim]({figure['ci95'][0]:.2f}–{figure['ci95'][1]:.2f})[/dim]"
+        text += f"\n[dim]{figure['ci95'][0]:.2f}–{figure['ci95'][1]:.2f}[/dim]"
     return text
 
 

@@ -109,7 +109,7 @@ def test_a_broken_evaluation_is_named(sweep: Path) -> None:
 def test_the_command_writes_table_csv_and_picture(sweep: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
     done = brokk("mode=compare", f"compare.runs={sweep}", "session.out=compared")
     assert done.code == 0
-    for part in ("ideal", "mlp", "0.3", "strict"):
+    for part in ("ideal", "mlp", "0.3", "strict", "travel"):
         assert part in done.out
     comparison = json.loads((tmp_path / "compared" / "comparison.json").read_text())
     assert [group["runs"] for group in comparison["groups"]] == [2, 2]
