@@ -58,8 +58,8 @@ class Kinematics:
     def __init__(self, machine: Machine, device: torch.device | str = "cpu") -> None:
         self._num_joints = machine.num_joints
         groups = _parallel_groups(machine.joints)
-        phase, angle, slide, self._rows = _Features(machine, groups).tables()
-        columns = [_group_columns(machine, group, is_last=group is groups[-1], rows=self._rows) for group in groups]
+        phase, angle, slide, rows = _features(machine, groups)
+        columns = [_group_columns(machine, group, is_last=group is groups[-1], rows=rows) for group in groups]
 
         def constant(array: np.ndarray) -> torch.Tensor:
             return torch.tensor(array, dtype=torch.float32, device=device)
@@ -69,9 +69,11 @@ class Kinematics:
         self._linear = constant(np.concatenate([block for block, _ in columns], axis=1))
         self._widths = [block.shape[1] for block, _ in columns]
         self._num_points = [count for _, count in columns]
-        self._vertical_first = machine.joints[0].kind == "hinge" and abs(machine.joints[0].axis[2]) > 1.0 - 1e-9
-        self._hinge = constant(np.array([joint.kind == "hinge" for joint in machine.joints], dtype=np.float32))[:, None]
-        self._pitch_counts = constant(np.array([not (i == 0 and self._vertical_first) for i in range(machine.num_joints)], dtype=float))
+        self._is_hinge = torch.tensor([joint.kind == "hinge" for joint in machine.joints], device=device)
+        # a slewing joint carries the arm's plane with it and so leaves the pitch alone, as slides do
+        turns = [joint.kind == "hinge" for joint in machine.joints]
+        turns[0] = turns[0] and not _turns_heading(machine.joints[0])
+        self._turns_tool = constant(np.array(turns, dtype=float))
         self._up = constant(np.array([0.0, 0.0, 1.0]))
 
     def pose(self, q: torch.Tensor) -> ToolPose:
@@ -103,12 +105,11 @@ class Kinematics:
         origins, directions, heading = chain
         axes, tool = directions[:, :-1], directions[:, -1]
         turning = torch.linalg.cross(axes, origins[:, -1:] - origins[:, :-1])
-        tip = torch.where(self._hinge > 0, turning, axes).transpose(1, 2)
-        # d pitch = w . (tool x (heading * tool_z - up * tool.heading)) / (tool_z^2 + (tool.heading)^2) for an angular velocity w;
-        # a vertical first joint carries the heading with it and leaves the pitch alone.
+        tip = torch.where(self._is_hinge[:, None], turning, axes).transpose(1, 2)
+        # d pitch = w . (tool x (heading * tool_z - up * tool.heading)) / (tool_z^2 + (tool.heading)^2) for an angular velocity w
         down, ahead = tool[:, 2:3], (tool * heading).sum(-1, keepdim=True)
         lever = torch.linalg.cross(tool, heading * down - self._up * ahead) / (down * down + ahead * ahead)
-        pitch = (axes @ lever[:, :, None])[..., 0] * self._hinge[:, 0] * self._pitch_counts
+        pitch = (axes @ lever[:, :, None])[..., 0] * self._turns_tool
         return Jacobian(tip.reshape(*lead, 3, -1), pitch.reshape(*lead, -1))
 
     def _chain(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -144,34 +145,34 @@ def _parallel_groups(joints: tuple[Joint, ...]) -> list[list[int]]:
     return groups
 
 
-class _Features:
-    """The functions of q in which all points are linear: 1, cos and sin of the summed angles, and those times each slide."""
+def _features(machine: Machine, groups: list[list[int]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[object, int]]:
+    """Lists the functions of q in which all points are linear: 1, cos and sin of the summed angles, and those times each slide.
 
-    def __init__(self, machine: Machine, groups: list[list[int]]) -> None:
-        self.machine, self.groups = machine, groups
+    Returns phase `(F,)` and angle `(J, F)` with feature = cos(phase + q angle), the selector of the slides `(J, S)`, and the number
+    of each row: `"1"`, `("cos", j)` and `("sin", j)` for the sum of the angles up to and with joint j of its group, `(s, key)` for
+    the row of `key` times the position of slide s.
+    """
+    num = machine.num_joints
+    phase, columns, rows = [0.0], [np.zeros(num)], {"1": 0}
+    for group in groups:
+        total = np.zeros(num)
+        for j in group:
+            if machine.joints[j].kind == "hinge":
+                total[j] = 1.0
+                for name, shift in (("cos", 0.0), ("sin", -np.pi / 2)):
+                    rows[name, j] = len(phase)
+                    phase.append(shift)
+                    columns.append(total.copy())
+    slides = [j for j, joint in enumerate(machine.joints) if joint.kind == "slide"]
+    base = dict(rows)
+    for position, s in enumerate(slides):
+        rows |= {(s, key): row + len(phase) * (position + 1) for key, row in base.items()}
+    return np.array(phase), np.array(columns).T, np.eye(num)[:, slides], rows
 
-    def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[object, int]]:
-        """Returns phase `(F,)` and angle `(J, F)` with feature = cos(phase + q angle), the slide selector `(J, S)`, and row numbers.
 
-        Rows are keyed `"1"`, `("cos", j)`, `("sin", j)` for the sum of the angles up to and with joint j of its group; a row times the
-        position of slide s has the key `(s, key)`.
-        """
-        num = self.machine.num_joints
-        phase, columns, rows = [0.0], [np.zeros(num)], {"1": 0}
-        for group in self.groups:
-            total = np.zeros(num)
-            for j in group:
-                if self.machine.joints[j].kind == "hinge":
-                    total[j] = 1.0
-                    for name, shift in (("cos", 0.0), ("sin", -np.pi / 2)):
-                        rows[name, j] = len(phase)
-                        phase.append(shift)
-                        columns.append(total.copy())
-        slides = [j for j, joint in enumerate(self.machine.joints) if joint.kind == "slide"]
-        base = dict(rows)
-        for position, s in enumerate(slides):
-            rows |= {(s, key): row + len(phase) * (position + 1) for key, row in base.items()}
-        return np.array(phase), np.array(columns).T, np.eye(num)[:, slides], rows
+def _turns_heading(first: Joint) -> bool:
+    """Returns whether the first joint slews the arm, so that its plane turns with it."""
+    return first.kind == "hinge" and abs(first.axis[2]) > 1.0 - 1e-9
 
 
 class _Linear:
@@ -199,8 +200,9 @@ class _Linear:
 def _group_columns(machine: Machine, group: list[int], is_last: bool, rows: dict[object, int]) -> tuple[np.ndarray, int]:
     """Returns the coefficients of what one group contributes, `(F, 15 + 3 P)` (`3 + 3 P` for the last group), and `P`.
 
-    Heading (only meaningful for the first group, 3), for all but the last group the rows of the transposed rotation behind the group (9)
-    and the shift (3), then `P` points: origin and origin + axis of each joint; for the last group also tip and tip + tool axis.
+    Heading (only meaningful for the first group, 3), for all but the last group the rows of the transposed rotation behind the
+    group (9) and the shift (3), then `P` points: origin and origin + axis of each joint; for the last group also tip and tip + tool
+    axis.
     """
     hinges = [j for j in group if machine.joints[j].kind == "hinge"]
     axis = np.array(machine.joints[hinges[0]].axis) if hinges else np.array([0.0, 0.0, 1.0])
@@ -223,8 +225,7 @@ def _group_columns(machine: Machine, group: list[int], is_last: bool, rows: dict
             place.add(np.array(joint.axis), axis, hinge, slide=j)
     heading = _Linear(rows)
     first = machine.joints[group[0]]
-    turns = first.kind == "hinge" and abs(first.axis[2]) > 1.0 - 1e-9
-    heading.add(np.array([1.0, 0.0, 0.0]), np.array(first.axis), group[0] if turns else None)
+    heading.add(np.array([1.0, 0.0, 0.0]), np.array(first.axis), group[0] if _turns_heading(first) else None)
     blocks = [heading.table]
     if is_last:
         tool = np.array([d.value for d in machine.tool_m])

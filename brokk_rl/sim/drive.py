@@ -1,13 +1,13 @@
 """The drive: makes the joints follow what the actuator model predicts, holds the arm, and yields where something blocks it.
 
-Each joint has a servo of its own inside MuJoCo, force = stiffness (act - q) - damping q', cut off at the yield force (the relief valve).
-Its reference is accumulated from the predicted increments. "Present position + increment" would be wrong: any sag under load becomes the
-next starting point, and the arm sinks. Within a control period the reference moves on at constant speed v (MuJoCo integrates ctrl = v into
-act), led by v damping / stiffness, so that damping does not cost a lag.
+Each joint has a servo of its own inside MuJoCo, force = stiffness (act - q) - damping q', cut off at the yield force (the relief
+valve). Its reference is accumulated from the predicted increments. "Present position + increment" would be wrong: any sag under
+load becomes the next starting point, and the arm sinks. Within a control period the reference moves on at constant speed v (MuJoCo
+integrates ctrl = v into act), led by v damping / stiffness, so that damping does not cost a lag.
 
-The simulation has no gravity: the actuator model was learned on a machine that has its weight, so what gravity does to the motion is
-already in its increments and must not be counted twice. Nothing but the machine moves, so that this is the same as compensating it link by
-link, and cheaper.
+The simulation has no gravity: the actuator model was learned on a machine that has its weight, so what gravity does to the motion
+is already in its increments and must not be counted twice. Nothing but the machine moves, so that this is the same as compensating
+it link by link, and cheaper.
 """
 
 import mujoco
@@ -85,7 +85,7 @@ class Drive:
         reference.add_(increment)
 
     def diverged(self, qvel: torch.Tensor) -> torch.Tensor:
-        """Returns the worlds, `(N,)` bool, whose joint speeds, `(N, J)`, are absurd or NaN, or whose references are no longer finite.
+        """Returns the worlds, `(N,)` bool, that are beyond use: absurd or NaN joint speeds, `(N, J)`, or references not finite.
 
         The references count because the cut-off at the yield force turns NaN into a force that looks sound.
         """

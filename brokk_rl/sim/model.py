@@ -76,7 +76,9 @@ def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
     drawn = spec.copy().compile()
     links = [spec.joint(name).parent for name in machine.joint_names]
     ends = [np.array([d.value for d in joint.origin_m]) for joint in machine.joints[1:]] + [_values(machine.tool_m)]
-    for joint, link, end, drawn_end in zip(machine.joints, links, ends, [*(b.pos for b in links[1:]), spec.site("tip").pos], strict=True):
+    for joint, link, end, drawn_end in zip(
+        machine.joints, links, ends, [*(b.pos for b in links[1:]), spec.site("tip").pos], strict=True
+    ):
         _stretch(link, np.array(drawn_end), end)
         _write_inertia(link, drawn, joint.mass_kg.value, joint.com_m)
         link.pos = _values(joint.origin_m)

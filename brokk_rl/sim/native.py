@@ -63,7 +63,9 @@ class NativeWorld:
         self._batch = Batch(self.model, num_worlds, num_threads)
         self._substeps = substeps
         self._state, self._warning = torch.from_numpy(self._batch.state), torch.from_numpy(self._batch.warning)
-        bound = {name: torch.from_numpy(self._batch.bind(name)) for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")}
+        bound = {
+            name: torch.from_numpy(self._batch.bind(name)) for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
+        }
         self._qpos, self._qvel, self._act, self._ctrl, self._mocap_pos, self._mocap_quat = bound.values()
         self._geom_size, self._geom_pos = (torch.from_numpy(self._batch.expand(name)) for name in ("geom_size", "geom_pos"))
         self._placement = Placement(self.model, self.device, torch.float64)

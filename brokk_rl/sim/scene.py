@@ -1,8 +1,9 @@
 """The concrete block with the borehole: what may differ from world to world, and what that means for MuJoCo's geoms.
 
-A scene is a vector of `COLUMNS`. The block is a mocap body whose origin is the centre of the borehole's rim, z along the hole's axis out
-of the block. The borehole is a regular octagon around the drilled circle: four slabs whose inner faces make a square, four posts that cut
-its corners. A slab that serves as block and wall of the hole saves half of the geom pairs that a closed ring would need.
+A scene is a vector of `COLUMNS`. The block is a mocap body whose origin is the centre of the borehole's rim, z along the hole's
+axis out of the block. The borehole is a regular octagon around the drilled circle: four slabs whose inner faces make a square, four
+posts that cut its corners. A slab that serves as block and wall of the hole saves half of the geom pairs that a closed ring would
+need.
 """
 
 from dataclasses import dataclass
@@ -12,8 +13,8 @@ import numpy as np
 import torch
 
 COLUMNS = ("hole_x_m", "hole_y_m", "rim_z_m", "yaw_rad", "block_scale", "hole_radius_m")
-"""Columns of a scene, `S` of them: centre of the rim in the base frame, turn of the block about the vertical, factor on its footprint,
-radius of the circle that the borehole's walls inscribe."""
+"""Columns of a scene, `S` of them: centre of the rim in the base frame, turn of the block about the vertical, factor on its
+footprint, radius of the circle that the borehole's walls inscribe."""
 SIZE = len(COLUMNS)
 
 HALF_LENGTH_M, HALF_WIDTH_M, HEIGHT_M = 0.5, 0.4, 0.75
@@ -21,10 +22,13 @@ HALF_LENGTH_M, HALF_WIDTH_M, HEIGHT_M = 0.5, 0.4, 0.75
 HOLE_RADIUS_M = 0.05
 """Paper: a borehole of 10 cm."""
 HOLE_DEPTH_M = 0.40
-MAX_SCALE, MAX_HOLE_RADIUS_M = 1.25, 0.08
-"""Bounds of a scene; MuJoCo's bounding volumes are compiled for the largest block and stay valid for every smaller one."""
+SCALE_BOUNDS, HOLE_RADIUS_BOUNDS_M = (0.5, 1.25), (0.01, 0.08)
+"""Bounds of a scene; MuJoCo's bounding volumes are compiled for the largest geoms within them and so hold every smaller one."""
+GROUND = "ground"
+"""The plane on which the chisel stops: the ground, or the bottom of a hole that goes deeper than the ground."""
 POST_M = 0.02
-"""Half the thickness of the posts; more than `MAX_HOLE_RADIUS_M * (sqrt(2) - 1) / 2`, so that they reach the corners of the square."""
+"""Half the thickness of the posts; more than the largest radius times (sqrt(2) - 1) / 2, so that they reach the corners of the
+square."""
 
 _TOOL, _ARM = 1, 2  # contact bits: the chisel meets the real hole, everything else the block as if it had none
 _FRICTION = (0.4, 0.005, 0.0001)  # steel on concrete
@@ -54,7 +58,7 @@ def nominal(num_worlds: int, device: torch.device | str = "cpu") -> torch.Tensor
 
 
 def collision_block(scale: float, radius_m: float) -> Block:
-    """Returns the colliding geoms of a block; sizes and positions are affine in both arguments."""
+    """Returns the colliding boxes of a block; sizes and positions are affine in both arguments."""
     length, width, middle = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale, -HEIGHT_M / 2
     parts: list[tuple[str, tuple[float, float, float], tuple[float, float, float], float]] = []
     for sign, name in ((1, "front"), (-1, "back")):
@@ -75,14 +79,19 @@ def collision_block(scale: float, radius_m: float) -> Block:
 def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
     """Adds the mocap body `block` with its geoms, as large as a scene may make it; `visual` adds what only the eye needs."""
     body = spec.worldbody.add_body(name="block", mocap=True, pos=nominal(1)[0, :3].numpy())
-    block = collision_block(MAX_SCALE, MAX_HOLE_RADIUS_M)
-    for name, size, pos, yaw in zip(block.names, block.size, block.pos, block.yaw_rad, strict=True):
+    block = collision_block(1.0, HOLE_RADIUS_M)
+    largest = np.max([collision_block(scale, radius).size for scale in SCALE_BOUNDS for radius in HOLE_RADIUS_BOUNDS_M], axis=0)
+    for name, size, pos, yaw in zip(block.names, largest, block.pos, block.yaw_rad, strict=True):
         is_envelope = name == "block_envelope"
         body.add_geom(
             name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn(yaw), contype=0,
             conaffinity=_ARM if is_envelope else _TOOL, friction=_FRICTION, group=3 if is_envelope else 1,
             material="hole_bottom" if name == "plug" else "concrete",
         )  # fmt: skip
+    body.add_geom(
+        name=GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1, 1, 1), pos=(0, 0, -HEIGHT_M), contype=0, conaffinity=_TOOL,
+        friction=_FRICTION, group=3,
+    )  # fmt: skip
     if visual:
         body.add_camera(
             name="close", pos=(-0.75, -1.15, 0.75), fovy=38, mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY, targetbody="block"
@@ -107,15 +116,18 @@ class Placement:
         # affine in scale and radius, hence three evaluations give the whole map
         stack = [np.concatenate([b.size, b.pos], axis=1) for b in (nominal, larger, wider)]
         table = np.stack([stack[0], stack[1] - stack[0], stack[2] - stack[0]])
+        table = np.concatenate([table, np.zeros((3, 1, 6))], axis=1)  # the ground, set by the height of the rim
         self._table = torch.tensor(table.reshape(3, -1), dtype=dtype, device=device)
-        self.geom_ids = torch.tensor([model.geom(name).id for name in nominal.names], device=device)
-        self._lower = torch.tensor([0.5, 0.01], dtype=dtype, device=device)
-        self._upper = torch.tensor([MAX_SCALE, MAX_HOLE_RADIUS_M], dtype=dtype, device=device)
+        self.geom_ids = torch.tensor([model.geom(name).id for name in (*nominal.names, GROUND)], device=device)
+        self._lower = torch.tensor([SCALE_BOUNDS[0], HOLE_RADIUS_BOUNDS_M[0]], dtype=dtype, device=device)
+        self._upper = torch.tensor([SCALE_BOUNDS[1], HOLE_RADIUS_BOUNDS_M[1]], dtype=dtype, device=device)
 
     def geoms(self, scene: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns sizes and positions of the block's geoms, `(N, G, 3)` each, for scenes `(N, S)`; out-of-bounds sizes are clamped."""
-        shape = torch.minimum(torch.maximum(scene[:, 4:6].to(self._table.dtype), self._lower), self._upper)
+        """Returns sizes and positions of the block's geoms, `(N, G, 3)` each, for scenes `(N, S)`, clamped to the bounds."""
+        scene = scene.to(self._table.dtype)
+        shape = torch.minimum(torch.maximum(scene[:, 4:6], self._lower), self._upper)
         both = torch.addmm(self._table[:1], shape, self._table[1:]).unflatten(1, (-1, 6))
+        both[:, -1, 5] = -scene[:, 2].clamp(min=HOLE_DEPTH_M)
         return both[..., :3], both[..., 3:]
 
     def pose(self, scene: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

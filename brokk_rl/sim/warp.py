@@ -37,7 +37,14 @@ class Warp:
     tolerance: float
 
     def check(self) -> None:
-        counts = (self.num_worlds, self.substeps, self.num_contacts, self.num_constraints, self.iterations, self.linesearch_iterations)
+        counts = (
+            self.num_worlds,
+            self.substeps,
+            self.num_contacts,
+            self.num_constraints,
+            self.iterations,
+            self.linesearch_iterations,
+        )
         if min(counts) < 1 or self.tolerance <= 0.0:
             raise ConfigError(f"sim: expected counts of 1 or more and a positive tolerance, got {counts} and {self.tolerance}")
 
@@ -49,7 +56,9 @@ class Warp:
         """
         device = torch.device(device)
         if device.type == "cuda" and not torch.cuda.is_available():
-            raise DeviceError(f"device '{device}' was asked for, but torch finds no CUDA GPU here; choose sim=native (or sim=auto) and the CPU")
+            raise DeviceError(
+                f"device '{device}' was asked for, but torch finds no CUDA GPU here; choose sim=native (or sim=auto) and the CPU"
+            )
         if device.type == "cuda" and device.index is None:
             device = torch.device("cuda", torch.cuda.current_device())
         from brokk_rl.sim.warp_world import WarpWorld  # takes seconds to import, so only where it is needed

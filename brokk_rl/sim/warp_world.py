@@ -26,7 +26,7 @@ _LOST = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowT
 def _keep_peak(sensordata: wp.array2d[float], is_touch: wp.array[float], peak: wp.array[float]):
     """Raises each world's peak to the present sum of its touch sensors."""
     world = wp.tid()
-    total = float(0.0)
+    total = 0.0
     for i in range(is_touch.shape[0]):
         total += is_touch[i] * sensordata[world, i]
     peak[world] = wp.max(peak[world], total)
@@ -35,9 +35,9 @@ def _keep_peak(sensordata: wp.array2d[float], is_touch: wp.array[float], peak: w
 class WarpWorld:
     """Fulfils `brokk_rl.contracts.World` on a GPU (or, for tests, on the CPU).
 
-    All tensors are views of Warp's arrays. `step` and `reset` use torch's current stream and keep every address, so that the caller may
-    capture them together with its own torch operations inside `torch.cuda.graph`. Outside a capture the solver's loop asks the host
-    after each iteration, which is slow.
+    All tensors are views of Warp's arrays. `step` and `reset` use torch's current stream and keep every address, so that the caller
+    may capture them together with its own torch operations inside `torch.cuda.graph`. Outside a capture the solver's loop asks the
+    host after each iteration, which is slow.
 
     Args:
         spec: Sizes and solver settings.

@@ -1,28 +1,18 @@
 """The Warp world on a real GPU: graphs, parity with MuJoCo C, faults."""
 
-from pathlib import Path
-
 import pytest
 import torch
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 
-import conf
 from brokk_rl.sim.native import Native
 from brokk_rl.sim.scene import nominal
 from brokk_rl.sim.warp import Warp
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+pytestmark = pytest.mark.gpu
 
 NUM_WORLDS = 64
 SPEC = Warp(
     num_worlds=NUM_WORLDS, substeps=5, num_contacts=16, num_constraints=48, iterations=20, linesearch_iterations=20, tolerance=1e-6
 )
-
-
-@pytest.fixture(scope="module")
-def machine():
-    return instantiate(OmegaConf.load(Path(conf.__file__).parent / "machine" / "brokk170.yaml"), _convert_="all")
 
 
 def _captured(world, increment):

@@ -1,0 +1,127 @@
+"""Forward kinematics against MuJoCo, against differences, and by hand."""
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Dimension, Joint, Machine
+from brokk_rl.sim.model import compile_model
+
+
+def _random_positions(machine: Machine, count: int) -> torch.Tensor:
+    share = torch.rand(count, machine.num_joints, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return (torch.tensor(machine.lower) + share * torch.tensor(machine.upper - machine.lower)).float()
+
+
+def _dimensions(*values: float) -> tuple[Dimension, ...]:
+    return tuple(Dimension(value=value, source="test", confidence="high") for value in values)
+
+
+def _chain(machine: Machine, kinds: str, axes: list[tuple[float, float, float]]) -> Machine:
+    """Returns a machine with joints of `kinds` (h or s) about `axes` and skew origins."""
+    joints = tuple(
+        dataclasses.replace(
+            machine.joints[0],
+            name=f"j{i}",
+            kind="hinge" if kind == "h" else "slide",
+            axis=axis,
+            origin_m=_dimensions(0.3, 0.1 * i, 0.2),
+        )
+        for i, (kind, axis) in enumerate(zip(kinds, axes, strict=True))
+    )
+    return dataclasses.replace(machine, joints=joints, exclusive=(), levers=(), tool_m=_dimensions(0.4, 0.1, -0.2))
+
+
+def _mujoco_chain(joints: tuple[Joint, ...], tool: tuple[Dimension, ...]) -> mujoco.MjModel:
+    """Returns a bare MuJoCo model of the chain."""
+    spec = mujoco.MjSpec()
+    body = spec.worldbody
+    for joint in joints:
+        body = body.add_body(pos=[d.value for d in joint.origin_m], mass=1.0, inertia=(1, 1, 1))
+        kind = mujoco.mjtJoint.mjJNT_HINGE if joint.kind == "hinge" else mujoco.mjtJoint.mjJNT_SLIDE
+        body.add_joint(type=kind, axis=joint.axis)
+    body.add_site(name="tip", pos=[d.value for d in tool])
+    return spec.compile()
+
+
+def test_outstretched_arm_reaches_as_far_as_its_links_add_up_to(machine):
+    pose = Kinematics(machine).pose(torch.zeros(5))
+    # 0.25 + 1.50 + 1.25 + 1.00 + 1.20 forward, 0.62 + 0.28 up
+    torch.testing.assert_close(pose.tip_in_base_m, torch.tensor([5.2, 0.0, 0.9]), atol=1e-6, rtol=0)
+    assert pose.pitch_rad.item() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_tool_that_points_straight_down_has_the_papers_pitch(machine):
+    pose = Kinematics(machine).pose(torch.tensor([math.pi / 2, 0.0, 0.0, 0.0, math.pi / 2]))
+    # slewed to the left; 0.25 + 1.50 + 1.25 + 1.00 to the side, 0.9 - 1.2 up
+    torch.testing.assert_close(pose.tip_in_base_m, torch.tensor([0.0, 4.0, -0.3]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(pose.axis_in_base, torch.tensor([0.0, 0.0, -1.0]), atol=1e-6, rtol=0)
+    assert pose.pitch_rad.item() == pytest.approx(math.pi / 2, abs=1e-6)
+
+
+def test_tip_and_joints_agree_with_mujoco(machine):
+    model = compile_model(machine, 0.01)
+    data = mujoco.MjData(model)
+    q = _random_positions(machine, 50)
+    pose = Kinematics(machine).pose(q)
+    for i, row in enumerate(q.double().numpy()):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(pose.tip_in_base_m[i], data.site("tip").xpos, atol=3e-6)
+        np.testing.assert_allclose(pose.joints_in_base_m[i], [data.body(f"{n}_link").xpos for n in machine.joint_names], atol=3e-6)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "axes"),
+    [
+        ("hhh", [(1, 0, 0), (0, 1, 0), (0, 0, 1)]),
+        ("shs", [(0, 0, 1), (0, 1, 0), (1, 0, 0)]),
+        ("hshs", [(0, 0, 1), (1, 0, 0), (0, 0, 1), (0, 1, 0)]),
+        ("hhhs", [(0, 0, 1), (0, 0.6, 0.8), (0, 0.6, 0.8), (0, 0, 1)]),
+        ("ss", [(1, 0, 0), (0, 1, 0)]),
+    ],
+)
+def test_any_serial_chain_agrees_with_mujoco(machine, kinds, axes):
+    chain = _chain(machine, kinds, axes)
+    model = _mujoco_chain(chain.joints, chain.tool_m)
+    data = mujoco.MjData(model)
+    q = torch.randn(20, len(kinds), generator=torch.Generator().manual_seed(1))
+    kinematics = Kinematics(chain)
+    tip, jacobian = kinematics.pose(q).tip_in_base_m, kinematics.jacobian(q).tip
+    reference = np.zeros((3, len(kinds)))
+    for i, row in enumerate(q.double().numpy()):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacSite(model, data, reference, None, 0)
+        np.testing.assert_allclose(tip[i], data.site("tip").xpos, atol=5e-6)
+        np.testing.assert_allclose(jacobian[i], reference, atol=5e-6)
+
+
+def test_jacobians_are_the_derivatives_of_the_pose(machine):
+    kinematics = Kinematics(machine)
+    q, step = _random_positions(machine, 50), 1e-2
+    jacobian = kinematics.jacobian(q)
+    for j in range(machine.num_joints):
+        shift = torch.zeros(machine.num_joints)
+        shift[j] = step
+        ahead, behind = kinematics.pose(q + shift), kinematics.pose(q - shift)
+        torch.testing.assert_close(
+            jacobian.tip[..., j], (ahead.tip_in_base_m - behind.tip_in_base_m) / (2 * step), atol=3e-4, rtol=0
+        )
+        turned = torch.remainder(ahead.pitch_rad - behind.pitch_rad + math.pi, 2 * math.pi) - math.pi
+        torch.testing.assert_close(jacobian.pitch[..., j], turned / (2 * step), atol=3e-4, rtol=0)
+
+
+def test_leading_dimensions_are_kept(machine):
+    q = _random_positions(machine, 6)
+    kinematics = Kinematics(machine)
+    pose, jacobian = kinematics.pose(q.view(2, 3, 5)), kinematics.jacobian(q.view(2, 3, 5))
+    assert pose.tip_in_base_m.shape == (2, 3, 3) and pose.pitch_rad.shape == (2, 3) and pose.joints_in_base_m.shape == (2, 3, 5, 3)
+    assert jacobian.tip.shape == (2, 3, 3, 5) and jacobian.pitch.shape == (2, 3, 5)
+    torch.testing.assert_close(pose.tip_in_base_m[1, 2], kinematics.pose(q[5]).tip_in_base_m)

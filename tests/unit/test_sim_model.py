@@ -1,0 +1,158 @@
+"""From a machine and its MJCF to a model."""
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Dimension, Machine
+from brokk_rl.sim.model import compile_model
+from brokk_rl.sim.native import Native
+from brokk_rl.sim.scene import HOLE_RADIUS_M, Placement, collision_block, nominal
+
+SMALL_MJCF = """
+<mujoco>
+  <worldbody>
+    <body name="mast_link"><joint name="mast"/><geom type="capsule" size="0.1" fromto="0 0 0 0 0 1"/>
+      <body name="swing_link" pos="0 0 1"><joint name="swing"/><geom type="capsule" size="0.06" fromto="0 0 0 1.5 0 0"/>
+        <body name="lance_link" pos="1.5 0 0"><joint name="lance"/>
+          <geom name="rod" type="capsule" size="0.04" fromto="0 0 -0.4 0 0 -0.96" contype="1" conaffinity="0"/>
+          <site name="tip" pos="0 0 -1"/><site name="feel" type="sphere" size="3"/>
+        </body></body></body>
+  </worldbody>
+  <sensor><touch site="feel"/></sensor>
+</mujoco>"""
+
+
+def _dimension(value: float) -> Dimension:
+    return Dimension(value=value, source="test", confidence="high")
+
+
+def _small(machine: Machine, path: Path) -> Machine:
+    """Returns a machine of two hinges and a vertical slide whose MJCF lies at `path`."""
+    path.write_text(SMALL_MJCF)
+    parts = (
+        ("mast", "hinge", (0, 0, 1), (0, 0, 0.1)),
+        ("swing", "hinge", (0, 0, 1), (0, 0, 1)),
+        ("lance", "slide", (0, 0, 1), (1.5, 0, 0)),
+    )
+    joints = tuple(
+        dataclasses.replace(
+            machine.joints[0], name=name, kind=kind, axis=axis, origin_m=tuple(_dimension(float(x)) for x in origin), home=0.0
+        )
+        for name, kind, axis, origin in parts
+    )
+    tool = tuple(_dimension(x) for x in (0.0, 0.0, -1.0))
+    return dataclasses.replace(machine, name="small", mjcf=str(path), joints=joints, exclusive=(), levers=(), tool_m=tool)
+
+
+def test_numbers_of_the_machine_stand_in_the_model(machine):
+    model = compile_model(machine, 0.01)
+    np.testing.assert_allclose(model.jnt_range, np.stack([machine.lower, machine.upper], 1))
+    np.testing.assert_allclose(
+        [model.body(f"{j.name}_link").mass[0] for j in machine.joints], [j.mass_kg.value for j in machine.joints]
+    )
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], [j.stiffness.value for j in machine.joints])
+    np.testing.assert_allclose(model.actuator_forcerange[:, 1], [j.yield_force.value for j in machine.joints])
+    assert [model.actuator(i).name for i in range(model.nu)] == list(machine.joint_names)
+
+
+def test_a_longer_boom_is_drawn_longer(machine):
+    joints = list(machine.joints)
+    joints[2] = dataclasses.replace(joints[2], origin_m=(_dimension(3.0), _dimension(0.0), _dimension(0.0)))
+    longer = dataclasses.replace(machine, joints=tuple(joints))
+    plain, drawn = compile_model(machine, 0.01, visual=True), compile_model(longer, 0.01, visual=True)
+    boom = next(i for i in range(plain.ngeom) if plain.geom_bodyid[i] == plain.body("q2_link").id)
+    assert drawn.geom_size[boom, 0] == pytest.approx(2 * plain.geom_size[boom, 0], rel=1e-2)
+    assert drawn.geom_pos[boom, 0] == pytest.approx(2 * plain.geom_pos[boom, 0])
+    assert drawn.geom_size[boom, 1] == pytest.approx(plain.geom_size[boom, 1], rel=1e-2)
+
+
+def test_pictures_do_not_change_the_physics(machine):
+    models = [compile_model(machine, 0.01, visual=visual) for visual in (False, True)]
+    finals = []
+    for model in models:
+        data = mujoco.MjData(model)
+        data.qpos[:] = data.act[:] = machine.home
+        data.ctrl[:] = 0.1
+        mujoco.mj_step(model, data, 200)
+        finals.append(data.qpos.copy())
+    np.testing.assert_allclose(*finals, rtol=0, atol=1e-9)
+
+
+def test_joints_that_do_not_match_are_named(machine):
+    other = dataclasses.replace(machine, joints=machine.joints[:4], levers=())
+    with pytest.raises(ConfigError, match=r"missing: none, unknown: q5"):
+        compile_model(other, 0.01)
+
+
+def test_a_missing_mjcf_says_where_to_put_it(machine):
+    with pytest.raises(ConfigError, match="set `mjcf`"):
+        compile_model(dataclasses.replace(machine, mjcf="nowhere.xml"), 0.01)
+
+
+def test_a_second_machine_is_only_a_machine_and_an_mjcf(machine, tmp_path):
+    small = _small(machine, tmp_path / "small.xml")
+    world = Native(num_worlds=2, substeps=5, num_threads=1).build(small, "cpu")
+    scene = nominal(2)
+    scene[:, 0], scene[:, 2] = 1.5, 0.05
+    start = torch.zeros(2, 3)
+    world.reset(torch.ones(2, dtype=torch.bool), start, scene)
+    for _ in range(40):  # the lance goes down 0.3 m from 0.1 m, into the hole right below it
+        world.step(torch.tensor([[0.0, 0.0, -0.005]]).expand(2, -1))
+    tip = Kinematics(small).pose(world.q).tip_in_base_m
+    torch.testing.assert_close(tip[0], torch.tensor([1.5, 0.0, -0.1]), atol=5e-3, rtol=0)
+    assert not world.faults.any()
+
+
+def test_the_walls_of_the_hole_lie_exactly_at_its_radius():
+    block = collision_block(1.0, HOLE_RADIUS_M)
+    for name, size, pos, yaw in zip(block.names, block.size, block.pos, block.yaw_rad, strict=True):
+        if name.startswith(("slab", "post")):
+            outward = pos[:2] / np.linalg.norm(pos[:2])
+            axis = 0 if abs(outward @ [np.cos(yaw), np.sin(yaw)]) > 0.5 else 1
+            assert np.linalg.norm(pos[:2]) - size[axis] == pytest.approx(HOLE_RADIUS_M, abs=1e-12)
+
+
+@pytest.mark.parametrize(("scale", "radius_m"), [(1.0, 0.05), (1.1, 0.045), (0.9, 0.08)])
+def test_a_hole_has_walls_all_round_and_nothing_inside(scale, radius_m):
+    block = collision_block(scale, radius_m)
+    angles = np.linspace(0, 2 * np.pi, 721)
+    for distance, expected in ((0.999, False), (1.0 / np.cos(np.pi / 8) + 0.001, True), (1.4, True), (1.8, True)):
+        points = distance * radius_m * np.stack([np.cos(angles), np.sin(angles)], 1)
+        inside = np.zeros(len(points), dtype=bool)
+        for name, size, pos, yaw in zip(block.names, block.size, block.pos, block.yaw_rad, strict=True):
+            if name.startswith(("slab", "post")):
+                turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+                inside |= (np.abs((points - pos[:2]) @ turn) <= size[:2]).all(1)
+        assert (inside == expected).all()
+
+
+def test_scenes_become_the_geoms_of_their_block(machine):
+    model = compile_model(machine, 0.01)
+    placement = Placement(model, "cpu", torch.float64)
+    scene = nominal(2)
+    scene[1, 3:] = torch.tensor([0.3, 1.1, 0.06])
+    size, pos = placement.geoms(scene)
+    for row, (scale, radius_m) in enumerate([(1.0, 0.05), (1.1, 0.06)]):
+        block = collision_block(scale, radius_m)
+        np.testing.assert_allclose(size[row, :-1], block.size, atol=1e-7)
+        np.testing.assert_allclose(pos[row, :-1], block.pos, atol=1e-7)
+    np.testing.assert_allclose(pos[:, -1, 2], [-0.75, -0.75], atol=1e-7)  # the ground lies under the rim
+    _, turn = placement.pose(scene)
+    np.testing.assert_allclose(turn[1], [np.cos(0.15), 0, 0, np.sin(0.15)], atol=1e-7)
+
+
+def test_bounding_volumes_hold_every_block(machine):
+    model = compile_model(machine, 0.01)
+    placement = Placement(model, "cpu", torch.float64)
+    scene = nominal(4)
+    scene[:, 4:] = torch.tensor([[0.5, 0.01], [1.25, 0.01], [0.5, 0.08], [9.0, 9.0]])
+    size, _ = placement.geoms(scene)
+    assert (size.norm(dim=-1) <= torch.tensor(model.geom_rbound)[placement.geom_ids] + 1e-9).all()
+    assert (size <= torch.tensor(model.geom_aabb[:, 3:])[placement.geom_ids] + 1e-9).all()

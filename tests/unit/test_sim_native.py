@@ -1,0 +1,278 @@
+"""The native world against plain MuJoCo, and what drive, contact, resets and faults must do."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from brokk_rl.errors import ConfigError, DeviceError
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.sim.native import Native, NativeWorld
+from brokk_rl.sim.scene import nominal
+
+DOWN = math.pi / 2
+
+
+def _world(machine: Machine, num_worlds: int = 1) -> NativeWorld:
+    return Native(num_worlds=num_worlds, substeps=5, num_threads=2).build(machine, "cpu")
+
+
+def _all(num_worlds: int) -> torch.Tensor:
+    return torch.ones(num_worlds, dtype=torch.bool)
+
+
+def _motion(kinematics: Kinematics, q: torch.Tensor, shift_m: torch.Tensor, turn_rad: torch.Tensor) -> torch.Tensor:
+    """Returns the increment of q1, q3, q4, q5 that shifts the tip and turns the tool, first order."""
+    jacobian = kinematics.jacobian(q)
+    rows = torch.cat([jacobian.tip, jacobian.pitch[:, None]], 1)[..., [0, 2, 3, 4]]
+    step = torch.zeros_like(q)
+    step[:, [0, 2, 3, 4]] = torch.linalg.solve(rows, torch.cat([shift_m, turn_rad[:, None]], 1))
+    return step
+
+
+def _above_hole(machine: Machine, scene: torch.Tensor, offset_m: torch.Tensor, height_m: float = 0.05) -> torch.Tensor:
+    """Returns joint positions that hold the chisel upright above the hole of each scene, `offset_m` to the side."""
+    kinematics = Kinematics(machine)
+    q = torch.tensor(machine.home, dtype=torch.float32).repeat(len(scene), 1)
+    goal = scene[:, :3] + torch.cat([offset_m, torch.full((len(scene), 1), height_m)], 1)
+    for _ in range(40):
+        pose = kinematics.pose(q)
+        q = q + 0.5 * _motion(kinematics, q, goal - pose.tip_in_base_m, DOWN - pose.pitch_rad)
+    return q
+
+
+def _lower(machine: Machine, world: NativeWorld, q: torch.Tensor, depth_m: float, speed_m_s: float = 0.1) -> torch.Tensor:
+    """Commands a straight way down for `depth_m`; returns the greatest contact force of each world."""
+    kinematics = Kinematics(machine)
+    peak, command = torch.zeros(len(q)), q.clone()
+    down = torch.tensor([[0.0, 0.0, -speed_m_s * machine.period_s]]).expand(len(q), -1)
+    for _ in range(round(depth_m / speed_m_s / machine.period_s)):
+        step = _motion(kinematics, command, down, DOWN - kinematics.pose(command).pitch_rad)
+        command = command + step
+        world.step(step)
+        peak = torch.maximum(peak, world.contact_force_n)
+    return peak
+
+
+def test_worlds_do_exactly_what_a_loop_over_plain_mujoco_does(machine):
+    world = _world(machine, 3)
+    generator = torch.Generator().manual_seed(0)
+    speed = torch.tensor(machine.max_speed, dtype=torch.float32)
+    data = [mujoco.MjData(world._batch.get_model(i)) for i in range(3)]
+    for i, one in enumerate(data):
+        mujoco.mj_setState(world._batch.get_model(i), one, world._batch.state[i], mujoco.mjtState.mjSTATE_INTEGRATION)
+    velocity = torch.zeros(3, 5)
+    touched = False
+    for _ in range(60):
+        velocity = 0.9 * velocity + 0.3 * speed * torch.randn(3, 5, generator=generator)
+        world.step(velocity * machine.period_s)
+        for i, one in enumerate(data):
+            # the drive's outputs at the start of the period: what MuJoCo integrated since is ctrl for one period
+            one.ctrl[:] = world._ctrl[i].numpy()
+            one.act[:] = (
+                world._drive.reference[i].numpy() - world._ctrl[i].numpy() * 0.05 + (world._drive._lead * world._ctrl[i]).numpy()
+            )
+            peak = 0.0
+            for _ in range(5):
+                mujoco.mj_step(world._batch.get_model(i), one)
+                peak = max(peak, one.sensordata.sum())
+            assert world.contact_force_n[i].item() == pytest.approx(peak, rel=1e-4, abs=1e-3)
+            np.testing.assert_allclose(world._qpos[i].numpy(), one.qpos, atol=1e-6)
+            touched = touched or peak > 0
+            mujoco.mj_setState(world._batch.get_model(i), one, world._batch.state[i], mujoco.mjtState.mjSTATE_INTEGRATION)
+    assert touched
+
+
+def test_the_number_of_threads_changes_nothing(machine):
+    finals = []
+    for threads in (1, 2):
+        world = Native(num_worlds=8, substeps=5, num_threads=threads).build(machine, "cpu")
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(20):
+            world.step(0.02 * torch.randn(8, 5, generator=generator))
+        finals.append(world.q.clone())
+    assert torch.equal(*finals)
+
+
+def test_the_arm_holds_its_place_for_a_minute(machine):
+    world = _world(machine)
+    start = world.q.clone()
+    for _ in range(1200):
+        world.step(torch.zeros(1, 5))
+    assert (world.q - start).abs().max() < 1e-4
+
+
+def test_the_arm_does_not_creep_under_load(machine):
+    world, scene = _world(machine), nominal(1)
+    q = _above_hole(machine, scene, torch.tensor([[0.15, 0.0]]))
+    world.reset(_all(1), q, scene)
+    _lower(machine, world, q, depth_m=0.054)
+    for _ in range(20):
+        force = _settle(world)
+    start = world.q.clone()
+    for _ in range(400):
+        _settle(world)
+    assert force.item() > 1_000
+    assert (world.q - start).abs().max() < 2e-3  # friction in MuJoCo is not perfectly dry: the tip creeps a little
+
+
+def test_free_motion_follows_the_prediction_within_a_milliradian(machine):
+    world = _world(machine)
+    reference, errors = world.q.double().clone(), []
+    speed = 0.5 * torch.tensor(machine.max_speed) * torch.tensor([1.0, 0.5, 1.0, 1.0, 1.0])
+    for i in range(400):
+        phase = 2 * math.pi * i * machine.period_s / 6.0 + torch.arange(5)
+        increment = (speed * phase.sin() * machine.period_s)[None]
+        reference += increment
+        world.step(increment.float())
+        errors.append((world.q - reference)[0])
+    assert (torch.stack(errors) ** 2).mean(0).sqrt().max() < 1e-3
+
+
+def test_a_blocked_joint_pushes_no_harder_than_its_relief_valve_and_does_not_wind_up(machine):
+    world = _world(machine)
+    scene = nominal(1)
+    q = _above_hole(machine, scene, torch.tensor([[0.25, 0.0]]))
+    world.reset(_all(1), q, scene)
+    _lower(machine, world, q, depth_m=0.3)
+    held = torch.stack([_settle(world) for _ in range(20)]).max()
+    # 30 kNm of q2 at 2.35 m are 12.8 kN, and no joint pushes harder than that on the tip
+    assert 1_000 < held < 14_000
+    leash = torch.tensor([j.yield_force.value / j.stiffness.value for j in machine.joints])
+    assert ((world._drive.reference - world._qpos).abs() <= leash + 0.02).all()
+    kinematics = Kinematics(machine)
+    pressed = kinematics.pose(world.q).tip_in_base_m[0, 2]
+    for _ in range(10):  # as soon as the command turns, the tip leaves the block
+        world.step(_motion(kinematics, world.q, torch.tensor([[0.0, 0.0, 0.01]]), torch.zeros(1)))
+    assert world.contact_force_n.item() == 0.0
+    assert kinematics.pose(world.q).tip_in_base_m[0, 2] > pressed + 0.03
+
+
+def _settle(world: NativeWorld) -> torch.Tensor:
+    world.step(torch.zeros(world.num_worlds, 5))
+    return world.contact_force_n.clone()
+
+
+def test_a_centred_chisel_goes_in_without_force(machine):
+    world, scene = _world(machine), nominal(1)
+    q = _above_hole(machine, scene, torch.zeros(1, 2))
+    world.reset(_all(1), q, scene)
+    peak = _lower(machine, world, q, depth_m=0.35)
+    depth = scene[0, 2] - Kinematics(machine).pose(world.q).tip_in_base_m[0, 2]
+    assert peak.item() == 0.0 and depth > 0.295
+
+
+@pytest.mark.parametrize("offset_mm", [8, 15, 20])
+def test_a_chisel_beside_the_middle_slides_in(machine, offset_mm):
+    angles = torch.arange(8) * math.pi / 4
+    scene = nominal(8)
+    scene[:, 3] = 0.2  # a turned block, so that the directions meet flats and corners
+    world = _world(machine, 8)
+    q = _above_hole(machine, scene, offset_mm / 1000 * torch.stack([angles.cos(), angles.sin()], 1))
+    world.reset(_all(8), q, scene)
+    _lower(machine, world, q, depth_m=0.35)
+    depth = scene[:, 2] - Kinematics(machine).pose(world.q).tip_in_base_m[:, 2]
+    assert (depth > 0.25).all()
+    assert not world.faults.any()
+
+
+def test_a_chisel_on_the_face_does_not_go_in(machine):
+    scene = nominal(3)
+    world = _world(machine, 3)
+    q = _above_hole(machine, scene, torch.tensor([[0.12, 0.0], [-0.2, 0.1], [0.0, -0.15]]))
+    world.reset(_all(3), q, scene)
+    peak = _lower(machine, world, q, depth_m=0.3)
+    depth = scene[:, 2] - Kinematics(machine).pose(world.q).tip_in_base_m[:, 2]
+    assert (depth < 0.01).all() and (peak > 1_000).all()
+
+
+def test_a_hole_that_goes_deeper_than_the_ground_can_be_entered(machine):
+    scene = nominal(1)
+    scene[:, 2] = 0.2
+    world = _world(machine)
+    q = _above_hole(machine, scene, torch.zeros(1, 2))
+    world.reset(_all(1), q, scene)
+    peak = _lower(machine, world, q, depth_m=0.35)
+    assert peak.item() == 0.0
+    assert Kinematics(machine).pose(world.q).tip_in_base_m[0, 2] < -0.09
+
+
+def test_a_narrower_hole_is_narrower(machine):
+    scene = nominal(2)
+    scene[1, 5] = 0.035
+    world = _world(machine, 2)
+    q = _above_hole(machine, scene, torch.zeros(2, 2))
+    world.reset(_all(2), q, scene)
+    _lower(machine, world, q, depth_m=0.2)
+    depth = scene[:, 2] - Kinematics(machine).pose(world.q).tip_in_base_m[:, 2]
+    assert depth[0] > 0.14 and depth[1] < 0.04
+
+
+def test_a_reset_touches_only_the_worlds_of_its_mask(machine):
+    world = _world(machine, 4)
+    for _ in range(5):
+        world.step(torch.full((4, 5), 0.01))
+    before = world.state_dict()
+    mask = torch.tensor([False, True, False, False])
+    scene = nominal(4)
+    scene[:, 0] += 0.3
+    world.reset(mask, torch.zeros(4, 5), scene)
+    after = world.state_dict()
+    for name, tensor in before.items():
+        assert torch.equal(tensor[~mask], after[name][~mask]), name
+    assert (world.q[1] == 0).all()
+    assert not torch.equal(before["state"][1], after["state"][1])
+
+
+def test_an_empty_mask_changes_nothing(machine):
+    world = _world(machine, 2)
+    world.step(torch.full((2, 5), 0.01))
+    before = world.state_dict()
+    world.reset(torch.zeros(2, dtype=torch.bool), torch.zeros(2, 5), nominal(2))
+    assert all(torch.equal(tensor, world.state_dict()[name]) for name, tensor in before.items())
+
+
+def test_a_restored_state_goes_on_bit_for_bit(machine):
+    generator = torch.Generator().manual_seed(3)
+    increments = 0.02 * torch.randn(40, 4, 5, generator=generator)
+    scene = nominal(4)
+    scene[:, 4], scene[:, 5] = torch.linspace(0.9, 1.1, 4), torch.linspace(0.045, 0.055, 4)
+    world = _world(machine, 4)
+    world.reset(_all(4), world.q.clone(), scene)
+    for increment in increments[:20]:
+        world.step(increment)
+    state = world.state_dict()
+    other = _world(machine, 4)
+    other.load_state_dict(state)
+    for increment in increments[20:]:
+        world.step(increment)
+        other.step(increment)
+    assert all(torch.equal(tensor, other.state_dict()[name]) for name, tensor in world.state_dict().items())
+
+
+def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine):
+    world = _world(machine, 3)
+    start = world.q.clone()
+    increment = torch.zeros(3, 5)
+    increment[1, 2] = math.nan
+    world.step(increment)
+    assert world.faults.tolist() == [False, True, False]
+    world.step(torch.zeros(3, 5))
+    assert world.faults.tolist() == [False, True, False]
+    world.reset(world.faults.clone(), start, nominal(3))
+    world.step(torch.zeros(3, 5))
+    assert not world.faults.any()
+    torch.testing.assert_close(world.q, start, atol=1e-6, rtol=0)
+
+
+def test_a_gpu_asked_of_the_native_world_says_what_to_do(machine):
+    with pytest.raises(DeviceError, match="sim=warp"):
+        Native(num_worlds=1, substeps=5, num_threads=0).build(machine, torch.device("cuda"))
+
+
+def test_no_worlds_are_a_config_error():
+    with pytest.raises(ConfigError, match="num_worlds"):
+        Native(num_worlds=0, substeps=5, num_threads=0)
