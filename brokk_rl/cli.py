@@ -7,6 +7,7 @@ import errno
 import logging
 import os
 import re
+import signal
 import sys
 import traceback
 from collections.abc import Iterator
@@ -39,6 +40,7 @@ def main() -> int:
     """Runs the command and returns its exit code: 0 done, 1 our own fault, 2 something the user can mend, 130 interrupted."""
     trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
     set_up_logging()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a run that a scheduler stops ends like one stopped by hand
     try:
         with _hydra_raises():
             extensions.register()
@@ -112,6 +114,7 @@ def set_up_logging() -> None:
     """Shows log records to a person, on stderr; does nothing where someone has set up logging already."""
     handler = RichHandler(console=Console(stderr=True), show_path=False, log_time_format="%H:%M:%S", omit_repeated_times=False)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # tells of its font cache otherwise
 
 
 class SweepFolder(Callback):
@@ -143,6 +146,8 @@ def explain(error: BaseException) -> str | None:
     if full:
         where = f" ({full.filename})" if full.filename else ""
         return f"the disk is full{where}. Free some space, or choose another disk with session.out=<folder>."
+    if any(type(e).__name__ == "OutOfMemoryError" for e in chain):  # torch's, without importing torch for it
+        return f"the memory of the GPU is full: use fewer environments, or session.device=cpu ({error})"
     if ours:
         return f"{ours}{_node(error)}"
     if missing:
