@@ -20,16 +20,19 @@ class Windows:
         machine: Gives joints and history.
         horizon: Steps to predict, `K`.
         device: Where the tensors live.
+        purpose: What they are for, in error messages.
 
     Attributes:
         u: Commands of all recordings, `(J, T)`.
         q: Positions of all recordings, `(J, T)`.
 
     Raises:
-        RecordingError: no recording is long enough for a single window.
+        RecordingError: no recording is long enough for a single window, or a joint is never commanded.
     """
 
-    def __init__(self, recordings: Sequence[Recording], machine: Machine, horizon: int, device: torch.device) -> None:
+    def __init__(
+        self, recordings: Sequence[Recording], machine: Machine, horizon: int, device: torch.device, purpose: str = "to fit to"
+    ) -> None:
         self.u = torch.cat([torch.as_tensor(recording.u) for recording in recordings]).T.contiguous().to(device)
         self.q = torch.cat([torch.as_tensor(recording.q) for recording in recordings]).T.contiguous().to(device)
         self.num_history, self.horizon = machine.num_history, horizon

@@ -124,7 +124,7 @@ class _Fitting:
         self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
         self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
         self._normalise(Windows(train, machine, 1, device))
-        held = Windows(validation, machine, self._steps(config.validation_s), device)
+        held = Windows(validation, machine, self._steps(config.validation_s), device, "held out to stop the fit by")
         self._held = held.draw(512, 0.2, torch.Generator().manual_seed(0))
         self._average = {name: value.detach().clone() for name, value in networks.named_parameters()}
         self._kept = {name: value.clone() for name, value in self._average.items()}

@@ -1,8 +1,8 @@
 """The paper's actuator network, one per joint, all joints computed as one.
 
 The paper feeds 13 commands and 13 positions. Here the 13 positions of a joint enter as its newest position and the 12 increments
-between them: the same information in another basis, so that the network sees speeds at full resolution instead of small differences of
-large numbers, and what it learns in one place holds in another unless the data say otherwise.
+between them: the same information in another basis, so that the network sees speeds at full resolution instead of small
+differences of large numbers, and what it learns in one place holds in another unless the data say otherwise.
 """
 
 from itertools import pairwise

@@ -16,6 +16,13 @@ from brokk_rl.record import Recording
 KNOTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7)
 """Commands at which the static curve bends, on either side."""
 RESOLUTION_S = 0.01
+LONGEST_S = 1.0
+"""Longest delay searched for; more than the history of any model here, so that a history too short shows."""
+SMOOTHING = np.hanning(11)[1:-1] / np.hanning(11).sum()
+"""Applied to command curve and motion alike. Without it a delay between samples, which averages two commands, would be preferred
+because averaging looks like the valve's lag."""
+AT_STOP = 0.005
+"""A joint this close to its stop, as a part of its travel, tells nothing about the delay."""
 RESAMPLED = 200
 MIN_MOVING = 100
 """Samples with a command, in all recordings together, below which no delay is estimated."""
@@ -40,12 +47,12 @@ def delays(recordings: Sequence[Recording], machine: Machine, generator: np.rand
     """Returns the dead time of each joint; `None` for a joint that is hardly commanded.
 
     Raises:
-        RecordingError: no recording is longer than the history.
+        RecordingError: no recording is long enough to search in.
     """
-    usable = [recording for recording in recordings if recording.num_samples > machine.num_history + 1]
+    usable = [recording for recording in recordings if recording.duration_s > 2.0 * LONGEST_S]
     if not usable:
-        raise RecordingError(f"too little data: no recording is longer than the history of {machine.num_history} samples")
-    grid_s = np.arange(0.0, (machine.num_history - 1) * machine.period_s + 1e-9, RESOLUTION_S)
+        raise RecordingError(f"too little data: no recording is longer than {2.0 * LONGEST_S:g} s")
+    grid_s = np.arange(0.0, LONGEST_S + 1e-9, RESOLUTION_S)
     return {name: _delay(usable, joint, grid_s, machine, generator) for joint, name in enumerate(machine.joint_names)}
 
 
@@ -68,18 +75,20 @@ def _delay(
 def _moments(recording: Recording, joint: int, grid_s: np.ndarray, machine: Machine) -> np.ndarray:
     """Returns, for each delay, the sums of products of the curve's features and the increment, shape `(D, F + 1, F + 1)`."""
     u, q = recording.u[:, joint].astype(np.float64), recording.q[:, joint].astype(np.float64)
-    first = machine.num_history
-    now = np.arange(first, len(u) - 1)
-    moved = (q[now + 1] - q[now])[:, None]
-    knots = np.array(KNOTS)
+    knots, reach = np.array(KNOTS), int(LONGEST_S / machine.period_s) + 1
+    curve = np.concatenate([np.maximum(u[:, None] - knots, 0.0), np.maximum(-u[:, None] - knots, 0.0)], 1)[:-1]
+    curve = np.apply_along_axis(np.convolve, 0, curve, SMOOTHING, mode="valid")
+    moved = np.convolve(np.diff(q), SMOOTHING, mode="valid")
+    margin = AT_STOP * (machine.upper[joint] - machine.lower[joint])
+    stopped = (q[:-1] < machine.lower[joint] + margin) | (q[:-1] > machine.upper[joint] - margin)
+    free = np.convolve(stopped, np.ones(len(SMOOTHING)), mode="valid") < 0.5  # a stop ends the motion before the command does
+    now = np.flatnonzero(free[reach:]) + reach
     found = []
     for delay_s in grid_s:
         whole, part = divmod(delay_s / machine.period_s + 1e-9, 1.0)
-        extend, retract = 0.0, 0.0
-        for share, back in ((part, int(whole) + 1), (1.0 - part, int(whole))):  # the command changes inside the period
-            delayed = u[now - min(back, first)][:, None]
-            extend, retract = extend + share * np.maximum(delayed - knots, 0.0), retract + share * np.maximum(-delayed - knots, 0.0)
-        features = np.concatenate([extend, retract, moved], 1)
+        back = int(whole)
+        delayed = part * curve[now - back - 1] + (1.0 - part) * curve[now - back]  # the command changes inside the period
+        features = np.concatenate([delayed, moved[now, None]], 1)
         found.append(features.T @ features)
     return np.stack(found)
 

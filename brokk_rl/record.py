@@ -187,7 +187,8 @@ def check(recording: Recording, where: str) -> None:
     if (row := _first(np.abs(period_s * recording.rate_hz - 1.0) > RATE_TOLERANCE)) is not None:
         raise RecordingError(
             f"{where}: row {row + 1}, column 't_s': {period_s[row]:g} s after the row before, but brokk.rate_hz = "
-            f"{recording.rate_hz:g} means {1.0 / recording.rate_hz:g} s (20 % are allowed); split the recording at the gap or state its rate"
+            f"{recording.rate_hz:g} means {1.0 / recording.rate_hz:g} s (20 % are allowed); split the recording at the gap or "
+            "state its rate"
         )
 
 

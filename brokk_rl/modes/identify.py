@@ -111,8 +111,9 @@ class Identify:
             test, found = found[1 :: options.hold_out], [r for i, r in enumerate(found) if i % options.hold_out != 1]
         validation, train = found[:: options.hold_out], [r for i, r in enumerate(found) if i % options.hold_out]
         if not (train and validation and test):
+            count = len(found) + (len(test) if options.test is None else 0)
             raise RecordingError(
-                f"too little data: {len(found) + (len(test) if options.test is None else 0)} recordings do not make a set to fit to, one "
+                f"too little data: {count} recordings do not make a set to fit to, one "
                 "to stop by and one to judge by; record more, or shorter files (collect.file_minutes)"
             )
         return train, validation, test
@@ -152,16 +153,15 @@ def _facts(recordings: Sequence[Recording]) -> dict[str, Any]:
 
 
 def _show(result: dict[str, Any], fitted: dict[str, Actuator]) -> None:
-    table = Table(title="free-running error at the end of the horizon (RMSE)")
-    table.add_column("joint")
-    for name in fitted:
-        for horizon_s in HORIZONS_S:
-            table.add_column(f"{name} {horizon_s:g} s", justify="right")
-    table.add_column("delay", justify="right")
+    table = Table(title="free-running error at the end of the horizon (RMSE, rad or m)", box=None)
+    for column in ("joint", "model", *(f"{horizon_s:g} s" for horizon_s in HORIZONS_S), "dead time"):
+        table.add_column(column, justify="left" if column in ("joint", "model") else "right")
     for joint, models in result["joints"].items():
-        cells = [f"{models[name][f'{h:g}']['rmse']:.4f}" for name in fitted for h in HORIZONS_S]
         delay = result["delay_s"][joint]
-        table.add_row(joint, *cells, "-" if delay is None else f"{delay['value']:.2f} s")
+        for row, name in enumerate(fitted):
+            cells = [f"{models[name][f'{horizon_s:g}']['rmse']:.4f}" for horizon_s in HORIZONS_S]
+            last = "" if row or delay is None else f"{delay['value']:.2f} s"
+            table.add_row("" if row else joint, name, *cells, last)
     Console().print(table)
 
 

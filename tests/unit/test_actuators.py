@@ -1,0 +1,304 @@
+"""Ideal, lag and the hydraulic plant against numbers worked by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+
+from actuators.gravity import GRAVITY_M_S2, Gravity
+from actuators.hydraulic import Hydraulic
+from actuators.lag import Lag
+from actuators.parameters import per_joint
+from actuators.transport import commands_in_force, opened
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+
+CPU = torch.device("cpu")
+ALL = ("ideal", "lag", "hydraulic")
+
+
+def roll(actuator: Any, machine: Machine, u: torch.Tensor, q: torch.Tensor | None = None) -> torch.Tensor:
+    """Returns the positions `(T + 1, N, J)` under the commands `u` `(T, N, J)`, from rest at `q` or at home."""
+    model = actuator.build(machine, u.shape[1], CPU)
+    at = torch.as_tensor(machine.home, dtype=torch.float32).expand(u.shape[1:]) if q is None else q
+    history = rest(machine, at)
+    path = [at]
+    for command in u:
+        history.push_u(command)
+        history.push_q(model.step(history))
+        path.append(history.q[:, -1].clone())
+    return torch.stack(path)
+
+
+def rest(machine: Machine, q: torch.Tensor) -> History:
+    """Returns the history of a machine at rest at `q` `(N, J)`."""
+    shape = (q.shape[0], machine.num_history, machine.num_joints)
+    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
+    history.reset(torch.ones(q.shape[0], dtype=torch.bool), q)
+    return history
+
+
+def held(machine: Machine, steps: int, **level: float) -> torch.Tensor:
+    """Returns `steps` periods of constant commands for one environment, `(T, 1, J)`, e.g. `held(machine, 20, q3=0.5)`."""
+    u = torch.zeros(steps, 1, machine.num_joints)
+    for name, value in level.items():
+        u[:, 0, machine.joint_names.index(name)] = value
+    return u
+
+
+def lag(**changes: Any) -> Lag:
+    plain = {
+        "dead_time_s": 0.0,
+        "dead_band_extend": 0.0,
+        "dead_band_retract": 0.0,
+        "gain": 1.0,
+        "time_constant_s": 0.0,
+        "spread": {},
+    }
+    return Lag(**(plain | changes))
+
+
+def hydraulic(**changes: Any) -> Hydraulic:
+    return dataclasses.replace(option("actuator", "hydraulic"), **changes)
+
+
+def plain_plant(**changes: Any) -> Hydraulic:
+    """A plant without load, friction, overlap, notch and drift: speed is flow."""
+    none = {"overlap_extend": 0.0, "overlap_retract": 0.0, "hysteresis": 0.0, "notch": 0.0, "load_sensitivity": 0.0}
+    quiet = {"coulomb": 0.0, "breakaway": 0.0, "viscous": 0.02, "leak_hz": 0.0, "thermal_gain": 0.0, "speed_scale": 1.0}
+    return hydraulic(**(none | quiet | {"retract_ratio": 1.0, "flow_share": 0.1} | changes))
+
+
+def speed(path: torch.Tensor, machine: Machine, name: str, last: int = 6) -> float:
+    """Returns the mean speed of a joint over the last periods."""
+    j = machine.joint_names.index(name)
+    return float(path[-1, 0, j] - path[-1 - last, 0, j]) / (last * machine.period_s)
+
+
+def test_ideal_moves_full_speed_times_command(machine: Machine) -> None:
+    path = roll(option("actuator", "ideal"), machine, held(machine, 1, q1=0.5, q4=-1.0))
+    # 50 ms at half of 0.4 rad/s, and at full 0.34 rad/s the other way
+    np.testing.assert_allclose((path[1] - path[0])[0], [0.010, 0, 0, -0.017, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_joint_stays_at_its_stop(name: str, machine: Machine) -> None:
+    near = torch.tensor(machine.upper, dtype=torch.float32)[None] - 0.004
+    path = roll(option("actuator", name), machine, held(machine, 30, q1=1.0), near)
+    assert path[-1, 0, 0] == pytest.approx(machine.upper[0], abs=1e-6)
+
+
+def test_lag_follows_the_analytic_step_response(machine: Machine) -> None:
+    delay_s, constant_s, level = 0.23, 0.12, 0.6
+    path = roll(lag(dead_time_s=delay_s, time_constant_s=constant_s), machine, held(machine, 24, q1=level))
+    t_s = np.maximum(0.0, 0.05 * np.arange(25) - delay_s)
+    expected = 0.4 * level * (t_s - constant_s * (1.0 - np.exp(-t_s / constant_s)))
+    np.testing.assert_allclose(path[:, 0, 0], expected, atol=2e-6)
+
+
+def test_a_dead_time_between_samples_is_exact(machine: Machine) -> None:
+    # 0.33 s = 6.6 periods: after 7 periods the joint has moved for 0.4 of one, 0.4 * 0.05 s * 0.4 rad/s
+    path = roll(lag(dead_time_s=0.33), machine, held(machine, 8, q1=1.0))
+    np.testing.assert_allclose(path[[6, 7, 8], 0, 0], [0.0, 0.008, 0.028], atol=1e-6)
+
+
+def test_the_machines_dead_time_shifts_by_eleven_periods(machine: Machine) -> None:
+    path = roll(lag(dead_time_s=None), machine, held(machine, 13, q1=1.0))
+    np.testing.assert_allclose(path[[11, 12, 13], 0, 0], [0.0, 0.02, 0.04], atol=1e-6)
+
+
+def test_commands_in_force_splits_the_period() -> None:
+    u = torch.arange(5.0)[None, :, None]
+    earlier, later, part = commands_in_force(u, torch.tensor([[1.25]]))
+    assert (earlier.item(), later.item(), part.item()) == (2.0, 3.0, 0.25)
+
+
+def test_the_dead_band_ends_on_each_side_by_itself() -> None:
+    u = torch.tensor([-1.0, -0.6, -0.2, 0.0, 0.1, 0.55, 1.0])
+    expected = [-1.0, -0.5, 0.0, 0.0, 0.0, 0.5, 1.0]  # (0.6 - 0.2) / 0.8 and (0.55 - 0.1) / 0.9
+    np.testing.assert_allclose(opened(u, torch.tensor(0.1), torch.tensor(0.2)), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("dead_time_s", [0.61, 2.0])
+def test_a_dead_time_beyond_the_history_is_refused(machine: Machine, dead_time_s: float) -> None:
+    with pytest.raises(ConfigError, match=r"actuator\.dead_time_s.*num_history"):
+        lag(dead_time_s=dead_time_s).build(machine, 1, CPU)
+
+
+def test_gravity_of_a_hanging_arm_is_the_sum_of_moments(machine: Machine) -> None:
+    # arm stretched out level: every centre of mass lies ahead of q5 by com_x, and so on back to q2
+    q = torch.zeros(1, 5)
+    load = Gravity(machine, CPU).load(q)[0]
+    q5 = 225 * 0.42
+    q4 = 110 * 0.45 + 225 * (1.00 + 0.42)
+    q3 = 150 * 0.60 + 110 * (1.25 + 0.45) + 225 * (2.25 + 0.42)
+    q2 = 230 * 0.72 + 150 * (1.5 + 0.60) + 110 * (2.75 + 0.45) + 225 * (3.75 + 0.42)
+    np.testing.assert_allclose(load, GRAVITY_M_S2 * np.array([0.0, q2, q3, q4, q5]), rtol=1e-4)
+
+
+def test_gravity_is_the_slope_of_potential_energy(machine: Machine) -> None:
+    q = torch.tensor([[0.3, -0.7, 0.9, 0.5, -0.4]], dtype=torch.float64)
+    load = Gravity(machine, CPU).load(q.float())[0]
+    slope = [(_energy(machine, q + step) - _energy(machine, q - step)) / 2e-4 for step in 1e-4 * torch.eye(5, dtype=torch.float64)]
+    np.testing.assert_allclose(load, -np.array(slope), atol=2.0)
+
+
+def _energy(machine: Machine, q: torch.Tensor) -> float:
+    """Potential energy, with the arm's pitch summed by hand (q2 to q5 turn about y, positive down)."""
+    pitch, height, energy = 0.0, 0.62 + 0.28, 0.0
+    lengths = [joint.origin_m[0].value for joint in machine.joints[2:]] + [0.0]
+    for joint, length, angle in zip(machine.joints[1:], lengths, q[0, 1:].tolist(), strict=True):
+        pitch += angle
+        x, _, z = joint.com_m
+        energy += joint.mass_kg.value * GRAVITY_M_S2 * (height - x * math.sin(pitch) + z * math.cos(pitch))
+        height -= length * math.sin(pitch)
+    return energy
+
+
+def test_the_plant_starts_to_move_near_the_machines_dead_time(machine: Machine) -> None:
+    for name in machine.joint_names:
+        path = roll(option("actuator", "hydraulic"), machine, held(machine, 20, **{name: 1.0}))
+        moved = (path[:, 0, machine.joint_names.index(name)] - path[0, 0, machine.joint_names.index(name)]).abs() > 0.002
+        assert int(moved.int().argmax()) in (11, 12, 13)  # within 0.55 to 0.65 s
+
+
+def test_the_plant_reaches_about_the_machines_speed(machine: Machine) -> None:
+    for name, full in zip(machine.joint_names, machine.max_speed, strict=True):
+        path = roll(option("actuator", "hydraulic"), machine, held(machine, 40, **{name: 1.0}))
+        assert speed(path, machine, name) == pytest.approx(full, rel=0.12)
+
+
+def test_retracting_is_faster_by_the_area_ratio(machine: Machine) -> None:
+    plant = plain_plant(retract_ratio=1.4)
+    out, back = (speed(roll(plant, machine, held(machine, 40, q3=level)), machine, "q3") for level in (0.5, -0.5))
+    assert back / out == pytest.approx(-1.4, rel=0.01)
+    assert out == pytest.approx(0.5 * 0.26, rel=0.03)
+
+
+def test_twice_the_pumps_flow_halves_the_speeds(machine: Machine) -> None:
+    plant = plain_plant(flow_share=1.0)
+    alone = roll(plant, machine, held(machine, 40, q3=1.0))
+    both = roll(plant, machine, held(machine, 40, q3=1.0, q4=1.0))
+    assert speed(both, machine, "q3") == pytest.approx(0.5 * speed(alone, machine, "q3"), rel=0.01)
+    assert speed(both, machine, "q4") == pytest.approx(0.5 * 0.34, rel=0.01)
+
+
+def test_enough_flow_leaves_joints_alone(machine: Machine) -> None:
+    plant = plain_plant(flow_share=0.5)
+    both = roll(plant, machine, held(machine, 40, q3=1.0, q4=1.0))
+    assert speed(both, machine, "q3") == pytest.approx(0.26, rel=0.03)
+
+
+def test_a_command_inside_the_overlap_moves_nothing(machine: Machine) -> None:
+    plant = hydraulic(leak_hz=0.0)
+    path = roll(plant, machine, held(machine, 60, q2=0.09, q3=-0.1))
+    assert (path[-1] - path[0]).abs().max() < 2e-4
+    assert abs(speed(roll(plant, machine, held(machine, 60, q2=0.25)), machine, "q2")) > 0.005
+
+
+def test_lowering_is_faster_than_lifting_under_load(machine: Machine) -> None:
+    plant = plain_plant(load_sensitivity=1.0)
+    down, up = (speed(roll(plant, machine, held(machine, 40, q2=level)), machine, "q2") for level in (1.0, -1.0))
+    assert down > 0.18 > -up > 0.1
+
+
+def test_a_machine_at_rest_creeps_no_more_than_its_leak(machine: Machine) -> None:
+    path = roll(option("actuator", "hydraulic"), machine, held(machine, 200))
+    assert (path[-1] - path[0]).abs().max() < 0.002
+    leaking = roll(hydraulic(leak_hz=0.2), machine, held(machine, 200))
+    assert leaking[-1, 0, 1] - leaking[0, 0, 1] > 0.005  # the boom sinks
+
+
+def test_oil_warms_with_work_and_speeds_the_machine_up(machine: Machine) -> None:
+    plant = hydraulic(oil_time_s=2.0, oil_start_c=20.0, thermal_gain=0.002)
+    model = plant.build(machine, 1, CPU)
+    history = rest(machine, torch.as_tensor(machine.home, dtype=torch.float32)[None])
+    history.u[:] = held(machine, 13, q1=1.0)[:, 0]
+    early = float((model.step(history) - history.q[:, -1])[0, 0])
+    steps = [float((model.step(history) - history.q[:, -1])[0, 0]) for _ in range(200)]
+    assert model.state["oil_c"].item() == pytest.approx(20.0 + 45.0 * 0.4, abs=0.5)  # q1 takes 0.4 of the pump
+    assert steps[-1] > early
+    assert steps[-1] / steps[40] > 1.005
+
+
+def test_half_the_time_step_gives_the_same_path(machine: Machine) -> None:
+    u = (torch.rand(60, 1, 5, generator=torch.Generator().manual_seed(3)) * 2.0 - 1.0).repeat_interleave(5, 0)
+    coarse, fine = (roll(hydraulic(substep_s=step_s), machine, u) for step_s in (0.005, 0.0025))
+    assert (coarse - fine).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_run_repeats_and_environments_do_not_touch(name: str, machine: Machine) -> None:
+    u = torch.rand(40, 3, 5, generator=torch.Generator().manual_seed(1)) * 2.0 - 1.0
+    together = roll(option("actuator", name), machine, u)
+    torch.testing.assert_close(together, roll(option("actuator", name), machine, u), rtol=0, atol=0)
+    alone = roll(option("actuator", name), machine, u[:, 1:2])
+    torch.testing.assert_close(together[:, 1:2], alone, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_reset_reaches_the_masked_environments_only(name: str, machine: Machine) -> None:
+    model = option("actuator", name).build(machine, 3, CPU)
+    history = rest(machine, torch.as_tensor(machine.home, dtype=torch.float32).expand(3, 5))
+    fresh = {key: value.clone() for key, value in model.state.items()}
+    for _ in range(20):
+        history.push_u(torch.ones(3, 5))
+        history.push_q(model.step(history))
+    used = {key: value.clone() for key, value in model.state.items()}
+    addresses = {key: value.data_ptr() for key, value in model.state.items()}
+    model.reset(torch.tensor([False, True, False]))
+    for key, value in model.state.items():
+        torch.testing.assert_close(value[1], fresh[key][1])
+        torch.testing.assert_close(value[[0, 2]], used[key][[0, 2]])
+        assert value.data_ptr() == addresses[key]
+
+
+def test_spread_draws_within_its_width_anew_at_each_reset(machine: Machine) -> None:
+    model = lag(dead_time_s=0.5, spread={"dead_time_s": 0.1, "gain": 0.2}).build(machine, 4000, CPU)
+    drawn = model.state["drawn_gain"].clone()
+    assert 0.8 <= drawn.min() < 0.81
+    assert 1.19 < drawn.max() <= 1.2
+    assert drawn.mean() == pytest.approx(1.0, abs=0.01)
+    assert drawn.std() == pytest.approx(0.2 / math.sqrt(3.0), rel=0.03)  # uniform
+    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 1])[0, 1]) < 0.05
+    assert abs(np.corrcoef(drawn[:, 0], model.state["drawn_dead_time_s"][:, 0])[0, 1]) < 0.05
+    mask = torch.arange(4000) < 2000
+    model.reset(mask)
+    again = model.state["drawn_gain"]
+    assert (again[2000:] == drawn[2000:]).all()
+    assert (again[:2000] != drawn[:2000]).float().mean() > 0.99
+
+
+def test_an_unknown_spread_lists_the_choices(machine: Machine) -> None:
+    with pytest.raises(ConfigError, match=r"actuator\.spread: 'speed' is no parameter; .*gain"):
+        lag(spread={"speed": 0.1}).build(machine, 1, CPU)
+
+
+def test_a_table_by_joint_needs_every_joint_or_other(machine: Machine) -> None:
+    assert per_joint({"q2": 2, "other": 1}, machine, "x").tolist() == [1, 2, 1, 1, 1]
+    assert per_joint({"boom": 9, "other": 1}, machine, "x").tolist() == [1, 1, 1, 1, 1]  # a table for several machines
+    with pytest.raises(ConfigError, match="x: no value for q1, q3, q4, q5"):
+        per_joint({"q2": 2.0}, machine, "x")
+    with pytest.raises(ConfigError, match="x: 'q6' is no joint"):
+        per_joint({"q6": 2.0}, machine, "x")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"breakaway": 0.01}, "breakaway"),
+        ({"mode_hz": 0.0}, "mode_hz"),
+        ({"notch": 1.5}, "notch"),
+        ({"substep_s": 0.02}, "substep_s"),
+    ],
+)
+def test_a_plant_that_makes_no_sense_is_refused(machine: Machine, changes: dict[str, float], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        hydraulic(**changes).build(machine, 1, CPU)

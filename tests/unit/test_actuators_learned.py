@@ -1,0 +1,158 @@
+"""The batched network against plain ones, its behaviour at rest, and checkpoints that must not be loaded."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from composed import option
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from actuators import checkpoint
+from actuators.mlp import Mlp, load
+from actuators.network import JointNetworks
+from brokk_rl.errors import CheckpointError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+
+CPU = torch.device("cpu")
+
+
+def networks(seed: int = 0) -> JointNetworks:
+    return JointNetworks(5, 13, 32, torch.Generator().manual_seed(seed))
+
+
+def written(path: Path, machine: Machine, **tensors: torch.Tensor) -> Path:
+    made = networks()
+    checkpoint.write(path, "mlp", machine, {**made.state_dict(), **tensors}, {"width": 32})
+    return path
+
+
+def test_one_batched_network_is_five_networks() -> None:
+    batched = networks()
+    inputs = torch.randn(5, 7, 26)
+    together = batched(inputs)
+    for joint in range(5):
+        alone = nn.Sequential(nn.Linear(26, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1))
+        with torch.no_grad():
+            for layer, weight, bias in zip(alone[::2], batched.weight, batched.bias, strict=True):
+                layer.weight.copy_(weight[joint].T)
+                layer.bias.copy_(bias[joint, 0])
+        torch.testing.assert_close(together[joint], alone(inputs[joint])[:, 0], atol=1e-6, rtol=1e-5)
+
+
+def test_inputs_are_commands_increments_and_the_newest_position() -> None:
+    made = networks()
+    made.increment_scale.fill_(0.01)
+    made.position_center.fill_(0.5)
+    made.position_scale.fill_(2.0)
+    made.command_scale.fill_(0.5)
+    q = 0.1 + 0.01 * torch.arange(13.0).expand(5, 1, 13)
+    u = torch.full((5, 1, 13), 0.25)
+    expected = torch.tensor([0.5] * 13 + [1.0] * 12 + [(0.1 + 0.12 - 0.5) / 2.0]).expand(5, 1, 26)
+    torch.testing.assert_close(made.inputs(u, q), expected)
+
+
+def test_a_free_run_in_one_go_is_step_by_step(machine: Machine, tmp_path: Path) -> None:
+    made = networks(3)
+    made.increment_scale.fill_(0.01)
+    lower, upper = (torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper))
+    generator = torch.Generator().manual_seed(1)
+    u = torch.rand(5, 4, 12 + 30, generator=generator) * 2.0 - 1.0
+    q = (0.03 * torch.rand(5, 4, 13, generator=generator)).cumsum(2) - 0.3
+    path = made.roll_out(u, q, lower, upper)
+    checkpoint.write(tmp_path / "a.safetensors", "mlp", machine, made.state_dict(), {"width": 32})
+    model = Mlp(checkpoint=str(tmp_path / "a.safetensors")).build(machine, 4, CPU)
+    history = History(q=q.permute(1, 2, 0).clone(), u=u[..., :13].roll(1, 2).permute(1, 2, 0).clone())
+    for k in range(30):
+        history.push_u(u[..., 12 + k].T)
+        history.push_q(model.step(history))
+        torch.testing.assert_close(history.q[:, -1].T, path[..., k], atol=2e-5, rtol=0)
+
+
+def test_increments_below_the_noise_are_none() -> None:
+    made = networks()
+    made.quiet.fill_(0.001)
+    output = torch.tensor([[-0.004, -0.0005, 0.0, 0.001, 0.003]]).expand(5, 5)
+    torch.testing.assert_close(made.increment(output)[0], torch.tensor([-0.003, 0.0, 0.0, 0.0, 0.002]))
+
+
+def test_the_shipped_machine_at_rest_stays_at_rest(machine: Machine) -> None:
+    actuator, num_envs = option("actuator", "mlp"), 64
+    generator = torch.Generator().manual_seed(0)
+    lower, upper = (torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper))
+    q = lower + (upper - lower) * torch.rand(num_envs, 5, generator=generator)
+    for level in (0.0, 0.04, -0.04):  # inside the dead band of every joint
+        model = actuator.build(machine, num_envs, CPU)
+        history = History(q=torch.zeros(num_envs, 13, 5), u=torch.zeros(num_envs, 13, 5))
+        history.reset(torch.ones(num_envs, dtype=torch.bool), q)
+        for _ in range(200):  # 10 s
+            history.push_u(torch.full((num_envs, 5), level))
+            history.push_q(model.step(history))
+        assert (history.q[:, -1] - q).abs().max() < 0.002, f"command {level}"
+
+
+def test_the_shipped_model_reaches_a_target_and_stays(machine: Machine) -> None:
+    model = option("actuator", "mlp").build(machine, 1, CPU)
+    home = torch.as_tensor(machine.home, dtype=torch.float32)[None]
+    target = home + torch.tensor([[0.5, 0.0, 0.4, -0.4, 0.5]])
+    history = History(q=torch.zeros(1, 13, 5), u=torch.zeros(1, 13, 5))
+    history.reset(torch.ones(1, dtype=torch.bool), home)
+    error = []
+    for _ in range(600):
+        gap = target - history.q[:, -1]
+        push = (1.5 * gap).clamp(-0.6, 0.6) + 0.12 * gap.sign() * (gap.abs() > 0.01)
+        history.push_u(push)
+        history.push_q(model.step(history))
+        error.append(gap.abs().max().item())
+    assert max(error[-100:]) < 0.03
+
+
+def test_a_missing_checkpoint_names_what_ships(machine: Machine) -> None:
+    with pytest.raises(CheckpointError, match=r"no file 'nowhere\.safetensors'.*brokk170\.safetensors.*mode=identify"):
+        load("nowhere.safetensors", machine)
+
+
+@pytest.mark.parametrize("keep", [0, 5, 200, -100])
+def test_a_truncated_checkpoint_is_refused(tmp_path: Path, machine: Machine, keep: int) -> None:
+    path = written(tmp_path / "a.safetensors", machine)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(CheckpointError, match=r"a\.safetensors: corrupt or truncated"):
+        load(str(path), machine)
+
+
+def test_nan_weights_are_refused(tmp_path: Path, machine: Machine) -> None:
+    path = written(tmp_path / "a.safetensors", machine, quiet=torch.tensor([0.0, 0.0, float("nan"), 0.0, 0.0]))
+    with pytest.raises(CheckpointError, match=r"tensor 'quiet' holds NaN"):
+        load(str(path), machine)
+
+
+def test_a_checkpoint_of_another_machine_names_what_differs(tmp_path: Path, machine: Machine) -> None:
+    other = dataclasses.replace(machine, name="brokk400", period_s=0.06)
+    with pytest.raises(CheckpointError, match="made for another machine: name, control differ"):
+        load(str(written(tmp_path / "a.safetensors", other)), machine)
+
+
+def test_tensors_of_another_network_are_refused(tmp_path: Path, machine: Machine) -> None:
+    path = written(tmp_path / "a.safetensors", machine)
+    tensors = load_file(path)
+    header = {"brokk": json.dumps(checkpoint.read(path, "mlp", machine)[1] | {"width": 16})}
+    save_file(tensors, path, metadata=header)
+    with pytest.raises(CheckpointError, match="do not fit the network"):
+        load(str(path), machine)
+
+
+def test_weights_of_others_are_refused(tmp_path: Path, machine: Machine) -> None:
+    save_file({"a": torch.zeros(1)}, tmp_path / "a.safetensors")
+    with pytest.raises(CheckpointError, match="not an actuator of ours"):
+        load(str(tmp_path / "a.safetensors"), machine)
+
+
+def test_another_kind_of_actuator_is_refused(tmp_path: Path, machine: Machine) -> None:
+    checkpoint.write(tmp_path / "a.safetensors", "arx", machine, {"weight": torch.zeros(5, 38)}, {})
+    with pytest.raises(CheckpointError, match="holds a 'arx' of schema 1, expected a 'mlp'"):
+        load(str(tmp_path / "a.safetensors"), machine)

@@ -1,0 +1,182 @@
+"""From excitation to a fitted model: each step on cases small enough to know the answer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+
+from actuators.lag import Lag
+from actuators.linear import ArxFit, Hold
+from brokk_rl import dead_time, open_loop, record
+from brokk_rl.errors import RecordingError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+CPU = torch.device("cpu")
+PLANT = Lag(dead_time_s=0.43, dead_band_extend=0.06, dead_band_retract=0.09, gain=0.9, time_constant_s=0.0, spread={})
+
+
+def drive(machine: Machine, excitation: str, num_runs: int, seconds: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Returns commands and positions, each `(N, T, J)`, of `PLANT` under an excitation."""
+    process = option("excitation", excitation).build(machine, num_runs, np.random.default_rng(seed))
+    model = PLANT.build(machine, num_runs, CPU)
+    shape = (num_runs, machine.num_history, machine.num_joints)
+    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
+    q = torch.as_tensor(process.start, dtype=torch.float32)
+    history.reset(torch.ones(num_runs, dtype=torch.bool), q)
+    commands, positions = [], []
+    for _ in range(round(seconds / machine.period_s)):
+        u = process.command(q.numpy())
+        commands.append(u)
+        positions.append(q.numpy())
+        history.push_u(torch.as_tensor(u, dtype=torch.float32))
+        q = model.step(history)
+        history.push_q(q)
+    return np.stack(commands, 1), np.stack(positions, 1)
+
+
+def recordings(machine: Machine, excitation: str, num_runs: int, seconds: float, seed: int = 0) -> list[Recording]:
+    u, q = drive(machine, excitation, num_runs, seconds, seed)
+    return [
+        Recording(machine=machine.name, joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0,
+                  t_s=np.arange(u.shape[1]) * 0.05, u=u[n].astype(np.float32), q=q[n].astype(np.float32))
+        for n in range(num_runs)
+    ]  # fmt: skip
+
+
+def test_sines_move_one_joint_and_come_home_from_the_stops(machine: Machine) -> None:
+    u, q = drive(machine, "sine", 10, 240.0)
+    for n in range(10):
+        assert set(np.flatnonzero(np.abs(u[n]).max(0))) == {n % 5}
+    assert np.abs(u).max() <= 1.0
+    travel = machine.upper - machine.lower
+    reached = (np.ptp(q, axis=1).reshape(2, 5, 5).max(0)[range(5), range(5)]) / travel
+    assert (reached > 0.5).all()
+    home = np.abs(q[:, :, :] - machine.home).max(2) < 0.1
+    assert (home[:, 200:].sum(1) > 0).all()
+
+
+def test_levels_never_move_an_exclusive_joint_with_others(machine: Machine) -> None:
+    u, q = drive(machine, "levels", 8, 120.0)
+    others = np.delete(u, 1, axis=2)
+    assert not ((u[:, :, 1] != 0) & (others != 0).any(2)).any()
+    assert (u[:, :, 1] != 0).any()
+    assert ((others != 0).sum(2) >= 2).mean() > 0.3
+    assert np.abs(u).max() <= 1.0
+    assert (q > machine.lower + 1e-4).all()
+    assert (q < machine.upper - 1e-4).all()
+
+
+def test_an_excitation_repeats_with_its_seed(machine: Machine) -> None:
+    for name in ("sine", "levels"):
+        first, again, other = (drive(machine, name, 5, 10.0, seed)[0] for seed in (1, 1, 2))
+        assert (first == again).all()
+        assert (first != other).any()
+
+
+def test_the_dead_time_is_found_to_the_hundredth(machine: Machine) -> None:
+    found = dead_time.delays(recordings(machine, "sine", 10, 60.0), machine, np.random.default_rng(0))
+    for delay in found.values():
+        assert delay is not None
+        assert delay.value_s == pytest.approx(0.43, abs=0.011)
+        assert delay.ci95_s[0] - 0.011 <= 0.43 <= delay.ci95_s[1] + 0.011
+        assert delay.explained > 0.98
+
+
+def test_a_joint_that_rests_has_no_dead_time(machine: Machine) -> None:
+    only_q1 = recordings(machine, "sine", 1, 30.0)
+    found = dead_time.delays(only_q1, machine, np.random.default_rng(0))
+    assert found["q1"] is not None
+    assert found["q3"] is None
+
+
+def test_the_plant_itself_runs_freely_without_error(machine: Machine) -> None:
+    runs = recordings(machine, "levels", 3, 30.0)
+    cut = open_loop.windows(runs, machine, 10.0, 5.0)
+    assert (cut.q.shape, cut.u.shape) == ((12, 213, 5), (12, 212, 5))  # 4 windows a run: 0, 5, 10 and 15 s
+    predicted = open_loop.free_run(PLANT, machine, cut, CPU)
+    assert np.abs(predicted - cut.measured).max() < 1e-4
+
+
+def test_errors_are_those_at_the_end_of_each_horizon(machine: Machine) -> None:
+    cut = open_loop.windows(recordings(machine, "levels", 2, 20.0), machine, 2.0, 10.0)
+    ramp = 0.01 * np.arange(1, 41)[None, :, None]
+    table = open_loop.errors(cut.measured + ramp, cut, machine, (1.0, 2.0), np.random.default_rng(0))
+    row = table["q1"]["2"]
+    assert row["rmse"] == pytest.approx(0.40, abs=1e-5)
+    assert row["percent"] == pytest.approx(100 * 0.40 / 3.2, abs=1e-3)
+    assert row["path_mean"] == pytest.approx(0.205, abs=1e-5)  # mean of 0.01 to 0.40
+    assert row["ci95"] == pytest.approx([0.40, 0.40], abs=1e-5)
+    assert table["q1"]["1"]["rmse"] == pytest.approx(0.20, abs=1e-5)
+
+
+def test_too_short_recordings_are_refused(machine: Machine) -> None:
+    runs = recordings(machine, "sine", 2, 5.0)
+    with pytest.raises(RecordingError, match=r"too little data: a free run of 10 s needs 10\.65 s"):
+        open_loop.windows(runs, machine, 10.0, 1.0)
+
+
+def test_a_linear_machine_is_learned_by_the_linear_model(machine: Machine, tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    u = generator.uniform(-1.0, 1.0, (400, 5)).astype(np.float32)
+    q = np.zeros((400, 5), dtype=np.float32)
+    q[:, 1] = -0.7
+    for k in range(12, 399):
+        q[k + 1] = q[k] + 0.002 * u[k - 11] + 0.3 * (q[k] - q[k - 1])
+    run = Recording(
+        machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(400) * 0.05, u=u, q=q
+    )
+    actuator = ArxFit(name="arx", ridge=1e-8).fit(machine, [run], [run], tmp_path, 0, CPU)
+    cut = open_loop.windows([run], machine, 5.0, 1.0)
+    error, still = (np.abs(open_loop.free_run(model, machine, cut, CPU) - cut.measured).max() for model in (actuator, Hold()))
+    assert error < 0.02 * still
+
+
+def test_too_little_data_is_said(machine: Machine, tmp_path: Path) -> None:
+    runs = recordings(machine, "sine", 2, 20.0)
+    with pytest.raises(RecordingError, match="too little data: joint q3 is never commanded in the 2 recordings"):
+        option("fit", "mlp").fit(machine, runs, runs, tmp_path, 0, CPU)
+
+
+TINY = (
+    "identify.hold_out=3", "fit.one_step_updates=120", "fit.one_step_batch=256", "fit.updates=40", "fit.horizons_s=[0.5]",
+    "fit.batch=64", "fit.validate_every=40",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_collect_and_identify_from_the_command(brokk: Callable[..., object], tmp_path: Path, machine: Machine) -> None:
+    small = ("collect.run_minutes=1.0", "collect.file_minutes=0.5", "actuator=lag")
+    assert brokk("mode=collect", "session.out=sine", "collect.num_runs=10", *small).code == 0
+    assert (
+        brokk("mode=collect", "session.out=levels", "excitation=levels", "collect.num_runs=3", "session.seed=1", *small).code == 0
+    )
+    files = sorted(Path("sine/recordings").iterdir())
+    assert len(files) == 20
+    first, second = (record.read(path, machine) for path in files[:2])
+    assert first.num_samples == second.num_samples == 600
+    assert first.metadata["source"] == "simulator: Lag, excitation: Sine"
+    assert json.loads(first.metadata["fingerprint"]) == machine.fingerprint()
+    assert second.metadata["created"] == record.later(first.metadata["created"], 30.0)
+    done = brokk(
+        "mode=identify", "session.out=fit", "session.device=cpu", "identify.recordings=sine/recordings/*",
+        "identify.test=levels/recordings/*", *TINY,
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    result = json.loads(Path("fit/identification.json").read_text())
+    for rows in result["joints"].values():
+        assert rows["mlp"]["5"]["rmse"] < rows["hold"]["5"]["rmse"]
+        assert set(rows["arx"]) == {"1", "2", "5", "10"}
+    assert result["delay_s"]["q1"]["value"] == pytest.approx(0.55 + 0.1, abs=0.06)  # with the lag of 0.1 s
+    assert Path("fit/prediction.png").stat().st_size > 1000
+    assert (
+        brokk("mode=identify", "session.out=again", "identify.recordings=sine/recordings/*", "identify.test=sine/recordings/*").code
+        == 2
+    )

@@ -1,0 +1,169 @@
+"""Recordings: the file as others read it, and every refusal by file, row and column."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from brokk_rl import record
+from brokk_rl.errors import RecordingError, StorageError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+JOINTS = ("q1", "q2", "q3", "q4", "q5")
+
+
+def recording(num_samples: int = 40, **changes: object) -> Recording:
+    generator = np.random.default_rng(0)
+    whole = Recording(
+        machine="brokk170", joints=JOINTS, units=("rad",) * 5, rate_hz=20.0,
+        t_s=np.arange(num_samples) * 0.05,
+        u=generator.uniform(-1.0, 1.0, (num_samples, 5)),
+        q=generator.uniform(-0.2, 0.0, (num_samples, 5)),
+    )  # fmt: skip
+    return replace(whole, **changes)
+
+
+def changed(path: Path, column: str, row: int, value: float) -> Path:
+    """Changes one cell behind the format's back."""
+    table = pq.read_table(path)
+    values = table.column(column).to_numpy().copy()
+    values[row] = value
+    index = table.column_names.index(column)
+    pq.write_table(table.set_column(index, column, pa.array(values)), path)
+    return path
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    record.write(recording(), tmp_path / "run.parquet")
+    return tmp_path / "run.parquet"
+
+
+def test_the_file_is_what_the_format_says(path: Path) -> None:
+    file = pq.ParquetFile(path)
+    schema = {field.name: str(field.type) for field in file.schema_arrow}
+    assert list(schema) == ["t_s", *(f"u_{j}" for j in JOINTS), *(f"q_{j}_rad" for j in JOINTS)]
+    assert schema["t_s"] == "double"
+    assert set(list(schema.values())[1:]) == {"float"}
+    metadata = {key: value for key, value in file.schema_arrow.metadata.items() if key.startswith(b"brokk.")}
+    assert metadata == {b"brokk.schema": b"1", b"brokk.machine": b"brokk170", b"brokk.rate_hz": b"20"}
+    assert file.metadata.row_group(0).column(0).compression == "ZSTD"
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(num_samples=st.integers(2, 60), jitter=st.floats(0.0, 0.09), seed=st.integers(0, 99), oil=st.booleans())
+def test_what_is_written_is_read(tmp_path: Path, machine: Machine, num_samples: int, jitter: float, seed: int, oil: bool) -> None:
+    generator = np.random.default_rng(seed)
+    t_s = np.arange(num_samples) * 0.05 + 0.05 * jitter * generator.uniform(-1.0, 1.0, num_samples)
+    extra = {"oil_c": generator.uniform(20.0, 60.0, num_samples).astype(np.float32)} if oil else {}
+    before = recording(num_samples, t_s=t_s, extra=extra, metadata={"source": "test", "seed": str(seed)})
+    record.write(before, tmp_path / "a.parquet")
+    after = record.read(tmp_path / "a.parquet", machine)
+    np.testing.assert_array_equal(after.t_s, t_s)
+    np.testing.assert_array_equal(after.u, before.u.astype(np.float32))
+    np.testing.assert_array_equal(after.q, before.q.astype(np.float32))
+    assert {key: value.tolist() for key, value in after.extra.items()} == {key: value.tolist() for key, value in extra.items()}
+    assert (after.metadata, after.rate_hz, after.joints) == (before.metadata, 20.0, JOINTS)
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "value", "message"),
+    [
+        ("u_q3", 7, 1.2, r"run\.parquet: row 7, column 'u_q3': command 1\.2 lies outside \[-1, 1\]"),
+        ("u_q1", 0, np.nan, r"run\.parquet: row 0, column 'u_q1': nan is not a number"),
+        ("q_q5_rad", 39, np.inf, r"run\.parquet: row 39, column 'q_q5_rad': inf is not a number"),
+        ("t_s", 5, 0.2, r"run\.parquet: row 5, column 't_s': time does not increase \(0\.2 s, then 0\.2 s\)"),
+        (
+            "t_s",
+            5,
+            0.265,
+            r"run\.parquet: row 5, column 't_s': 0\.065 s after the row before, but brokk\.rate_hz = 20 means 0\.05 s",
+        ),
+        ("t_s", 39, 9.0, r"run\.parquet: row 39, column 't_s': 7\.1 s after .*split the recording at the gap"),
+    ],
+)
+def test_a_bad_cell_is_refused_by_name(path: Path, machine: Machine, column: str, row: int, value: float, message: str) -> None:
+    with pytest.raises(RecordingError, match=message):
+        record.read(changed(path, column, row, value), machine)
+
+
+def test_a_missing_column_is_refused_with_the_nearest_names(path: Path, machine: Machine) -> None:
+    table = pq.read_table(path)
+    names = [name.replace("q_q4_rad", "q_q4_deg") for name in table.column_names]
+    pq.write_table(table.rename_columns(names).replace_schema_metadata(table.schema.metadata), path)
+    with pytest.raises(RecordingError, match=r"run\.parquet: column 'q_q4_rad' is missing; did you mean 'q_q\d_\w+'\?"):
+        record.read(path, machine)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({}, r"metadata 'brokk\.schema' is missing"),
+        (
+            {"brokk.schema": "2", "brokk.machine": "brokk170", "brokk.rate_hz": "20"},
+            r"brokk\.schema is '2', this version reads '1'",
+        ),
+        ({"brokk.schema": "1", "brokk.machine": "crane", "brokk.rate_hz": "20"}, "unknown machine 'crane', expected 'brokk170'"),
+        ({"brokk.schema": "1", "brokk.machine": "brokk170", "brokk.rate_hz": "fast"}, "'fast', expected a positive number"),
+        ({"brokk.schema": "1", "brokk.machine": "brokk170", "brokk.rate_hz": "100"}, r"row 1, column 't_s': 0\.05 s after"),
+    ],
+)
+def test_wrong_metadata_is_refused(path: Path, machine: Machine, metadata: dict[str, str], message: str) -> None:
+    pq.write_table(pq.read_table(path).replace_schema_metadata(metadata), path)
+    with pytest.raises(RecordingError, match=message):
+        record.read(path, machine)
+
+
+def test_a_truncated_file_is_refused(path: Path, machine: Machine) -> None:
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(RecordingError, match=r"run\.parquet: truncated or not a Parquet file"):
+        record.read(path, machine)
+
+
+def test_a_column_of_text_is_refused(path: Path, machine: Machine) -> None:
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(1, "u_q1", pa.array(["0.1"] * len(table))), path)
+    with pytest.raises(RecordingError, match="column 'u_q1' holds string, expected numbers"):
+        record.read(path, machine)
+
+
+def test_a_glob_without_a_file_is_refused(tmp_path: Path, machine: Machine) -> None:
+    with pytest.raises(RecordingError, match=r"no recording matches .*nothing"):
+        record.read_all(str(tmp_path / "nothing*.parquet"), machine)
+
+
+def test_further_columns_are_kept_and_may_have_gaps(tmp_path: Path, machine: Machine) -> None:
+    force = np.full(40, np.nan)
+    record.write(recording(extra={"force_n": force}), tmp_path / "a.parquet")
+    assert np.isnan(record.read(tmp_path / "a.parquet", machine).extra["force_n"]).all()
+
+
+def test_a_bad_recording_is_not_written(tmp_path: Path) -> None:
+    bad = recording()
+    bad.u[3, 1] = -1.5
+    with pytest.raises(RecordingError, match="row 3, column 'u_q2'"):
+        record.write(bad, tmp_path / "a.parquet")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(table: pa.Table, where: Path, **_: object) -> None:
+        where.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", full)
+    with pytest.raises(StorageError, match="No space left on device; nothing was left behind"):
+        record.write(recording(), tmp_path / "a.parquet")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_later_adds_seconds() -> None:
+    assert record.later("2026-11-20T10:00:00.000+00:00", 90.5) == "2026-11-20T10:01:30.500+00:00"
