@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
+import math
 import os
 import re
 import signal
@@ -28,6 +29,7 @@ from rich.logging import RichHandler
 
 from brokk_rl import extensions, registry
 from brokk_rl.errors import BrokkError, choices
+from brokk_rl.session import missing_folders, remove_empty
 
 log = logging.getLogger(__name__)
 
@@ -80,21 +82,34 @@ def _run(cfg: DictConfig) -> float | None:
     """Instantiates the mode and runs it within its session, where it has one."""
     if "session" not in cfg:
         return instantiate(cfg, _convert_="all").run()
-    settings = HydraConfig.get()
     folder = run_folder(cfg)
     try:
         mode = instantiate(cfg, session={"out": str(folder)}, _convert_="all")
+        with mode.session.start(_resolved(cfg), _facts(cfg, mode), resume=bool(getattr(mode, "resume", None))) as record:
+            objective = mode.run()
+            record.fields["objective"] = objective if objective is not None and math.isfinite(objective) else None
+            return objective
     except Exception:
-        with contextlib.suppress(OSError):
-            folder.rmdir()  # made by Hydra for a job of a sweep; stays if it holds anything
+        if HydraConfig.get().mode is RunMode.MULTIRUN:
+            remove_empty([folder])  # made by Hydra; stays if the job has written into it
         raise
-    chosen = {str(key): value for key, value in settings.runtime.choices.items() if value and str(key).split("/")[0] != "hydra"}
-    facts: dict[str, Any] = {"mode": _mode_name(cfg), "choices": chosen, "overrides": list(settings.overrides.task)}
+
+
+def _facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
+    """Returns what `session.json` says about how the run was put together."""
+    settings = HydraConfig.get()
+    made = OmegaConf.to_container(settings.runtime.choices)
+    assert isinstance(made, dict)
+    chosen = {str(key): value for key, value in made.items() if value and str(key).split("/")[0] != "hydra"}
+    overrides = list(settings.overrides.task)
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if value.startswith("["):  # Hydra keeps no record of options that were chosen as a list
+            chosen.setdefault(key, value)
+    facts: dict[str, Any] = {"mode": _mode_name(cfg), "choices": chosen, "overrides": overrides}
     if machine := getattr(mode, "machine", None):
         facts |= {"machine": machine.name, "fingerprint": machine.fingerprint()}
-    with mode.session.start(_resolved(cfg), facts, resume=bool(getattr(mode, "resume", None))) as record:
-        record.fields["objective"] = mode.run()
-    return record.fields["objective"]
+    return facts
 
 
 def run_folder(cfg: DictConfig) -> Path:
@@ -120,21 +135,19 @@ def set_up_logging() -> None:
 class SweepFolder(Callback):
     """Remembers the folder that Hydra makes for a sweep before it has composed a single job."""
 
-    path: Path | None = None
+    new: tuple[Path, ...] = ()
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Called by Hydra before it makes the folder."""
-        path = Path(str(config.hydra.sweep.dir))
-        type(self).path = None if path.exists() else path
+        type(self).new = tuple(missing_folders(Path(str(config.hydra.sweep.dir))))
 
     @classmethod
     def drop_if_unused(cls) -> None:
-        """Removes the folder when no job has written into it."""
-        if cls.path and cls.path.is_dir() and {p.name for p in cls.path.iterdir()} <= {"multirun.yaml"}:
-            (cls.path / "multirun.yaml").unlink(missing_ok=True)
-            with contextlib.suppress(OSError):
-                cls.path.rmdir()
-                cls.path.parent.rmdir()  # `multirun`, if this was the only sweep
+        """Removes what Hydra made when no job has written into it."""
+        if cls.new and cls.new[0].is_dir() and {path.name for path in cls.new[0].iterdir()} <= {"multirun.yaml"}:
+            (cls.new[0] / "multirun.yaml").unlink(missing_ok=True)
+            remove_empty(cls.new)
+        cls.new = ()
 
 
 def explain(error: BaseException) -> str | None:

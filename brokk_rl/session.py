@@ -6,10 +6,9 @@ import hashlib
 import json
 import os
 import random
-import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -129,6 +128,7 @@ class Session:
             fields["started"] = before.get("started", fields["started"])
             fields["resumed"] = [*before.get("resumed", []), _now()]
         record = Record(self.folder, fields)
+        new_folders = missing_folders(self.folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_text(self.folder / RESOLVED, resolved)
@@ -144,7 +144,7 @@ class Session:
             raise
         except BaseException as error:
             record.fields["error"] = f"{type(error).__name__}: {error}"
-            if isinstance(error, BrokkError) and not before and self._drop_if_unused():
+            if isinstance(error, BrokkError) and not before and self._take_back(new_folders):
                 record = None  # refused before anything was done: nothing stays behind
             raise
         finally:
@@ -152,13 +152,13 @@ class Session:
                 record.fields |= {"outcome": outcome, "ended": _now()}
                 record.write()
 
-    def _drop_if_unused(self) -> bool:
-        """Removes the run folder if nothing but the files of `start` is in it; says whether it did."""
+    def _take_back(self, new_folders: Sequence[Path]) -> bool:
+        """Removes the files of `start` and the folders made for them, unless the run has written something; says whether it did."""
         if {path.name for path in self.folder.iterdir()} - {RECORD, RESOLVED}:
             return False
-        shutil.rmtree(self.folder)
-        with suppress(OSError):
-            self.folder.parent.rmdir()  # `runs`, if this was the only run
+        for name in (RECORD, RESOLVED):
+            (self.folder / name).unlink()
+        remove_empty(new_folders)
         return True
 
 
@@ -202,6 +202,18 @@ def write_text(path: Path, text: str) -> None:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def missing_folders(folder: Path) -> list[Path]:
+    """Returns `folder` and those above it that do not exist yet, the innermost first."""
+    return [path for path in (folder, *folder.parents) if not path.exists()]
+
+
+def remove_empty(folders: Sequence[Path]) -> None:
+    """Removes folders, innermost first, until one holds something."""
+    with suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def versions() -> dict[str, str]:

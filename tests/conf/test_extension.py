@@ -66,7 +66,7 @@ class Show:
             raise KeyboardInterrupt
         names = [type(part).__name__ for part in (self.actuator, self.task, self.perception)]
         (self.session.folder / "seen.json").write_text(json.dumps(names))
-        return self.actuator.share
+        return float("nan") if self.fails == "to learn" else self.actuator.share
 '''
 MODE = """# @package _global_
 defaults:
@@ -152,6 +152,16 @@ def test_a_failed_run_says_so_in_its_record(mine: Path, brokk: Callable[..., Any
 def test_an_interrupted_run_says_so_in_its_record(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
     assert brokk("mode=show", "session.out=run", "fails='by hand'").code == 130
     assert '"outcome": "interrupted"' in (tmp_path / "run" / "session.json").read_text()
+
+
+def test_an_objective_that_is_no_number_does_not_break_the_record(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    assert brokk("mode=show", "session.out=run", "fails='to learn'").code == 0
+    assert '"objective": null' in (tmp_path / "run" / "session.json").read_text()
+
+
+def test_a_group_may_be_chosen_as_a_list(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    assert brokk("mode=show", "perception=[truth]", "session.out=run").code == 0
+    assert '"perception": "[truth]"' in (tmp_path / "run" / "session.json").read_text()
 
 
 def test_a_sweep_has_one_folder_for_each_job_and_no_others(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:

@@ -83,6 +83,13 @@ def test_a_run_that_is_refused_before_it_wrote_anything_leaves_no_folder(tmp_pat
     assert not (tmp_path / "runs").exists()
 
 
+def test_a_folder_that_was_there_before_stays(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(ConfigError), session(tmp_path / "mine").start("", {}):
+        raise ConfigError("no")
+    assert list((tmp_path / "mine").iterdir()) == []
+
+
 def test_a_run_that_is_refused_after_it_wrote_something_keeps_it(tmp_path: Path) -> None:
     def begin_and_fail() -> None:
         with session(tmp_path / "a").start("", {}):
