@@ -106,7 +106,7 @@ class Logbook:
             "episodes": found["episodes"],
             "fault_rate": found["fault_rate"],
             "policy/learning_rate": float(rest["learning_rate"]),
-            "policy/action_std": float(rest["action_std"].mean()),
+            "policy/action_std": float(rest["action_std"].detach().mean()),
             **{f"loss/{name}": float(value) for name, value in loss_dict.items()},
         }
         # an iteration in which no episode ended says nothing about episodes: keep what was known

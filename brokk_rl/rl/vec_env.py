@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from brokk_rl.contracts import Actuator, ActuatorModel, Effect, Simulator, Task, TaskProcess, World
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
+from brokk_rl.rl.graph import capture
 
 Starts = dict[str, torch.Tensor]
 
@@ -81,13 +82,15 @@ class ControlLoop(VecEnv):
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.timed_out = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.reason = torch.full((self.num_envs,), -1.0, device=self.device)
-        self.finished = {name: torch.zeros_like(value) for name, value in task.episode.items()}
+        self._finished = torch.zeros(len(task.episode), self.num_envs, device=self.device)
+        self.finished = dict(zip(task.episode, self._finished, strict=True))
         """Figures of the episode that ended in the last step, valid where `done`."""
-        self.totals = {name: torch.zeros((), device=self.device) for name in (*task.episode, *(f"end/{r}" for r in task.reasons))}
-        """Sums over finished episodes since `statistics` was last asked."""
+        self._total_names = (*task.episode, *(f"end/{reason}" for reason in task.reasons))
+        self._totals = torch.zeros(len(self._total_names), device=self.device)  # over episodes finished since `statistics` was last asked
         self._steps = 0
         self._action = torch.zeros(self.num_envs, self.num_actions, device=self.device)
-        self._groups: dict[str, torch.Tensor] = {}
+        # addresses that stay: a captured graph writes to them
+        self._groups = {name: torch.zeros_like(value) for name, value in task.observe(self.history).items()}
         self._graph: torch.cuda.CUDAGraph | None = None
         self.begin()
 
@@ -108,24 +111,24 @@ class ControlLoop(VecEnv):
     @torch.no_grad()
     def begin(self, starts: Starts | None = None) -> None:
         """Starts a new episode everywhere: from `starts`, each entry `(N, …)`, else from random rows of the pool."""
-        everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        self._reset(everywhere, starts or self._draw())
-        self._groups = {name: value.clone() for name, value in self.task.observe(self.history).items()}
+        start = starts or self._draw()
+        self.done.fill_(True)
+        self.world.reset(self.done, start["q"], start["scene"])
+        self._perceive(start)
+        self.done.fill_(False)
 
-    def capture(self) -> None:
-        """Captures the control step in a CUDA graph where device and world allow it; a few steps are simulated on the way."""
+    def capture(self, fuse: bool = False) -> None:
+        """Captures the control step in a CUDA graph where device and world allow it; a few steps are simulated on the way.
+
+        Args:
+            fuse: First have `torch.compile` fuse the small operations around the physics, which takes a minute and a C compiler.
+        """
         if self.device.type != "cuda" or not self.world.supports_graphs:
             return
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream), torch.no_grad():
-            for _ in range(3):  # kernels are compiled and buffers allocated before anything is recorded
-                self._advance()
-        torch.cuda.current_stream().wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        with torch.no_grad(), torch.cuda.graph(graph):
-            self._advance()
-        self._graph = graph
+        if fuse:
+            parts = {name: torch.compile(getattr(self, name), fullgraph=True, dynamic=False) for name in ("_command", "_judge", "_perceive")}
+            self.__dict__.update(parts)
+        self._graph = capture(self._advance, self.device)
         self.begin()
 
     def get_observations(self) -> TensorDict:
@@ -145,12 +148,11 @@ class ControlLoop(VecEnv):
 
     def statistics(self) -> dict[str, float]:
         """Returns means over the episodes finished since the last call, shares of their endings, and their number; one synchronisation."""
-        values = dict(zip(self.totals, torch.stack(tuple(self.totals.values())).tolist(), strict=True))
+        values = dict(zip(self._total_names, self._totals.tolist(), strict=True))
         endings = {name: value for name, value in values.items() if name.startswith("end/")}
         episodes = sum(endings.values())
         fault_rate = values["end/fault"] / max(1, self._steps * self.num_envs)
-        for total in self.totals.values():
-            total.zero_()
+        self._totals.zero_()
         self._steps = 0
         return {name: value / max(1.0, episodes) for name, value in values.items()} | {"episodes": episodes, "fault_rate": fault_rate}
 
@@ -176,30 +178,39 @@ class ControlLoop(VecEnv):
 
     def _advance(self) -> None:
         """One control step on the device."""
+        self.world.step(self._command())
+        start = self._judge()
+        self.world.reset(self.done, start["q"], start["scene"])
+        self._perceive(start)
+
+    def _command(self) -> torch.Tensor:
+        """Puts the action into force; returns how far the drive shall move each joint, `(N, J)`."""
         self.history.push_u(self.task.command(self._action))
-        ahead = self.actuator.step(self.history)
-        self.world.step(ahead - self.history.q[:, -1])
+        return self.actuator.step(self.history) - self.history.q[:, -1]
+
+    def _judge(self) -> Starts:
+        """Judges what the world has done; returns where the finished environments start anew."""
         self.history.push_q(self.world.q)
         transition = self.task.step(self.history, self.world)
+        done = transition.terminated | transition.timed_out
         self.reward.copy_(transition.reward)
         self.timed_out.copy_(transition.timed_out)
-        self.done.copy_(transition.terminated | transition.timed_out)
+        self.done.copy_(done)
         self.reason.copy_(transition.reason)
-        for name, value in self.task.episode.items():
-            self.finished[name].copy_(value)
-            self.totals[name] += (value * self.done).sum()
-        for index, name in enumerate(self.task.reasons):
-            self.totals[f"end/{name}"] += (self.done & (self.reason == index)).sum()
-        self._reset(self.done, self._draw())
+        finished = torch.stack(tuple(self.task.episode.values()))
+        self._finished.copy_(finished)
+        ending = torch.arange(len(self.task.reasons), device=self.device)[:, None] == transition.reason
+        self._totals.add_((torch.cat((finished, ending)) * done).sum(1))
+        return self._draw()
+
+    def _perceive(self, start: Starts) -> None:
+        """Resets finished environments and observes all of them."""
+        self.history.reset(self.done, start["q"])
+        self.actuator.reset(self.done)
+        self.task.reset(self.done, start)
         for name, value in self.task.observe(self.history).items():
             self._groups[name].copy_(value)
 
     def _draw(self) -> Starts:
         rows = torch.randint(len(self.starts["q"]), (self.num_envs,), device=self.device)
         return {key: value[rows] for key, value in self.starts.items()}
-
-    def _reset(self, mask: torch.Tensor, start: Starts) -> None:
-        self.world.reset(mask, start["q"], start["scene"])
-        self.history.reset(mask, start["q"])
-        self.actuator.reset(mask)
-        self.task.reset(mask, start)

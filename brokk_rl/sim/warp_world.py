@@ -26,7 +26,7 @@ _LOST = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowT
 def _keep_peak(sensordata: wp.array2d[float], is_touch: wp.array[float], peak: wp.array[float]):
     """Raises each world's peak to the present sum of its touch sensors."""
     world = wp.tid()
-    total = 0.0
+    total = wp.float32(0.0)  # a plain literal would be a constant to Warp
     for i in range(is_touch.shape[0]):
         total += is_touch[i] * sensordata[world, i]
     peak[world] = wp.max(peak[world], total)

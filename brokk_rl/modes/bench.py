@@ -1,0 +1,138 @@
+"""`brokk mode=bench`: how fast physics, control step and training are on this computer."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from brokk_rl.contracts import Actuator, Effect, Simulator, Task
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.rl.graph import capture
+from brokk_rl.rl.logbook import Logbook
+from brokk_rl.rl.runner import Runner, Training
+from brokk_rl.rl.tracking import Off
+from brokk_rl.rl.vec_env import ControlLoop, Plant
+from brokk_rl.session import Session, versions, write_json
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class Sizes:
+    """What to measure.
+
+    Attributes:
+        num_envs: Numbers of environments, one row each.
+        seconds: Least time of each measurement.
+        iterations: Training iterations timed, after one to warm up.
+    """
+
+    num_envs: tuple[int, ...]
+    seconds: float
+    iterations: int
+
+    def check(self) -> None:
+        if not self.num_envs or min(self.num_envs) < 1:
+            raise ConfigError(f"bench.num_envs: expected one or more positive numbers, got {list(self.num_envs)}")
+
+
+@spec
+class Bench:
+    """Measures rates: physics alone, the whole control step, and training, for several numbers of environments.
+
+    Attributes:
+        session: Folder and device.
+        machine: The machine.
+        sim: Physics.
+        task: Task.
+        actuator: Actuator model.
+        effect: Effects, by name.
+        rl: Training configuration.
+        bench: What to measure.
+    """
+
+    session: Session
+    machine: Machine
+    sim: Simulator
+    task: Task
+    actuator: Actuator
+    effect: dict[str, Effect]
+    rl: Training
+    bench: Sizes
+
+    def run(self) -> float:
+        """Measures; returns the training rate of the last row."""
+        device = self.session.torch_device()
+        plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect)
+        rows = []
+        for num_envs in self.bench.num_envs:
+            self.session.seed_all()
+            loop = plant.build(device, num_envs, self.rl.num_starts, self.session.stream("starts"))
+            rows.append(self._measure(loop, device))
+            log.info("%d environments: %s", num_envs, ", ".join(f"{k} {v:,.0f}" for k, v in rows[-1].items() if k.endswith("_per_s")))
+        name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu, {torch.get_num_threads()} threads"
+        results = {"device": name, **rows[-1], "versions": versions(), "rows": rows}
+        write_json(self.session.folder / "benchmark.json", results)
+        _print(rows)
+        return float(rows[-1]["train_env_steps_per_s"])
+
+    def _measure(self, loop: ControlLoop, device: torch.device) -> dict[str, Any]:
+        num = loop.num_envs
+        still = torch.zeros(num, self.machine.num_joints, device=device)
+        graphs = device.type == "cuda" and loop.world.supports_graphs
+        physics = capture(lambda: loop.world.step(still), device).replay if graphs else lambda: loop.world.step(still)
+        physics_s = self._time(physics, device)
+        loop.capture()
+        action = torch.zeros(num, loop.num_actions, device=device)
+        step_s = self._time(lambda: loop.step(action), device)
+        runner_steps = int(self.rl.runner["num_steps_per_env"])
+        book = Logbook(self.session.folder, Off().open(self.session.folder, {}), loop.statistics, num * runner_steps, 1.0, lambda *_: 0.0)
+        runner = Runner(loop, self.rl, self.session.folder, device, book, {})
+        runner.learn(1)
+        _wait(device)
+        start = time.perf_counter()
+        runner.learn(self.bench.iterations)
+        _wait(device)
+        train_s = (time.perf_counter() - start) / (self.bench.iterations * runner_steps)
+        return {
+            "num_envs": num,
+            "physics_env_steps_per_s": num / physics_s,
+            "env_steps_per_s": num / step_s,
+            "train_env_steps_per_s": num / train_s,
+            "graph": loop.graph_active,
+        }
+
+    def _time(self, step: Callable[[], object], device: torch.device) -> float:
+        """Returns the seconds that one call takes, the mean over at least `bench.seconds`."""
+        for _ in range(3):
+            step()
+        _wait(device)
+        calls, spent = 0, 0.0
+        while spent < self.bench.seconds:
+            start = time.perf_counter()
+            for _ in range(10):
+                step()
+            _wait(device)
+            calls, spent = calls + 10, spent + time.perf_counter() - start
+        return spent / calls
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _print(rows: list[dict[str, Any]]) -> None:
+    table = Table("environments", "physics /s", "control step /s", "training /s", "CUDA graph")
+    for row in rows:
+        rates = [f"{row[name]:,.0f}" for name in ("physics_env_steps_per_s", "env_steps_per_s", "train_env_steps_per_s")]
+        table.add_row(f"{row['num_envs']:,}", *rates, "yes" if row["graph"] else "no")
+    Console().print(table)

@@ -1,0 +1,26 @@
+"""Capturing a step in a CUDA graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+WARM_UP = 3
+"""Calls before the capture: kernels are compiled and buffers allocated before anything is recorded."""
+
+
+@torch.no_grad()
+def capture(step: Callable[[], None], device: torch.device) -> torch.cuda.CUDAGraph:
+    """Returns a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses."""
+    with torch.cuda.device(device):
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UP):
+                step()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            step()
+    return graph
