@@ -196,7 +196,7 @@ class HydraulicModel:
             speed = (speed + dt * (force + weight) / inertia) / (1.0 + rub * friction)
             moved = q + dt * speed
             q = moved.clamp(self._lower, self._upper)
-            speed = torch.where(q == moved, speed, 0.0)
+            speed = speed.masked_fill(q != moved, 0.0)
 
         for name, value in (("pilot", pilot), ("spool", spool), ("spool_rate", spool_rate), ("speed", speed), ("force", force)):
             state[name].copy_(value)

@@ -84,5 +84,5 @@ class LagModel:
             q = q + target * duration_s + (speed - target) * time_constant_s * (1.0 - decay)
             speed = target + (speed - target) * decay
         held = q.clamp(self._lower, self._upper)
-        self._speed.copy_(torch.where(held == q, speed, 0.0))  # a joint at its stop has no speed left
+        self._speed.copy_(speed.masked_fill(held != q, 0.0))  # a joint at its stop has no speed left
         return held

@@ -77,7 +77,7 @@ def _moments(recording: Recording, joint: int, grid_s: np.ndarray, machine: Mach
     u, q = recording.u[:, joint].astype(np.float64), recording.q[:, joint].astype(np.float64)
     knots, reach = np.array(KNOTS), int(LONGEST_S / machine.period_s) + 1
     curve = np.concatenate([np.maximum(u[:, None] - knots, 0.0), np.maximum(-u[:, None] - knots, 0.0)], 1)[:-1]
-    curve = np.apply_along_axis(np.convolve, 0, curve, SMOOTHING, mode="valid")
+    curve = np.stack([np.convolve(feature, SMOOTHING, mode="valid") for feature in curve.T], 1)
     moved = np.convolve(np.diff(q), SMOOTHING, mode="valid")
     margin = AT_STOP * (machine.upper[joint] - machine.lower[joint])
     stopped = (q[:-1] < machine.lower[joint] + margin) | (q[:-1] > machine.upper[joint] - margin)

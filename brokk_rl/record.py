@@ -1,4 +1,4 @@
-"""Recordings: the log of one run of a machine, its twin or the simulator, as one Parquet file (shared/formats.md, "Recording").
+"""Recordings: the log of one run of a machine, its twin or the simulator, as one Parquet file.
 
 Axes: `T` time, `J` joints in machine order. Row `k` holds the measured position at `t_s[k]` and the command in force from then on.
 """

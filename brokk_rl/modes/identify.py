@@ -23,7 +23,7 @@ from brokk_rl.spec import spec
 log = logging.getLogger(__name__)
 
 HORIZONS_S = (1.0, 2.0, 5.0, 10.0)
-"""Horizons of `identification.json` (shared/formats.md)."""
+"""Horizons of `identification.json`."""
 
 
 @spec
