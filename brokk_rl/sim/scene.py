@@ -76,6 +76,17 @@ def collision_block(scale: float, radius_m: float) -> Block:
     return Block(names, np.array(size, float), np.array(pos, float), np.array(yaw, float))
 
 
+def drilled_wall(radius_m: float, num_parts: int = 24) -> Block:
+    """Returns thin boxes that make the octagon look like a drilled hole, ending just below its rim."""
+    half = radius_m * (np.sqrt(2.0) - 1.0) / 2 + 0.002  # out to the corners of the square between the slabs
+    angles = 2 * np.pi * np.arange(num_parts) / num_parts
+    width = (radius_m + 2 * half) * np.tan(np.pi / num_parts)
+    depth = HOLE_DEPTH_M / 2
+    size = np.tile([half, width, depth], (num_parts, 1))
+    pos = np.stack([(radius_m + half) * np.cos(angles), (radius_m + half) * np.sin(angles), np.full(num_parts, -0.0003 - depth)], 1)
+    return Block(tuple(f"wall_{i}" for i in range(num_parts)), size, pos, angles)
+
+
 def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
     """Adds the mocap body `block` with its geoms, as large as a scene may make it; `visual` adds what only the eye needs."""
     body = spec.worldbody.add_body(name="block", mocap=True, pos=nominal(1)[0, :3].numpy())
@@ -83,9 +94,10 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
     largest = np.max([collision_block(scale, radius).size for scale in SCALE_BOUNDS for radius in HOLE_RADIUS_BOUNDS_M], axis=0)
     for name, size, pos, yaw in zip(block.names, largest, block.pos, block.yaw_rad, strict=True):
         is_envelope = name == "block_envelope"
+        is_shown = name.startswith("slab") or name == "plug"
         body.add_geom(
             name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn(yaw), contype=0,
-            conaffinity=_ARM if is_envelope else _TOOL, friction=_FRICTION, group=3 if is_envelope else 1,
+            conaffinity=_ARM if is_envelope else _TOOL, friction=_FRICTION, group=1 if is_shown else 3,
             material="hole_bottom" if name == "plug" else "concrete",
         )  # fmt: skip
     body.add_geom(
@@ -93,8 +105,14 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
         friction=_FRICTION, group=3,
     )  # fmt: skip
     if visual:
+        wall = drilled_wall(HOLE_RADIUS_M)
+        for name, size, pos, yaw in zip(wall.names, wall.size, wall.pos, wall.yaw_rad, strict=True):
+            body.add_geom(
+                name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn(yaw), contype=0, conaffinity=0, group=2,
+                material="concrete",
+            )  # fmt: skip
         body.add_camera(
-            name="close", pos=(-0.75, -1.15, 0.75), fovy=38, mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY, targetbody="block"
+            name="close", pos=(-0.65, -1.05, 0.70), fovy=52, mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY, targetbody="block"
         )
 
 
