@@ -174,14 +174,21 @@ def _picture(path: Path, cut: open_loop.Windows, predicted: dict[str, np.ndarray
 
     steps = cut.measured.shape[1]
     t_s = machine.period_s * np.arange(1, steps + 1)
+    colours = dict(
+        zip([other for other in predicted if other != name], ("tab:gray", "tab:orange", "tab:green", "tab:red"), strict=False)
+    )
     figure, axes = pyplot.subplots(machine.num_joints, 3, figsize=(12, 2.2 * machine.num_joints), squeeze=False, sharex=True)
     for j, joint in enumerate(machine.joints):
         travel = np.abs(np.diff(cut.measured[:, :, j], axis=1)).sum(1)
         for axis, window in zip(axes[j], np.argsort(-travel)[:3], strict=False):
             axis.plot(t_s, cut.measured[window, :, j], color="black", label="measured")
             for other, value in predicted.items():
-                style = {"color": "tab:blue"} if other == name else {"linewidth": 0.8, "linestyle": "--"}
-                axis.plot(t_s, value[window, :, j], label=other, **style)
+                if other == name:
+                    axis.plot(t_s, value[window, :, j], label=other, color="tab:blue")
+                else:
+                    axis.plot(
+                        t_s, value[window, :, j], label=other, color=colours.get(other, "tab:purple"), linewidth=0.8, linestyle="--"
+                    )
         axes[j][0].set_ylabel(f"{joint.name} [{joint.unit}]")
     axes[0][0].legend(fontsize="small")
     for axis in axes[-1]:
