@@ -203,7 +203,7 @@ class TaskProcess(Protocol):
         ...
 
     def describe(self) -> dict[str, Any]:
-        """Returns order, scale and filters of the `policy` vector for the policy's contract, as plain JSON data."""
+        """Returns `size`, order, scale and filters of the `policy` vector for the policy's contract, as plain JSON data."""
         ...
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:

@@ -1,8 +1,9 @@
 """The policy's observation vector (paper, Table I), the same code in training and on the machine.
 
 Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first (H x J); 133 numbers for five joints
-and 13 samples. Each part is normalised with an approximate mean and standard deviation that follow from the configuration, so that a
-policy carries no hidden statistics.
+and 13 samples. A task in which the wanted pitch of the tool differs from episode to episode appends it as one more number. Each part is
+normalised with an approximate mean and standard deviation that follow from the configuration, so that a policy carries no hidden
+statistics.
 """
 
 from collections.abc import Callable
@@ -16,15 +17,23 @@ from brokk_rl.spec import spec
 
 @spec
 class Scaling:
-    """Approximate mean and standard deviation of the target point in the base frame (m)."""
+    """Normalisation of the target.
+
+    Attributes:
+        target_mean_m: Approximate mean of the target point in the base frame.
+        target_std_m: Its approximate standard deviation.
+        pitch_rad: Approximate mean and standard deviation of the wanted pitch where it differs from episode to episode and so belongs
+            to the vector; `null` where the task fixes it.
+    """
 
     target_mean_m: tuple[float, float, float]
     target_std_m: tuple[float, float, float]
+    pitch_rad: tuple[float, float] | None
 
 
-def size(machine: Machine) -> int:
-    """Returns the length of the observation vector."""
-    return 3 + 2 * machine.num_history * machine.num_joints
+def size(machine: Machine, with_pitch: bool = False) -> int:
+    """Returns the length of the observation vector, that of the paper or with the wanted pitch behind it."""
+    return 3 + 2 * machine.num_history * machine.num_joints + with_pitch
 
 
 class Encoder:
@@ -46,39 +55,51 @@ class Encoder:
     ) -> None:
         self.shape = (machine.num_history, machine.num_joints)
         self._machine, self._scaling = machine, scaling
-        self.size = size(machine)
+        self.has_pitch = scaling.pitch_rad is not None
+        self.size = size(machine, self.has_pitch)
         self._concat = concat
         self._target_mean_m = constant(np.float32(scaling.target_mean_m))
         self._target_std_m = constant(np.float32(scaling.target_std_m))
+        self._pitch_mean_rad, self._pitch_std_rad = scaling.pitch_rad or (0.0, 1.0)
         self._q_mean = constant(np.float32((machine.lower + machine.upper) / 2))
         self._q_std = constant(np.float32((machine.upper - machine.lower) / 4))
 
-    def encode(self, target_in_base_m: Any, q: Any, u: Any) -> Any:
-        """Returns the vector, shape `(N, 3 + 2 H J)`.
+    def encode(self, target_in_base_m: Any, q: Any, u: Any, pitch_rad: Any = None) -> Any:
+        """Returns the vector, shape `(N, size)`.
 
         Args:
             target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N, 3)`.
             q: Measured joint positions, oldest first, shape `(N, H, J)`, rad or m.
             u: Commands in force, oldest first, shape `(N, H, J)`, in [-1, 1].
+            pitch_rad: Wanted pitch of the tool, shape `(N,)`; left out where the task fixes it.
         """
         target = (target_in_base_m - self._target_mean_m) / self._target_std_m
         joints = ((q - self._q_mean) / self._q_std).reshape(len(q), -1)
-        return self._concat((target, joints, u.reshape(len(u), -1)), 1)
+        parts = (target, joints, u.reshape(len(u), -1))
+        if self.has_pitch:
+            parts = (*parts, ((pitch_rad - self._pitch_mean_rad) / self._pitch_std_rad)[:, None])
+        return self._concat(parts, 1)
 
     def decode(self, vector: Any) -> tuple[Any, Any, Any]:
         """Inverts `encode`: returns target `(N, 3)` in m, positions and commands `(N, H, J)`."""
         num = self.shape[0] * self.shape[1]
         target = vector[:, :3] * self._target_std_m + self._target_mean_m
         q = vector[:, 3 : 3 + num].reshape(-1, *self.shape) * self._q_std + self._q_mean
-        return target, q, vector[:, 3 + num :].reshape(-1, *self.shape)
+        return target, q, vector[:, 3 + num : 3 + 2 * num].reshape(-1, *self.shape)
+
+    def decode_pitch(self, vector: Any) -> Any:
+        """Returns the wanted pitch `(N,)` in rad, where `has_pitch`."""
+        return vector[:, -1] * self._pitch_std_rad + self._pitch_mean_rad
 
     def describe(self) -> dict[str, Any]:
         """Returns order and scale of the vector as plain JSON data, for the contract of a policy."""
         lower, upper = self._machine.lower, self._machine.upper
+        order = ["target_in_base_m (3)", "q oldest first (H x J)", "u oldest first (H x J)"]
+        pitch = {"pitch": {"mean_rad": self._pitch_mean_rad, "std_rad": self._pitch_std_rad}} if self.has_pitch else {}
         return {
             "size": self.size,
-            "order": ["target_in_base_m (3)", "q oldest first (H x J)", "u oldest first (H x J)"],
+            "order": [*order, "pitch_rad (1)"] if self.has_pitch else order,
             "target": {"mean_m": list(self._scaling.target_mean_m), "std_m": list(self._scaling.target_std_m)},
             "q": {"mean": ((lower + upper) / 2).tolist(), "std": ((upper - lower) / 4).tolist()},
             "u": {"mean": 0.0, "std": 1.0},
-        }
+        } | pitch

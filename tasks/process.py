@@ -7,9 +7,9 @@ be captured in one CUDA graph.
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pkgutil import resolve_name
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import torch
 
@@ -40,7 +40,10 @@ class Goal(Protocol):
 
 @dataclass
 class Options:
-    """The parts of a task's configuration that the process itself uses; see `tasks.tool_pose` and the task's spec."""
+    """The parts of a task's configuration that the process itself uses; see `tasks.tool_pose` and the task's spec.
+
+    The target point of the process lies `depth_m` below that of the goal.
+    """
 
     episode_s: float
     end_on_success: bool
@@ -52,6 +55,11 @@ class Options:
     scaling: Scaling
     classical: Classical
     reward: dict[str, Term]
+
+    @classmethod
+    def of(cls, task: object, **fixed: Any) -> Self:
+        """Returns the options of a task's spec, whose fields have the same names; `fixed` are those that the task does not leave open."""
+        return cls(**{field.name: fixed[field.name] if field.name in fixed else getattr(task, field.name) for field in fields(cls)})
 
 
 class ToolPoseProcess:
@@ -224,12 +232,13 @@ class ToolPoseProcess:
         state["estimate_m"].copy_(sample)
         q = history.q * state["q_scale"][:, None, None]
         u = history.u * state["u_scale"][:, None, None]
-        guidance = self._controller.guide(q, u, sample - self._down, state["start.target_pitch_rad"], self.options.switch.reach_m)
+        pitch_rad = state["start.target_pitch_rad"]
+        guidance = self._controller.guide(q, u, sample - self._down, pitch_rad, self.options.switch.reach_m)
         positioning = self.options.switch.positioning(guidance)
         state["positioning"].copy_(positioning)
         state["rule_reach_m"].copy_(guidance.reach_m if self.options.switch.rule == "planar" else guidance.reach_3d_m)
         state["command"].copy_(guidance.command)
-        state["policy"].copy_(self._encoder.encode(sample, q, u))
+        state["policy"].copy_(self._encoder.encode(sample, q, u, pitch_rad))
         state["features"].copy_(features(guidance, positioning, u[:, -1]))
         state["privileged"].copy_(self._privileged(sample))
 
@@ -248,7 +257,7 @@ class ToolPoseProcess:
 
 
 class Deployable(torch.nn.Module):
-    """The whole policy as it runs on the machine: from the observation vector `(B, 3 + 2 H J)` to masked commands `(B, J)`.
+    """The whole policy as it runs on the machine: from the observation vector `(B, O)` to masked commands `(B, J)`.
 
     Everything that training computes beside the paper's observation (guidance, phase, residual, masks) is inside, so that nothing of it
     has to be written again, in another order or scale, where the policy is deployed.
@@ -264,7 +273,8 @@ class Deployable(torch.nn.Module):
         """Returns valve commands, `(B, J)` in [-1, 1]."""
         process, options = self._process, self._process.options
         target_m, q, u = process._encoder.decode(observation)
-        pitch = torch.full_like(target_m[:, 0], self._pitch_rad)
+        varies = process._encoder.has_pitch
+        pitch = process._encoder.decode_pitch(observation) if varies else torch.full_like(target_m[:, 0], self._pitch_rad)
         guidance = process._controller.guide(q, u, target_m - process._down, pitch, options.switch.reach_m)
         positioning = options.switch.positioning(guidance)
         groups = {"policy": observation, "guide": features(guidance, positioning, u[:, -1])}

@@ -4,6 +4,9 @@ A start is kept only if the tool begins in the open and if, after the exclusive 
 reach the wanted pose within their limits. Checked once with the kinematics when a task is built, so that resets only pick rows.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
 
 from brokk_rl.classical import ClassicalController
@@ -27,6 +30,71 @@ class Arms:
     floor_m: float
     clearance_m: float
     nearest_m: float
+
+
+@dataclass
+class Targets:
+    """Candidates for what an arm shall reach; `M` of them.
+
+    Attributes:
+        target_m: Target point in the base frame, `(M, 3)`.
+        pitch_rad: Wanted pitch of the tool, `(M,)`.
+        scene: Scene around it, `(M, S)`; see `sim.scene`.
+        object_z_m: Height of the top of the object, `(M,)`.
+    """
+
+    target_m: torch.Tensor
+    pitch_rad: torch.Tensor
+    scene: torch.Tensor
+    object_z_m: torch.Tensor
+
+
+Uniform = Callable[[tuple[float, float]], torch.Tensor]
+"""Draws `(M,)` numbers between two bounds."""
+
+
+def random_starts(
+    count: int,
+    seed: int,
+    draw: Callable[[Uniform], Targets],
+    arms: Arms,
+    machine: Machine,
+    controller: ClassicalController,
+    reach_m: tuple[float, float],
+    depth_m: float,
+    what: str,
+) -> dict[str, torch.Tensor]:
+    """Returns `count` starts from which the target can be reached: `q`, `scene`, `target_m`, `target_pitch_rad`.
+
+    Args:
+        count: Number of starts.
+        seed: The same seed gives the same starts.
+        draw: Draws targets.
+        arms: Where the arm may begin.
+        machine: The machine.
+        controller: Gives kinematics and reach.
+        reach_m: Good working range.
+        depth_m: How far below `target_m` the tool must get.
+        what: Name of the task, for the message when too few are found.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    batch = max(4 * count, 256)
+
+    def uniform(bounds: tuple[float, float]) -> torch.Tensor:
+        return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
+
+    drawn = []
+    for _ in range(64):
+        targets = draw(uniform)
+        q, free = random_arms(arms, machine, controller, targets.object_z_m, generator)
+        rows = {"q": q, "scene": targets.scene, "target_m": targets.target_m, "target_pitch_rad": targets.pitch_rad}
+        rows = {name: value[free] for name, value in rows.items()}
+        deep = rows["target_m"] - torch.tensor([0.0, 0.0, depth_m])
+        done = reachable(controller, machine, rows["q"], deep, rows["target_pitch_rad"], reach_m, arms.margin_rad)
+        drawn.append({name: value[done] for name, value in rows.items()})
+        if sum(len(found["q"]) for found in drawn) >= count:
+            break
+    return keep(count, drawn, what)
 
 
 def random_arms(

@@ -12,7 +12,7 @@ from brokk_rl.sim import scene
 from brokk_rl.spec import spec
 from tasks.process import Options, ToolPoseProcess
 from tasks.reward import Term
-from tasks.starts import Arms, keep, random_arms, reachable
+from tasks.starts import Arms, Targets, Uniform, random_starts
 from tasks.tool_pose import Action, Noise, Switch
 
 DOWN_RAD = math.pi / 2
@@ -94,19 +94,7 @@ class BoreholeInsertion:
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Returns the task for `num_envs` environments on `device`."""
-        options = Options(
-            episode_s=self.episode_s,
-            end_on_success=self.end_on_success,
-            limit_margin=self.limit_margin,
-            depth_m=self.depth_m,
-            noise=self.noise,
-            switch=self.switch,
-            action=self.action,
-            scaling=self.scaling,
-            classical=self.classical,
-            reward=self.reward,
-        )
-        return ToolPoseProcess(Insertion(self, machine), options, machine, num_envs, device)
+        return ToolPoseProcess(Insertion(self, machine), Options.of(self), machine, num_envs, device)
 
 
 class Insertion:
@@ -119,15 +107,8 @@ class Insertion:
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """See `tasks.process.Goal`."""
         task, hole = self._task, self._task.hole
-        generator = torch.Generator().manual_seed(seed)
-        controller = task.classical.build(self._machine, torch.device("cpu"))
-        batch = max(4 * count, 256)
 
-        def uniform(bounds: tuple[float, float]) -> torch.Tensor:
-            return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
-
-        drawn = []
-        for _ in range(64):
+        def draw(uniform: Uniform) -> Targets:
             distance, bearing = uniform(hole.distance_m), uniform(hole.bearing_rad)
             rim = torch.stack((distance * bearing.cos(), distance * bearing.sin(), uniform(hole.rim_z_m)), 1)
             columns = {
@@ -136,18 +117,17 @@ class Insertion:
                 "rim_z_m": rim[:, 2],
                 "yaw_rad": bearing + uniform(hole.yaw_rad),
                 "block_scale": uniform(hole.block_scale),
-                "hole_radius_m": torch.full((batch,), hole.radius_m),
+                "hole_radius_m": torch.full_like(distance, hole.radius_m),
             }
-            scenes = torch.stack([columns[name] for name in scene.COLUMNS], 1)
-            q, good = random_arms(task.arms, self._machine, controller, rim[:, 2], generator)
-            down = torch.full((batch,), DOWN_RAD)
-            deep = rim - torch.tensor([0.0, 0.0, task.depth_m])
-            q, rim, scenes, deep, down = q[good], rim[good], scenes[good], deep[good], down[good]
-            done = reachable(controller, self._machine, q, deep, down, task.switch.reach_m, task.arms.margin_rad)
-            drawn.append({"q": q[done], "scene": scenes[done], "target_m": rim[done], "target_pitch_rad": down[done]})
-            if sum(len(rows["q"]) for rows in drawn) >= count:
-                break
-        return keep(count, drawn, "borehole_insertion")
+            return Targets(
+                target_m=rim,
+                pitch_rad=torch.full_like(distance, DOWN_RAD),
+                scene=torch.stack([columns[name] for name in scene.COLUMNS], 1),
+                object_z_m=rim[:, 2],
+            )
+
+        controller = task.classical.build(self._machine, torch.device("cpu"))
+        return random_starts(count, seed, draw, task.arms, self._machine, controller, task.switch.reach_m, task.depth_m, "borehole_insertion")
 
     def judge(self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """See `tasks.process.Goal`."""

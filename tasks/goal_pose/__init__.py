@@ -1,0 +1,141 @@
+"""Moving the tool to a pose that someone asks for: a point in the open and a pitch (the paper's outlook)."""
+
+import torch
+
+from brokk_rl.classical import Classical
+from brokk_rl.contracts import TaskProcess
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.observation import Scaling
+from brokk_rl.sim import scene
+from brokk_rl.spec import spec
+from tasks.process import Options, ToolPoseProcess
+from tasks.reward import Term
+from tasks.starts import Arms, Targets, Uniform, random_starts
+from tasks.tool_pose import Action, Noise, Switch
+
+BLOCK_AWAY_M = -20.0
+"""Where the block stands along x: behind the machine and out of its reach, so that nothing but the ground is in the way."""
+
+
+@spec
+class Pose:
+    """Which poses are asked for; uniform ranges (lowest, highest), of which those are kept that the arm can reach.
+
+    Attributes:
+        distance_m: Horizontal distance of the target point from the slew axis.
+        bearing_rad: Its bearing from straight ahead.
+        height_m: Its height above the ground.
+        pitch_rad: Wanted pitch; pi/2 points straight down.
+    """
+
+    distance_m: tuple[float, float]
+    bearing_rad: tuple[float, float]
+    height_m: tuple[float, float]
+    pitch_rad: tuple[float, float]
+
+    def check(self) -> None:
+        for name in ("distance_m", "bearing_rad", "height_m", "pitch_rad"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ConfigError(f"task.pose.{name}: expected (lowest, highest), got [{low}, {high}]")
+
+
+@spec
+class Tolerance:
+    """When the pose counts as reached.
+
+    Attributes:
+        strict_distance_m: Distance of the tool point from the target.
+        strict_pitch_rad: Pitch error.
+        paper_alignment: The paper's measure of alignment: both r^d and r^o at least this.
+    """
+
+    strict_distance_m: float
+    strict_pitch_rad: float
+    paper_alignment: float
+
+
+@spec
+class GoalPose:
+    """Move the tool to any reachable pose: a target point and a wanted pitch, nothing in the way.
+
+    Attributes:
+        episode_s: Time limit.
+        end_on_success: Whether strict success ends the episode.
+        limit_margin: Distance to a joint limit (rad or m) at which the episode ends.
+        pose: Which poses are asked for.
+        arms: Where the arm may begin.
+        tolerance: Criteria of success.
+        noise: What the policy is told is wrong by.
+        switch: When only q2 moves.
+        action: How the policy's output becomes commands.
+        scaling: Normalisation of target point and pitch.
+        classical: The classical controller, baseline and base of residual actions.
+        reward: Reward terms by name.
+    """
+
+    episode_s: float
+    end_on_success: bool
+    limit_margin: float
+    pose: Pose
+    arms: Arms
+    tolerance: Tolerance
+    noise: Noise
+    switch: Switch
+    action: Action
+    scaling: Scaling
+    classical: Classical
+    reward: dict[str, Term]
+
+    def check(self) -> None:
+        if self.scaling.pitch_rad is None and self.pose.pitch_rad[0] != self.pose.pitch_rad[1]:
+            raise ConfigError("task.scaling.pitch_rad: the wanted pitch differs from episode to episode, so the policy must be told: give (mean, std)")
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
+        """Returns the task for `num_envs` environments on `device`."""
+        return ToolPoseProcess(Reaching(self, machine), Options.of(self, depth_m=0.0), machine, num_envs, device)
+
+
+class Reaching:
+    """Starts and criteria of the pose task; fulfils `tasks.process.Goal`."""
+
+    def __init__(self, task: GoalPose, machine: Machine) -> None:
+        self._task = task
+        self._machine = machine
+
+    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
+        """See `tasks.process.Goal`."""
+        task, pose = self._task, self._task.pose
+
+        def draw(uniform: Uniform) -> Targets:
+            distance, bearing = uniform(pose.distance_m), uniform(pose.bearing_rad)
+            place = scene.nominal(len(distance))
+            place[:, scene.COLUMNS.index("hole_x_m")] = BLOCK_AWAY_M
+            return Targets(
+                target_m=torch.stack((distance * bearing.cos(), distance * bearing.sin(), uniform(pose.height_m)), 1),
+                pitch_rad=uniform(pose.pitch_rad),
+                scene=place,
+                object_z_m=torch.zeros_like(distance),
+            )
+
+        controller = task.classical.build(self._machine, torch.device("cpu"))
+        return random_starts(count, seed, draw, task.arms, self._machine, controller, task.switch.reach_m, 0.0, "goal_pose")
+
+    def judge(self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """See `tasks.process.Goal`."""
+        rules = self._task.tolerance
+        distance = (start["target_m"] - tip_m).norm(dim=1)
+        turn = (start["target_pitch_rad"] - pitch_rad).abs()
+        return {
+            "success": (distance <= rules.strict_distance_m) & (turn <= rules.strict_pitch_rad),
+            "paper_success": (1 / (1 + distance) >= rules.paper_alignment) & (1 / (1 + turn) >= rules.paper_alignment),
+            "closeness": _closeness(distance, turn),
+        }
+
+
+def _closeness(distance_m: torch.Tensor, turn_rad: torch.Tensor) -> torch.Tensor:
+    """Returns how near a pose is to reached, 0 to 1: distance at three scales, pitch at three, and both together."""
+    near = sum(1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.05)) / 3
+    turned = sum(1 / (1 + turn_rad / scale) for scale in (1.0, 0.3, 0.05)) / 3
+    return 0.5 * near + 0.2 * turned + 0.3 * near * turned
