@@ -153,7 +153,8 @@ def _features(machine: Machine, groups: list[list[int]]) -> tuple[np.ndarray, np
     the row of `key` times the position of slide s.
     """
     num = machine.num_joints
-    phase, columns, rows = [0.0], [np.zeros(num)], {"1": 0}
+    phase, columns = [0.0], [np.zeros(num)]
+    rows: dict[object, int] = {"1": 0}
     for group in groups:
         total = np.zeros(num)
         for j in group:

@@ -50,19 +50,12 @@ def _view(axes, scene: np.ndarray, up: int):
     length, width = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale
     if up == 2:
         reach = abs(length * np.cos(yaw)) + abs(width * np.sin(yaw))
-        outline = [
-            [-reach, 0],
-            [-radius, 0],
-            [-radius, -HOLE_DEPTH_M],
-            [radius, -HOLE_DEPTH_M],
-            [radius, 0],
-            [reach, 0],
-            [reach, -rim_z],
-        ]
-        corners = [*np.array([*outline, [-reach, -rim_z]]), x, rim_z]
+        xs = [-reach, -radius, -radius, radius, radius, reach, reach, -reach]
+        zs = [0.0, 0.0, -HOLE_DEPTH_M, -HOLE_DEPTH_M, 0.0, 0.0, -rim_z, -rim_z]
+        corners = np.stack([xs, zs], axis=1) + np.array([x, rim_z])
     else:
         turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-        corners = np.array([[-length, -width], [length, -width], [length, width], [-length, width]]) @ turn.T + [x, y]
+        corners = np.array([[-length, -width], [length, -width], [length, width], [-length, width]]) @ turn.T + np.array([x, y])
     axes.fill(*corners.T, color="0.75", zorder=0)
     if up == 2:
         axes.axhline(0.0, color="0.4", linewidth=1)

@@ -169,7 +169,8 @@ def write(path: Path, draw: Callable[[Iterable[int]], Iterator[np.ndarray]], num
     stride = max(1, math.ceil(num_steps / MAX_FRAMES))
     steps = sorted({*range(0, num_steps, stride), num_steps - 1})
     chosen = {round(i * (len(steps) - 1) / (NUM_STILLS - 1)): i for i in range(NUM_STILLS)}
-    writer = imageio_ffmpeg.write_frames(str(path), SIZE, fps=1.0 / (period_s * stride), quality=7, macro_block_size=4)
+    rate_hz = 1.0 / (period_s * stride)
+    writer = imageio_ffmpeg.write_frames(str(path), SIZE, fps=rate_hz, quality=7, macro_block_size=4)  # pyright: ignore[reportArgumentType]
     writer.send(None)
     try:
         for count, picture in enumerate(draw(steps)):

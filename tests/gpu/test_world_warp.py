@@ -11,7 +11,7 @@ pytestmark = pytest.mark.gpu
 
 NUM_WORLDS = 64
 SPEC = Warp(
-    num_worlds=NUM_WORLDS, substeps=5, num_contacts=16, num_constraints=48, iterations=20, linesearch_iterations=20, tolerance=1e-6
+    num_worlds=NUM_WORLDS, substeps=5, num_contacts=16, num_constraints=40, iterations=20, linesearch_iterations=20, tolerance=1e-6
 )
 
 

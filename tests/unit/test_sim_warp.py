@@ -11,7 +11,7 @@ from brokk_rl.sim.warp import Warp
 
 NUM_WORLDS = 8
 WARP = Warp(
-    num_worlds=NUM_WORLDS, substeps=5, num_contacts=16, num_constraints=48, iterations=6, linesearch_iterations=8, tolerance=1e-6
+    num_worlds=NUM_WORLDS, substeps=5, num_contacts=16, num_constraints=40, iterations=6, linesearch_iterations=8, tolerance=1e-6
 )
 NATIVE = Native(num_worlds=NUM_WORLDS, substeps=5, num_threads=2)
 
