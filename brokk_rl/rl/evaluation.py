@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import binomtest
 
 from brokk_rl.contracts import Policy
+from brokk_rl.intervals import wilson
 from brokk_rl.rl.vec_env import ControlLoop, Starts
 
 
@@ -76,12 +76,6 @@ def evaluate(loop: ControlLoop, policy: Policy, starts: Starts, seed: int, num_r
     return _summary(figures, reason, loop), _episodes(tape, starts, figures, loop), torch.cat(seen)
 
 
-def proportion(successes: int, count: int) -> dict[str, Any]:
-    """Returns a share with its 95 % Wilson interval."""
-    interval = binomtest(successes, count).proportion_ci(0.95, method="wilson")
-    return {"mean": successes / count, "ci95": [float(interval.low), float(interval.high)]}
-
-
 def _summary(figures: dict[str, torch.Tensor], reason: torch.Tensor, loop: ControlLoop) -> dict[str, Any]:
     table = {name: value.cpu().numpy() for name, value in figures.items()}
     strict, paper = table["success_strict"] > 0, table["success_paper"] > 0
@@ -89,8 +83,8 @@ def _summary(figures: dict[str, torch.Tensor], reason: torch.Tensor, loop: Contr
     endings = reason.cpu().numpy()
     return {
         "episodes": len(strict),
-        "success_strict": proportion(int(strict.sum()), len(strict)),
-        "success_paper": proportion(int(paper.sum()), len(strict)),
+        "success_strict": _share(strict),
+        "success_paper": _share(paper),
         "time_to_insert_s": {
             "median": float(np.median(times)) if len(times) else None,
             "p95": float(np.quantile(times, 0.95)) if len(times) else None,
@@ -100,6 +94,11 @@ def _summary(figures: dict[str, torch.Tensor], reason: torch.Tensor, loop: Contr
         "valve_travel": float(table["valve_travel"].mean()),
         "terminations": {name: int((endings == index).sum()) for index, name in enumerate(loop.task.reasons)},
     }
+
+
+def _share(happened: np.ndarray) -> dict[str, Any]:
+    low, high = wilson(int(happened.sum()), len(happened))
+    return {"mean": float(happened.mean()), "ci95": [low, high]}
 
 
 def _episodes(tape: list[tuple[torch.Tensor, ...]], starts: Starts, figures: dict[str, torch.Tensor], loop: ControlLoop) -> list[Episode]:

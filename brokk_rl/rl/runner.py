@@ -7,6 +7,7 @@ import copy
 import io
 import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ class Runner(OnPolicyRunner):
                 # the first round is short and shows how long one takes
                 left = (budget.max_seconds - book.seconds) * book.env_steps / book.seconds / steps if book.env_steps else 1
                 rounds = min(rounds, max(1, round(left)))
-            with contextlib.redirect_stdout(io.StringIO()):
+            with contextlib.redirect_stdout(io.StringIO()), _tensor_cores(self.env.graph_active):
                 self.learn(rounds, init_at_random_ep_len=first and self.training.random_episode_lengths)
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
@@ -175,6 +176,21 @@ class Runner(OnPolicyRunner):
         self.current_learning_iteration = content["iter"]
         set_random_state(content["random"], self.device)
         return {}
+
+
+@contextlib.contextmanager
+def _tensor_cores(allowed: bool) -> Iterator[None]:
+    """Lets matrix products use TF32 meanwhile.
+
+    Only where the control step is a captured graph, whose kernels were chosen before: ten bits of mantissa are enough for a network, but
+    would put the tool of a 5 m arm millimetres off.
+    """
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if allowed else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def checkpoints(folder: Path) -> list[Path]:
