@@ -1,9 +1,10 @@
 """The policy's observation vector (paper, Table I), the same code in training and on the machine.
 
-Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first (H x J); 133 numbers for five joints
-and 13 samples. A task in which the wanted pitch of the tool differs from episode to episode appends it as one more number. Each part is
-normalised with an approximate mean and standard deviation that follow from the configuration, so that a policy carries no hidden
-statistics.
+Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first (H x J); 133 numbers for five
+    joints
+and 13 samples. A task in which the wanted pitch of the tool differs from episode to episode appends it as one more number. Each
+part is normalised with an approximate mean and standard deviation that follow from the configuration, so that a policy carries no
+hidden statistics.
 """
 
 from collections.abc import Callable
@@ -22,8 +23,8 @@ class Scaling:
     Attributes:
         target_mean_m: Approximate mean of the target point in the base frame.
         target_std_m: Its approximate standard deviation.
-        pitch_rad: Approximate mean and standard deviation of the wanted pitch where it differs from episode to episode and so belongs
-            to the vector; `null` where the task fixes it.
+        pitch_rad: Approximate mean and standard deviation of the wanted pitch where it differs from episode to episode and so
+            belongs to the vector; `null` where the task fixes it.
     """
 
     target_mean_m: tuple[float, float, float]
@@ -58,11 +59,11 @@ class Encoder:
         self.has_pitch = scaling.pitch_rad is not None
         self.size = size(machine, self.has_pitch)
         self._concat = concat
-        self._target_mean_m = constant(np.float32(scaling.target_mean_m))
-        self._target_std_m = constant(np.float32(scaling.target_std_m))
+        self._target_mean_m = constant(np.array(scaling.target_mean_m, np.float32))
+        self._target_std_m = constant(np.array(scaling.target_std_m, np.float32))
         self._pitch_mean_rad, self._pitch_std_rad = scaling.pitch_rad or (0.0, 1.0)
-        self._q_mean = constant(np.float32((machine.lower + machine.upper) / 2))
-        self._q_std = constant(np.float32((machine.upper - machine.lower) / 4))
+        self._q_mean = constant(((machine.lower + machine.upper) / 2).astype(np.float32))
+        self._q_std = constant(((machine.upper - machine.lower) / 4).astype(np.float32))
 
     def encode(self, target_in_base_m: Any, q: Any, u: Any, pitch_rad: Any = None) -> Any:
         """Returns the vector, shape `(N, size)`.

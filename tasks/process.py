@@ -1,8 +1,8 @@
 """A tool-pose task at work: episodes, observations, masks and judgement for `N` environments at once.
 
-What differs between tasks (which target, what success means) is in the `Goal` that a task hands in; everything here is the same for all of
-them. No method synchronises with the host, and every tensor of `state` and `episode` keeps its address, so that the whole control step can
-be captured in one CUDA graph.
+What differs between tasks (which target, what success means) is in the `Goal` that a task hands in; everything here is the same
+for all of them. No method synchronises with the host, and every tensor of `state` and `episode` keeps its address, so that the
+whole control step can be captured in one CUDA graph.
 """
 
 import math
@@ -58,14 +58,14 @@ class Options:
 
     @classmethod
     def of(cls, task: object, **fixed: Any) -> Self:
-        """Returns the options of a task's spec, whose fields have the same names; `fixed` are those that the task does not leave open."""
+        """Returns the options of a task's spec, whose fields have the same names; the task does not leave `fixed` open."""
         return cls(**{field.name: fixed[field.name] if field.name in fixed else getattr(task, field.name) for field in fields(cls)})
 
 
 class ToolPoseProcess:
     """See the module; fulfils `brokk_rl.contracts.TaskProcess`."""
 
-    reasons = REASONS
+    reasons: tuple[str, ...] = REASONS
 
     def __init__(self, goal: Goal, options: Options, machine: Machine, num_envs: int, device: torch.device) -> None:
         def constant(values: object) -> torch.Tensor:
@@ -115,7 +115,11 @@ class ToolPoseProcess:
         flat = torch.sqrt(1 - lift.square())
         bias = torch.stack((flat * turn.cos(), flat * turn.sin(), lift), 1) * uniform[:, 2:3] * noise.target_bias_m
         fresh = {f"start.{key}": value for key, value in start.items()}
-        fresh |= {"bias_m": bias, "q_scale": 1 + noise.q_scale * (2 * uniform[:, 3] - 1), "u_scale": 1 + noise.u_scale * (2 * uniform[:, 4] - 1)}
+        fresh |= {
+            "bias_m": bias,
+            "q_scale": 1 + noise.q_scale * (2 * uniform[:, 3] - 1),
+            "u_scale": 1 + noise.u_scale * (2 * uniform[:, 4] - 1),
+        }
         fresh["closeness"] = start["closeness"]
         zero = torch.zeros((), device=mask.device)
         for name, value in state.items():
@@ -181,7 +185,7 @@ class ToolPoseProcess:
         return Transition(reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason)
 
     def observe(self, history: History) -> dict[str, torch.Tensor]:
-        """See `TaskProcess.observe`: `policy`, `guide` (what the classical controller makes of it), `privileged` (for the critic)."""
+        """See `TaskProcess.observe`: `policy`, `guide` (what the classical controller makes of it), `privileged` (critic only)."""
         self._perceive(history)
         return {"policy": self.state["policy"], "guide": self.state["features"], "privileged": self.state["privileged"]}
 
@@ -259,8 +263,8 @@ class ToolPoseProcess:
 class Deployable(torch.nn.Module):
     """The whole policy as it runs on the machine: from the observation vector `(B, O)` to masked commands `(B, J)`.
 
-    Everything that training computes beside the paper's observation (guidance, phase, residual, masks) is inside, so that nothing of it
-    has to be written again, in another order or scale, where the policy is deployed.
+    Everything that training computes beside the paper's observation (guidance, phase, residual, masks) is inside, so that nothing
+    of it has to be written again, in another order or scale, where the policy is deployed.
     """
 
     def __init__(self, process: ToolPoseProcess, network: torch.nn.Module) -> None:

@@ -1,7 +1,7 @@
 """Reward terms: free functions from the state after a control step to one number per environment, shape `(N,)`.
 
-A task lists the terms it uses with their weights in its YAML (`task.reward.<name>.weight=…`); an extension names its own functions there
-by `package.module:function`. The six terms of the paper's equation 1 carry the symbol of their term in the docstring.
+A task lists the terms it uses with their weights in its YAML (`task.reward.<name>.weight=…`); an extension names its own functions
+there by `package.module:function`. The six terms of the paper's equation 1 carry the symbol of their term in the docstring.
 """
 
 from pkgutil import resolve_name
@@ -29,7 +29,9 @@ class Term:
         try:
             resolve_name(self.function)
         except (ImportError, AttributeError, ValueError) as error:
-            raise ConfigError(f"reward term '{self.function}' cannot be found ({error}); expected package.module:function") from error
+            raise ConfigError(
+                f"reward term '{self.function}' cannot be found ({error}); expected package.module:function"
+            ) from error
 
     def __call__(self, state: ToolState) -> torch.Tensor:
         """Returns the weighted term, `(N,)`."""
@@ -76,7 +78,7 @@ def command_change(state: ToolState) -> torch.Tensor:
 
 
 def progress(state: ToolState) -> torch.Tensor:
-    """Gain of closeness in this step: a potential, so that it changes what is learned first but not what is best (Ng et al. 1999)."""
+    """Gain of closeness: a potential, so that it changes what is learned first but not what is best (Ng et al. 1999)."""
     return state.closeness - state.closeness_before
 
 

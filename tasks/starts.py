@@ -1,7 +1,8 @@
 """Random starts from which a tool-pose task can be done.
 
-A start is kept only if the tool begins in the open and if, after the exclusive joints have brought the target into reach, the other joints
-reach the wanted pose within their limits. Checked once with the kinematics when a task is built, so that resets only pick rows.
+A start is kept only if the tool begins in the open and if, after the exclusive joints have brought the target into reach, the
+other joints reach the wanted pose within their limits. Checked once with the kinematics when a task is built, so that resets only
+pick rows.
 """
 
 from collections.abc import Callable
@@ -123,7 +124,8 @@ def reachable(
 ) -> torch.Tensor:
     """Returns from which `q`, `(M, J)`, the target pose can be reached under the masks, `(M,)` bool.
 
-    First the exclusive joints move until the reach lies well inside the good working range, then the others by damped least squares.
+    First the exclusive joints move until the reach lies well inside the good working range, then the others by damped least
+    squares.
     """
     exclusive = torch.as_tensor(machine.is_exclusive)
     lower = torch.as_tensor(machine.lower, dtype=torch.float32) + margin_rad
@@ -157,5 +159,7 @@ def keep(count: int, drawn: list[dict[str, torch.Tensor]], what: str) -> dict[st
     joined = {key: torch.cat([batch[key] for batch in drawn]) for key in drawn[0]}
     found = len(joined["q"])
     if found < count:
-        raise ConfigError(f"{what}: only {found} of {count} starts were reachable; widen the joint limits or narrow the ranges of the task")
+        raise ConfigError(
+            f"{what}: only {found} of {count} starts were reachable; widen the joint limits or narrow the ranges of the task"
+        )
     return {key: value[:count] for key, value in joined.items()}

@@ -1,8 +1,8 @@
 """Bringing the tool to a pose: what the tasks of this package share.
 
-A task of this family has a target point and a wanted pitch. The policy sees an estimate of the target that is wrong in the way a camera is
-wrong, positions and commands through a scale that is slightly off, and acts under the masks of the machine: the exclusive joints alone
-while positioning, all others afterwards.
+A task of this family has a target point and a wanted pitch. The policy sees an estimate of the target that is wrong in the way a
+camera is wrong, positions and commands through a scale that is slightly off, and acts under the masks of the machine: the
+exclusive joints alone while positioning, all others afterwards.
 """
 
 from typing import Literal
@@ -21,7 +21,8 @@ class Noise:
         target_sample_m: Uniform error of the target in each sample and axis (±).
         target_bias_m: Length of the constant error of the target, uniform from 0, in a random direction.
         target_relative: Uniform error of each sample as a share of each coordinate (±); the paper's 5 %.
-        filter: `mean` gives the policy the mean of all estimates of the episode, as a tracker of a fixed hole does; `none` each sample.
+        filter: `mean` gives the policy the mean of all estimates of the episode, as a tracker of a fixed hole does; `none` each
+            sample.
         q_scale: Scale error of all measured positions (±).
         u_scale: Scale error of all recorded commands (±).
     """
@@ -39,9 +40,10 @@ class Switch:
     """When only the exclusive joints move (paper, section III-B).
 
     Attributes:
-        rule: `planar`: while the reach, with the target turned into the arm's plane, is out of range and the tool is not low; it does not
-            depend on where q1 points and always lets the episode proceed. `text`: the same with the distance in space, as the paper's text
-            says. `equation`: while that distance is out of range or the tool is above the height, as the paper's equation 1 says.
+        rule: `planar`: while the reach, with the target turned into the arm's plane, is out of range and the tool is not low; it
+            does not depend on where q1 points and always lets the episode proceed. `text`: the same with the distance in space, as
+            the paper's text says. `equation`: while that distance is out of range or the tool is above the height, as the paper's
+            equation 1 says.
         reach_m: The good working range (nearest, farthest).
         height_m: Height of the tool below which the exclusive joints rest, to keep it off the ground.
     """

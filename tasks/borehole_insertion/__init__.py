@@ -127,7 +127,9 @@ class Insertion:
             )
 
         controller = task.classical.build(self._machine, torch.device("cpu"))
-        return random_starts(count, seed, draw, task.arms, self._machine, controller, task.switch.reach_m, task.depth_m, "borehole_insertion")
+        return random_starts(
+            count, seed, draw, task.arms, self._machine, controller, task.switch.reach_m, task.depth_m, "borehole_insertion"
+        )
 
     def judge(self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """See `tasks.process.Goal`."""

@@ -90,7 +90,9 @@ class GoalPose:
 
     def check(self) -> None:
         if self.scaling.pitch_rad is None and self.pose.pitch_rad[0] != self.pose.pitch_rad[1]:
-            raise ConfigError("task.scaling.pitch_rad: the wanted pitch differs from episode to episode, so the policy must be told: give (mean, std)")
+            raise ConfigError(
+                "task.scaling.pitch_rad: the wanted pitch differs between episodes, so the policy must be told: give [mean, std]"
+            )
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Returns the task for `num_envs` environments on `device`."""
@@ -136,6 +138,6 @@ class Reaching:
 
 def _closeness(distance_m: torch.Tensor, turn_rad: torch.Tensor) -> torch.Tensor:
     """Returns how near a pose is to reached, 0 to 1: distance at three scales, pitch at three, and both together."""
-    near = sum(1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.05)) / 3
-    turned = sum(1 / (1 + turn_rad / scale) for scale in (1.0, 0.3, 0.05)) / 3
+    near = torch.stack([1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.05)]).mean(0)
+    turned = torch.stack([1 / (1 + turn_rad / scale) for scale in (1.0, 0.3, 0.05)]).mean(0)
     return 0.5 * near + 0.2 * turned + 0.3 * near * turned
