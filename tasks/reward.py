@@ -27,11 +27,13 @@ class Term:
 
     def check(self) -> None:
         try:
-            resolve_name(self.function)
+            found = resolve_name(self.function)
         except (ImportError, AttributeError, ValueError) as error:
             raise ConfigError(
                 f"reward term '{self.function}' cannot be found ({error}); expected package.module:function"
             ) from error
+        if not callable(found):
+            raise ConfigError(f"reward term '{self.function}' is no function; expected package.module:function")
 
     def __call__(self, state: ToolState) -> torch.Tensor:
         """Returns the weighted term, `(N,)`."""
@@ -60,7 +62,7 @@ def pitch(state: ToolState) -> torch.Tensor:
 
 def insertion(state: ToolState) -> torch.Tensor:
     """r^i: r^d + r^o (weighted five times in the paper) while the paper's criterion of success holds."""
-    return state.paper_success * (1.0 / (1.0 + state.distance_m) + 1.0 / (1.0 + state.pitch_error_rad))
+    return (state.paper_success & ~state.positioning) * (1.0 / (1.0 + state.distance_m) + 1.0 / (1.0 + state.pitch_error_rad))
 
 
 def far_contact(state: ToolState) -> torch.Tensor:
@@ -69,12 +71,17 @@ def far_contact(state: ToolState) -> torch.Tensor:
     return (far & ~state.positioning) * state.contact_force_n
 
 
-def command_change(state: ToolState) -> torch.Tensor:
-    """r^a: sum over joints of the change of command since the last step."""
-    return (state.u - state.u_before).abs().sum(1)
+def approach_command_change(state: ToolState) -> torch.Tensor:
+    """r^a: sum over joints of the change of command since the last step, once not positioning."""
+    return ~state.positioning * command_change(state)
 
 
 # beyond the paper
+
+
+def command_change(state: ToolState) -> torch.Tensor:
+    """Sum over joints of the change of command since the last step, in all phases."""
+    return (state.u - state.u_before).abs().sum(1)
 
 
 def progress(state: ToolState) -> torch.Tensor:

@@ -1,0 +1,112 @@
+"""Reward terms on numbers worked by hand; `state` is a machine that approaches a target 0.25 m away with a pitch error of 0.25 rad."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from brokk_rl.errors import ConfigError
+from tasks import reward
+from tasks.state import ToolState
+
+YES, NO = torch.tensor([True]), torch.tensor([False])
+
+
+@pytest.fixture
+def state() -> ToolState:
+    return ToolState(
+        tip_m=torch.tensor([[2.5, 0.0, 0.9]]),
+        pitch_rad=torch.tensor([1.25]),
+        target_m=torch.tensor([[2.5, 0.2, 0.75]]),  # 0.2 and 0.15 make 0.25
+        target_pitch_rad=torch.tensor([1.5]),
+        reach_m=torch.tensor([2.0]),
+        reach_range_m=(1.7, 2.4),
+        positioning=NO,
+        contact_force_n=torch.tensor([0.0]),
+        u=torch.tensor([[0.5, 0.0, -0.25, 0.0, 1.0]]),
+        u_before=torch.tensor([[0.25, 0.0, 0.25, 0.0, 1.0]]),
+        lateral_m=torch.tensor([0.2]),
+        success=NO,
+        paper_success=NO,
+        failed=NO,
+        closeness=torch.tensor([0.5]),
+        closeness_before=torch.tensor([0.375]),
+    )
+
+
+@pytest.mark.parametrize(
+    ("reach_m", "expected"),
+    [(2.9, 0.25 / 1.5), (2.4, 0.25), (1.7, 0.25), (1.2, 0.25 / 1.5), (3.4, 0.25 / 2)],
+)
+def test_working_distance_falls_off_outside_the_good_range(state: ToolState, reach_m: float, expected: float) -> None:
+    positioning = replace(state, positioning=YES, reach_m=torch.tensor([reach_m]))
+    assert reward.working_distance(positioning).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_while_positioning_only_the_working_distance_counts(state: ToolState) -> None:
+    positioning = replace(state, positioning=YES, contact_force_n=torch.tensor([900.0]), paper_success=YES)
+    for term in (reward.distance, reward.pitch, reward.insertion, reward.far_contact, reward.approach_command_change):
+        assert term(positioning).item() == 0.0, term.__name__
+    assert reward.working_distance(state).item() == 0.0, "and once it is done, all the others"
+
+
+def test_distance_is_one_over_one_plus_metres(state: ToolState) -> None:
+    assert reward.distance(state).item() == pytest.approx(1 / 1.25)
+
+
+def test_pitch_is_one_over_one_plus_radians_both_ways(state: ToolState) -> None:
+    assert reward.pitch(state).item() == pytest.approx(1 / 1.25)
+    assert reward.pitch(replace(state, pitch_rad=torch.tensor([1.75]))).item() == pytest.approx(1 / 1.25)
+
+
+def test_insertion_pays_both_alignments_while_the_papers_criterion_holds(state: ToolState) -> None:
+    assert reward.insertion(state).item() == 0.0
+    assert reward.insertion(replace(state, paper_success=YES)).item() == pytest.approx(0.8 + 0.8)
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "expected"), [(0.5, 120.0), (0.43, 120.0), (0.42, 0.0), (0.25, 0.0)]
+)  # r^d = 0.7 at 3/7 m = 0.4286 m
+def test_contact_costs_its_force_only_far_from_the_hole(state: ToolState, distance_m: float, expected: float) -> None:
+    touching = replace(state, contact_force_n=torch.tensor([120.0]), target_m=state.tip_m + torch.tensor([[0.0, 0.0, distance_m]]))
+    assert reward.far_contact(touching).item() == pytest.approx(expected)
+
+
+def test_command_change_sums_over_joints(state: ToolState) -> None:
+    assert reward.approach_command_change(state).item() == pytest.approx(0.25 + 0.5)
+    assert reward.command_change(replace(state, positioning=YES)).item() == pytest.approx(0.75), "this one counts everywhere"
+
+
+def test_the_papers_total_on_one_state(state: ToolState) -> None:
+    """r^d + r^o + r^i - r^c - r^a, 0.8 + 0.8 + 5 (0.8 + 0.8) - 0 - 0.0075."""
+    done = replace(state, paper_success=YES)
+    weights = {"distance": 1, "pitch": 1, "insertion": 5, "far_contact": -0.01, "approach_command_change": -0.01, "working_distance": 1}
+    total = sum(reward.Term(function=f"tasks.reward:{name}", weight=weight)(done) for name, weight in weights.items())
+    assert float(total) == pytest.approx(1.6 + 8.0 - 0.0075, rel=1e-5)
+
+
+def test_progress_is_the_gain_of_closeness(state: ToolState) -> None:
+    assert reward.progress(state).item() == 0.125
+
+
+def test_success_and_duration_are_one(state: ToolState) -> None:
+    assert reward.success(state).item() == 0.0 and reward.success(replace(state, success=YES)).item() == 1.0
+    assert reward.duration(state).item() == 1.0
+
+
+def test_failing_costs_one_and_what_was_gained(state: ToolState) -> None:
+    assert reward.failure(state).item() == 0.0
+    assert reward.failure(replace(state, failed=YES)).item() == 1.5
+
+
+def test_contact_counts_kilonewtons_up_to_ten(state: ToolState) -> None:
+    forces = torch.tensor([0.0, 2500.0, 80000.0])
+    assert reward.contact(replace(state, contact_force_n=forces)).tolist() == [0.0, 2.5, 10.0]
+
+
+@pytest.mark.parametrize("function", ["tasks.reward:nonsense", "no.such.module:f", "tasks.reward"])
+def test_a_term_that_is_no_function_is_refused(function: str) -> None:
+    with pytest.raises(ConfigError, match="expected package.module:function"):
+        reward.Term(function=function, weight=1.0)
