@@ -49,6 +49,7 @@ class Options:
     end_on_success: bool
     limit_margin: float
     depth_m: float
+    memory: int
     noise: Noise
     switch: Switch
     action: Action
@@ -203,6 +204,14 @@ class ToolPoseProcess:
         """See `TaskProcess.deployable`."""
         return Deployable(self, network)
 
+    def remembered(self, q: torch.Tensor, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the history that the policy sees, `(N, H, J)` each: samples older than `memory` look like a machine at rest before them."""
+        forgotten = q.shape[1] - self.options.memory
+        if forgotten <= 0:
+            return q, u
+        still = q[:, forgotten : forgotten + 1].expand(-1, forgotten, -1)
+        return torch.cat((still, q[:, forgotten:]), 1), torch.cat((torch.zeros_like(still), u[:, forgotten:]), 1)
+
     def _start(self) -> dict[str, torch.Tensor]:
         return {name.removeprefix("start."): value for name, value in self.state.items() if name.startswith("start.")}
 
@@ -234,8 +243,7 @@ class ToolPoseProcess:
             # the observation after the reset is the first sample
             sample = state["estimate_sum_m"] / (state["age"] + 1)[:, None]
         state["estimate_m"].copy_(sample)
-        q = history.q * state["q_scale"][:, None, None]
-        u = history.u * state["u_scale"][:, None, None]
+        q, u = self.remembered(history.q * state["q_scale"][:, None, None], history.u * state["u_scale"][:, None, None])
         pitch_rad = state["start.target_pitch_rad"]
         guidance = self._controller.guide(q, u, sample - self._down, pitch_rad, self.options.switch.reach_m)
         positioning = self.options.switch.positioning(guidance)
@@ -277,10 +285,13 @@ class Deployable(torch.nn.Module):
         """Returns valve commands, `(B, J)` in [-1, 1]."""
         process, options = self._process, self._process.options
         target_m, q, u = process._encoder.decode(observation)
+        q, u = process.remembered(q, u)
         varies = process._encoder.has_pitch
         pitch = process._encoder.decode_pitch(observation) if varies else torch.full_like(target_m[:, 0], self._pitch_rad)
         guidance = process._controller.guide(q, u, target_m - process._down, pitch, options.switch.reach_m)
         positioning = options.switch.positioning(guidance)
+        if options.memory < q.shape[1]:
+            observation = process._encoder.encode(target_m, q, u, pitch)
         groups = {"policy": observation, "guide": features(guidance, positioning, u[:, -1])}
         return options.action.command(self.network(groups), guidance.command, positioning, process._exclusive)
 

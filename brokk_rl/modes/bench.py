@@ -90,7 +90,7 @@ class Bench:
         graphs = device.type == "cuda" and loop.world.supports_graphs
         physics = capture(lambda: loop.world.step(still), device).replay if graphs else lambda: loop.world.step(still)
         physics_s = self._time(physics, device)
-        loop.capture()
+        loop.capture(self.rl.fuse)
         action = torch.zeros(num, loop.num_actions, device=device)
         step_s = self._time(lambda: loop.step(action), device)
         runner_steps = int(self.rl.runner["num_steps_per_env"])

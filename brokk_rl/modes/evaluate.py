@@ -15,6 +15,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import Episode, evaluate
 from brokk_rl.rl.vec_env import ControlLoop, Plant
 from brokk_rl.session import Session, write_json
+from brokk_rl.sim.video import render_video
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -120,8 +121,6 @@ def evaluate_policies(
     _print(table)
     if evaluation.video:
         shown = next((episode for episode in recorded[first] if episode.success), recorded[first][0])
-        from brokk_rl.sim.video import render_video
-
         path = render_video(plant.machine, shown, session.folder / "insertion.mp4")
         log.info("video of one episode: %s", path)
     return results, seen[first]

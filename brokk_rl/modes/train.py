@@ -59,7 +59,7 @@ class Train:
         self.session.seed_all()
         plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect)
         loop = plant.build(device, self.rl.num_envs, self.rl.num_starts, self.session.stream("starts"))
-        loop.capture()
+        loop.capture(self.rl.fuse)
         state = "active" if loop.graph_active else "not used (they need sim=warp on a GPU)"
         log.info("%d environments on %s, %s; CUDA graphs: %s", loop.num_envs, device, type(loop.world).__name__, state)
         self.session.seed_all()  # capturing has drawn random numbers

@@ -190,7 +190,8 @@ class ControlLoop(VecEnv):
 
     def _judge(self) -> Starts:
         """Judges what the world has done; returns where the finished environments start anew."""
-        self.history.push_q(self.world.q)
+        # a world that became NaN is a fault and starts anew; its numbers must not poison the sums over all worlds
+        self.history.push_q(self.world.q.nan_to_num())
         transition = self.task.step(self.history, self.world)
         done = transition.terminated | transition.timed_out
         self.reward.copy_(transition.reward)

@@ -70,6 +70,7 @@ class BoreholeInsertion:
         hole: Where the hole may be.
         arms: Where the arm may begin.
         success: Criteria.
+        memory: Newest samples of history that the policy sees; the machine's `num_history` for all of them.
         noise: What the policy is told is wrong by.
         switch: When only q2 moves.
         action: How the policy's output becomes commands.
@@ -85,6 +86,7 @@ class BoreholeInsertion:
     hole: Hole
     arms: Arms
     success: Success
+    memory: int
     noise: Noise
     switch: Switch
     action: Action

@@ -67,6 +67,7 @@ class GoalPose:
         pose: Which poses are asked for.
         arms: Where the arm may begin.
         tolerance: Criteria of success.
+        memory: Newest samples of history that the policy sees; the machine's `num_history` for all of them.
         noise: What the policy is told is wrong by.
         switch: When only q2 moves.
         action: How the policy's output becomes commands.
@@ -81,6 +82,7 @@ class GoalPose:
     pose: Pose
     arms: Arms
     tolerance: Tolerance
+    memory: int
     noise: Noise
     switch: Switch
     action: Action
