@@ -97,8 +97,8 @@ class Kinematics:
             tip_in_base_m=origins[:, -1].reshape(*lead, 3),
             axis_in_base=axis.reshape(*lead, 3),
             pitch_rad=pitch.reshape(lead),
-            joints_in_base_m=origins[:, :-1].reshape(*lead, -1, 3),
-            axes_in_base=directions[:, :-1].reshape(*lead, -1, 3),
+            joints_in_base_m=origins[:, :-1].reshape(*lead, self._num_joints, 3),
+            axes_in_base=directions[:, :-1].reshape(*lead, self._num_joints, 3),
         )
 
     def _jacobian(self, chain: tuple[torch.Tensor, torch.Tensor, torch.Tensor], lead: torch.Size) -> Jacobian:
@@ -110,7 +110,7 @@ class Kinematics:
         down, ahead = tool[:, 2:3], (tool * heading).sum(-1, keepdim=True)
         lever = torch.linalg.cross(tool, heading * down - self._up * ahead) / (down * down + ahead * ahead)
         pitch = (axes @ lever[:, :, None])[..., 0] * self._turns_tool
-        return Jacobian(tip.reshape(*lead, 3, -1), pitch.reshape(*lead, -1))
+        return Jacobian(tip.reshape(*lead, 3, self._num_joints), pitch.reshape(*lead, self._num_joints))
 
     def _chain(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Returns origins `(B, J + 1, 3)` (joints, then tip), unit axes likewise (last: the tool's) and the heading `(B, 3)`."""

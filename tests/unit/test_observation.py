@@ -18,7 +18,12 @@ def samples(machine: Machine, count: int = 4) -> tuple[np.ndarray, np.ndarray, n
     target = generator.uniform((2, -1, 0.6), (3, 1, 0.9), (count, 3))
     q = generator.uniform(machine.lower, machine.upper, (count, machine.num_history, machine.num_joints))
     u = generator.uniform(-1, 1, q.shape)
-    return target.astype(np.float32), q.astype(np.float32), u.astype(np.float32), generator.uniform(0.6, 2, count).astype(np.float32)
+    return (
+        target.astype(np.float32),
+        q.astype(np.float32),
+        u.astype(np.float32),
+        generator.uniform(0.6, 2, count).astype(np.float32),
+    )
 
 
 def in_torch(machine: Machine, scaling: Scaling) -> Encoder:

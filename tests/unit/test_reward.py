@@ -36,10 +36,7 @@ def state() -> ToolState:
     )
 
 
-@pytest.mark.parametrize(
-    ("reach_m", "expected"),
-    [(2.9, 0.25 / 1.5), (2.4, 0.25), (1.7, 0.25), (1.2, 0.25 / 1.5), (3.4, 0.25 / 2)],
-)
+@pytest.mark.parametrize(("reach_m", "expected"), [(2.9, 0.25 / 1.5), (2.4, 0.25), (1.7, 0.25), (1.2, 0.25 / 1.5), (3.4, 0.25 / 2)])
 def test_working_distance_falls_off_outside_the_good_range(state: ToolState, reach_m: float, expected: float) -> None:
     positioning = replace(state, positioning=YES, reach_m=torch.tensor([reach_m]))
     assert reward.working_distance(positioning).item() == pytest.approx(expected, rel=1e-5)
@@ -82,7 +79,14 @@ def test_command_change_sums_over_joints(state: ToolState) -> None:
 def test_the_papers_total_on_one_state(state: ToolState) -> None:
     """r^d + r^o + r^i - r^c - r^a, 0.8 + 0.8 + 5 (0.8 + 0.8) - 0 - 0.0075."""
     done = replace(state, paper_success=YES)
-    weights = {"distance": 1, "pitch": 1, "insertion": 5, "far_contact": -0.01, "approach_command_change": -0.01, "working_distance": 1}
+    weights = {
+        "distance": 1,
+        "pitch": 1,
+        "insertion": 5,
+        "far_contact": -0.01,
+        "approach_command_change": -0.01,
+        "working_distance": 1,
+    }
     total = sum(reward.Term(function=f"tasks.reward:{name}", weight=weight)(done) for name, weight in weights.items())
     assert float(total) == pytest.approx(1.6 + 8.0 - 0.0075, rel=1e-5)
 

@@ -19,9 +19,7 @@ def switch(rule: str) -> Switch:
 
 
 def seen(reach_m: float, reach_3d_m: float, tip_z_m: float) -> Any:
-    return SimpleNamespace(
-        reach_m=torch.tensor([reach_m]), reach_3d_m=torch.tensor([reach_3d_m]), tip_z_m=torch.tensor([tip_z_m])
-    )
+    return SimpleNamespace(reach_m=torch.tensor([reach_m]), reach_3d_m=torch.tensor([reach_3d_m]), tip_z_m=torch.tensor([tip_z_m]))
 
 
 @pytest.mark.parametrize(
@@ -37,7 +35,9 @@ def seen(reach_m: float, reach_3d_m: float, tip_z_m: float) -> Any:
         (2.4, 2.4, 0.1, False, False, False),
     ],
 )
-def test_each_rule_of_the_switch(reach_m: float, reach_3d_m: float, tip_z_m: float, planar: bool, text: bool, equation: bool) -> None:
+def test_each_rule_of_the_switch(
+    reach_m: float, reach_3d_m: float, tip_z_m: float, planar: bool, text: bool, equation: bool
+) -> None:
     for rule, expected in (("planar", planar), ("text", text), ("equation", equation)):
         assert switch(rule).positioning(seen(reach_m, reach_3d_m, tip_z_m)).item() is expected, rule
 

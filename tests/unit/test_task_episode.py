@@ -1,0 +1,370 @@
+"""Episodes of tool-pose tasks: starts, criteria at their edges, endings, figures and noise, in a world that a test writes by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from composed import option
+from kinematic import KinematicWorld
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from tasks.process import REASONS
+from tasks.starts import keep, reachable
+
+CPU = torch.device("cpu")
+TASKS = ("borehole_insertion", "goal_pose")
+
+
+class Stage:
+    """One or more environments of a task whose arm stands where a test puts it."""
+
+    def __init__(self, machine: Machine, name: str = "borehole_insertion", num_envs: int = 1, **changes: Any) -> None:
+        self.task = replace(option("task", name), **changes)
+        self.process: Any = self.task.build(machine, num_envs, CPU)
+        self.world = KinematicWorld(machine, num_envs)
+        start = self.process.starts(num_envs, 1)
+        self.history = History(
+            q=start["q"][:, None].repeat(1, machine.num_history, 1), u=torch.zeros(num_envs, machine.num_history, 5)
+        )
+        self.process.reset(torch.ones(num_envs, dtype=torch.bool), start)
+        self.start = start
+        self.tip_m = Kinematics(machine).pose(start["q"]).tip_in_base_m
+
+    def target_below_tip(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> None:
+        """Puts the target so that the tool stands at (x, y, z) from it."""
+        self.process.state["start.target_m"].copy_(self.tip_m - torch.tensor([x_m, y_m, z_m]))
+
+    def step(self) -> Any:
+        return self.process.step(self.history, self.world)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_starts_lie_within_the_limits_and_in_the_open(name: str, machine: Machine) -> None:
+    task = option("task", name)
+    start = task.build(machine, 1, CPU).starts(256, 5)
+    lower, upper = torch.tensor(machine.lower), torch.tensor(machine.upper)
+    margin = task.arms.margin_rad - 1e-5
+    assert ((start["q"] >= lower + margin) & (start["q"] <= upper - margin)).all()
+    tip = Kinematics(machine).pose(start["q"]).tip_in_base_m
+    top = start["scene"][:, 2] if name == "borehole_insertion" else torch.zeros(256)
+    assert (tip[:, 2] > top + task.arms.clearance_m).all() and (tip[:, 2] > task.arms.floor_m).all()
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_same_seed_gives_the_same_starts_and_another_others(name: str, machine: Machine) -> None:
+    process = option("task", name).build(machine, 1, CPU)
+    first, again, other = process.starts(32, 3), process.starts(32, 3), process.starts(32, 4)
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    assert not torch.equal(first["q"], other["q"]) and not torch.equal(first["target_m"], other["target_m"])
+
+
+def test_holes_lie_in_their_ranges_and_the_scene_holds_the_target(machine: Machine) -> None:
+    task = option("task", "borehole_insertion")
+    start = task.build(machine, 1, CPU).starts(256, 5)
+    assert torch.equal(start["scene"][:, :3], start["target_m"])
+    far = start["target_m"][:, :2].norm(dim=1)
+    assert ((far >= 2.3 - 1e-5) & (far <= 3.5 + 1e-5)).all()
+    assert ((start["scene"][:, 4] >= 1.0) & (start["scene"][:, 4] <= 1.1)).all()
+    assert (start["target_pitch_rad"] == torch.tensor(torch.pi / 2)).all()
+
+
+def test_poses_have_many_pitches_and_no_block_near(machine: Machine) -> None:
+    start = option("task", "goal_pose").build(machine, 1, CPU).starts(256, 5)
+    pitch = start["target_pitch_rad"]
+    assert pitch.min() >= 0.6 and pitch.max() <= 2.0 and pitch.std() > 0.2
+    assert ((start["scene"][:, :2] - start["target_m"][:, :2]).norm(dim=1) > 15.0).all()
+
+
+def test_too_few_reachable_starts_are_an_error_that_says_what_to_change() -> None:
+    with pytest.raises(ConfigError, match="goal_pose: only 2 of 3 starts were reachable; widen the joint limits"):
+        keep(3, [{"q": torch.zeros(2, 5)}, {"q": torch.zeros(0, 5)}], "goal_pose")
+
+
+def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
+    task = option("task", "goal_pose")
+    controller = task.classical.build(machine, CPU)
+    found = reachable(controller, machine, torch.zeros(0, 5), torch.zeros(0, 3), torch.zeros(0), (1.7, 2.4), 0.1)
+    assert found.shape == (0,)
+
+
+def test_a_pitch_that_varies_must_be_told_to_the_policy() -> None:
+    task = option("task", "goal_pose")
+    with pytest.raises(ConfigError, match="policy must be told"):
+        replace(task, scaling=replace(task.scaling, pitch_rad=None))
+
+
+def judged(machine: Machine, name: str, at_m: tuple[float, float, float], pitch_rad: float = torch.pi / 2) -> tuple[bool, bool]:
+    """Returns strict and paper's success of a tool at `at_m` from the target point, which wants to be met straight down."""
+    goal: Any = option("task", name).build(machine, 1, CPU)
+    start = {"target_m": torch.tensor([[2.5, 0.5, 0.75]]), "target_pitch_rad": torch.tensor([torch.pi / 2])}
+    verdict = goal.goal.judge(start["target_m"] + torch.tensor([at_m]), torch.tensor([pitch_rad]), start)
+    return bool(verdict["success"]), bool(verdict["paper_success"])
+
+
+@pytest.mark.parametrize(
+    ("at_m", "strict"),
+    [
+        ((0.0, 0.0, -0.101), True),  # 0.10 m below the rim
+        ((0.0, 0.0, -0.099), False),
+        ((0.0, 0.0, -0.30), True),  # deeper is as good
+        ((0.0125, 0.0, -0.12), True),  # 5 cm hole, 4 cm chisel and 3 mm of slack leave 13 mm
+        ((0.0, -0.0135, -0.12), False),  # that deep beside the hole would be in the concrete
+        ((0.0095, 0.0095, -0.12), False),  # 13.4 mm off axis
+        ((0.0, 0.0, 0.2), False),
+    ],
+)
+def test_strict_insertion_needs_depth_inside_the_hole(at_m: tuple[float, float, float], strict: bool, machine: Machine) -> None:
+    assert judged(machine, "borehole_insertion", at_m)[0] is strict
+
+
+@pytest.mark.parametrize(
+    ("at_m", "turn_rad", "paper"),
+    [
+        ((0.0, 0.0, -0.14), 0.0, True),
+        ((0.0, 0.0, -0.051), 0.0, True),  # 5 cm below the rim is the height limit, and 8.9 cm from the target point
+        ((0.0, 0.0, -0.049), 0.0, False),
+        ((0.11, 0.0, -0.14), 0.0, True),  # 1 / 1.11 = 0.901; the paper does not ask to be inside the hole
+        ((0.112, 0.0, -0.14), 0.0, False),  # 1 / 1.112 = 0.899
+        ((0.0, 0.0, -0.14), 0.110, True),
+        ((0.0, 0.0, -0.14), -0.112, False),
+    ],
+)
+def test_the_papers_success_needs_alignment_and_height(
+    at_m: tuple[float, float, float], turn_rad: float, paper: bool, machine: Machine
+) -> None:
+    assert judged(machine, "borehole_insertion", at_m, torch.pi / 2 + turn_rad)[1] is paper
+
+
+@pytest.mark.parametrize(
+    ("at_m", "turn_rad", "strict", "paper"),
+    [
+        ((0.0, 0.0, 0.0), 0.0, True, True),
+        ((0.0, 0.0, 0.0295), 0.0, True, True),
+        ((0.0, 0.0, -0.0305), 0.0, False, True),
+        ((0.018, 0.018, 0.018), 0.0, False, True),  # 31 mm
+        ((0.0, 0.0, 0.0), 0.0495, True, True),
+        ((0.0, 0.0, 0.0), -0.0505, False, True),
+        ((0.112, 0.0, 0.0), 0.0, False, False),
+        ((0.0, 0.0, 0.0), 0.112, False, False),
+    ],
+)
+def test_a_pose_is_reached_within_three_centimetres_and_a_twentieth_of_a_radian(
+    at_m: tuple[float, float, float], turn_rad: float, strict: bool, paper: bool, machine: Machine
+) -> None:
+    assert judged(machine, "goal_pose", at_m, torch.pi / 2 + turn_rad) == (strict, paper)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_closeness_grows_on_the_way_from_none_to_one(name: str, machine: Machine) -> None:
+    goal = option("task", name).build(machine, 1, CPU).goal  # type: ignore[attr-defined]
+    depth_m = 0.14 if name == "borehole_insertion" else 0.0
+    height_m = torch.linspace(2.0, -depth_m, 50)
+    target = torch.tensor([[2.5, 0.0, 0.7]]).repeat(50, 1)
+    tip = target + torch.stack((0 * height_m, 0 * height_m, height_m), 1)
+    down = torch.full((50,), torch.pi / 2)
+    closeness = goal.judge(tip, down, {"target_m": target, "target_pitch_rad": down})["closeness"]
+    assert (closeness.diff() > 0).all() and closeness[0] > 0 and closeness[-1] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_start_in_contact_ends_at_once_with_no_reward(machine: Machine) -> None:
+    stage = Stage(machine)
+    stage.world.contact_force_n.fill_(500.0)
+    end = stage.step()
+    assert end.terminated.item() and not end.timed_out.item() and end.reward.item() == 0.0
+    assert REASONS[int(end.reason)] == "start_in_contact"
+
+
+def test_contact_later_in_the_episode_goes_on(machine: Machine) -> None:
+    stage = Stage(machine)
+    assert not stage.step().terminated.item()
+    stage.world.contact_force_n.fill_(500.0)
+    touched = stage.step()
+    assert not touched.terminated.item() and touched.reason.item() == -1 and touched.reward.item() != 0.0
+
+
+@pytest.mark.parametrize("joint", range(5))
+def test_a_joint_at_its_limit_ends_the_episode_as_a_failure(joint: int, machine: Machine) -> None:
+    stage = Stage(machine)
+    stage.step()
+    stage.history.q[0, -1, joint] = float(machine.upper[joint]) - 0.011
+    assert not stage.step().terminated.item(), "11 mrad from the end of the travel is still inside"
+    stage.history.q[0, -1, joint] = float(machine.upper[joint]) - 0.009
+    end = stage.step()
+    assert end.terminated.item() and not end.timed_out.item() and REASONS[int(end.reason)] == "joint_limit"
+    assert end.reward.item() < -5.0, "5 (1 + closeness) is lost"
+
+
+def test_the_time_limit_is_a_time_out_and_no_failure(machine: Machine) -> None:
+    stage = Stage(machine, episode_s=0.2)
+    ends = [stage.step() for _ in range(4)]
+    assert [bool(end.timed_out) for end in ends] == [False, False, False, True]
+    assert not any(bool(end.terminated) for end in ends) and REASONS[int(ends[3].reason)] == "time_limit"
+
+
+def test_an_episode_that_fails_in_its_last_step_is_no_time_out(machine: Machine) -> None:
+    stage = Stage(machine, episode_s=0.05)
+    stage.history.q[0, -1, 0] = float(machine.upper[0])
+    end = stage.step()
+    assert end.terminated.item() and not end.timed_out.item() and REASONS[int(end.reason)] == "joint_limit"
+
+
+def test_episodes_put_out_of_step_end_earlier_but_know_their_first_step(machine: Machine) -> None:
+    stage = Stage(machine, episode_s=1.0)
+    stage.process.state["steps"].fill_(18.0)  # what rsl-rl does through episode_length_buf
+    stage.world.contact_force_n.fill_(500.0)
+    assert REASONS[int(stage.step().reason)] == "start_in_contact"
+    stage.world.contact_force_n.fill_(0.0)
+    assert stage.step().timed_out.item()
+
+
+def test_a_fault_ends_the_episode_without_reward_or_success(machine: Machine) -> None:
+    stage = Stage(machine)
+    stage.target_below_tip(z_m=-0.12)
+    stage.world.faults.fill_(True)
+    end = stage.step()
+    assert end.terminated.item() and end.reward.item() == 0.0 and REASONS[int(end.reason)] == "fault"
+    assert stage.process.episode["success_strict"].item() == 0.0
+
+
+def test_success_ends_the_episode_only_where_it_shall(machine: Machine) -> None:
+    for ends in (True, False):
+        stage = Stage(machine, end_on_success=ends)
+        stage.step()
+        stage.target_below_tip(z_m=-0.12)
+        end = stage.step()
+        assert bool(end.terminated) is ends and (REASONS[int(end.reason)] == "success") is ends
+        assert stage.process.episode["success_strict"].item() == 1.0
+
+
+def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
+    """Five steps of 50 ms: commands 0.5, 0.5, -0.5 of q1 and still; 30 mm beside the hole, then inside at 0.2 s, then out again."""
+    task = option("task", "borehole_insertion")
+    stage = Stage(machine, end_on_success=False, action=replace(task.action, kind="direct", scale=1.0))
+    script = [  # command of q1, force, tool from the target
+        (0.5, 0.0, (0.03, 0.0, 0.5)),
+        (0.5, 900.0, (0.03, 0.0, 0.3)),
+        (-0.5, 400.0, (0.02, 0.0, 0.1)),
+        (-0.5, 0.0, (0.004, 0.003, -0.12)),
+        (-0.5, 0.0, (0.3, 0.0, 0.5)),
+    ]
+    for command, force_n, at_m in script:
+        stage.process.command(torch.tensor([[command, 0.9, 0.0, 0.0, 0.0]]))  # q2 is masked: not positioning
+        stage.world.contact_force_n.fill_(force_n)
+        stage.target_below_tip(*at_m)
+        stage.step()
+    figures = {name: value.item() for name, value in stage.process.episode.items()}
+    assert figures["valve_travel"] == pytest.approx((0.5 + 0 + 1.0 + 0 + 0) / 0.05 / 5)  # 6 full strokes a second
+    assert figures["time_to_insert_s"] == pytest.approx(0.2)
+    assert figures["lateral_error_m"] == pytest.approx(0.005, abs=1e-6)  # when it was inserted
+    assert figures["peak_force_n"] == 900.0
+    assert figures["length"] == 5 and figures["success_strict"] == 1.0
+
+
+def test_an_episode_never_inserted_reports_its_last_lateral_error(machine: Machine) -> None:
+    stage = Stage(machine)
+    for lateral_m in (0.3, 0.2, 0.06):
+        stage.target_below_tip(x_m=lateral_m, z_m=0.3)
+        stage.step()
+    assert stage.process.episode["lateral_error_m"].item() == pytest.approx(0.06, abs=1e-6)
+    assert stage.process.episode["time_to_insert_s"].item() == 0.0
+
+
+def estimates(stage: Stage, count: int) -> torch.Tensor:
+    """Returns the errors of the first estimates of an episode, `(count, N, 3)`."""
+    found = []
+    for _ in range(count):
+        stage.process.observe(stage.history)
+        found.append(stage.process.state["estimate_m"] - stage.process.state["start.target_m"])
+        stage.step()
+    return torch.stack(found)
+
+
+def noise(**changes: Any) -> Any:
+    silent = {
+        "target_sample_m": 0.0,
+        "target_bias_m": 0.0,
+        "target_relative": 0.0,
+        "filter": "none",
+        "q_scale": 0.0,
+        "u_scale": 0.0,
+    }
+    return replace(option("task", "borehole_insertion").noise, **(silent | changes))
+
+
+def test_the_mean_filter_gives_the_mean_of_all_samples_so_far(machine: Machine) -> None:
+    errors = {}
+    for kind in ("none", "mean"):
+        stage = Stage(machine, num_envs=16, noise=noise(target_sample_m=0.01, filter=kind))
+        torch.manual_seed(3)
+        errors[kind] = estimates(stage, 20)
+    running = errors["none"].cumsum(0) / torch.arange(1, 21)[:, None, None]
+    torch.testing.assert_close(errors["mean"], running, rtol=0, atol=2e-6)
+    assert errors["none"].abs().max() <= 0.01 + 1e-6 and errors["mean"][-1].std() < errors["none"][-1].std() / 3
+
+
+def test_the_bias_is_constant_within_an_episode_and_bounded(machine: Machine) -> None:
+    torch.manual_seed(0)
+    stage = Stage(machine, num_envs=512, noise=noise(target_bias_m=0.008))
+    errors = estimates(stage, 3)
+    torch.testing.assert_close(errors[0], errors[2], rtol=0, atol=1e-6)
+    length = errors[0].norm(dim=1)
+    assert length.max() <= 0.008 + 1e-6 and length.max() > 0.0075 and length.min() < 0.0005
+    assert errors[0].mean(0).abs().max() < 0.001, "all directions alike"
+
+
+def test_the_papers_noise_is_a_share_of_each_coordinate(machine: Machine) -> None:
+    torch.manual_seed(0)
+    stage = Stage(machine, num_envs=512, noise=noise(target_relative=0.05))
+    first, second = (error.abs() / stage.start["target_m"].abs() for error in estimates(stage, 2))
+    assert first.max() <= 0.05 + 1e-5 and first.max() > 0.049
+    assert not torch.equal(first, second), "white: drawn anew in each sample"
+
+
+def test_positions_and_commands_are_scaled_by_one_factor_an_episode(machine: Machine) -> None:
+    torch.manual_seed(0)
+    stage = Stage(machine, num_envs=256, noise=noise(q_scale=0.1, u_scale=0.1))
+    stage.history.q.fill_(1.0)
+    stage.history.u.fill_(0.5)
+    _, q, u = stage.process._encoder.decode(stage.process.observe(stage.history)["policy"])
+    q_factor, u_factor = q.flatten(1), u.flatten(1) / 0.5
+    for factor in (q_factor, u_factor):
+        middle = factor.median(1).values
+        assert (factor - middle[:, None]).abs().max() < 1e-5, "all joints and samples alike"
+        assert 0.9 - 1e-4 <= middle.min() < 0.91 and 1.09 < middle.max() <= 1.1 + 1e-4
+    before = stage.process.state["q_scale"].clone()
+    stage.step()
+    stage.process.observe(stage.history)
+    assert torch.equal(before, stage.process.state["q_scale"])
+
+
+def test_without_noise_the_policy_sees_the_truth(machine: Machine) -> None:
+    stage = Stage(machine, "goal_pose", num_envs=4, noise=noise())
+    vector = stage.process.observe(stage.history)["policy"]
+    target, q, _ = stage.process._encoder.decode(vector)
+    torch.testing.assert_close(target, stage.start["target_m"], rtol=0, atol=1e-6)
+    torch.testing.assert_close(q, stage.history.q, rtol=0, atol=1e-6)
+    torch.testing.assert_close(stage.process._encoder.decode_pitch(vector), stage.start["target_pitch_rad"], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("kind", ["direct", "residual"])
+def test_the_deployed_policy_commands_what_the_task_does(name: str, kind: str, machine: Machine) -> None:
+    """From the observation vector alone, with another pitch in each episode of goal_pose."""
+    stage = Stage(machine, name, num_envs=64, action=replace(option("task", name).action, kind=kind))
+    torch.manual_seed(0)
+    stage.history.u.uniform_(-1, 1)
+    groups = stage.process.observe(stage.history)
+    weights = torch.randn(groups["policy"].shape[1] + groups["guide"].shape[1], 5) * 0.05
+
+    class Linear(torch.nn.Module):
+        def forward(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+            return torch.cat((groups["policy"], groups["guide"]), 1) @ weights
+
+    deployed = stage.process.deployable(Linear())(groups["policy"])
+    torch.testing.assert_close(deployed, stage.process.command(Linear()(groups)), rtol=0, atol=1e-3)
