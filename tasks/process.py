@@ -13,12 +13,13 @@ from typing import Any, Protocol, Self
 
 import torch
 
-from brokk_rl.classical import Classical, ClassicalController, Guidance
+from brokk_rl.classical import Classical, ClassicalController
 from brokk_rl.contracts import Transition, World
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.observation import Encoder, Scaling
+from tasks.deployable import Deployable, features
 from tasks.reward import Term
 from tasks.state import ToolState
 from tasks.tool_pose import Action, Noise, Switch
@@ -150,6 +151,8 @@ class ToolPoseProcess:
         failed = ((q < self._lower) | (q > self._upper)).any(1)
         touching = first & (world.contact_force_n > 0)
         fault = world.faults
+        # what a diverged world says about forces may be NaN, and one NaN would poison the sums over all worlds
+        force_n = torch.where(fault, 0.0, world.contact_force_n)
         success = verdict["success"] & ~fault & ~touching
         seen = ToolState(
             tip_m=pose.tip_in_base_m,
@@ -159,7 +162,7 @@ class ToolPoseProcess:
             reach_m=state["rule_reach_m"],
             reach_range_m=options.switch.reach_m,
             positioning=state["positioning"].bool(),
-            contact_force_n=world.contact_force_n,
+            contact_force_n=force_n,
             u=state["u"],
             u_before=state["u_before"],
             lateral_m=(start["target_m"] - pose.tip_in_base_m)[:, :2].norm(dim=1),
@@ -182,7 +185,7 @@ class ToolPoseProcess:
             reason = torch.where(endings[index], float(index), reason)
         self._count(seen, reward, success)
         state["closeness"].copy_(verdict["closeness"])
-        state["contact_force_n"].copy_(world.contact_force_n)
+        state["contact_force_n"].copy_(force_n)
         return Transition(reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason)
 
     def observe(self, history: History) -> dict[str, torch.Tensor]:
@@ -205,7 +208,7 @@ class ToolPoseProcess:
         return Deployable(self, network)
 
     def remembered(self, q: torch.Tensor, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the history that the policy sees, `(N, H, J)` each: samples older than `memory` look like a machine at rest before them."""
+        """Returns the history that the policy sees, `(N, H, J)` each; before the last `memory` samples the machine looks at rest."""
         forgotten = q.shape[1] - self.options.memory
         if forgotten <= 0:
             return q, u
@@ -266,40 +269,3 @@ class ToolPoseProcess:
             state["positioning"],
         )
         return torch.cat(((sample - state["start.target_m"]) * 100, torch.stack(rest, 1)), 1)
-
-
-class Deployable(torch.nn.Module):
-    """The whole policy as it runs on the machine: from the observation vector `(B, O)` to masked commands `(B, J)`.
-
-    Everything that training computes beside the paper's observation (guidance, phase, residual, masks) is inside, so that nothing
-    of it has to be written again, in another order or scale, where the policy is deployed.
-    """
-
-    def __init__(self, process: ToolPoseProcess, network: torch.nn.Module) -> None:
-        super().__init__()
-        self.network = network
-        self._process = process
-        self._pitch_rad = float(process.starts(1, 0)["target_pitch_rad"][0])
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Returns valve commands, `(B, J)` in [-1, 1]."""
-        process, options = self._process, self._process.options
-        target_m, q, u = process._encoder.decode(observation)
-        q, u = process.remembered(q, u)
-        varies = process._encoder.has_pitch
-        pitch = process._encoder.decode_pitch(observation) if varies else torch.full_like(target_m[:, 0], self._pitch_rad)
-        guidance = process._controller.guide(q, u, target_m - process._down, pitch, options.switch.reach_m)
-        positioning = options.switch.positioning(guidance)
-        if options.memory < q.shape[1]:
-            observation = process._encoder.encode(target_m, q, u, pitch)
-        groups = {"policy": observation, "guide": features(guidance, positioning, u[:, -1])}
-        return options.action.command(self.network(groups), guidance.command, positioning, process._exclusive)
-
-
-def features(guidance: Guidance, positioning: torch.Tensor, u_last: torch.Tensor) -> torch.Tensor:
-    """Returns what the default policy is told beside the paper's observation, all of it computed from that observation."""
-    errors = torch.cat((guidance.error_m, guidance.goal_error_m[:, None]), 1)
-    scales = (errors, (errors / 0.1).tanh(), (errors / 0.02).tanh())
-    turn = guidance.pitch_error_rad[:, None]
-    reach = (guidance.reach_m - 2.0)[:, None]
-    return torch.cat((guidance.command, u_last, *scales, turn, (turn / 0.1).tanh(), reach, positioning[:, None].float()), 1)

@@ -1,4 +1,4 @@
-"""A world without physics for tests of tasks and control loops: joints go where the actuator model says, nothing is ever touched."""
+"""A world without physics for tests of tasks and control loops: joints go where the actuator model says and touch nothing."""
 
 from __future__ import annotations
 

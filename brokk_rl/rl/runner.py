@@ -169,15 +169,15 @@ class Runner(OnPolicyRunner):
         try:
             self.alg.load(content, None, strict=True)
             self.env.load_state_dict(content["env"])
+            self.alg.learning_rate = content["learning_rate"]
+            self.current_learning_iteration = content["iter"]
+            set_random_state(content["random"], self.device)
+            book: Logbook = self.logger  # type: ignore[assignment]
+            book.load_state_dict(content["book"])  # last: it rewrites progress.csv
         except (KeyError, RuntimeError) as error:
             raise CheckpointError(
                 f"{path} does not fit this configuration: {str(error).splitlines()[0]}. Resume with the run's own resolved.yaml."
             ) from error
-        self.alg.learning_rate = content["learning_rate"]
-        book: Logbook = self.logger  # type: ignore[assignment]
-        book.load_state_dict(content["book"])
-        self.current_learning_iteration = content["iter"]
-        set_random_state(content["random"], self.device)
         return {}
 
 

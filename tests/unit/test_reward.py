@@ -1,4 +1,4 @@
-"""Reward terms on numbers worked by hand; `state` is a machine that approaches a target 0.25 m away with a pitch error of 0.25 rad."""
+"""Reward terms on numbers worked by hand; `state` has 0.25 m and 0.25 rad left to the target."""
 
 from __future__ import annotations
 
@@ -112,5 +112,5 @@ def test_contact_counts_kilonewtons_up_to_ten(state: ToolState) -> None:
 
 @pytest.mark.parametrize("function", ["tasks.reward:nonsense", "no.such.module:f", "tasks.reward"])
 def test_a_term_that_is_no_function_is_refused(function: str) -> None:
-    with pytest.raises(ConfigError, match="expected package.module:function"):
+    with pytest.raises(ConfigError, match=r"expected package\.module:function"):
         reward.Term(function=function, weight=1.0)

@@ -1,4 +1,4 @@
-"""Episodes of tool-pose tasks: starts, criteria at their edges, endings, figures and noise, in a world that a test writes by hand."""
+"""Episodes of tool-pose tasks: starts, criteria at their edges, endings, figures and noise, in a world written by hand."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def test_the_planar_rule_does_not_depend_on_where_q1_points(machine: Machine) ->
 
 
 def test_in_space_q2_alone_cannot_bring_a_target_behind_the_shoulder_into_range(machine: Machine) -> None:
-    """The deadlock that the planar rule is there for: q1 points 1.5 rad away, and no q2 ends the positioning of text and equation."""
+    """Why there is a planar rule: with q1 1.5 rad away, no q2 ends the positioning of text and equation."""
     q = torch.tensor(machine.home, dtype=torch.float32).repeat(100, 1)
     q[:, 0] = 1.5
     q[:, 1] = torch.linspace(float(machine.lower[1]), float(machine.upper[1]), 100)

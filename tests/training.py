@@ -1,0 +1,82 @@
+"""A training run small enough for a test: few environments without physics, a small network."""
+
+from __future__ import annotations
+
+import copy
+import csv
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from composed import option
+from kinematic import Kinematic
+
+from brokk_rl.machine import Machine
+from brokk_rl.rl.logbook import Logbook
+from brokk_rl.rl.runner import Budget, Runner, Training
+from brokk_rl.rl.tracking import Off
+from brokk_rl.rl.vec_env import ControlLoop, Plant
+
+CPU = torch.device("cpu")
+STEPS = 4
+TIMES = ("seconds", "rate/env_steps_per_s", "rate/collect_s", "rate/learn_s")
+"""Columns of `progress.csv` that differ from run to run."""
+
+
+def plant(machine: Machine, task: Any = None, sim: Any = None) -> Plant:
+    """Returns what a small control loop is made of."""
+    return Plant(
+        machine=machine,
+        sim=sim or Kinematic(),
+        task=task or option("task", "borehole_insertion"),
+        actuator=option("actuator", "lag"),
+        effects={},
+    )
+
+
+def small(max_env_steps: int | None = None, max_seconds: float | None = None, **changes: Any) -> Training:
+    """Returns the shipped training configuration, made small."""
+    shipped = option("rl", "ppo")
+    runner = copy.deepcopy(shipped.runner)
+    runner["num_steps_per_env"] = STEPS
+    runner["algorithm"] |= {"num_learning_epochs": 2, "num_mini_batches": 2}
+    for network in ("actor", "critic"):
+        runner[network]["hidden_dims"] = [16]
+    budget = Budget(max_env_steps=max_env_steps, max_seconds=max_seconds)
+    return replace(shipped, **{"num_envs": 16, "num_starts": 64, "save_interval": 1, "runner": runner, "budget": budget} | changes)
+
+
+def make(machine: Machine, folder: Path, training: Training, loop: ControlLoop | None = None) -> tuple[Runner, Logbook]:
+    """Returns a runner on a control loop of its own; every run of a test starts from the same seed."""
+    folder.mkdir(exist_ok=True)
+    torch.manual_seed(0)
+    loop = loop or plant(machine).build(CPU, training.num_envs, training.num_starts, 0)
+    book = Logbook(
+        folder, Off().open(folder, {}), loop.statistics, STEPS * loop.num_envs, training.max_fault_rate, training.budget.share_spent
+    )
+    return Runner(loop, training, folder, CPU, book, machine.fingerprint()), book
+
+
+def train(machine: Machine, folder: Path, training: Training, resume: Path | None = None) -> Runner:
+    """Trains until the budget is spent, from the beginning or from a checkpoint."""
+    runner, book = make(machine, folder, training)
+    with book:
+        if resume:
+            torch.manual_seed(999)  # whatever happened in this process before, the checkpoint knows better
+            runner.load(str(resume))
+        runner.run()
+    return runner
+
+
+def weights(runner: Runner) -> dict[str, torch.Tensor]:
+    """Returns all learned numbers of actor and critic."""
+    return {
+        f"{part}.{name}": value for part in ("actor", "critic") for name, value in getattr(runner.alg, part).state_dict().items()
+    }
+
+
+def progress(folder: Path) -> list[dict[str, str]]:
+    """Returns the rows of `progress.csv` without the columns that tell the time."""
+    with (folder / "progress.csv").open(newline="") as file:
+        return [{name: value for name, value in row.items() if name not in TIMES} for row in csv.DictReader(file)]

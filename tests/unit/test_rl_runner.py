@@ -1,0 +1,224 @@
+"""Training: budgets, checkpoints, and what is said when one cannot be written or used."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import training as runs
+
+from brokk_rl.errors import CheckpointError, ConfigError, SimulationError, StorageError
+from brokk_rl.machine import Machine
+from brokk_rl.modes.train import find_checkpoint
+from brokk_rl.rl.runner import Budget, checkpoints, read_checkpoint
+
+ITERATION = 16 * runs.STEPS
+"""Control steps of one iteration."""
+
+
+def test_the_budget_of_steps_ends_training(machine: Machine, tmp_path: Path) -> None:
+    runner = runs.train(machine, tmp_path, runs.small(max_env_steps=5 * ITERATION))
+    rows = runs.progress(tmp_path)
+    assert [int(float(row["env_steps"])) for row in rows] == [ITERATION * (i + 1) for i in range(5)]
+    assert [int(row["iteration"]) for row in rows] == list(range(5)) and runner.current_learning_iteration == 5
+
+
+def test_a_budget_that_is_no_multiple_of_an_iteration_is_filled_up(machine: Machine, tmp_path: Path) -> None:
+    runs.train(machine, tmp_path, runs.small(max_env_steps=2 * ITERATION + 1, save_interval=50))
+    assert float(runs.progress(tmp_path)[-1]["env_steps"]) == 3 * ITERATION
+
+
+def test_the_budget_of_seconds_ends_training(machine: Machine, tmp_path: Path) -> None:
+    runner, book = runs.make(machine, tmp_path, runs.small(max_seconds=0.4, save_interval=1000))
+    with book:
+        runner.run()
+    assert 0.4 <= book.seconds < 2.0
+
+
+def test_the_first_budget_that_is_spent_counts() -> None:
+    budget = Budget(max_env_steps=100, max_seconds=10.0)
+    assert budget.share_spent(50, 2.0) == 0.5 and budget.share_spent(20, 9.0) == 0.9 and budget.share_spent(100, 0.0) == 1.0
+    assert Budget(max_env_steps=None, max_seconds=10.0).share_spent(10**9, 5.0) == 0.5
+
+
+def test_training_without_an_end_is_refused() -> None:
+    with pytest.raises(ConfigError, match="max_env_steps, max_seconds or both"):
+        Budget(max_env_steps=None, max_seconds=None)
+
+
+def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(machine: Machine, tmp_path: Path) -> None:
+    runs.train(machine, tmp_path, runs.small(max_env_steps=7 * ITERATION, save_interval=2, keep_checkpoints=2))
+    assert [path.name for path in checkpoints(tmp_path)] == ["model_6.pt", "model_7.pt"]
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None:
+    for iteration in (100, 9, 20):
+        (tmp_path / f"model_{iteration}.pt").touch()
+    assert [path.name for path in checkpoints(tmp_path)] == ["model_9.pt", "model_20.pt", "model_100.pt"]
+    assert find_checkpoint(tmp_path).name == "model_100.pt"
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device"), RuntimeError("PytorchStreamWriter failed writing file")]
+)
+def test_a_full_disk_leaves_the_older_checkpoint_and_nothing_half_written(
+    error: Exception, machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner = runs.train(machine, tmp_path, runs.small(max_env_steps=ITERATION))
+    before = (tmp_path / "model_1.pt").read_bytes()
+
+    def fails(content: Any, path: Path) -> None:
+        path.write_bytes(b"half a checkp")
+        raise error
+
+    monkeypatch.setattr(torch, "save", fails)
+    runner.current_learning_iteration += 1
+    with pytest.raises(StorageError, match="The checkpoint before it is untouched"):
+        runner.checkpoint()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model_1.pt", "progress.csv"]
+    assert (tmp_path / "model_1.pt").read_bytes() == before
+    read_checkpoint(tmp_path / "model_1.pt", "cpu")
+
+
+def test_a_folder_that_cannot_be_written_is_a_storage_error(machine: Machine, tmp_path: Path) -> None:
+    runner, book = runs.make(machine, tmp_path / "run", runs.small(max_env_steps=ITERATION))
+    (tmp_path / "run").rmdir()
+    with book, pytest.raises(StorageError, match=r"cannot write the checkpoint .*model_0\.pt"):
+        runner.checkpoint()
+
+
+@pytest.fixture
+def checkpoint(machine: Machine, tmp_path: Path) -> Path:
+    runs.train(machine, tmp_path / "run", runs.small(max_env_steps=ITERATION))
+    return tmp_path / "run" / "model_1.pt"
+
+
+def changed(checkpoint: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
+    content = torch.load(checkpoint, weights_only=True)
+    change(content)
+    torch.save(content, checkpoint)
+    return checkpoint
+
+
+def loading(machine: Machine, checkpoint: Path, **changes: Any) -> None:
+    runner, book = runs.make(machine, checkpoint.parent, runs.small(max_env_steps=ITERATION, **changes))
+    with book:
+        runner.load(str(checkpoint))
+
+
+def test_a_truncated_checkpoint_is_named_corrupt(checkpoint: Path, machine: Machine) -> None:
+    checkpoint.write_bytes(checkpoint.read_bytes()[:2000])
+    with pytest.raises(CheckpointError, match=r"model_1\.pt is corrupt .*take an older one"):
+        loading(machine, checkpoint)
+
+
+def test_bytes_that_are_no_checkpoint_are_named_corrupt(checkpoint: Path, machine: Machine) -> None:
+    for content in (b"", b"hello", b"\x80\x04]q\x00."):
+        checkpoint.write_bytes(content)
+        with pytest.raises(CheckpointError, match="corrupt or not a checkpoint"):
+            loading(machine, checkpoint)
+
+
+def test_a_checkpoint_cannot_run_code(checkpoint: Path, machine: Machine) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return (Path.touch, (checkpoint.with_name("trapped"),))
+
+    torch.save({"actor_state_dict": Trap()}, checkpoint)
+    with pytest.raises(CheckpointError, match="corrupt or not a checkpoint"):
+        loading(machine, checkpoint)
+    assert not checkpoint.with_name("trapped").exists()
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_weights_that_are_no_numbers_are_refused_by_name(number: float, checkpoint: Path, machine: Machine) -> None:
+    def spoil(content: dict[str, Any]) -> None:
+        next(value for name, value in content["actor_state_dict"].items() if name.endswith("weight"))[0, 0] = number
+
+    with pytest.raises(CheckpointError, match=r"NaN or infinite weights in .*weight"):
+        loading(machine, changed(checkpoint, spoil))
+
+
+def test_a_checkpoint_of_another_machine_names_what_differs(checkpoint: Path, machine: Machine) -> None:
+    longer = replace(machine, tool_m=(replace(machine.tool_m[0], value=1.3), *machine.tool_m[1:]))
+    with pytest.raises(CheckpointError, match="made for another machine: geometry differ"):
+        loading(longer, checkpoint)
+
+
+def test_a_checkpoint_without_a_stamp_is_of_no_machine(checkpoint: Path, machine: Machine) -> None:
+    with pytest.raises(CheckpointError, match="another machine: name, joints, limits, geometry, control, levers"):
+        loading(machine, changed(checkpoint, lambda content: content.pop("fingerprint")))
+
+
+@pytest.mark.parametrize("key", ["env", "optimizer_state_dict", "book", "random", "learning_rate", "iter"])
+def test_a_checkpoint_that_lacks_a_part_is_refused(key: str, checkpoint: Path, machine: Machine) -> None:
+    with pytest.raises(CheckpointError, match="does not fit this configuration"):
+        loading(machine, changed(checkpoint, lambda content: content.pop(key)))
+
+
+def test_a_checkpoint_of_another_network_or_number_of_environments_is_refused(checkpoint: Path, machine: Machine) -> None:
+    wider = runs.small(max_env_steps=1).runner
+    wider["actor"]["hidden_dims"] = [32]
+    with pytest.raises(CheckpointError, match="does not fit this configuration"):
+        loading(machine, checkpoint, runner=wider)
+    with pytest.raises(CheckpointError, match="does not fit this configuration"):
+        loading(machine, checkpoint, num_envs=8)
+
+
+def test_a_refused_checkpoint_leaves_the_progress_alone(checkpoint: Path, machine: Machine) -> None:
+    before = (checkpoint.parent / "progress.csv").read_text()
+    checkpoint.write_bytes(b"")
+    with pytest.raises(CheckpointError):
+        loading(machine, checkpoint)
+    assert (checkpoint.parent / "progress.csv").read_text() == before
+
+
+def test_resuming_where_there_is_no_checkpoint_says_so(tmp_path: Path, machine: Machine) -> None:
+    for path in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(CheckpointError, match="there is no checkpoint"):
+            find_checkpoint(path)
+    with pytest.raises(CheckpointError, match="there is no checkpoint"):
+        read_checkpoint(find_checkpoint(tmp_path / "model_3.pt"), "cpu")
+
+
+def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: Path) -> None:
+    runner, book = runs.make(machine, tmp_path, runs.small(max_env_steps=100 * ITERATION, max_fault_rate=0.001))
+    step = runner.env.world.step
+
+    def diverges(increment: torch.Tensor) -> None:
+        step(increment)
+        runner.env.world.q[3] = torch.nan
+        runner.env.world.contact_force_n[3] = torch.nan
+        runner.env.world.faults[3] = True
+
+    runner.env.world.step = diverges  # type: ignore[method-assign]
+    # one of 16 environments in each step: 6.25 %
+    with book, pytest.raises(SimulationError, match=r"6\.25% of the control steps of iteration 0 .*limit 0\.10%"):
+        runner.run()
+
+
+def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(machine: Machine, tmp_path: Path) -> None:
+    runner, book = runs.make(machine, tmp_path, runs.small(max_env_steps=3 * ITERATION, max_fault_rate=0.1))
+    step, calls = runner.env.world.step, [0]
+
+    def diverges_once(increment: torch.Tensor) -> None:
+        step(increment)
+        calls[0] += 1
+        if calls[0] == 2:
+            runner.env.world.q[3] = torch.nan
+            runner.env.world.contact_force_n[3] = torch.nan
+            runner.env.world.faults[3] = True
+
+    runner.env.world.step = diverges_once  # type: ignore[method-assign]
+    with book:
+        runner.run()
+    rows = runs.progress(tmp_path)
+    assert [float(row["fault_rate"]) for row in rows] == [1 / ITERATION, 0.0, 0.0]
+    assert float(rows[0]["episode/end/fault"]) == 1.0 and all(value != "nan" for row in rows for value in row.values())
+    assert all(value.isfinite().all() for value in runs.weights(runner).values())
