@@ -1,0 +1,113 @@
+"""Effects on how much of a command the valve sees."""
+
+from typing import ClassVar
+
+import torch
+
+from actuators.effects.ranges import Joints, Number, Value
+from actuators.effects.timing import with_newest
+from actuators.effects.wrapped import EffectSpec, Memory, Moment
+from actuators.transport import opened
+from brokk_rl.spec import spec
+
+
+@spec
+class DeadBand(EffectSpec):
+    """No flow below a command, on each side; a full command still opens the valve fully.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        extend: Command up to which nothing moves in the positive direction.
+        retract: The same for the negative direction.
+    """
+
+    joints: Joints
+    extend: Value
+    retract: Value
+    side = "command"
+    numbers: ClassVar = {
+        "extend": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.6)),
+        "retract": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.6)),
+    }
+
+    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`(|u| - band) / (1 - band)` beyond the band of its side, else 0."""
+        return opened(now.history.u, now.value["extend"][:, None], now.value["retract"][:, None]), {}
+
+
+@spec
+class Saturation(EffectSpec):
+    """Beyond a command the speed no longer grows: a lower top speed, both ways.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        level: Command beyond which the valve opens no further.
+    """
+
+    joints: Joints
+    level: Value
+    side = "command"
+    numbers: ClassVar = {"level": Number("1", none=1.0, typical=0.75, bounds=(0.05, 1.0))}
+
+    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`u` cut off at plus and minus `level`."""
+        level = now.value["level"][:, None]
+        return torch.minimum(torch.maximum(now.history.u, -level), level), {}
+
+
+@spec
+class RateLimit(EffectSpec):
+    """The command's slope is bounded.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        stroke_s: Shortest time from no command to a full one.
+    """
+
+    joints: Joints
+    stroke_s: Value
+    side = "command"
+    numbers: ClassVar = {"stroke_s": Number("s", none=0.0, typical=0.4, bounds=(0.0, 5.0))}
+
+    def begin(self, now: Moment) -> Memory:
+        """Commands so far have been slow enough."""
+        return {"sent": now.history.u[:, :-1]}
+
+    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """The command, no further than `period / stroke` from the one before."""
+        before, reach = now.memory["sent"][:, -1], now.plant.period_s / now.value["stroke_s"].clamp(min=1e-6)
+        return with_newest(now, torch.minimum(torch.maximum(now.history.u[:, -1], before - reach), before + reach))
+
+
+@spec
+class Stiction(EffectSpec):
+    """A joint starts later than it stops: at rest it takes a larger command to move it than to keep it moving.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        start: Command beyond which a resting joint starts.
+        stop: Command at which a moving joint stops; taken as `start` where it is larger.
+    """
+
+    joints: Joints
+    start: Value
+    stop: Value
+    side = "command"
+    smooth = False
+    numbers: ClassVar = {
+        "start": Number("1", none=0.0, typical=0.14, bounds=(0.0, 0.6)),
+        "stop": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.6)),
+    }
+
+    def begin(self, now: Moment) -> Memory:
+        """A joint whose command was beyond `start` is moving."""
+        before = now.history.u[:, -2]
+        return {"sent": now.history.u[:, :-1], "moving": before.sign() * (before.abs() > now.value["start"])}
+
+    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """The command while the joint moves, else 0; a reversal is a new start."""
+        u, start = now.history.u[:, -1], now.value["start"]
+        goes_on = (now.memory["moving"] == u.sign()) & (u.abs() > torch.minimum(now.value["stop"], start))
+        moving = u.sign() * ((u.abs() > start) | goes_on)
+        sent, memory = with_newest(now, u * moving.abs())
+        return sent, memory | {"moving": moving}

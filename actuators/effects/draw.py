@@ -1,0 +1,31 @@
+"""Random numbers from a counter in the state instead of a generator.
+
+No host is involved, a CUDA graph may hold the draws, and a run that is restored from its state goes on exactly; a generator would
+be memory outside the state, which the contract of an actuator model forbids.
+"""
+
+import math
+
+import torch
+
+
+def counter(num_envs: int, salt: int, device: torch.device) -> torch.Tensor:
+    """Returns where the draws of each environment begin, `(N,)` int64, from torch's seed; `salt` keeps effects apart."""
+    seed = (torch.initial_seed() + salt * 2_654_435_761) % 2**31
+    return torch.arange(num_envs, dtype=torch.int64, device=device) * 2_654_435_761 + seed
+
+
+def uniform(draw: torch.Tensor, column: int, width: int) -> torch.Tensor:
+    """Returns numbers in [0, 1), `(N, width)`, for the counter `(N,)`; another `column` (below 256) gives independent ones."""
+    place = torch.arange(width, dtype=torch.int64, device=draw.device) + 256 * column
+    key = draw[:, None] * 65_536 + place
+    key = key * -7_046_029_254_386_353_131  # splitmix64, which wraps around in int64
+    key = (key ^ ((key >> 30) & 0x3FFFFFFFF)) * -4_658_895_280_553_007_687
+    key = (key ^ ((key >> 27) & 0x1FFFFFFFFF)) * -7_723_592_293_110_705_685
+    return ((key >> 40) & 0xFFFFFF).to(torch.float32) / float(1 << 24)
+
+
+def normal(draw: torch.Tensor, column: int, width: int) -> torch.Tensor:
+    """Returns standard normal numbers, `(N, width)` (Box and Muller); uses up `column` and `column + 1`."""
+    radius = torch.sqrt(-2.0 * torch.log(1.0 - uniform(draw, column, width)))
+    return radius * torch.cos(2.0 * math.pi * uniform(draw, column + 1, width))

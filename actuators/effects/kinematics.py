@@ -1,0 +1,106 @@
+"""Effects on where tool and borehole are, against what the drawings say."""
+
+from typing import ClassVar
+
+import torch
+
+from actuators.effects.ranges import Joints, Number, Value
+from actuators.effects.wrapped import EffectSpec, Plant
+from brokk_rl.spec import spec
+
+
+def _angle(typical_rad: float) -> Number:
+    return Number("rad", none=0.0, typical=typical_rad, bounds=(-0.3, 0.3), per_joint=False)
+
+
+def _shift(typical_m: float) -> Number:
+    return Number("m", none=0.0, typical=typical_m, bounds=(-0.5, 0.5), per_joint=False)
+
+
+@spec
+class LinkLength(EffectSpec):
+    """Links are longer or shorter than drawn.
+
+    Attributes:
+        joints: Joints whose links differ, or `all`.
+        extra_m: How much farther than drawn the next joint, or the tool's tip, lies from this joint.
+    """
+
+    joints: Joints
+    extra_m: Value
+    side = "kinematics"
+    stage = "kinematics"
+    numbers: ClassVar = {"extra_m": Number("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3))}
+
+    def tool(self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant) -> torch.Tensor:
+        """Moves the point along each link by what the link is too long."""
+        pose = plant.kinematics.pose(q)
+        ends = torch.cat((pose.joints_in_base_m, pose.tip_in_base_m[:, None]), 1)
+        links = ends[:, 1:] - ends[:, :-1]
+        along = links / links.norm(dim=2, keepdim=True).clamp(min=1e-9)
+        return point_m + (value["extra_m"][..., None] * along).sum(1)
+
+
+@spec
+class BaseTilt(EffectSpec):
+    """The machine does not stand level; instruments and site drawings do. The weight is not turned with it.
+
+    Attributes:
+        roll_rad: Turn about x, forward; positive lifts the left side.
+        pitch_rad: Turn about y, to the left; positive lowers the front.
+    """
+
+    roll_rad: Value
+    pitch_rad: Value
+    side = "kinematics"
+    stage = "kinematics"
+    numbers: ClassVar = {"roll_rad": _angle(0.03), "pitch_rad": _angle(0.03)}
+
+    def tool(self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant) -> torch.Tensor:
+        """Turns the point with the base."""
+        return turned(point_m, value["roll_rad"], value["pitch_rad"], torch.zeros_like(value["roll_rad"]))
+
+
+@spec
+class Extrinsics(EffectSpec):
+    """The camera is not where its calibration says: what it sees is turned about the base and displaced.
+
+    Attributes:
+        x_m: Displacement of what is seen, forward.
+        y_m: To the left.
+        z_m: Up.
+        roll_rad: Turn of what is seen about x.
+        pitch_rad: About y.
+        yaw_rad: About z.
+    """
+
+    x_m: Value
+    y_m: Value
+    z_m: Value
+    roll_rad: Value
+    pitch_rad: Value
+    yaw_rad: Value
+    side = "kinematics"
+    stage = "perception"
+    numbers: ClassVar = {name: _shift(0.02) for name in ("x_m", "y_m", "z_m")} | {
+        name: _angle(0.01) for name in ("roll_rad", "pitch_rad", "yaw_rad")
+    }
+
+    def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Turns the point about the base and displaces it."""
+        shift_m = torch.cat((value["x_m"], value["y_m"], value["z_m"]), 1)
+        return turned(point_m, value["roll_rad"], value["pitch_rad"], value["yaw_rad"]) + shift_m
+
+
+def turned(point_m: torch.Tensor, roll_rad: torch.Tensor, pitch_rad: torch.Tensor, yaw_rad: torch.Tensor) -> torch.Tensor:
+    """Returns points `(N, 3)` turned about the fixed axes x, then y, then z, by angles `(N, 1)`; exact for angles of zero."""
+    x, y, z = point_m.split(1, 1)
+    y, z = _turn(y, z, roll_rad)
+    z, x = _turn(z, x, pitch_rad)
+    x, y = _turn(x, y, yaw_rad)
+    return torch.cat((x, y, z), 1)
+
+
+def _turn(a: torch.Tensor, b: torch.Tensor, angle_rad: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    cos, sin = torch.cos(angle_rad), torch.sin(angle_rad)
+    return cos * a - sin * b, sin * a + cos * b

@@ -1,0 +1,78 @@
+"""Effects of what presses on the cylinders: the arm's weight, and the other joints on the same pump."""
+
+from typing import ClassVar
+
+import torch
+
+from actuators.effects.ranges import Joints, Number, Value
+from actuators.effects.wrapped import EffectSpec, Memory, Moment
+from brokk_rl.spec import spec
+
+LEAST_HEAD, MOST_HEAD = 0.05, 2.0
+"""Pressure over the valve against that without load: a joint neither stalls nor runs away in a static formula."""
+
+
+@spec
+class LoadDependence(EffectSpec):
+    """Speed depends on pose and weight: slower lifting, faster lowering.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        sensitivity: Share of the weight, over the machine's `yield_force`, that is missing from the pressure over the valve.
+    """
+
+    joints: Joints
+    sensitivity: Value
+    side = "speed"
+    numbers: ClassVar = {"sensitivity": Number("1", none=0.0, typical=0.5, bounds=(0.0, 1.5))}
+
+    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`moved (sqrt(1 + sensitivity sign(moved) weight / yield_force) - 1)`: the orifice equation."""
+        head = 1.0 + now.value["sensitivity"] * now.moved.sign() * _weight(now)
+        return now.moved * (head.clamp(LEAST_HEAD, MOST_HEAD).sqrt() - 1.0), {}
+
+
+@spec
+class Creep(EffectSpec):
+    """Sinks at zero command: oil leaks through the closed valve, the more the heavier the load.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        sink_rad_s: Speed under a weight as large as the machine's `yield_force` (m/s for a sliding joint); a stretched-out boom
+            bears about half of that, a slewing joint none.
+    """
+
+    joints: Joints
+    sink_rad_s: Value
+    side = "speed"
+    numbers: ClassVar = {"sink_rad_s": Number("rad/s", none=0.0, typical=0.004, bounds=(0.0, 0.1))}
+
+    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`sink weight / yield_force period`, in the direction of the weight, moving or not."""
+        return now.value["sink_rad_s"] * _weight(now) * now.plant.period_s, {}
+
+
+@spec
+class FlowSharing(EffectSpec):
+    """Joints slow each other when moving together, as they share one pump.
+
+    Attributes:
+        joints: Joints on the pump, or `all`; others neither draw from it nor are slowed.
+        demand: Flow of a joint at the machine's `max_speed` over the flow of the pump.
+    """
+
+    joints: Joints
+    demand: Value
+    side = "joints"
+    numbers: ClassVar = {"demand": Number("1", none=0.0, typical=0.7, bounds=(0.0, 2.0))}
+
+    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`moved (1 / max(1, sum of demands) - 1)`: all are slowed in proportion."""
+        demand = now.value["demand"]
+        asked = (demand * (now.moved / now.plant.full_step).abs()).sum(1, keepdim=True)
+        return now.moved * (1.0 / asked.clamp(min=1.0) - 1.0) * (demand > 0), {}
+
+
+def _weight(now: Moment) -> torch.Tensor:
+    """Returns the force with which the weight pushes each joint in its positive direction, over its yield force, `(N, J)`."""
+    return now.plant.gravity.load(now.history.q[:, -1]) / now.plant.yield_force

@@ -1,0 +1,181 @@
+"""Effects on how fast a joint moves for what the valve does, joint by joint."""
+
+import math
+from typing import ClassVar
+
+import torch
+
+from actuators.effects.ranges import Joints, Number, Value
+from actuators.effects.wrapped import EffectSpec, Memory, Moment
+from brokk_rl.spec import spec
+
+
+@spec
+class FlowGain(EffectSpec):
+    """Speed per command changed, both ways.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        gain: Factor on the speed.
+    """
+
+    joints: Joints
+    gain: Value
+    side = "speed"
+    numbers: ClassVar = {"gain": Number("1", none=1.0, typical=0.85, bounds=(0.1, 3.0))}
+
+    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`(gain - 1) moved`."""
+        return (now.value["gain"] - 1.0) * now.moved, {}
+
+
+@spec
+class Asymmetry(EffectSpec):
+    """Speed per command changed in one direction.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        extend_gain: Factor on the speed in the positive direction.
+        retract_gain: The same for the negative direction.
+    """
+
+    joints: Joints
+    extend_gain: Value
+    retract_gain: Value
+    side = "speed"
+    numbers: ClassVar = {
+        "extend_gain": Number("1", none=1.0, typical=0.8, bounds=(0.1, 3.0)),
+        "retract_gain": Number("1", none=1.0, typical=0.8, bounds=(0.1, 3.0)),
+    }
+
+    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`(gain of the direction - 1) moved`."""
+        gain = torch.where(now.moved > 0, now.value["extend_gain"], now.value["retract_gain"])
+        return (gain - 1.0) * now.moved, {}
+
+
+@spec
+class Lag(EffectSpec):
+    """A slower first-order response.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        time_constant_s: Time constant with which the speed follows that of the inner model.
+    """
+
+    joints: Joints
+    time_constant_s: Value
+    side = "speed"
+    numbers: ClassVar = {"time_constant_s": Number("s", none=0.0, typical=0.12, bounds=(0.0, 2.0))}
+
+    def begin(self, now: Moment) -> Memory:
+        """The joint goes on as fast as it moved last."""
+        return {"speed": last_step(now)}
+
+    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """Exact solution of `time_constant v' + v = v_inner` over the period; `speed` is way in one period."""
+        periods = now.value["time_constant_s"].clamp(min=1e-9) / now.plant.period_s
+        decay, behind = torch.exp(-1.0 / periods), now.memory["speed"] - now.moved
+        return behind * periods * (1.0 - decay), {"speed": now.moved + behind * decay}
+
+
+@spec
+class Backlash(EffectSpec):
+    """Play that is taken up at reversals.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        gap_rad: Whole width of the play (m for a sliding joint).
+    """
+
+    joints: Joints
+    gap_rad: Value
+    side = "speed"
+    numbers: ClassVar = {"gap_rad": Number("rad", none=0.0, typical=0.01, bounds=(0.0, 0.2))}
+
+    def begin(self, now: Moment) -> Memory:
+        """A moving joint lies against the side towards which it moves, a resting one in the middle."""
+        q = now.history.q
+        return {"slack": 0.5 * now.value["gap_rad"] * (1.0 - (q[:, -1] - q[:, 0]).sign())}
+
+    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`slack` is the way to go in the positive direction before the joint follows."""
+        before = torch.minimum(now.memory["slack"], now.value["gap_rad"])
+        slack = torch.minimum((before - now.moved).clamp(min=0.0), now.value["gap_rad"])
+        return slack - before, {"slack": slack}
+
+
+@spec
+class Compliance(EffectSpec):
+    """Oil and structure give way: the joint rings after a change of speed.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        ringing_s: Period of the undamped oscillation, 1 / frequency.
+        damping: Damping ratio.
+    """
+
+    joints: Joints
+    ringing_s: Value
+    damping: Value
+    side = "speed"
+    numbers: ClassVar = {
+        "ringing_s": Number("s", none=0.0, typical=0.3, bounds=(0.0, 2.0)),
+        "damping": Number("1", none=None, typical=0.12, bounds=(0.02, 0.95)),
+    }
+
+    def begin(self, now: Moment) -> Memory:
+        """The joint moves steadily."""
+        still = torch.zeros_like(now.moved)
+        return {"deflection": still, "rate": still, "speed": last_step(now) / now.plant.period_s}
+
+    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`d'' + 2 damping w d' + w^2 d = -v'`, where the inner speed `v` changes at the beginning of each period; exact."""
+        period_s, damping = now.plant.period_s, now.value["damping"]
+        w = 2.0 * math.pi / now.value["ringing_s"].clamp(min=1e-5)  # beyond 100 kHz nothing is left after a period, to the last bit
+        ringing, fade = w * torch.sqrt(1.0 - damping.square()), damping * w
+        speed = now.moved / period_s
+        d, rate = now.memory["deflection"], now.memory["rate"] + now.memory["speed"] - speed
+        decay, cos, sin = torch.exp(-fade * period_s), torch.cos(ringing * period_s), torch.sin(ringing * period_s)
+        after = decay * (d * cos + (rate + fade * d) / ringing * sin)
+        rate = decay * (rate * cos - (fade * rate + w.square() * d) / ringing * sin)
+        return after - d, {"deflection": after, "rate": rate, "speed": speed}
+
+
+@spec
+class ThermalDrift(EffectSpec):
+    """Speed changes slowly with running time, as oil warms up.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        change: Relative change of the speed after a long time.
+        time_s: Time constant of warming up.
+        elapsed_s: Time that the machine has run at the reset.
+    """
+
+    joints: Joints
+    change: Value
+    time_s: Value
+    elapsed_s: Value
+    side = "speed"
+    numbers: ClassVar = {
+        "change": Number("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
+        "time_s": Number("s", none=None, typical=1200.0, bounds=(1.0, 36_000.0)),
+        "elapsed_s": Number("s", none=None, typical=0.0, bounds=(0.0, 360_000.0)),
+    }
+
+    def begin(self, now: Moment) -> Memory:
+        """The clock starts."""
+        return {"running_s": torch.zeros_like(now.moved)}
+
+    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`change (1 - exp(-t / time)) moved`, `t` at the middle of the period."""
+        running_s, period_s = now.memory["running_s"], now.plant.period_s
+        t_s = now.value["elapsed_s"] + running_s + 0.5 * period_s
+        warm = 1.0 - torch.exp(-t_s / now.value["time_s"])
+        return now.value["change"] * warm * now.moved, {"running_s": running_s + period_s}
+
+
+def last_step(now: Moment) -> torch.Tensor:
+    """Returns how far the joints moved in the last period, `(N, J)`."""
+    return now.history.q[:, -1] - now.history.q[:, -2]

@@ -1,0 +1,144 @@
+"""Effects on when a command arrives."""
+
+from typing import ClassVar
+
+import torch
+
+from actuators.effects.ranges import Joints, Number, Value
+from actuators.effects.wrapped import EffectSpec, Memory, Moment
+from brokk_rl.spec import spec
+
+
+class _Delayed(EffectSpec):
+    """Commands shifted in time by a constant, exact in the way a joint with constant speed goes.
+
+    A shift that is no multiple of the period gives the mean of the command over each period. The inner model sees a shifted
+    history, so that commands which have left its history must be remembered for as long again.
+    """
+
+    side = "command"
+    stage = "timing"
+
+    def begin(self, now: Moment) -> Memory:
+        """Before the history the command was what it is at its beginning."""
+        u = now.history.u
+        return {"older": u[:, :1].expand(-1, u.shape[1] - 1, -1)}
+
+    def _shifted(self, now: Moment, shift_s: torch.Tensor) -> tuple[torch.Tensor, Memory]:
+        u = now.history.u
+        known = torch.cat((now.memory["older"], u), 1)
+        places = torch.arange(u.shape[1] - 1, known.shape[1], device=u.device)[:, None]
+        return _at(known, places - (shift_s / now.plant.period_s)[:, None]), {"older": known[:, 1 : u.shape[1]]}
+
+
+@spec
+class DeadTime(_Delayed):
+    """Commands act later by a constant time.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        dead_time_s: Transport delay beyond that of the inner model.
+    """
+
+    joints: Joints
+    dead_time_s: Value
+    numbers: ClassVar = {"dead_time_s": Number("s", none=0.0, typical=0.1, bounds=(0.0, 0.5))}
+
+    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`u(t - dead_time)`."""
+        return self._shifted(now, now.value["dead_time_s"])
+
+
+@spec
+class ClockOffset(_Delayed):
+    """Positions and commands are stamped by different clocks.
+
+    In a recording a position stamped late looks like a command that acts late, and for a controller the loop is longer by as much;
+    so it is simulated as one. A negative offset shows the inner model commands ahead of time: exact up to its own dead time.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        offset_s: How much later than their commands positions are stamped.
+    """
+
+    joints: Joints
+    offset_s: Value
+    numbers: ClassVar = {"offset_s": Number("s", none=0.0, typical=0.05, bounds=(-0.3, 0.3))}
+
+    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`u(t - offset)`."""
+        return self._shifted(now, now.value["offset_s"])
+
+
+@spec
+class DelayJitter(EffectSpec):
+    """Each command frame is late by a time of its own, which joints share; no frame overtakes another.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        jitter_s: Longest delay; delays are uniform from 0.
+    """
+
+    joints: Joints
+    jitter_s: Value
+    side = "command"
+    stage = "timing"
+    stochastic = True
+    numbers: ClassVar = {"jitter_s": Number("s", none=0.0, typical=0.03, bounds=(0.0, 0.5))}
+
+    def begin(self, now: Moment) -> Memory:
+        """Frames have been in time."""
+        return {"sent": now.history.u[:, :-1], "delay": torch.zeros_like(now.moved)}
+
+    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """`u(t - delay)`, in which the delay grows by no more than one period a period."""
+        u = now.history.u
+        delay = torch.minimum(now.value["jitter_s"] / now.plant.period_s * now.chance, now.memory["delay"] + 1.0)
+        newest = _at(u, (u.shape[1] - 1.0 - delay)[:, None])[:, 0]
+        sent, memory = with_newest(now, newest)
+        return sent, memory | {"delay": delay}
+
+
+@spec
+class FrameLoss(EffectSpec):
+    """Command frames get lost, for all joints at once; the command before is held.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        probability: Share of frames that are lost.
+    """
+
+    joints: Joints
+    probability: Value
+    side = "command"
+    stage = "timing"
+    stochastic = True
+    smooth = False
+    numbers: ClassVar = {"probability": Number("1", none=0.0, typical=0.02, bounds=(0.0, 0.95))}
+
+    def begin(self, now: Moment) -> Memory:
+        """All frames have arrived."""
+        return {"sent": now.history.u[:, :-1]}
+
+    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+        """The newest command, or where it is lost the one before as the valve saw it."""
+        lost = now.chance < now.value["probability"]
+        return with_newest(now, torch.where(lost, now.memory["sent"][:, -1], now.history.u[:, -1]))
+
+
+def with_newest(now: Moment, newest: torch.Tensor) -> tuple[torch.Tensor, Memory]:
+    """Returns what the inner model has seen so far, `sent` of the memory, with `newest`, `(N, J)`, behind it; and the memory."""
+    u = torch.cat((now.memory["sent"], newest[:, None]), 1)
+    return u, {"sent": u[:, 1:]}
+
+
+def _at(u: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
+    """Returns commands `(N, T, J)` at fractional samples `place`, `(N, K, J)`, held beyond both ends."""
+    last = u.shape[1] - 1
+    behind = last - place
+    # half a millionth of a period forgives 0.15 / 0.05 = 2.9999998
+    whole = torch.floor(behind + 5e-7)
+    part = (behind - whole).clamp(0.0, 1.0)
+    newest = last - whole.to(torch.int64)
+    later, earlier = (u.gather(1, (newest - back).clamp(0, last)) for back in (0, 1))
+    return later + part * (earlier - later)
