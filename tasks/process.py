@@ -208,7 +208,7 @@ class ToolPoseProcess:
         return Deployable(self, network)
 
     def remembered(self, q: torch.Tensor, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the history that the policy sees, `(N, H, J)` each; before the last `memory` samples the machine looks at rest."""
+        """Returns the history that the policy sees, `(N, H, J)` each; before its last `memory` samples all looks at rest."""
         forgotten = q.shape[1] - self.options.memory
         if forgotten <= 0:
             return q, u

@@ -1,0 +1,192 @@
+"""The policy bundle: what is refused, and that the ONNX file says what the network says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+import training as runs
+from composed import option
+from safetensors.torch import load_file, save_file
+
+from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.observation import Encoder
+from brokk_rl.rl import export
+from brokk_rl.rl.policy import Network, Trained, make_actor, read_bundle, write_bundle
+from brokk_rl.rl.vec_env import ControlLoop
+
+CPU = torch.device("cpu")
+TRAINING = runs.small(max_seconds=1.0)
+SILENT = {"target_sample_m": 0.0, "target_bias_m": 0.0, "target_relative": 0.0, "filter": "none", "q_scale": 0.0, "u_scale": 0.0}
+
+
+@dataclass
+class Bundle:
+    """An exported policy whose network says something else for every observation."""
+
+    folder: Path
+    loop: ControlLoop
+    actor: Any
+    contract: dict[str, Any]
+
+
+def export_policy(machine: Machine, folder: Path, name: str, kind: str) -> Bundle:
+    folder.mkdir(exist_ok=True)
+    torch.manual_seed(0)
+    task = option("task", name)
+    task = replace(task, noise=replace(task.noise, **SILENT), action=replace(task.action, kind=kind))
+    loop = runs.plant(machine, task).build(CPU, 16, 64, 3)
+    config = TRAINING.runner_config()
+    actor = make_actor(config["actor"], config["obs_groups"], loop)
+    with torch.no_grad():
+        for parameter in actor.mlp.parameters():
+            parameter.copy_(torch.randn_like(parameter) * 0.1)
+    contract = write_bundle(folder, actor, TRAINING, loop, {"env_steps": 0})
+    seen = []
+    for _ in range(25):
+        seen.append(loop.get_observations()["policy"])
+        loop.step(torch.randn(16, 5))
+    export.export_onnx(folder, actor, task.build(machine, 1, CPU), contract, torch.cat(seen))
+    return Bundle(folder, loop, actor, json.loads((folder / "policy.json").read_text()))
+
+
+@pytest.fixture(scope="module")
+def bundle(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    return export_policy(machine, tmp_path_factory.mktemp("policy"), "borehole_insertion", "residual")
+
+
+@pytest.fixture
+def copied(bundle: Bundle, tmp_path: Path) -> Path:
+    for path in bundle.folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    return tmp_path
+
+
+def test_a_bundle_is_three_files_and_nothing_else(bundle: Bundle) -> None:
+    assert sorted(path.name for path in bundle.folder.iterdir()) == ["policy.json", "policy.onnx", "policy.safetensors"]
+
+
+def test_the_contract_says_all_that_the_machine_needs(bundle: Bundle, machine: Machine) -> None:
+    contract = bundle.contract
+    assert contract["schema"] == 1 and contract["machine"] == "brokk170" and contract["rate_hz"] == 20.0
+    assert contract["fingerprint"] == machine.fingerprint()
+    assert contract["joints"] == contract["command"]["order"] == ["q1", "q2", "q3", "q4", "q5"] and contract["exclusive"] == ["q2"]
+    assert contract["observation"]["size"] == 133 and contract["observation"]["switch"]["rule"] == "planar"
+    parity = contract["parity"]
+    assert parity["observations"] == 400 and parity["largest_difference"] < export.TOLERANCE and parity["at_an_edge"] <= 2
+
+
+def test_the_onnx_file_carries_the_contract(bundle: Bundle, machine: Machine) -> None:
+    session = onnxruntime.InferenceSession(bundle.folder / "policy.onnx", providers=["CPUExecutionProvider"])
+    told = session.get_modelmeta().custom_metadata_map
+    assert told["brokk.machine"] == "brokk170" and json.loads(told["brokk.fingerprint"]) == machine.fingerprint()
+    assert json.loads(told["brokk.observation"]) == bundle.contract["observation"] and float(told["brokk.rate_hz"]) == 20.0
+    (given,), (taken,) = session.get_inputs(), session.get_outputs()
+    assert (given.name, given.shape) == ("observation", ["batch", 133]) and taken.name == "command"
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("borehole_insertion", "residual"), ("borehole_insertion", "direct"), ("goal_pose", "residual")]
+)
+def test_on_the_machine_it_commands_what_it_did_in_the_simulator(name: str, kind: str, machine: Machine, tmp_path: Path) -> None:
+    """Numpy's encoder and onnxruntime on the recorded history against the control loop's own way from observation to command."""
+    made = export_policy(machine, tmp_path / "policy", name, kind)
+    session = onnxruntime.InferenceSession(made.folder / "policy.onnx", providers=["CPUExecutionProvider"])
+    encoder = Encoder(machine, option("task", name).scaling)
+    loop, policy = made.loop, Network(made.actor, made.loop)
+    loop.begin()
+    off, rows = [], 0
+    for _ in range(60):
+        groups = dict(loop.get_observations().items())
+        recorded = [loop.task.state[f"start.{key}"].numpy() for key in ("target_m", "target_pitch_rad")]
+        vector = encoder.encode(recorded[0], loop.history.q.numpy(), loop.history.u.numpy(), recorded[1])
+        on_machine = session.run(None, {"observation": vector.astype(np.float32)})[0]
+        with torch.no_grad():
+            _, _, done, _ = loop.step(policy.act(groups))
+        in_force = loop.history.u[:, -1].numpy()[~done.numpy()]
+        difference = np.abs(on_machine[~done.numpy()] - in_force).max(1)
+        off.append(difference > 1e-3)
+        rows += len(difference)
+    assert rows > 900 and np.concatenate(off).mean() < 0.005, "but at the edges of masks and dead bands, as in the parity check"
+
+
+def test_a_trained_policy_is_read_back_as_it_was_written(bundle: Bundle) -> None:
+    groups = dict(bundle.loop.get_observations().items())
+    again = Trained(folder=str(bundle.folder)).build(bundle.loop, 0)
+    with torch.no_grad():
+        assert torch.equal(again.act(groups), Network(bundle.actor, bundle.loop).act(groups))
+
+
+def test_an_empty_folder_holds_no_policy(tmp_path: Path, machine: Machine) -> None:
+    with pytest.raises(CheckpointError, match=r"holds no policy \(policy\.json is missing\)"):
+        read_bundle(tmp_path, machine)
+
+
+@pytest.mark.parametrize("file", ["policy.safetensors", "policy.json"])
+@pytest.mark.parametrize("content", [b"", b"{", b"\x10\x00\x00\x00\x00\x00\x00\x00nonsense in here"])
+def test_a_corrupt_file_is_named_with_the_way_out(file: str, content: bytes, copied: Path, machine: Machine) -> None:
+    (copied / file).write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"is corrupt: .*mode=export"):
+        read_bundle(copied, machine)
+
+
+def test_truncated_and_missing_weights_are_corrupt(copied: Path, machine: Machine) -> None:
+    path = copied / "policy.safetensors"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(CheckpointError, match="is corrupt"):
+        read_bundle(copied, machine)
+    path.unlink()
+    with pytest.raises(CheckpointError, match="is corrupt"):
+        read_bundle(copied, machine)
+
+
+def test_weights_that_are_no_numbers_are_refused_by_name(copied: Path, machine: Machine) -> None:
+    weights = load_file(copied / "policy.safetensors")
+    weights["mlp.0.weight"][0, 0] = torch.nan
+    save_file(weights, copied / "policy.safetensors")
+    with pytest.raises(CheckpointError, match=r"NaN or infinite weights in mlp\.0\.weight"):
+        read_bundle(copied, machine)
+
+
+def test_a_policy_of_another_machine_names_what_differs(copied: Path, machine: Machine) -> None:
+    slower = replace(machine, period_s=0.1)
+    with pytest.raises(CheckpointError, match="another machine: control differ"):
+        read_bundle(copied, slower)
+
+
+def test_a_policy_of_another_task_is_refused(copied: Path, machine: Machine) -> None:
+    loop = runs.plant(machine, option("task", "goal_pose")).build(CPU, 2, 4, 0)
+    with pytest.raises(CheckpointError, match="do not fit task and machine .*task=…"):
+        Trained(folder=str(copied)).build(loop, 0)
+
+
+def test_an_observation_group_that_the_task_does_not_give_is_refused(bundle: Bundle) -> None:
+    config = TRAINING.runner_config()
+    with pytest.raises(ConfigError, match="gives no group camera"):
+        make_actor(config["actor"], {"actor": ["policy", "camera"]}, bundle.loop)
+
+
+def test_a_file_that_says_something_else_is_not_left_behind(
+    bundle: Bundle, copied: Path, machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (copied / "policy.onnx").unlink()
+
+    class Wrong:
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            pass
+
+        def run(self, names: None, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
+            return [np.ones((len(feed["observation"]), 5), np.float32)]
+
+    monkeypatch.setattr(export.onnxruntime, "InferenceSession", Wrong)
+    task = option("task", "borehole_insertion").build(machine, 1, CPU)
+    with pytest.raises(CheckpointError, match="differs from the network in"):
+        export.export_onnx(copied, bundle.actor, task, bundle.contract, bundle.loop.get_observations()["policy"])
+    assert sorted(path.name for path in copied.iterdir()) == ["policy.json", "policy.safetensors"]

@@ -1,0 +1,169 @@
+"""The control loop: who is reset, what is seen, what is counted, and that evaluation is the same for everybody."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+import training as runs
+from composed import option
+
+from brokk_rl.machine import Machine
+from brokk_rl.rl.evaluation import evaluate
+from brokk_rl.rl.policy import Classical, Untrained
+from brokk_rl.rl.vec_env import ControlLoop
+
+CPU = torch.device("cpu")
+
+
+def make(machine: Machine, num_envs: int = 8, **changes: Any) -> ControlLoop:
+    torch.manual_seed(0)
+    task = replace(option("task", "borehole_insertion"), **changes)
+    return runs.plant(machine, task).build(CPU, num_envs, 64, 5)
+
+
+def snapshot(loop: ControlLoop) -> dict[str, torch.Tensor]:
+    state = loop.state_dict()
+    return state["tensors"] | {f"world.{name}": value for name, value in state["world"].items()}
+
+
+def test_only_finished_environments_begin_anew(machine: Machine) -> None:
+    loop = make(machine)
+    for _ in range(3):
+        loop.step(torch.zeros(8, 5))
+    loop.episode_length_buf = torch.where(torch.arange(8) < 2, loop.max_episode_length - 1, loop.episode_length_buf)
+    before = snapshot(loop)
+    _, _, done, extras = loop.step(torch.zeros(8, 5))
+    assert done.tolist() == [True, True, *[False] * 6] and extras["time_outs"].tolist() == done.tolist()
+    after = snapshot(loop)
+    assert (after["task.steps"][:2] == 0).all() and (after["task.steps"][2:] == 4).all()
+    assert (after["episode.length"][:2] == 0).all() and (after["episode.length"][2:] == 4).all()
+    targets = "task.start.target_m"
+    assert (after[targets][:2] != before[targets][:2]).any() and torch.equal(after[targets][2:], before[targets][2:])
+    assert (after["history.u"][:2] == 0).all() and (after["history.q"][:2].diff(dim=1) == 0).all()
+    assert torch.equal(after["history.q"][:2, -1], after["world.q"][:2]) and torch.equal(
+        after["world.q"][:2], after["task.start.q"][:2]
+    )
+    assert torch.equal(after["history.q"][2:, :-1], before["history.q"][2:, 1:])
+
+
+def test_a_failure_is_no_time_out(machine: Machine) -> None:
+    loop = make(machine)
+    loop.step(torch.zeros(8, 5))
+    loop.world.q[3, 0] = float(machine.upper[0])
+    loop.episode_length_buf = torch.full((8,), loop.max_episode_length - 1)
+    _, _, done, extras = loop.step(torch.zeros(8, 5))
+    assert done.all() and extras["time_outs"].tolist() == [index != 3 for index in range(8)]
+    assert loop.task.reasons[int(loop.reason[3])] == "joint_limit"
+
+
+def test_asking_twice_gives_the_same_observation(machine: Machine) -> None:
+    loop = make(machine)
+    loop.step(torch.randn(8, 5))
+    state, random = snapshot(loop), torch.get_rng_state()
+    first, second = loop.get_observations(), loop.get_observations()
+    assert all(torch.equal(first[name], second[name]) for name in first.keys())
+    assert torch.equal(random, torch.get_rng_state()) and all(
+        torch.equal(value, state[name]) for name, value in snapshot(loop).items()
+    )
+
+
+def test_what_was_handed_out_does_not_change_later(machine: Machine) -> None:
+    loop = make(machine)
+    seen = loop.get_observations()
+    kept = seen["policy"].clone()
+    loop.step(torch.ones(8, 5))
+    assert torch.equal(seen["policy"], kept)
+
+
+def test_a_restored_loop_goes_on_exactly(machine: Machine) -> None:
+    loop = make(machine)
+    actions = 2 * torch.randn(40, 8, 5)
+    for action in actions[:20]:
+        loop.step(action)
+    state, random = loop.state_dict(), torch.get_rng_state()
+    first = [(loop.step(action)[1].clone(), loop.get_observations()) for action in actions[20:]]
+    other = make(machine)
+    other.load_state_dict(state)
+    torch.set_rng_state(random)
+    for action, (reward, seen) in zip(actions[20:], first, strict=True):
+        found = other.step(action)
+        assert torch.equal(found[1], reward) and all(torch.equal(found[0][name], seen[name]) for name in seen.keys())
+
+
+def test_statistics_count_what_ended_since_they_were_last_asked(machine: Machine) -> None:
+    loop = make(machine, episode_s=0.2)
+    loop.statistics()
+    for _ in range(4):
+        loop.step(torch.zeros(8, 5))
+    found = loop.statistics()
+    assert found["episodes"] == 8 and found["end/time_limit"] == 1.0 and found["length"] == 4.0 and found["fault_rate"] == 0.0
+    assert loop.statistics()["episodes"] == 0
+
+
+def test_the_action_of_a_step_is_in_force_in_that_step(machine: Machine) -> None:
+    loop = make(machine, action=replace(option("task", "borehole_insertion").action, kind="direct", scale=1.0))
+    action = torch.linspace(-1, 1, 40).reshape(8, 5)
+    positioning = loop.task.state["positioning"].bool()
+    loop.step(action)
+    exclusive = torch.as_tensor(machine.is_exclusive)
+    assert torch.equal(loop.history.u[:, -1], torch.where(exclusive == positioning[:, None], action, 0.0))
+
+
+def results(loop: ControlLoop, policy: Any, seed: int = 7) -> dict[str, Any]:
+    starts = {name: value[: loop.num_envs] for name, value in loop.starts.items()}
+    return evaluate(loop, policy.build(loop, 0), starts, seed, 2)[0]
+
+
+def test_evaluating_a_policy_twice_gives_the_same_figures(machine: Machine) -> None:
+    loop = make(machine, 32, episode_s=6.0)
+    first = results(loop, Classical())
+    torch.rand(100)
+    assert results(loop, Classical()) == first and first["episodes"] == 32
+    assert sum(first["terminations"].values()) == 32, "every episode ends in one way"
+    assert results(make(machine, 32, episode_s=6.0), Classical()) == first, "also in another loop"
+
+
+def test_every_policy_meets_the_same_holes_and_the_same_errors(machine: Machine) -> None:
+    loop = make(machine, 16, episode_s=1.0)
+    met: list[dict[str, torch.Tensor]] = []
+
+    class Looks:
+        def __init__(self, act: Any) -> None:
+            self._act = act
+
+        def build(self, loop: ControlLoop, seed: int) -> Any:
+            return self
+
+        def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+            names = ("start.target_m", "start.q", "start.scene", "bias_m", "q_scale", "u_scale", "estimate_m")
+            if loop.task.state["age"].eq(0).all():
+                met.append({name: loop.task.state[name].clone() for name in names})
+            return self._act(groups["policy"])
+
+    for act in (lambda seen: torch.zeros(16, 5), lambda seen: torch.randn(16, 5)):
+        results(loop, Looks(act))
+    assert len(met) == 2 and all(torch.equal(met[0][name], met[1][name]) for name in met[0])
+
+
+def test_an_untrained_policy_depends_on_its_seed_alone(machine: Machine) -> None:
+    loop = make(machine)
+    seen = dict(loop.get_observations().items())
+    untrained = Untrained(training=runs.small(max_seconds=1.0))
+    before = torch.get_rng_state()
+    first, again, other = (untrained.build(loop, seed).act(seen) for seed in (1, 1, 2))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(machine: Machine) -> None:
+    loop = make(machine, 4, episode_s=0.5)
+    starts = {name: value[:4] for name, value in loop.starts.items()}
+    _, episodes, seen = evaluate(loop, Classical().build(loop, 0), starts, 7, 2)
+    assert len(episodes) == 2 and seen.shape[1] == 133
+    for row, episode in enumerate(episodes):
+        assert episode.q[0] == pytest.approx(starts["q"][row].numpy()) and (episode.u[0] == 0).all()
+        assert len(episode.t_s) == len(episode.q) == len(episode.u) == len(episode.force_n) == 10
+        assert abs(episode.q[1:] - episode.q[:-1]).max() <= 0.45 * 0.05 + 1e-6, "no jump: top speed is 0.45 rad/s"
