@@ -74,8 +74,8 @@ class Lag(EffectSpec):
 
     def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
         """Exact solution of `time_constant v' + v = v_inner` over the period; `speed` is way in one period."""
-        periods = now.value["time_constant_s"].clamp(min=1e-9) / now.plant.period_s
-        decay, behind = torch.exp(-1.0 / periods), now.memory["speed"] - now.moved
+        periods = now.value["time_constant_s"] / now.plant.period_s
+        decay, behind = torch.exp(-1.0 / periods.clamp(min=1e-6)), now.memory["speed"] - now.moved
         return behind * periods * (1.0 - decay), {"speed": now.moved + behind * decay}
 
 

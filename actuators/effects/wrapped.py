@@ -181,8 +181,8 @@ class Wrapped:
         if torch.is_grad_enabled():  # the history is written in place, and autograd may need what it was
             history = History(q=history.q.clone(), u=history.u.clone())
         now = self._moment(history, self._ranges.advance() if self.effect.stochastic else None)
-        begun = self._begin(now)
-        memory = {key: torch.where(_rows(self._fresh, value), begun[key], value) for key, value in self._memory.items()}
+        begun, fresh = self._begin(now), self._fresh.clone()
+        memory = {key: torch.where(_rows(fresh, value), begun[key], value) for key, value in self._memory.items()}
         now = replace(now, memory=memory)
         result, memory = self._commanded(now) if self.effect.side == "command" else self._moved(now)
         for key, value in memory.items():
