@@ -163,7 +163,7 @@ def test_a_policy_of_another_machine_names_what_differs(copied: Path, machine: M
 
 def test_a_policy_of_another_task_is_refused(copied: Path, machine: Machine) -> None:
     loop = runs.plant(machine, option("task", "goal_pose")).build(CPU, 2, 4, 0)
-    with pytest.raises(CheckpointError, match="do not fit task and machine .*task=…"):
+    with pytest.raises(CheckpointError, match=r"do not fit task and machine .*task=…"):
         Trained(folder=str(copied)).build(loop, 0)
 
 

@@ -64,7 +64,7 @@ def test_asking_twice_gives_the_same_observation(machine: Machine) -> None:
     loop.step(torch.randn(8, 5))
     state, random = snapshot(loop), torch.get_rng_state()
     first, second = loop.get_observations(), loop.get_observations()
-    assert all(torch.equal(first[name], second[name]) for name in first.keys())
+    assert all(torch.equal(first[name], second[name]) for name in first.keys())  # noqa: SIM118 (a TensorDict iterates over rows)
     assert torch.equal(random, torch.get_rng_state()) and all(
         torch.equal(value, state[name]) for name, value in snapshot(loop).items()
     )
@@ -90,7 +90,7 @@ def test_a_restored_loop_goes_on_exactly(machine: Machine) -> None:
     torch.set_rng_state(random)
     for action, (reward, seen) in zip(actions[20:], first, strict=True):
         found = other.step(action)
-        assert torch.equal(found[1], reward) and all(torch.equal(found[0][name], seen[name]) for name in seen.keys())
+        assert torch.equal(found[1], reward) and all(torch.equal(found[0][name], seen[name]) for name in seen.keys())  # noqa: SIM118
 
 
 def test_statistics_count_what_ended_since_they_were_last_asked(machine: Machine) -> None:
