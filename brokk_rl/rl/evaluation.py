@@ -69,9 +69,7 @@ def evaluate(loop: ControlLoop, policy: Policy, starts: Starts, seed: int, num_r
         for name, value in loop.finished.items():
             figures[name] = torch.where(now, value, figures[name])
         reason = torch.where(now, loop.reason, reason)
-        rows = slice(0, num_recorded)
-        # after a reset the world shows the next episode, so the last sample of a finished one is the step before
-        tape.append((loop.world.q[rows].clone(), loop.history.u[rows, -1].clone(), loop.world.contact_force_n[rows].clone(), running[rows].clone() & ~done[rows]))
+        tape.append(tuple(part[:num_recorded].clone() for part in (loop.end_q, loop.end_u, loop.end_force_n, running)))
         running &= ~done
     return _summary(figures, reason, loop), _episodes(tape, starts, figures, loop), torch.cat(seen)
 

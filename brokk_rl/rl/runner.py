@@ -115,12 +115,17 @@ class Runner(OnPolicyRunner):
                 # the first round is short and shows how long one takes
                 left = (budget.max_seconds - book.seconds) * book.env_steps / book.seconds / steps if book.env_steps else 1
                 rounds = min(rounds, max(1, round(left)))
-            with contextlib.redirect_stdout(io.StringIO()), _tensor_cores(self.env.graph_active):
+            with contextlib.redirect_stdout(io.StringIO()):
                 self.learn(rounds, init_at_random_ep_len=first and self.training.random_episode_lengths)
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
             self.checkpoint()
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Trains for some iterations; see `rsl_rl.runners.OnPolicyRunner`."""
+        with _tensor_cores(self.env.graph_active):
+            super().learn(num_learning_iterations, init_at_random_ep_len)
 
     def checkpoint(self) -> None:
         """Writes a checkpoint in one step, holding all that is needed to go on exactly; drops the oldest beyond `keep_checkpoints`.

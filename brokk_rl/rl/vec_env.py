@@ -85,6 +85,12 @@ class ControlLoop(VecEnv):
         self._finished = torch.zeros(len(task.episode), self.num_envs, device=self.device)
         self.finished = dict(zip(task.episode, self._finished, strict=True))
         """Figures of the episode that ended in the last step, valid where `done`."""
+        self.end_q = torch.zeros_like(world.q)
+        """Joint positions at the end of the last step, before finished environments began anew, `(N, J)`."""
+        self.end_u = torch.zeros_like(world.q)
+        """Commands of the last step, `(N, J)`."""
+        self.end_force_n = torch.zeros_like(world.contact_force_n)
+        """Peak contact force of the last step, likewise, `(N,)`."""
         self._total_names = (*task.episode, *(f"end/{reason}" for reason in task.reasons))
         self._totals = torch.zeros(len(self._total_names), device=self.device)  # over episodes finished since `statistics` was last asked
         self._steps = 0
@@ -185,7 +191,8 @@ class ControlLoop(VecEnv):
 
     def _command(self) -> torch.Tensor:
         """Puts the action into force; returns how far the drive shall move each joint, `(N, J)`."""
-        self.history.push_u(self.task.command(self._action))
+        self.end_u.copy_(self.task.command(self._action))
+        self.history.push_u(self.end_u)
         return self.actuator.step(self.history) - self.history.q[:, -1]
 
     def _judge(self) -> Starts:
@@ -198,6 +205,8 @@ class ControlLoop(VecEnv):
         self.timed_out.copy_(transition.timed_out)
         self.done.copy_(done)
         self.reason.copy_(transition.reason)
+        self.end_q.copy_(self.world.q)
+        self.end_force_n.copy_(self.world.contact_force_n)
         finished = torch.stack(tuple(self.task.episode.values()))
         self._finished.copy_(finished)
         ending = torch.arange(len(self.task.reasons), device=self.device)[:, None] == transition.reason
