@@ -125,7 +125,8 @@ class Measured:
 
     def reset(self, mask: torch.Tensor) -> None:
         """Forgets the true positions in the environments of `mask`, shape `(N,)` bool."""
-        self._q.detach_()
+        if self._q.requires_grad:
+            self._q.detach_()
         self._fresh.logical_or_(mask)
         self._model.reset(mask)
 

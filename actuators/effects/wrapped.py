@@ -3,7 +3,6 @@
 import re
 import zlib
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from typing import ClassVar, Literal
 
 import torch
@@ -21,27 +20,17 @@ Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
 
 
 class Plant:
-    """Numbers of the machine that effects need, as tensors: `full_step` (way at full speed in one period) and others, `(J,)`."""
+    """What effects need of the machine: `full_step` (way at full speed in one period) and the like, `(J,)`; weight; geometry."""
 
     def __init__(self, machine: Machine, device: torch.device) -> None:
         def tensor(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
-        self._machine, self._device = machine, device
         self.period_s = machine.period_s
         self.full_step = tensor(machine.max_speed * machine.period_s)
         self.lower, self.upper = tensor(machine.lower), tensor(machine.upper)
         self.yield_force = tensor([joint.yield_force.value for joint in machine.joints])
-
-    @cached_property
-    def gravity(self) -> Gravity:
-        """The weight on each joint."""
-        return Gravity(self._machine, self._device)
-
-    @cached_property
-    def kinematics(self) -> Kinematics:
-        """The machine as its drawings have it."""
-        return Kinematics(self._machine, self._device)
+        self.gravity, self.kinematics = Gravity(machine, device), Kinematics(machine, device)
 
 
 @dataclass(frozen=True)
@@ -170,7 +159,8 @@ class Wrapped:
         """Forgets in the environments of `mask`, shape `(N,)` bool, and draws their parameters; cuts all gradients."""
         self.inner.reset(mask)
         for value in self._memory.values():
-            value.detach_()
+            if value.requires_grad:
+                value.detach_()
         self._fresh.logical_or_(mask)
         self._ranges.redraw(mask)
 

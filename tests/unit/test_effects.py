@@ -225,7 +225,7 @@ def test_reset_reaches_the_masked_environments_only(name: str, machine: Machine)
     assert {key: value.data_ptr() for key, value in model.state.items()} == place
 
 
-@pytest.mark.parametrize("name", [name for name in SMOOTH if name not in ("clock_offset",)])
+@pytest.mark.parametrize("name", SMOOTH)
 def test_gradients_agree_with_candidates_side_by_side(name: str, machine: Machine) -> None:
     """Three environments hold a number minus, at, and plus a step; the gradient at the middle one must be their slope."""
     spec, u = effect(name), commands(machine, 30, 1).expand(-1, 3, -1)
