@@ -1,11 +1,11 @@
 """The classical controller: resolved-rate control of the tool with dead-time compensation, under the masks of the machine.
 
-It is what a user would pick instead of a learned policy, and it is the base on which the default policy learns a residual. It sees only
-what the policy sees: the measured history and the estimated target. Torch, batched, without a host synchronisation, and made of
-operations that ONNX knows, so that an exported policy carries it inside.
+It is what a user would pick instead of a learned policy, and it is the base on which the default policy learns a residual. It
+sees only what the policy sees: the measured history and the estimated target. Torch, batched, without a host synchronisation, and
+made of operations that ONNX knows, so that an exported policy carries it inside.
 
-Dead-time compensation is the idea of the Smith predictor (O. J. M. Smith, 1957): commands that were sent but have not acted yet are added
-to the measured position through a static map of the valve, and the controller acts on where the machine is going to be.
+Dead-time compensation is the idea of the Smith predictor (O. J. M. Smith, 1957): commands that were sent but have not acted yet
+are added to the measured position through a static map of the valve, and the controller acts on where the machine is going to be.
 Resolved-rate control with damped least squares follows Nakamura and Hanafusa (1986).
 """
 
@@ -58,11 +58,13 @@ class Guidance:
     """What the controller makes of a history and a target; `N` environments.
 
     Attributes:
-        command: Valve commands before the masks, `(N, J)` in [-1, 1]: exclusive joints as for positioning, the others as for the approach.
+        command: Valve commands before the masks, `(N, J)` in [-1, 1]: exclusive joints as for positioning, the others as for the
+            approach.
         error_m: Target minus predicted tool point, in the frame of the arm's plane (radial, tangential, up), `(N, 3)`.
         pitch_error_rad: Wanted minus predicted pitch, `(N,)`.
         goal_error_m: Waypoint minus predicted tool point, up, `(N,)`: hover height while not aligned, the final depth after.
-        reach_m: Measured distance from the first joint behind the exclusive ones to the target, turned into the arm's plane, `(N,)`.
+        reach_m: Measured distance from the first joint behind the exclusive ones to the target, turned into the arm's plane,
+            `(N,)`.
         reach_3d_m: The same measured in space.
         tip_z_m: Measured height of the tool point, `(N,)`.
     """
@@ -104,8 +106,8 @@ class ClassicalController:
     def valve(self, rate: torch.Tensor) -> torch.Tensor:
         """Inverts `rate`: returns the commands for joint speeds given as a share of the full speed, clipped to [-1, 1].
 
-        Speeds too small for the valve are given as pulses of `creep`: the prediction counts a pulse as soon as it is sent, so that no
-        more of them are sent than are needed.
+        Speeds too small for the valve are given as pulses of `creep`: the prediction counts a pulse as soon as it is sent, so
+        that no more of them are sent than are needed.
         """
         band = self.config.dead_band
         size = rate.abs()

@@ -90,9 +90,15 @@ class ActuatorFit(Protocol):
     """Name of the model in tables and files."""
 
     def fit(
-        self, machine: Machine, train: Sequence[Recording], validation: Sequence[Recording], folder: Path, seed: int, device: torch.device
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        validation: Sequence[Recording],
+        folder: Path,
+        seed: int,
+        device: torch.device,
     ) -> Actuator:
-        """Fits to `train`, stops or chooses by `validation`, leaves what it learned in `folder`, and returns the fitted actuator."""
+        """Fits to `train`, chooses by `validation`, leaves what it learned in `folder`, returns the fitted actuator."""
         ...
 
 
@@ -122,7 +128,7 @@ class World(Protocol):
     """True when `step` and `reset` may be captured in a CUDA graph."""
 
     def step(self, increment: torch.Tensor) -> None:
-        """Advances one control period, in which the drive moves each joint by `increment`, shape `(N, J)`, unless something blocks it."""
+        """Advances one control period; the drive moves each joint by `increment`, `(N, J)`, unless something blocks it."""
         ...
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:

@@ -128,8 +128,8 @@ class Machine:
                 raise ConfigError(f"machine {self.name}: '{other}' is none of its joints ({', '.join(names)})")
         if self.dead_time_s > (self.num_history - 1) * self.period_s + 1e-9:
             raise ConfigError(
-                f"machine {self.name}: {self.num_history} samples of {self.period_s} s do not span the dead time of {self.dead_time_s} s; "
-                "raise num_history"
+                f"machine {self.name}: {self.num_history} samples of {self.period_s} s do not span the dead time of "
+                f"{self.dead_time_s} s; raise num_history"
             )
 
     @property

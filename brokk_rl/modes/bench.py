@@ -77,7 +77,9 @@ class Bench:
             self.session.seed_all()
             loop = plant.build(device, num_envs, self.rl.num_starts, self.session.stream("starts"))
             rows.append(self._measure(loop, device))
-            log.info("%d environments: %s", num_envs, ", ".join(f"{k} {v:,.0f}" for k, v in rows[-1].items() if k.endswith("_per_s")))
+            log.info(
+                "%d environments: %s", num_envs, ", ".join(f"{k} {v:,.0f}" for k, v in rows[-1].items() if k.endswith("_per_s"))
+            )
         name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu, {torch.get_num_threads()} threads"
         results = {"device": name, **rows[-1], "versions": versions(), "rows": rows}
         write_json(self.session.folder / "benchmark.json", results)
@@ -94,7 +96,9 @@ class Bench:
         action = torch.zeros(num, loop.num_actions, device=device)
         step_s = self._time(lambda: loop.step(action), device)
         runner_steps = int(self.rl.runner["num_steps_per_env"])
-        book = Logbook(self.session.folder, Off().open(self.session.folder, {}), loop.statistics, num * runner_steps, 1.0, lambda *_: 0.0)
+        book = Logbook(
+            self.session.folder, Off().open(self.session.folder, {}), loop.statistics, num * runner_steps, 1.0, lambda *_: 0.0
+        )
         runner = Runner(loop, self.rl, self.session.folder, device, book, {})
         runner.learn(1)
         _wait(device)

@@ -127,7 +127,9 @@ def evaluate_policies(
 
 
 def _print(table: dict[str, Any]) -> None:
-    view = Table("policy", "strict success", "95 %", "paper's success", "time to insert", "lateral error", "peak force", "valve travel")
+    view = Table(
+        "policy", "strict success", "95 %", "paper's success", "time to insert", "lateral error", "peak force", "valve travel"
+    )
     for name, row in table.items():
         strict, time = row["success_strict"], row["time_to_insert_s"]["median"]
         view.add_row(

@@ -64,4 +64,6 @@ class Export:
         facts = {"checkpoint": str(path), "env_steps": content["book"]["env_steps"], "seconds": content["book"]["seconds"]}
         contract = write_bundle(self.session.folder, actor, self.rl, loop, facts)
         largest = export_onnx(self.session.folder, actor, loop.task, contract, observations)
-        log.info("%s: onnxruntime and torch differ by at most %.1e over %d observations", self.session.folder, largest, len(observations))
+        log.info(
+            "%s: onnxruntime and torch differ by at most %.1e over %d observations", self.session.folder, largest, len(observations)
+        )

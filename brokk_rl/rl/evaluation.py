@@ -35,7 +35,9 @@ class Episode:
 
 
 @torch.no_grad()
-def evaluate(loop: ControlLoop, policy: Policy, starts: Starts, seed: int, num_recorded: int) -> tuple[dict[str, Any], list[Episode], torch.Tensor]:
+def evaluate(
+    loop: ControlLoop, policy: Policy, starts: Starts, seed: int, num_recorded: int
+) -> tuple[dict[str, Any], list[Episode], torch.Tensor]:
     """Runs one episode from each start.
 
     Args:
@@ -46,8 +48,8 @@ def evaluate(loop: ControlLoop, policy: Policy, starts: Starts, seed: int, num_r
         num_recorded: Episodes recorded.
 
     Returns:
-        The fields of `evaluation.json` (without `seed`, `actuator`, `policy`), the recorded episodes, and some hundreds of observation
-        vectors `(B, O)`.
+        The fields of `evaluation.json` (without `seed`, `actuator`, `policy`), the recorded episodes, and some hundreds of
+        observation vectors `(B, O)`.
     """
     torch.manual_seed(seed)
     loop.begin(starts)
@@ -64,7 +66,7 @@ def evaluate(loop: ControlLoop, policy: Policy, starts: Starts, seed: int, num_r
             seen.append(groups["policy"][:16].clone())
             if not running.any():
                 break
-        groups, _, done, _ = loop.step(policy.act(dict(groups.items())))
+        groups, _, done, _ = loop.step(policy.act(dict(groups.items())))  # type: ignore[arg-type]
         now = done & running
         for name, value in loop.finished.items():
             figures[name] = torch.where(now, value, figures[name])
@@ -99,7 +101,9 @@ def _share(happened: np.ndarray) -> dict[str, Any]:
     return {"mean": float(happened.mean()), "ci95": [low, high]}
 
 
-def _episodes(tape: list[tuple[torch.Tensor, ...]], starts: Starts, figures: dict[str, torch.Tensor], loop: ControlLoop) -> list[Episode]:
+def _episodes(
+    tape: list[tuple[torch.Tensor, ...]], starts: Starts, figures: dict[str, torch.Tensor], loop: ControlLoop
+) -> list[Episode]:
     q, u, force, running = (torch.stack(parts).cpu().numpy() for parts in zip(*tape, strict=True))
     episodes = []
     for row in range(q.shape[1]):

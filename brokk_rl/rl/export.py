@@ -27,7 +27,7 @@ TOLERANCE = 1e-3
 
 
 class _Plain(torch.nn.Module):
-    """A copy of an actor network on the CPU that takes a plain dictionary of groups, without the TensorDict that ONNX does not know."""
+    """A copy of an actor on the CPU that takes a plain dictionary of groups: ONNX does not know the TensorDict."""
 
     def __init__(self, actor: MLPModel) -> None:
         super().__init__()
@@ -75,18 +75,24 @@ def export_onnx(folder: Path, actor: MLPModel, task: TaskProcess, contract: dict
     onnx.save(model, part)
     session = onnxruntime.InferenceSession(part.read_bytes(), providers=["CPUExecutionProvider"])
     found = session.run(None, {"observation": observations.cpu().numpy().astype(np.float32)})[0]
-    # at the edge of a mask or of the dead band the last bit of a float decides between two commands; such rows are counted, not compared
+    # at the edge of a mask or of the dead band the last bit of a float decides between two commands; such rows are counted, not
+    # compared
     difference = np.abs(found - expected).max(1)
     off = difference > TOLERANCE
     if off.mean() > 0.005:
         part.unlink()
         raise CheckpointError(
-            f"the exported policy differs from the network in {off.mean():.1%} of {len(off)} observations (largest {difference.max():.3g}); "
-            "nothing was written. This is a bug of the exporter or of a custom network layer."
+            f"the exported policy differs from the network in {off.mean():.1%} of {len(off)} observations "
+            f"(largest {difference.max():.3g}); nothing was written. This is a bug of the exporter or of a custom network layer."
         )
     part.replace(folder / ONNX)
     largest = float(difference[~off].max())
-    parity = {"observations": len(off), "largest_difference": largest, "at_an_edge": int(off.sum()), "onnxruntime": onnxruntime.__version__}
+    parity = {
+        "observations": len(off),
+        "largest_difference": largest,
+        "at_an_edge": int(off.sum()),
+        "onnxruntime": onnxruntime.__version__,
+    }
     write_json(folder / CONTRACT, contract | {"parity": parity})
     return largest
 

@@ -52,7 +52,13 @@ class Logbook:
         self._pending = 0
         self._last: dict[str, float] = {}
         self._clock = time.perf_counter()
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TimeRemainingColumn())
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[figures]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
         self._bar = Progress(*columns, console=Console(stderr=True))
         self._job = self._bar.add_task("training", total=1.0, figures="")
 
@@ -92,9 +98,9 @@ class Logbook:
         found = self._statistics()
         if found["fault_rate"] > self._max_fault_rate:
             raise SimulationError(
-                f"{found['fault_rate']:.2%} of the control steps of iteration {it} ended in a world that diverged, became NaN or overflowed "
-                f"its contact buffers (limit {self._max_fault_rate:.2%}). Look at the drive's stiffness, the time step (sim.substeps) and the "
-                "sizes of the buffers (sim)."
+                f"{found['fault_rate']:.2%} of the control steps of iteration {it} ended in a world that diverged, became NaN or "
+                f"overflowed its contact buffers (limit {self._max_fault_rate:.2%}). Look at the drive's stiffness, the time step "
+                "(sim.substeps) and the sizes of the buffers (sim)."
             )
         episode = {f"episode/{name}": value for name, value in found.items() if name not in ("episodes", "fault_rate")}
         figures = {

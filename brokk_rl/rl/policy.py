@@ -1,7 +1,8 @@
 """Policies that can be evaluated, and the bundle in which a trained one leaves the trainer.
 
-A bundle is a folder (or a run folder) with `policy.safetensors` (weights of the actor), `policy.json` (the contract: machine, rate, order
-and scale of observations and commands) and `policy.onnx` (everything from the observation vector to the masked command, for the machine).
+A bundle is a folder (or a run folder) with `policy.safetensors` (weights of the actor), `policy.json` (the contract: machine,
+rate, order and scale of observations and commands) and `policy.onnx` (everything from the observation vector to the masked
+command, for the machine).
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ class Network:
 def make_actor(config: dict[str, Any], obs_groups: dict[str, list[str]], loop: ControlLoop) -> MLPModel:
     """Returns an actor network of rsl-rl for the observation groups of `loop`."""
     actor_class, arguments = resolve_class(json.loads(json.dumps(config)))
-    missing = [name for name in obs_groups["actor"] if name not in loop.get_observations().keys()]
+    missing = [name for name in obs_groups["actor"] if name not in set(loop.get_observations().keys())]
     if missing:
         raise ConfigError(f"rl.runner.obs_groups.actor: the task gives no group {', '.join(missing)}")
     return actor_class(loop.get_observations(), obs_groups, "actor", loop.num_actions, **arguments).to(loop.device)
@@ -145,7 +146,9 @@ def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[st
         contract = json.loads((folder / CONTRACT).read_text())
         weights = load_file(folder / WEIGHTS)
     except (OSError, ValueError, SafetensorError) as error:
-        raise CheckpointError(f"the policy in {folder} is corrupt: {error}; export it again from a checkpoint (mode=export)") from error
+        raise CheckpointError(
+            f"the policy in {folder} is corrupt: {error}; export it again from a checkpoint (mode=export)"
+        ) from error
     machine.check_fingerprint(contract.get("fingerprint", {}), f"the policy in {folder}")
     bad = [name for name, value in weights.items() if not torch.isfinite(value).all()]
     if bad:

@@ -54,10 +54,11 @@ class Training:
         save_interval: Iterations between checkpoints; a killed run loses no more.
         keep_checkpoints: Newest checkpoints kept.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world before the run stops with an error.
-        fuse: On a GPU, let `torch.compile` fuse the small operations around the physics before the control step is captured: about a fifth
-            faster, for half a minute of compiling and a C compiler.
+        fuse: On a GPU, let `torch.compile` fuse the small operations around the physics before the control step is captured:
+            about a fifth faster, for half a minute of compiling and a C compiler.
         random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at once.
-        runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`, `num_steps_per_env`, …), handed on as it is.
+        runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`, `num_steps_per_env`, …), handed on as it
+            is.
     """
 
     num_envs: int | None
@@ -71,15 +72,15 @@ class Training:
     runner: dict[str, Any]
 
     def runner_config(self) -> dict[str, Any]:
-        """Returns a copy for rsl-rl, which writes into it; keys without a value are dropped, since its constructors know no `null`."""
+        """Returns a copy for rsl-rl, which writes into it; keys without a value are dropped: its constructors know no `null`."""
         return _without_nulls(copy.deepcopy(self.runner)) | {"save_interval": 10**9, "check_for_nan": False}
 
 
 class Runner(OnPolicyRunner):
     """Trains; see `Training`.
 
-    rsl-rl's own checkpoint lacks the environment, the random generators and the step count; ours holds all of them, so that a resumed run
-    on a CPU goes on bit for bit. It is read with `weights_only=True`: a checkpoint from a stranger cannot run code.
+    rsl-rl's own checkpoint lacks the environment, the random generators and the step count; ours holds all of them, so that a
+    resumed run on a CPU goes on bit for bit. It is read with `weights_only=True`: a checkpoint from a stranger cannot run code.
 
     Args:
         env: The control loop.
@@ -93,7 +94,13 @@ class Runner(OnPolicyRunner):
     env: ControlLoop
 
     def __init__(
-        self, env: ControlLoop, training: Training, folder: Path, device: torch.device, logbook: Logbook, fingerprint: dict[str, str]
+        self,
+        env: ControlLoop,
+        training: Training,
+        folder: Path,
+        device: torch.device,
+        logbook: Logbook,
+        fingerprint: dict[str, str],
     ) -> None:
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
@@ -161,7 +168,7 @@ class Runner(OnPolicyRunner):
             old.unlink()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Does nothing: rsl-rl would save in the middle of an iteration's bookkeeping; `checkpoint` follows every call of `learn`."""
+        """Does nothing: rsl-rl would save amid an iteration's bookkeeping; `checkpoint` follows every call of `learn`."""
 
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
         """Restores a checkpoint so that training goes on exactly.
@@ -190,8 +197,8 @@ class Runner(OnPolicyRunner):
 def _tensor_cores(allowed: bool) -> Iterator[None]:
     """Lets matrix products use TF32 meanwhile.
 
-    Only where the control step is a captured graph, whose kernels were chosen before: ten bits of mantissa are enough for a network, but
-    would put the tool of a 5 m arm millimetres off.
+    Only where the control step is a captured graph, whose kernels were chosen before: ten bits of mantissa are enough for a
+    network, but would put the tool of a 5 m arm millimetres off.
     """
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if allowed else before)
@@ -218,7 +225,9 @@ def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
     except FileNotFoundError as error:
         raise CheckpointError(f"there is no checkpoint {path}") from error
     except Exception as error:  # torch raises many kinds: pickle, zip, runtime, end of file
-        raise CheckpointError(f"{path} is corrupt or not a checkpoint of ours ({type(error).__name__}); take an older one") from error
+        raise CheckpointError(
+            f"{path} is corrupt or not a checkpoint of ours ({type(error).__name__}); take an older one"
+        ) from error
     bad = [name for state in states for name, value in state.items() if not torch.isfinite(value).all()]
     if bad:
         raise CheckpointError(f"{path} holds NaN or infinite weights in {', '.join(bad[:3])}; take an older checkpoint")
@@ -229,7 +238,9 @@ def check_stamp(content: dict[str, Any], fingerprint: dict[str, str], path: obje
     """Raises a `CheckpointError` naming what differs when the checkpoint belongs to another machine."""
     differing = [key for key, value in fingerprint.items() if content.get("fingerprint", {}).get(key) != value]
     if differing:
-        raise CheckpointError(f"{path} was made for another machine: {', '.join(differing)} differ. Choose the machine it was made for (machine=…).")
+        raise CheckpointError(
+            f"{path} was made for another machine: {', '.join(differing)} differ. Choose the machine it was made for (machine=…)."
+        )
 
 
 def random_state(device: torch.device | str) -> dict[str, torch.Tensor]:

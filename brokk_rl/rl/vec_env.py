@@ -1,7 +1,8 @@
 """The control loop of many simulated machines at once, as rsl-rl wants to see it.
 
-One control step is command → actuator model → drive and physics → judgement → resets → observation, all on the device, with fixed shapes
-and without a host synchronisation. Where the world allows it (Warp on a GPU) the whole step is captured once in a CUDA graph and replayed.
+One control step is command → actuator model → drive and physics → judgement → resets → observation, all on the device, with fixed
+shapes and without a host synchronisation. Where the world allows it (Warp on a GPU) the whole step is captured once in a CUDA
+graph and replayed.
 """
 
 from __future__ import annotations
@@ -71,7 +72,8 @@ class ControlLoop(VecEnv):
 
     def __init__(self, machine: Machine, world: World, actuator: ActuatorModel, task: TaskProcess, starts: Starts) -> None:
         self.machine, self.world, self.actuator, self.task = machine, world, actuator, task
-        self.num_envs, self.device = world.num_worlds, world.device
+        self.num_envs = world.num_worlds
+        self.device: torch.device = world.device
         self.num_actions = task.num_actions
         self.max_episode_length = task.max_episode_steps
         self.cfg: dict[str, Any] = {}
@@ -92,7 +94,9 @@ class ControlLoop(VecEnv):
         self.end_force_n = torch.zeros_like(world.contact_force_n)
         """Peak contact force of the last step, likewise, `(N,)`."""
         self._total_names = (*task.episode, *(f"end/{reason}" for reason in task.reasons))
-        self._totals = torch.zeros(len(self._total_names), device=self.device)  # over episodes finished since `statistics` was last asked
+        self._totals = torch.zeros(
+            len(self._total_names), device=self.device
+        )  # over episodes finished since `statistics` was last asked
         self._steps = 0
         self._action = torch.zeros(self.num_envs, self.num_actions, device=self.device)
         # addresses that stay: a captured graph writes to them
@@ -132,8 +136,8 @@ class ControlLoop(VecEnv):
         if self.device.type != "cuda" or not self.world.supports_graphs:
             return
         if fuse:
-            parts = {name: torch.compile(getattr(self, name), fullgraph=True, dynamic=False) for name in ("_command", "_judge", "_perceive")}
-            self.__dict__.update(parts)
+            for name in ("_command", "_judge", "_perceive"):
+                setattr(self, name, torch.compile(getattr(self, name), fullgraph=True, dynamic=False))
         self._graph = capture(self._advance, self.device)
         self.begin()
 
@@ -153,14 +157,20 @@ class ControlLoop(VecEnv):
         return self.get_observations(), self.reward, self.done, {"time_outs": self.timed_out}
 
     def statistics(self) -> dict[str, float]:
-        """Returns means over the episodes finished since the last call, shares of their endings, and their number; one synchronisation."""
+        """Returns means over the episodes finished since the last call, shares of their endings, and their number.
+
+        Reads back from the device once.
+        """
         values = dict(zip(self._total_names, self._totals.tolist(), strict=True))
         endings = {name: value for name, value in values.items() if name.startswith("end/")}
         episodes = sum(endings.values())
         fault_rate = values["end/fault"] / max(1, self._steps * self.num_envs)
         self._totals.zero_()
         self._steps = 0
-        return {name: value / max(1.0, episodes) for name, value in values.items()} | {"episodes": episodes, "fault_rate": fault_rate}
+        return {name: value / max(1.0, episodes) for name, value in values.items()} | {
+            "episodes": episodes,
+            "fault_rate": fault_rate,
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Returns copies of everything that must be stored to go on exactly; random generators are the session's."""

@@ -34,19 +34,27 @@ _TIMEOUT_S = 600
 
 
 class Motion(Protocol):
-    """What is shown: an episode of `T` control steps.
+    """What is shown: an episode of `T` control steps."""
 
-    Attributes:
-        q: Joint positions, `(T, J)`, rad or m.
-        u: Commands, `(T, J)`, in [-1, 1].
-        force_n: Peak contact force of each step, `(T,)`.
-        scene: The scene, `(S,)`; see `sim.scene`.
-    """
+    @property
+    def q(self) -> np.ndarray:
+        """Joint positions, `(T, J)`, rad or m."""
+        ...
 
-    q: np.ndarray
-    u: np.ndarray
-    force_n: np.ndarray
-    scene: np.ndarray
+    @property
+    def u(self) -> np.ndarray:
+        """Commands, `(T, J)`, in [-1, 1]."""
+        ...
+
+    @property
+    def force_n(self) -> np.ndarray:
+        """Peak contact force of each step, `(T,)`."""
+        ...
+
+    @property
+    def scene(self) -> np.ndarray:
+        """The scene, `(S,)`; see `sim.scene`."""
+        ...
 
 
 def render_video(machine: Machine, motion: Motion, path: Path) -> Path:

@@ -165,5 +165,5 @@ def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(m
     assert len(episodes) == 2 and seen.shape[1] == 133
     for row, episode in enumerate(episodes):
         assert episode.q[0] == pytest.approx(starts["q"][row].numpy()) and (episode.u[0] == 0).all()
-        assert len(episode.t_s) == len(episode.q) == len(episode.u) == len(episode.force_n) == 10
+        assert len(episode.t_s) == len(episode.q) == len(episode.u) == len(episode.force_n) == 11
         assert abs(episode.q[1:] - episode.q[:-1]).max() <= 0.45 * 0.05 + 1e-6, "no jump: top speed is 0.45 rad/s"
