@@ -6,10 +6,7 @@ import torch
 
 from actuators.effects import draw
 from actuators.effects.ranges import CHANCE, Joints, Number, Value
-from actuators.effects.wrapped import EffectSpec, Wrapped
-from brokk_rl.contracts import ActuatorModel
-from brokk_rl.history import History
-from brokk_rl.machine import Machine
+from actuators.effects.wrapped import EffectSpec
 from brokk_rl.spec import spec
 
 
@@ -103,40 +100,6 @@ class EncoderScale(EffectSpec):
     def truth(self, q: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
         """`q / scale`."""
         return q / _along(value["scale"], q)
-
-
-class Measured:
-    """A model with its sensors, for free runs: from measured positions to the next measured ones.
-
-    In a simulator the world keeps the true positions; in a free run nobody does. This keeps them, beginning where the history says,
-    and is an actuator model in which `history.q` and the result are what recordings hold.
-    """
-
-    def __init__(self, model: Wrapped, machine: Machine, num_envs: int, device: torch.device) -> None:
-        self._model: ActuatorModel = model
-        self._sensors = model
-        self._q = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
-        self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """`q`, the true history `(N, H, J)`, and the model's as `inner.…`."""
-        return {"q": self._q, "fresh": self._fresh} | {f"inner.{name}": value for name, value in self._model.state.items()}
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Forgets the true positions in the environments of `mask`, shape `(N,)` bool."""
-        if self._q.requires_grad:
-            self._q.detach_()
-        self._fresh.logical_or_(mask)
-        self._model.reset(mask)
-
-    def step(self, history: History) -> torch.Tensor:
-        """Returns the measured positions one control period later, shape `(N, J)`."""
-        true = torch.where(self._fresh[:, None, None], self._sensors.truth(history.q), self._q)
-        q = self._model.step(History(q=true, u=history.u))
-        self._q.copy_(torch.cat((true[:, 1:], q[:, None]), 1))
-        self._fresh.fill_(False)
-        return self._sensors.measure(q)
 
 
 def _along(value: torch.Tensor, q: torch.Tensor) -> torch.Tensor:

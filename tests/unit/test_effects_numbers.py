@@ -14,9 +14,9 @@ from composed import option
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from actuators.effects.affected import Affected
 from actuators.effects.kinematics import turned
-from actuators.effects.measurement import Measured
-from brokk_rl.checks import NUM_ENVS, check_actuator_model
+from brokk_rl.checks import check_actuator
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -306,21 +306,31 @@ def test_bias_and_scale_are_taken_back_by_truth(machine: Machine) -> None:
     torch.testing.assert_close(model.truth(1.02 * (histories + 0.01)), histories)
 
 
+def affected(actuator: str, **effects: Any) -> Affected:
+    specs = {name: replace(shipped("effect", name), **numbers) for name, numbers in effects.items()}
+    return Affected(actuator=shipped("actuator", actuator), effects=specs)
+
+
 def test_a_free_run_with_sensors_stays_in_measured_positions(machine: Machine) -> None:
-    scaled = wrapped("encoder_scale", machine, inner=shipped("actuator", "ideal").build(machine, 1, CPU), scale=1.1)
-    path = roll(Measured(scaled, machine, 1, CPU), machine, [1.0] * 3, at=np.full(5, 0.11))
+    scaled = affected("ideal", encoder_scale={"scale": 1.1}).build(machine, 1, CPU)
+    path = roll(scaled, machine, [1.0] * 3, at=np.full(5, 0.11))
     # the true angle starts at 0.1 and gains 0.02 a period; the encoder shows 1.1 of it
     np.testing.assert_allclose(path[:, 0, 0], [0.11, 0.132, 0.154, 0.176], atol=1e-6)
-    coarse = wrapped("quantisation", machine, inner=shipped("actuator", "ideal").build(machine, 1, CPU), step_rad=0.05)
-    path = roll(Measured(coarse, machine, 1, CPU), machine, [0.3] * 10, at=np.zeros(5))
+    coarse = affected("ideal", quantisation={"step_rad": 0.05}).build(machine, 1, CPU)
+    path = roll(coarse, machine, [0.3] * 10, at=np.zeros(5))
     assert path[-1, 0, 0].item() == pytest.approx(0.05)  # 0.06 in truth: steps too small to see still add up
 
 
-def test_a_model_with_its_sensors_is_an_actuator_model(machine: Machine) -> None:
-    model: Any = shipped("actuator", "lag").build(machine, NUM_ENVS, CPU)
-    for name in ("encoder_bias", "sensor_noise", "quantisation"):
-        model = shipped("effect", name).wrap(model, machine, NUM_ENVS, CPU)
-    check_actuator_model(Measured(model, machine, NUM_ENVS, CPU), machine, CPU)
+def test_candidates_run_side_by_side(machine: Machine) -> None:
+    model = affected("ideal", flow_gain={"gain": 1.0}, encoder_bias={"bias_rad": 0.1}).build(machine, 3, CPU)
+    model.effects["flow_gain"].parameters["gain"][:] = torch.tensor([0.5, 1.0, 2.0])[:, None]
+    path = roll(model, machine, [1.0], num=3, at=np.zeros(5))
+    np.testing.assert_allclose(path[1, :, 0], [0.01, 0.02, 0.04], atol=1e-6)
+
+
+@pytest.mark.parametrize("effects", [{}, {"encoder_bias": {}, "sensor_noise": {}, "quantisation": {}, "backlash": {}}])
+def test_an_actuator_with_its_effects_is_an_actuator(machine: Machine, effects: dict[str, Any]) -> None:
+    check_actuator(affected("lag", **effects), machine)
 
 
 def test_a_longer_link_moves_the_tool_along_it(machine: Machine) -> None:
