@@ -43,7 +43,9 @@ class LinkLength(EffectSpec):
 
 @spec
 class BaseTilt(EffectSpec):
-    """The machine does not stand level; instruments and site drawings do. The weight is not turned with it.
+    """The machine does not stand level, as instruments and site drawings do.
+
+    Camera and arm tilt together: the controller does not notice, outside instruments do. The weight is not turned with the machine.
 
     Attributes:
         roll_rad: Turn about x, forward; positive lifts the left side.
@@ -59,6 +61,11 @@ class BaseTilt(EffectSpec):
     def tool(self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant) -> torch.Tensor:
         """Turns the point with the base."""
         return turned(point_m, value["roll_rad"], value["pitch_rad"], torch.zeros_like(value["roll_rad"]))
+
+    def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Turns it back: the camera stands on the base."""
+        none = torch.zeros_like(value["roll_rad"])
+        return turned(turned(point_m, none, -value["pitch_rad"], none), -value["roll_rad"], none, none)
 
 
 @spec

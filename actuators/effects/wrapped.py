@@ -115,7 +115,7 @@ class EffectSpec:
         return point_m
 
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Returns where the camera sees a point of the base frame, `(N, 3)`; kinematics."""
+        """Returns where the camera sees a point, `(N, 3)` in the base frame; kinematics."""
         return point_m
 
 
@@ -198,7 +198,7 @@ class Wrapped:
         return self.effect.tool(point_m, q, self.parameters, self.plant)
 
     def target(self, point_m: torch.Tensor) -> torch.Tensor:
-        """Returns where the camera sees a point of the base frame, `(N, 3)`."""
+        """Returns where the camera sees a point, `(N, 3)` in the base frame."""
         point_m = getattr(self.inner, "target", _unchanged)(point_m)
         return self.effect.target(point_m, self.parameters)
 
@@ -209,7 +209,7 @@ class Wrapped:
         right and whose target is displaced; so the simulated geometry stays and the estimate moves.
         """
         tip_m = self.plant.kinematics.pose(q).tip_in_base_m
-        return (self.tool(tip_m, q) - tip_m) + (self.target(tip_m) - tip_m)
+        return self.target(self.tool(tip_m, q)) - tip_m
 
     def _moment(self, history: History, counter: torch.Tensor | None) -> Moment:
         return Moment(self.parameters, {}, history, self.plant, torch.zeros_like(history.q[:, -1]), counter)

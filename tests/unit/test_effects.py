@@ -66,6 +66,12 @@ def roll(model: Any, machine: Machine, u: torch.Tensor, moving: bool = False) ->
     return torch.stack(path)
 
 
+def places(model: Any, q: torch.Tensor) -> torch.Tensor:
+    """Returns where the point (1, 1, 1) of the tool is, and where the camera sees that point, `(N, 6)`."""
+    point_m = torch.ones(len(q), 3)
+    return torch.cat((model.tool(point_m, q), model.target(point_m)), 1)
+
+
 def stack(machine: Machine, inner: Any, specs: list[Any], num: int) -> Any:
     for spec in specs:
         inner = spec.wrap(inner, machine, num, CPU)
@@ -106,6 +112,7 @@ def test_the_neutral_value_changes_nothing(name: str, actuator: str, moving: boo
     assert torch.equal(model.measure(path[-1]), path[-1])
     assert torch.equal(model.truth(path[-1]), path[-1])
     assert torch.equal(model.misplacement(path[-1]), torch.zeros(2, 3))
+    assert torch.equal(places(model, path[-1]), torch.ones(2, 6))
 
 
 @every("effect")
@@ -116,7 +123,7 @@ def test_the_typical_value_changes_something(name: str, machine: Machine) -> Non
     model = effect(name, **seldom.get(name, {})).wrap(build(machine, 2, CPU), machine, 2, CPU)
     expected, path = roll(build(machine, 2, CPU), machine, u), roll(model, machine, u)
     seen = model.measure(path[-1])
-    moved = [(path - expected).abs().amax(), (seen - path[-1]).abs().amax(), model.misplacement(path[-1]).abs().amax()]
+    moved = [(path - expected).abs().amax(), (seen - path[-1]).abs().amax(), (places(model, path[-1]) - 1.0).abs().amax()]
     acting = {"command": 0, "speed": 0, "joints": 0, "measurement": 1, "kinematics": 2}[model.effect.side]
     assert [float(size) > 1e-5 for size in moved] == [place == acting for place in range(3)]
 
@@ -239,7 +246,7 @@ def test_gradients_agree_with_candidates_side_by_side(name: str, machine: Machin
         wanted = (middle + step * torch.tensor([-1.0, 0.0, 1.0])[:, None]).expand(3, width).clone().requires_grad_()
         model.parameters[key] = wanted
         path = roll(model, machine, u)
-        by_side = {"measurement": model.measure(path[-1]), "kinematics": model.misplacement(path[-1])}
+        by_side = {"measurement": model.measure(path[-1]), "kinematics": places(model, path[-1])}
         figure = by_side.get(spec.side, path).double().square().sum(dim=(0, 2) if spec.side not in by_side else 1)
         (gradient,) = torch.autograd.grad(figure[1], wanted)
         slope = (figure[2] - figure[0]).item() / (2.0 * step)

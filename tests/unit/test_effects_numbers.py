@@ -361,6 +361,8 @@ def test_tilt_turns_the_tool_with_the_base(machine: Machine) -> None:
     np.testing.assert_allclose(nose_down, [[3 * cos + 0.5 * sin, 1, 0.5 * cos - 3 * sin]], atol=1e-6)
     left_up = wrapped("base_tilt", machine, roll_rad=0.1, pitch_rad=0.0).tool(point_m, q)
     np.testing.assert_allclose(left_up, [[3, cos - 0.5 * sin, 0.5 * cos + sin]], atol=1e-6)
+    both = wrapped("base_tilt", machine, roll_rad=0.1, pitch_rad=-0.2)
+    np.testing.assert_allclose(both.target(both.tool(point_m, q)), point_m, atol=1e-6)  # the camera stands on the base
 
 
 def test_extrinsics_turn_and_displace_what_the_camera_sees(machine: Machine) -> None:
