@@ -54,6 +54,31 @@ class ActuatorModel(Protocol):
         ...
 
 
+class SensingModel(ActuatorModel, Protocol):
+    """An actuator model that also says what is seen of the motion; what effects on sensors and geometry make of a model.
+
+    A loop asks an actuator for `sides` (absent: none) and calls `measure` and `misplacement` only where they do something, once a
+    control period, after `reset`. `step` is given true positions.
+    """
+
+    @property
+    def sides(self) -> frozenset[str]:
+        """`measurement` where `measure` matters, `kinematics` where `misplacement` does."""
+        ...
+
+    def measure(self, q: torch.Tensor) -> torch.Tensor:
+        """Returns what the sensors say at the true positions `q`, `(N, J)`."""
+        ...
+
+    def truth(self, q: torch.Tensor) -> torch.Tensor:
+        """Returns the likeliest true positions where the sensors say `q`, `(N, J)` or `(N, H, J)`."""
+        ...
+
+    def misplacement(self, q: torch.Tensor) -> torch.Tensor:
+        """Returns how far off the controller believes a target near the tool at the true positions `q`, `(N, 3)` in m."""
+        ...
+
+
 class Actuator(Protocol):
     """A spec in `conf/actuator`: builds an actuator model."""
 
@@ -197,9 +222,10 @@ class TaskProcess(Protocol):
         """Judges the control step that has just been simulated."""
         ...
 
-    def observe(self, history: History) -> dict[str, torch.Tensor]:
+    def observe(self, history: History, shift_m: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """Returns the observation groups, called once a control step after `step` and `reset`.
 
+        `history` is what sensors say; `shift_m`, `(N, 3)`, is how far off the target is believed (`SensingModel.misplacement`).
         `policy` is the vector of `brokk_rl.observation`; the tensors are the task's own and are overwritten by the next call.
         """
         ...

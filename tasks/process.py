@@ -188,9 +188,9 @@ class ToolPoseProcess:
         state["contact_force_n"].copy_(force_n)
         return Transition(reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason)
 
-    def observe(self, history: History) -> dict[str, torch.Tensor]:
+    def observe(self, history: History, shift_m: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """See `TaskProcess.observe`: `policy`, `guide` (what the classical controller makes of it), `privileged` (critic only)."""
-        self._perceive(history)
+        self._perceive(history, shift_m)
         return {"policy": self.state["policy"], "guide": self.state["features"], "privileged": self.state["privileged"]}
 
     def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -233,7 +233,7 @@ class ToolPoseProcess:
         travel = (seen.u - seen.u_before).abs().sum(1) / period_s
         episode["valve_travel"] += (travel - episode["valve_travel"]) / episode["length"]
 
-    def _perceive(self, history: History) -> None:
+    def _perceive(self, history: History, shift_m: torch.Tensor | None) -> None:
         """Writes what the policy is told: estimate, guidance, phase and the observation groups."""
         noise, state = self.options.noise, self.state
         true_m = state["start.target_m"]
@@ -241,6 +241,8 @@ class ToolPoseProcess:
         if noise.target_relative:
             error = error + (2 * torch.rand_like(true_m) - 1) * noise.target_relative * true_m
         sample = true_m + state["bias_m"] + error
+        if shift_m is not None:
+            sample = sample + shift_m
         state["estimate_sum_m"] += sample
         if noise.filter == "mean":
             # the observation after the reset is the first sample

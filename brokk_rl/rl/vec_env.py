@@ -80,6 +80,11 @@ class ControlLoop(VecEnv):
         self.starts = starts
         shape = (self.num_envs, machine.num_history, machine.num_joints)
         self.history = History(q=torch.zeros(shape, device=self.device), u=torch.zeros(shape, device=self.device))
+        """What the controller sees."""
+        sides = getattr(actuator, "sides", frozenset())
+        self._senses, self._misplaces = "measurement" in sides, "kinematics" in sides
+        self.truth = History(q=self.history.q.clone(), u=self.history.u.clone()) if self._senses else self.history
+        """What the machine does; the same object where sensors are true."""
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.timed_out = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -174,7 +179,7 @@ class ControlLoop(VecEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """Returns copies of everything that must be stored to go on exactly; random generators are the session's."""
-        state: dict[str, torch.Tensor] = {"history.q": self.history.q, "history.u": self.history.u}
+        state: dict[str, torch.Tensor] = {"history.q": self.history.q, "history.u": self.history.u, "truth.q": self.truth.q}
         state |= {f"task.{name}": value for name, value in self.task.state.items()}
         state |= {f"episode.{name}": value for name, value in self.task.episode.items()}
         state |= {f"actuator.{name}": value for name, value in self.actuator.state.items()}
@@ -186,6 +191,8 @@ class ControlLoop(VecEnv):
         tensors = state["tensors"]
         self.history.q.copy_(tensors["history.q"])
         self.history.u.copy_(tensors["history.u"])
+        self.truth.q.copy_(tensors["truth.q"])
+        self.truth.u.copy_(tensors["history.u"])
         parts = {"task": self.task.state, "episode": self.task.episode, "actuator": self.actuator.state, "group": self._groups}
         for prefix, part in parts.items():
             for name, value in part.items():
@@ -202,14 +209,16 @@ class ControlLoop(VecEnv):
     def _command(self) -> torch.Tensor:
         """Puts the action into force; returns how far the drive shall move each joint, `(N, J)`."""
         self.end_u.copy_(self.task.command(self._action))
-        self.history.push_u(self.end_u)
-        return self.actuator.step(self.history) - self.history.q[:, -1]
+        self.truth.push_u(self.end_u)
+        if self._senses:
+            self.history.push_u(self.end_u)
+        return self.actuator.step(self.truth) - self.truth.q[:, -1]
 
     def _judge(self) -> Starts:
         """Judges what the world has done; returns where the finished environments start anew."""
         # a world that became NaN is a fault and starts anew; its numbers must not poison the sums over all worlds
-        self.history.push_q(self.world.q.nan_to_num())
-        transition = self.task.step(self.history, self.world)
+        self.truth.push_q(self.world.q.nan_to_num())
+        transition = self.task.step(self.truth, self.world)
         done = transition.terminated | transition.timed_out
         self.reward.copy_(transition.reward)
         self.timed_out.copy_(transition.timed_out)
@@ -225,10 +234,15 @@ class ControlLoop(VecEnv):
 
     def _perceive(self, start: Starts) -> None:
         """Resets finished environments and observes all of them."""
-        self.history.reset(self.done, start["q"])
+        self.truth.reset(self.done, start["q"])
         self.actuator.reset(self.done)
+        if self._senses:
+            q = self.actuator.measure(self.truth.q[:, -1])
+            self.history.push_q(q)
+            self.history.reset(self.done, q)
         self.task.reset(self.done, start)
-        for name, value in self.task.observe(self.history).items():
+        shift_m = self.actuator.misplacement(self.truth.q[:, -1]) if self._misplaces else None
+        for name, value in self.task.observe(self.history, shift_m).items():
             self._groups[name].copy_(value)
 
     def _draw(self) -> Starts:
