@@ -8,13 +8,13 @@ graph and replayed.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from brokk_rl.contracts import Actuator, ActuatorModel, Effect, Simulator, Task, TaskProcess, World
+from brokk_rl.contracts import Actuator, ActuatorModel, Effect, SensingModel, Simulator, Task, TaskProcess, World
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.graph import capture
@@ -82,8 +82,9 @@ class ControlLoop(VecEnv):
         self.history = History(q=torch.zeros(shape, device=self.device), u=torch.zeros(shape, device=self.device))
         """What the controller sees."""
         sides = getattr(actuator, "sides", frozenset())
-        self._senses, self._misplaces = "measurement" in sides, "kinematics" in sides
-        self.truth = History(q=self.history.q.clone(), u=self.history.u.clone()) if self._senses else self.history
+        self._sensing = cast(SensingModel, actuator) if "measurement" in sides else None
+        self._misplacing = cast(SensingModel, actuator) if "kinematics" in sides else None
+        self.truth = History(q=self.history.q.clone(), u=self.history.u.clone()) if self._sensing else self.history
         """What the machine does; the same object where sensors are true."""
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -210,7 +211,7 @@ class ControlLoop(VecEnv):
         """Puts the action into force; returns how far the drive shall move each joint, `(N, J)`."""
         self.end_u.copy_(self.task.command(self._action))
         self.truth.push_u(self.end_u)
-        if self._senses:
+        if self._sensing:
             self.history.push_u(self.end_u)
         return self.actuator.step(self.truth) - self.truth.q[:, -1]
 
@@ -236,12 +237,12 @@ class ControlLoop(VecEnv):
         """Resets finished environments and observes all of them."""
         self.truth.reset(self.done, start["q"])
         self.actuator.reset(self.done)
-        if self._senses:
-            q = self.actuator.measure(self.truth.q[:, -1])
+        if self._sensing:
+            q = self._sensing.measure(self.truth.q[:, -1])
             self.history.push_q(q)
             self.history.reset(self.done, q)
         self.task.reset(self.done, start)
-        shift_m = self.actuator.misplacement(self.truth.q[:, -1]) if self._misplaces else None
+        shift_m = self._misplacing.misplacement(self.truth.q[:, -1]) if self._misplacing else None
         for name, value in self.task.observe(self.history, shift_m).items():
             self._groups[name].copy_(value)
 
