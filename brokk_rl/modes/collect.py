@@ -65,9 +65,8 @@ class Collect:
         self.session.seed_all()
         generator = self.session.generator("collect")
         process = self.excitation.build(self.machine, self.collect.num_runs, generator)
-        device = (
-            torch.device("cpu") if self.session.device == "auto" else self.session.torch_device()
-        )  # a few dozen runs: CPU is faster
+        # a few dozen runs are faster on a CPU
+        device = torch.device("cpu") if self.session.device == "auto" else self.session.torch_device()
         files = self._drive(process, generator, device)
         minutes = self.collect.num_runs * self.collect.run_minutes
         log.info("%d recordings of %.0f minutes in all in %s", files, minutes, self.session.folder / FOLDER)

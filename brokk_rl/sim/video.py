@@ -29,6 +29,8 @@ MAX_FRAMES = 200
 SIZE = (1200, 540)
 CLOSE_WIDTH = 380
 """Width of the close-up at the right, pixels."""
+FAR_M = 10.0
+"""A block farther away than this is not part of the task."""
 NUM_STILLS = 3
 _TIMEOUT_S = 600
 
@@ -153,13 +155,15 @@ def _bars(pen, names: tuple[str, ...], u: np.ndarray, font, height: int) -> None
 
 
 def captions(machine: Machine, arrays: dict[str, np.ndarray]) -> list[str]:
-    """Returns a line for each step: time, how deep the tip is, how far beside the axis, and the contact force."""
+    """Returns a line for each step: time, where the tip is relative to the rim (unless the block is far away), and force."""
     tip = Kinematics(machine).pose(torch.as_tensor(arrays["q"], dtype=torch.float32)).tip_in_base_m.numpy() - arrays["scene"][:3]
-    return [
-        f"{step * machine.period_s:5.1f} s    depth {-100 * z:4.0f} cm    beside the axis {100 * math.hypot(x, y):5.1f} cm    "
-        f"{force:6.0f} N"
-        for step, ((x, y, z), force) in enumerate(zip(tip, arrays["force_n"], strict=True))
-    ]
+    concerned = float(np.hypot(*arrays["scene"][:2])) < FAR_M
+    lines = []
+    for step, ((x, y, z), force) in enumerate(zip(tip, arrays["force_n"], strict=True)):
+        side = "above" if z > 0 else "below"
+        where = f"{100 * abs(z):4.0f} cm {side} the rim, {100 * math.hypot(x, y):5.1f} cm off axis    " if concerned else ""
+        lines.append(f"{step * machine.period_s:5.1f} s    {where}{force:6.0f} N")
+    return lines
 
 
 def write(path: Path, draw: Callable[[Iterable[int]], Iterator[np.ndarray]], num_steps: int, period_s: float) -> None:
