@@ -160,5 +160,5 @@ class LevelsProcess:
         self._turn_s = np.where(turn, config.turn_s, self._turn_s) - machine.period_s
         if not machine.is_exclusive.any():
             return self._level.copy()
-        may_move = np.where(self._positioning[:, None], exclusive_mask(machine, True), exclusive_mask(machine, False))
+        may_move = exclusive_mask(machine.is_exclusive, self._positioning)
         return self._level * may_move

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
+from actuators.draw import hashed
 from brokk_rl.errors import ConfigError, choices
 from brokk_rl.machine import Machine
 
@@ -83,14 +84,6 @@ class Parameters:
             return
         self._draw.add_(mask.to(torch.int64))
         for column, (name, width) in enumerate(self._width.items()):
-            uniform = _hashed(self._draw[:, None] * 7_919 + self._joint + column * 104_729)
+            uniform = hashed(self._draw[:, None] * 7_919 + self._joint + column * 104_729)
             drawn = self._nominal[name] * (1.0 + width * (2.0 * uniform - 1.0))
             self.value[name].copy_(torch.where(mask[:, None], drawn, self.value[name]))
-
-
-def _hashed(key: torch.Tensor) -> torch.Tensor:
-    """Returns uniform numbers in [0, 1) for integer keys (the mixing steps of splitmix64, which wrap around in int64)."""
-    key = key * -7_046_029_254_386_353_131
-    key = (key ^ ((key >> 30) & 0x3FFFFFFFF)) * -4_658_895_280_553_007_687
-    key = (key ^ ((key >> 27) & 0x1FFFFFFFFF)) * -7_723_592_293_110_705_685
-    return ((key >> 40) & 0xFFFFFF).to(torch.float32) / float(1 << 24)

@@ -7,7 +7,7 @@ onto every file, so that a policy of one machine cannot be loaded on another unn
 import hashlib
 import json
 from dataclasses import asdict
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -194,9 +194,16 @@ class Machine:
             )
 
 
-def exclusive_mask(machine: Machine, positioning: bool) -> np.ndarray:
-    """Returns which joints may be commanded, shape `(J,)`: the exclusive ones while positioning, else all the others.
+def exclusive_mask(is_exclusive: Any, positioning: Any) -> Any:
+    """Returns which joints may be commanded: the exclusive ones while positioning, else all the others.
 
-    These are the paper's masks [0, 1, 0, 0, 0] and [1, 0, 1, 1, 1]; task, guard and levers all use this function.
+    These are the paper's masks [0, 1, 0, 0, 0] and [1, 0, 1, 1, 1]; tasks, excitations, guard and levers all use this function.
+
+    Args:
+        is_exclusive: `Machine.is_exclusive`, `(J,)` bool, numpy or torch.
+        positioning: One bool, or an array of the same kind, `(…,)`.
+
+    Returns:
+        `(J,)` for one bool, else `(…, J)`.
     """
-    return machine.is_exclusive if positioning else ~machine.is_exclusive
+    return is_exclusive == (positioning[..., None] if getattr(positioning, "ndim", 0) else positioning)

@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 
 from brokk_rl.classical import Guidance
+from brokk_rl.machine import exclusive_mask
 from brokk_rl.spec import spec
 
 
@@ -87,5 +88,5 @@ class Action:
         """
         u = self.scale * output + (base if self.kind == "residual" else 0.0)
         if self.mask:
-            u = torch.where(exclusive == positioning[:, None], u, 0.0)
+            u = torch.where(exclusive_mask(exclusive, positioning), u, 0.0)
         return u.clamp(-1.0, 1.0)

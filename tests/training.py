@@ -55,7 +55,7 @@ def make(machine: Machine, folder: Path, training: Training, loop: ControlLoop |
     book = Logbook(
         folder, Off().open(folder, {}), loop.statistics, STEPS * loop.num_envs, training.max_fault_rate, training.budget.share_spent
     )
-    return Runner(loop, training, folder, CPU, book, machine.fingerprint()), book
+    return Runner(loop, training, folder, CPU, book), book
 
 
 def train(machine: Machine, folder: Path, training: Training, resume: Path | None = None) -> Runner:

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects import draw
+from actuators import draw
 from actuators.effects.ranges import CHANCE, Joints, Number, Value
 from actuators.effects.wrapped import EffectSpec
 from brokk_rl.spec import spec

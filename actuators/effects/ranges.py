@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from actuators.effects import draw
+from actuators import draw
 from actuators.parameters import per_joint
 from brokk_rl.errors import ConfigError, choices
 from brokk_rl.machine import Machine

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 import torch
 
-from actuators.effects import draw
+from actuators import draw
 from actuators.effects.ranges import CHANCE, Joints, Number, Ranges
 from actuators.gravity import Gravity
 from brokk_rl.contracts import ActuatorModel

@@ -99,7 +99,7 @@ class Bench:
         book = Logbook(
             self.session.folder, Off().open(self.session.folder, {}), loop.statistics, num * runner_steps, 1.0, lambda *_: 0.0
         )
-        runner = Runner(loop, self.rl, self.session.folder, device, book, {})
+        runner = Runner(loop, self.rl, self.session.folder, device, book)
         runner.learn(1)
         _wait(device)
         start = time.perf_counter()

@@ -13,7 +13,7 @@ from brokk_rl.modes.train import find_checkpoint
 from brokk_rl.rl.evaluation import evaluate
 from brokk_rl.rl.export import export_onnx
 from brokk_rl.rl.policy import Network, make_actor, write_bundle
-from brokk_rl.rl.runner import Training, check_stamp, read_checkpoint
+from brokk_rl.rl.runner import Training, read_checkpoint
 from brokk_rl.rl.vec_env import Plant
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
@@ -54,7 +54,7 @@ class Export:
         path = find_checkpoint(Path(self.checkpoint))
         cpu = torch.device("cpu")
         content = read_checkpoint(path, cpu)
-        check_stamp(content, self.machine.fingerprint(), path)
+        self.machine.check_fingerprint(content.get("fingerprint", {}), str(path))
         plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects={})
         loop = plant.build(cpu, self.num_checked, self.num_checked, self.session.stream("starts"))
         config = self.rl.runner_config()

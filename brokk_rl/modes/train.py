@@ -68,7 +68,7 @@ class Train:
         tracker = self.tracking.open(folder, {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed})
         book = Logbook(folder, tracker, loop.statistics, steps, self.rl.max_fault_rate, self.rl.budget.share_spent)
         with book:
-            runner = Runner(loop, self.rl, folder, device, book, self.machine.fingerprint())
+            runner = Runner(loop, self.rl, folder, device, book)
             if checkpoint:
                 runner.load(str(checkpoint))
                 log.info("going on from %s: %d control steps, %.0f s", checkpoint, book.env_steps, book.seconds)

@@ -83,30 +83,21 @@ class Runner(OnPolicyRunner):
     resumed run on a CPU goes on bit for bit. It is read with `weights_only=True`: a checkpoint from a stranger cannot run code.
 
     Args:
-        env: The control loop.
+        env: The control loop; a checkpoint of another machine than its own is refused.
         training: Configuration.
         folder: Checkpoints go here.
         device: Where the networks live.
         logbook: Takes the place of rsl-rl's logger.
-        fingerprint: The machine's; a checkpoint of another machine is refused.
     """
 
     env: ControlLoop
 
-    def __init__(
-        self,
-        env: ControlLoop,
-        training: Training,
-        folder: Path,
-        device: torch.device,
-        logbook: Logbook,
-        fingerprint: dict[str, str],
-    ) -> None:
+    def __init__(self, env: ControlLoop, training: Training, folder: Path, device: torch.device, logbook: Logbook) -> None:
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
             super().__init__(env, training.runner_config(), log_dir=None, device=str(device))
         log.debug(printed.getvalue())
-        self.training, self.folder, self.fingerprint = training, folder, fingerprint
+        self.training, self.folder = training, folder
         self.logger = logbook  # type: ignore[assignment]
 
     def run(self) -> None:
@@ -150,7 +141,7 @@ class Runner(OnPolicyRunner):
             "env": self.env.state_dict(),
             "book": book.state_dict(),
             "random": random_state(self.device),
-            "fingerprint": self.fingerprint,
+            "fingerprint": self.env.machine.fingerprint(),
         }
         path = self.folder / f"model_{self.current_learning_iteration}.pt"
         part = path.with_suffix(".part")
@@ -177,7 +168,7 @@ class Runner(OnPolicyRunner):
             CheckpointError: The file is missing, corrupt, holds NaN or belongs to another machine or configuration.
         """
         content = read_checkpoint(Path(path), self.device)
-        check_stamp(content, self.fingerprint, path)
+        self.env.machine.check_fingerprint(content.get("fingerprint", {}), path)
         try:
             self.alg.load(content, None, strict=True)
             self.env.load_state_dict(content["env"])
@@ -232,15 +223,6 @@ def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
     if bad:
         raise CheckpointError(f"{path} holds NaN or infinite weights in {', '.join(bad[:3])}; take an older checkpoint")
     return content
-
-
-def check_stamp(content: dict[str, Any], fingerprint: dict[str, str], path: object) -> None:
-    """Raises a `CheckpointError` naming what differs when the checkpoint belongs to another machine."""
-    differing = [key for key, value in fingerprint.items() if content.get("fingerprint", {}).get(key) != value]
-    if differing:
-        raise CheckpointError(
-            f"{path} was made for another machine: {', '.join(differing)} differ. Choose the machine it was made for (machine=…)."
-        )
 
 
 def random_state(device: torch.device | str) -> dict[str, torch.Tensor]:

@@ -100,9 +100,8 @@ class ControlLoop(VecEnv):
         self.end_force_n = torch.zeros_like(world.contact_force_n)
         """Peak contact force of the last step, likewise, `(N,)`."""
         self._total_names = (*task.episode, *(f"end/{reason}" for reason in task.reasons))
-        self._totals = torch.zeros(
-            len(self._total_names), device=self.device
-        )  # over episodes finished since `statistics` was last asked
+        # sums over episodes finished since `statistics` was last asked
+        self._totals = torch.zeros(len(self._total_names), device=self.device)
         self._steps = 0
         self._action = torch.zeros(self.num_envs, self.num_actions, device=self.device)
         # addresses that stay: a captured graph writes to them

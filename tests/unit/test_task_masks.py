@@ -64,7 +64,7 @@ def test_the_masks_are_the_papers_and_those_of_the_machine(machine: Machine) -> 
     for positioning, paper in ((True, [0, 1, 0, 0, 0]), (False, [1, 0, 1, 1, 1])):
         flag = torch.tensor([positioning])
         u = action.command(torch.ones(1, 5), torch.zeros(1, 5), flag, torch.as_tensor(machine.is_exclusive))
-        assert u[0].tolist() == paper == exclusive_mask(machine, positioning).astype(int).tolist()
+        assert u[0].tolist() == paper == exclusive_mask(machine.is_exclusive, positioning).astype(int).tolist()
 
 
 def test_direct_and_residual_actions_on_numbers(machine: Machine) -> None:

@@ -18,8 +18,12 @@ def counter(num_envs: int, salt: int, device: torch.device) -> torch.Tensor:
 def uniform(draw: torch.Tensor, column: int, width: int) -> torch.Tensor:
     """Returns numbers in [0, 1), `(N, width)`, for the counter `(N,)`; another `column` (below 256) gives independent ones."""
     place = torch.arange(width, dtype=torch.int64, device=draw.device) + 256 * column
-    key = draw[:, None] * 65_536 + place
-    key = key * -7_046_029_254_386_353_131  # splitmix64, which wraps around in int64
+    return hashed(draw[:, None] * 65_536 + place)
+
+
+def hashed(key: torch.Tensor) -> torch.Tensor:
+    """Returns uniform numbers in [0, 1) for int64 keys: the mixing steps of splitmix64 (Steele et al. 2014), which wrap around."""
+    key = key * -7_046_029_254_386_353_131
     key = (key ^ ((key >> 30) & 0x3FFFFFFFF)) * -4_658_895_280_553_007_687
     key = (key ^ ((key >> 27) & 0x1FFFFFFFFF)) * -7_723_592_293_110_705_685
     return ((key >> 40) & 0xFFFFFF).to(torch.float32) / float(1 << 24)
