@@ -19,12 +19,12 @@ class Gravity:
         def tensor(rows: list) -> torch.Tensor:
             return torch.tensor(rows, dtype=torch.float32, device=device)
 
-        joints = machine.joints
-        self._axis = tensor([joint.axis for joint in joints])
-        self._origin_m = tensor([[d.value for d in joint.origin_m] for joint in joints])
-        self._com_m = tensor([joint.com_m for joint in joints])
-        self._mass_kg = tensor([joint.mass_kg.value for joint in joints])
-        self._hinge = tensor([float(joint.kind == "hinge") for joint in joints])
+        bodies = machine.bodies
+        self._axis = tensor([body.axis for body in bodies])
+        self._origin_m = tensor([[d.value for d in body.origin_m] for body in bodies])
+        self._com_m = tensor([body.com_m for body in bodies])
+        self._mass_kg = tensor([body.mass_kg.value for body in bodies])
+        self._hinge = tensor([float(joint.kind == "hinge") for joint in machine.joints])
         self._carried_kg = self._mass_kg.flip(0).cumsum(0).flip(0)
         x, y, z = self._axis.unbind(1)
         zero = torch.zeros_like(x)

@@ -129,8 +129,8 @@ class HydraulicModel:
 
         self._lower, self._upper = tensor(machine.lower), tensor(machine.upper)
         self._full_speed = tensor(machine.max_speed)
-        self._stiffness = tensor(np.array([joint.stiffness.value for joint in machine.joints]))
-        self._yield_force = tensor(np.array([joint.yield_force.value for joint in machine.joints]))
+        self._stiffness = tensor(np.array([body.stiffness.value for body in machine.bodies]))
+        self._yield_force = tensor(np.array([body.yield_force.value for body in machine.bodies]))
         shape = (num_envs, machine.num_joints)
         self._state = {name: torch.zeros(shape, device=device) for name in ("pilot", "spool", "spool_rate", "speed", "force")}
         self._state["oil_c"] = torch.zeros(num_envs, device=device)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from brokk_rl.machine import Joint, Machine
+from brokk_rl.machine import Machine
 
 
 class ToolPose(NamedTuple):
@@ -57,7 +57,7 @@ class Kinematics:
 
     def __init__(self, machine: Machine, device: torch.device | str = "cpu") -> None:
         self._num_joints = machine.num_joints
-        groups = _parallel_groups(machine.joints)
+        groups = _parallel_groups(machine)
         phase, angle, slide, rows = _features(machine, groups)
         columns = [_group_columns(machine, group, is_last=group is groups[-1], rows=rows) for group in groups]
 
@@ -72,7 +72,7 @@ class Kinematics:
         self._is_hinge = torch.tensor([joint.kind == "hinge" for joint in machine.joints], device=device)
         # a slewing joint carries the arm's plane with it and so leaves the pitch alone, as slides do
         turns = [joint.kind == "hinge" for joint in machine.joints]
-        turns[0] = turns[0] and not _turns_heading(machine.joints[0])
+        turns[0] = turns[0] and not _turns_heading(machine, 0)
         self._turns_tool = constant(np.array(turns, dtype=float))
         self._up = constant(np.array([0.0, 0.0, 1.0]))
 
@@ -130,17 +130,17 @@ class Kinematics:
         return origins, pairs[:, :, 1] - origins, heading
 
 
-def _parallel_groups(joints: tuple[Joint, ...]) -> list[list[int]]:
+def _parallel_groups(machine: Machine) -> list[list[int]]:
     """Splits the joints into runs of hinges about one direction; slides belong to the run before them."""
     groups: list[list[int]] = []
     axis: tuple[float, float, float] | None = None
-    for index, joint in enumerate(joints):
-        starts = not groups or (joint.kind == "hinge" and axis is not None and not np.allclose(joint.axis, axis, atol=1e-9))
+    for index, (joint, body) in enumerate(zip(machine.joints, machine.bodies, strict=True)):
+        starts = not groups or (joint.kind == "hinge" and axis is not None and not np.allclose(body.axis, axis, atol=1e-9))
         if starts:
             groups.append([])
             axis = None
         if joint.kind == "hinge":
-            axis = joint.axis
+            axis = body.axis
         groups[-1].append(index)
     return groups
 
@@ -171,9 +171,9 @@ def _features(machine: Machine, groups: list[list[int]]) -> tuple[np.ndarray, np
     return np.array(phase), np.array(columns).T, np.eye(num)[:, slides], rows
 
 
-def _turns_heading(first: Joint) -> bool:
-    """Returns whether the first joint slews the arm, so that its plane turns with it."""
-    return first.kind == "hinge" and abs(first.axis[2]) > 1.0 - 1e-9
+def _turns_heading(machine: Machine, first: int) -> bool:
+    """Returns whether joint `first` slews the arm, so that its plane turns with it."""
+    return machine.joints[first].kind == "hinge" and abs(machine.bodies[first].axis[2]) > 1.0 - 1e-9
 
 
 class _Linear:
@@ -206,7 +206,7 @@ def _group_columns(machine: Machine, group: list[int], is_last: bool, rows: dict
     axis.
     """
     hinges = [j for j in group if machine.joints[j].kind == "hinge"]
-    axis = np.array(machine.joints[hinges[0]].axis) if hinges else np.array([0.0, 0.0, 1.0])
+    axis = np.array(machine.bodies[hinges[0]].axis) if hinges else np.array([0.0, 0.0, 1.0])
     place, hinge = _Linear(rows), None
     points: list[np.ndarray] = []
 
@@ -217,19 +217,19 @@ def _group_columns(machine: Machine, group: list[int], is_last: bool, rows: dict
         points.extend((place.table.copy(), arrow.table))
 
     for j in group:
-        joint = machine.joints[j]
-        place.add(np.array([d.value for d in joint.origin_m]), axis, hinge)
-        with_arrow(np.array(joint.axis))
-        if joint.kind == "hinge":
+        body = machine.bodies[j]
+        place.add(np.array([d.value for d in body.origin_m]), axis, hinge)
+        with_arrow(np.array(body.axis))
+        if machine.joints[j].kind == "hinge":
             hinge = j
         else:
-            place.add(np.array(joint.axis), axis, hinge, slide=j)
+            place.add(np.array(body.axis), axis, hinge, slide=j)
     heading = _Linear(rows)
-    first = machine.joints[group[0]]
-    heading.add(np.array([1.0, 0.0, 0.0]), np.array(first.axis), group[0] if _turns_heading(first) else None)
+    first = group[0]
+    heading.add(np.array([1.0, 0.0, 0.0]), np.array(machine.bodies[first].axis), first if _turns_heading(machine, first) else None)
     blocks = [heading.table]
     if is_last:
-        tool = np.array([d.value for d in machine.tool_m])
+        tool = machine.tip_m
         place.add(tool, axis, hinge)
         with_arrow(tool / np.linalg.norm(tool))
     else:

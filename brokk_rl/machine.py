@@ -31,36 +31,51 @@ class Dimension:
 
 
 @spec
-class Joint:
-    """One actuated joint and the link behind it.
+class Body:
+    """The link behind a joint: where it is, what it weighs, and how its cylinder holds it.
 
     Attributes:
-        name: `q1`, `q2`, …; names the columns of recordings and the joint of the MJCF.
-        kind: `hinge` (rad) or `slide` (m).
-        axis: Unit axis in the frame of the parent link, right-handed.
+        axis: Unit axis of the joint in the frame of the parent link, right-handed.
         origin_m: Position of the joint in the frame of the parent link.
-        lower: Lower end of travel (rad or m).
-        upper: Upper end of travel.
-        home: Position to which data collection returns.
-        max_speed: Speed at full command (rad/s or m/s), the slower of both directions.
-        mass_kg: Mass of the link behind the joint.
-        com_m: Centre of mass of that link in its own frame.
+        mass_kg: Mass of the link.
+        com_m: Centre of mass of the link in its own frame.
         yield_force: Largest force (N) or torque (Nm) beyond the weight with which the joint pushes before its relief valve opens.
         stiffness: Stiffness of the closed cylinder seen at the joint (Nm/rad or N/m).
     """
 
-    name: str
-    kind: Literal["hinge", "slide"]
     axis: tuple[float, float, float]
     origin_m: tuple[Dimension, Dimension, Dimension]
-    lower: Dimension
-    upper: Dimension
-    home: float
-    max_speed: Dimension
     mass_kg: Dimension
     com_m: tuple[float, float, float]
     yield_force: Dimension
     stiffness: Dimension
+
+    def check(self) -> None:
+        if abs(float(np.linalg.norm(self.axis)) - 1.0) > 1e-6:
+            raise ConfigError(f"body: axis {self.axis} is not a unit vector")
+
+
+@spec
+class Joint:
+    """One actuated joint.
+
+    Attributes:
+        name: `q1`, `q2`, …; names the columns of recordings and the joint of the MJCF.
+        kind: `hinge` (rad) or `slide` (m).
+        lower: Lower end of travel (rad or m).
+        upper: Upper end of travel.
+        home: Position to which data collection returns.
+        max_speed: Speed at full command (rad/s or m/s), the slower of both directions.
+        body: The link behind it; `null` where it is not known: such a machine can be recorded and identified, but not simulated.
+    """
+
+    name: str
+    kind: Literal["hinge", "slide"]
+    lower: Dimension
+    upper: Dimension
+    home: float
+    max_speed: Dimension
+    body: Body | None
 
     @property
     def unit(self) -> str:
@@ -70,8 +85,6 @@ class Joint:
     def check(self) -> None:
         if not self.lower.value <= self.home <= self.upper.value:
             raise ConfigError(f"joint {self.name}: home {self.home} lies outside [{self.lower.value}, {self.upper.value}]")
-        if abs(float(np.linalg.norm(self.axis)) - 1.0) > 1e-6:
-            raise ConfigError(f"joint {self.name}: axis {self.axis} is not a unit vector")
 
 
 @spec
@@ -98,24 +111,24 @@ class Machine:
     Attributes:
         name: Config name, written into recordings and checkpoints.
         title: What it is, for people.
-        mjcf: File name of the model under `brokk_rl/sim/assets`, or an absolute path.
+        mjcf: File name of the model under `brokk_rl/sim/assets`, or an absolute path; `null`: there is none.
         period_s: Control period.
         dead_time_s: Nominal time from command to first motion.
         num_history: Samples of commands and positions that actuator models and policies see.
         joints: In machine order, from the base to the tool.
-        tool_m: Tool point (chisel tip) in the frame of the last link.
+        tool_m: Tool point (chisel tip) in the frame of the last link; `null`: not known.
         exclusive: Joints that never move together with any other joint.
         levers: Lever axis of each joint.
     """
 
     name: str
     title: str
-    mjcf: str
+    mjcf: str | None
     period_s: float
     dead_time_s: float
     num_history: int
     joints: tuple[Joint, ...]
-    tool_m: tuple[Dimension, Dimension, Dimension]
+    tool_m: tuple[Dimension, Dimension, Dimension] | None
     exclusive: tuple[str, ...]
     levers: tuple[Lever, ...]
 
@@ -167,17 +180,49 @@ class Machine:
         """True for joints that never move together with others, shape `(J,)`."""
         return np.array([name in self.exclusive for name in self.joint_names])
 
+    @property
+    def has_bodies(self) -> bool:
+        """True where geometry and masses are known, so that the machine can be simulated and its weight computed."""
+        return self.tool_m is not None and all(joint.body is not None for joint in self.joints)
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """The links in machine order.
+
+        Raises:
+            ConfigError: they are not known.
+        """
+        bodies = tuple(joint.body for joint in self.joints if joint.body is not None)
+        if len(bodies) < self.num_joints:
+            raise ConfigError(
+                f"machine '{self.name}' is known by its joints only; simulation, weight and tool point need joints[].body (axis, "
+                "origin, mass, …) in its file, or another machine=…"
+            )
+        return bodies
+
+    @property
+    def tip_m(self) -> np.ndarray:
+        """Tool point in the frame of the last link, `(3,)`.
+
+        Raises:
+            ConfigError: it is not known.
+        """
+        if self.tool_m is None:
+            raise ConfigError(f"machine '{self.name}' has no tool point; add tool_m to its file, or choose another machine=…")
+        return np.array([d.value for d in self.tool_m])
+
     def fingerprint(self) -> dict[str, str]:
         """Returns what another file must agree with to be used on this machine: a short hash of each group of fields.
 
         Sources, confidences, titles and home positions do not matter; names, order, limits, geometry, rate and masks do.
         """
-        geometry = [[d.value for d in joint.origin_m] + [*joint.axis] for joint in self.joints]
+        bodies = [joint.body for joint in self.joints]
+        geometry = [None if body is None else [d.value for d in body.origin_m] + [*body.axis] for body in bodies]
         groups = {
             "name": self.name,
             "joints": [[joint.name, joint.kind] for joint in self.joints],
             "limits": [self.lower.tolist(), self.upper.tolist()],
-            "geometry": [geometry, [d.value for d in self.tool_m]],
+            "geometry": [geometry, None if self.tool_m is None else self.tip_m.tolist()],
             "control": [self.period_s, self.num_history, list(self.exclusive)],
             "levers": [asdict(lever) for lever in self.levers],
         }

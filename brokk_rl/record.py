@@ -39,7 +39,7 @@ class Recording:
         u: Commands in force, shape `(T, J)`, in [-1, 1].
         q: Measured joint positions, shape `(T, J)`, rad or m.
         extra: Optional columns by name, each `(T,)`.
-        metadata: Further `brokk.*` metadata without the prefix: `source`, `fingerprint`, `created`, `seed`.
+        metadata: Further `brokk.*` metadata without the prefix: `source`, `fingerprint`, `created`, `seed`, `run`.
         path: Where it was read from.
     """
 
@@ -53,6 +53,11 @@ class Recording:
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)
     metadata: Mapping[str, str] = field(default_factory=dict)
     path: Path | None = None
+
+    @property
+    def run(self) -> str:
+        """The run of the machine that this is a part of: a long run is cut into files, and a log split where it has gaps."""
+        return self.metadata.get("run") or (self.path.stem if self.path else "")
 
     @property
     def num_samples(self) -> int:

@@ -3,6 +3,7 @@
 import re
 import zlib
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import ClassVar, Literal
 
 import torch
@@ -20,7 +21,10 @@ Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
 
 
 class Plant:
-    """What effects need of the machine: `full_step` (way at full speed in one period) and the like, `(J,)`; weight; geometry."""
+    """What effects need of the machine: `full_step` (way at full speed in one period) and the like, `(J,)`; weight; geometry.
+
+    Weight and geometry are made when an effect asks for them: most do not, and work on machines known by their joints only.
+    """
 
     def __init__(self, machine: Machine, device: torch.device) -> None:
         def tensor(values: object) -> torch.Tensor:
@@ -29,8 +33,23 @@ class Plant:
         self.period_s = machine.period_s
         self.full_step = tensor(machine.max_speed * machine.period_s)
         self.lower, self.upper = tensor(machine.lower), tensor(machine.upper)
-        self.yield_force = tensor([joint.yield_force.value for joint in machine.joints])
-        self.gravity, self.kinematics = Gravity(machine, device), Kinematics(machine, device)
+        self._machine, self._device = machine, device
+
+    @cached_property
+    def yield_force(self) -> torch.Tensor:
+        """`Body.yield_force` of each joint, `(J,)`."""
+        values = [body.yield_force.value for body in self._machine.bodies]
+        return torch.tensor(values, dtype=torch.float32, device=self._device)
+
+    @cached_property
+    def gravity(self) -> Gravity:
+        """The weight on each joint."""
+        return Gravity(self._machine, self._device)
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """The geometry."""
+        return Kinematics(self._machine, self._device)
 
 
 @dataclass(frozen=True)

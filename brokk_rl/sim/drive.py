@@ -32,15 +32,15 @@ def add_drive(spec: mujoco.MjSpec, machine: Machine, inertia: np.ndarray) -> Non
         machine: Gives stiffness and yield force.
         inertia: Inertia seen at each joint, `(J,)`, kg m² or kg.
     """
-    for joint, seen in zip(machine.joints, inertia, strict=True):
-        stiffness = joint.stiffness.value
+    for joint, body, seen in zip(machine.joints, machine.bodies, inertia, strict=True):
+        stiffness = body.stiffness.value
         damping = 2.0 * DAMPING_RATIO * float(np.sqrt(stiffness * seen))
         actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_intvelocity(kp=stiffness, kv=damping)
         actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
         actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
-        actuator.forcerange = (-joint.yield_force.value, joint.yield_force.value)
+        actuator.forcerange = (-body.yield_force.value, body.yield_force.value)
 
 
 class Drive:
@@ -65,7 +65,7 @@ class Drive:
         self.reference = torch.zeros(num_worlds, machine.num_joints, dtype=dtype, device=device)
         self._rate = 1.0 / machine.period_s
         self._lead = constant(damping / stiffness)
-        self._leash = constant(np.array([joint.yield_force.value for joint in machine.joints]) / stiffness)
+        self._leash = constant(np.array([body.yield_force.value for body in machine.bodies]) / stiffness)
 
     def step(self, q: torch.Tensor, increment: torch.Tensor, act: torch.Tensor, ctrl: torch.Tensor) -> None:
         """Moves the references on by one control period.

@@ -49,6 +49,8 @@ def contact_sensors(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _read(machine: Machine) -> mujoco.MjSpec:
+    if machine.mjcf is None:
+        raise ConfigError(f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose another machine=…")
     path = ASSETS / machine.mjcf
     if not path.exists():
         raise ConfigError(f"machine {machine.name}: no MJCF at {path}; set `mjcf` to a file under {ASSETS} or to an absolute path")
@@ -75,18 +77,18 @@ def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
     """Writes origins, axes, limits, masses and the tool point into `spec`."""
     drawn = spec.copy().compile()
     links = [spec.joint(name).parent for name in machine.joint_names]
-    ends = [np.array([d.value for d in joint.origin_m]) for joint in machine.joints[1:]] + [_values(machine.tool_m)]
-    for joint, link, end, drawn_end in zip(
-        machine.joints, links, ends, [*(b.pos for b in links[1:]), spec.site("tip").pos], strict=True
+    ends = [_values(body.origin_m) for body in machine.bodies[1:]] + [machine.tip_m]
+    for joint, body, link, end, drawn_end in zip(
+        machine.joints, machine.bodies, links, ends, [*(b.pos for b in links[1:]), spec.site("tip").pos], strict=True
     ):
         _stretch(link, np.array(drawn_end), end)
-        _write_inertia(link, drawn, joint.mass_kg.value, joint.com_m)
-        link.pos = _values(joint.origin_m)
+        _write_inertia(link, drawn, body.mass_kg.value, body.com_m)
+        link.pos = _values(body.origin_m)
         hinge = spec.joint(joint.name)
         hinge.type = mujoco.mjtJoint.mjJNT_HINGE if joint.kind == "hinge" else mujoco.mjtJoint.mjJNT_SLIDE
-        hinge.axis, hinge.pos = joint.axis, (0.0, 0.0, 0.0)
+        hinge.axis, hinge.pos = body.axis, (0.0, 0.0, 0.0)
         hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_TRUE, (joint.lower.value, joint.upper.value)
-    spec.site("tip").pos = _values(machine.tool_m)
+    spec.site("tip").pos = machine.tip_m
 
 
 def _values(dimensions: tuple) -> np.ndarray:

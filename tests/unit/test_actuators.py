@@ -153,11 +153,11 @@ def test_gravity_is_the_slope_of_potential_energy(machine: Machine) -> None:
 def _energy(machine: Machine, q: torch.Tensor) -> float:
     """Potential energy, with the arm's pitch summed by hand (q2 to q5 turn about y, positive down)."""
     pitch, height, energy = 0.0, 0.62 + 0.28, 0.0
-    lengths = [joint.origin_m[0].value for joint in machine.joints[2:]] + [0.0]
-    for joint, length, angle in zip(machine.joints[1:], lengths, q[0, 1:].tolist(), strict=True):
+    lengths = [body.origin_m[0].value for body in machine.bodies[2:]] + [0.0]
+    for body, length, angle in zip(machine.bodies[1:], lengths, q[0, 1:].tolist(), strict=True):
         pitch += angle
-        x, _, z = joint.com_m
-        energy += joint.mass_kg.value * GRAVITY_M_S2 * (height - x * math.sin(pitch) + z * math.cos(pitch))
+        x, _, z = body.com_m
+        energy += body.mass_kg.value * GRAVITY_M_S2 * (height - x * math.sin(pitch) + z * math.cos(pitch))
         height -= length * math.sin(pitch)
     return energy
 

@@ -345,8 +345,8 @@ def test_a_longer_link_moves_the_tool_along_it(machine: Machine) -> None:
 
 def test_a_longer_link_is_what_longer_origins_are(machine: Machine) -> None:
     joints = list(machine.joints)
-    x, y, z = joints[3].origin_m
-    joints[3] = replace(joints[3], origin_m=(replace(x, value=x.value + 0.03), y, z))
+    x, y, z = machine.bodies[3].origin_m
+    joints[3] = replace(joints[3], body=replace(machine.bodies[3], origin_m=(replace(x, value=x.value + 0.03), y, z)))
     q = torch.rand(4, 5, generator=torch.Generator().manual_seed(2)) - 0.5
     tip_m = Kinematics(machine).pose(q).tip_in_base_m
     expected = Kinematics(replace(machine, joints=tuple(joints))).pose(q).tip_in_base_m

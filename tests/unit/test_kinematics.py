@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from brokk_rl.kinematics import Kinematics
-from brokk_rl.machine import Dimension, Joint, Machine
+from brokk_rl.machine import Dimension, Machine
 from brokk_rl.sim.model import compile_model
 
 
@@ -29,23 +29,22 @@ def _chain(machine: Machine, kinds: str, axes: list[tuple[float, float, float]])
             machine.joints[0],
             name=f"j{i}",
             kind="hinge" if kind == "h" else "slide",
-            axis=axis,
-            origin_m=_dimensions(0.3, 0.1 * i, 0.2),
+            body=dataclasses.replace(machine.bodies[0], axis=axis, origin_m=_dimensions(0.3, 0.1 * i, 0.2)),
         )
         for i, (kind, axis) in enumerate(zip(kinds, axes, strict=True))
     )
     return dataclasses.replace(machine, joints=joints, exclusive=(), levers=(), tool_m=_dimensions(0.4, 0.1, -0.2))
 
 
-def _mujoco_chain(joints: tuple[Joint, ...], tool: tuple[Dimension, ...]) -> mujoco.MjModel:
+def _mujoco_chain(machine: Machine) -> mujoco.MjModel:
     """Returns a bare MuJoCo model of the chain."""
     spec = mujoco.MjSpec()
     body = spec.worldbody
-    for joint in joints:
-        body = body.add_body(pos=[d.value for d in joint.origin_m], mass=1.0, inertia=(1, 1, 1))
+    for joint, link in zip(machine.joints, machine.bodies, strict=True):
+        body = body.add_body(pos=[d.value for d in link.origin_m], mass=1.0, inertia=(1, 1, 1))
         kind = mujoco.mjtJoint.mjJNT_HINGE if joint.kind == "hinge" else mujoco.mjtJoint.mjJNT_SLIDE
-        body.add_joint(type=kind, axis=joint.axis)
-    body.add_site(name="tip", pos=[d.value for d in tool])
+        body.add_joint(type=kind, axis=link.axis)
+    body.add_site(name="tip", pos=machine.tip_m)
     return spec.compile()
 
 
@@ -88,7 +87,7 @@ def test_tip_and_joints_agree_with_mujoco(machine):
 )
 def test_any_serial_chain_agrees_with_mujoco(machine, kinds, axes):
     chain = _chain(machine, kinds, axes)
-    model = _mujoco_chain(chain.joints, chain.tool_m)
+    model = _mujoco_chain(chain)
     data = mujoco.MjData(model)
     q = torch.randn(20, len(kinds), generator=torch.Generator().manual_seed(1))
     kinematics = Kinematics(chain)

@@ -43,7 +43,11 @@ def _small(machine: Machine, path: Path) -> Machine:
     )
     joints = tuple(
         dataclasses.replace(
-            machine.joints[0], name=name, kind=kind, axis=axis, origin_m=tuple(_dimension(float(x)) for x in origin), home=0.0
+            machine.joints[0],
+            name=name,
+            kind=kind,
+            body=dataclasses.replace(machine.bodies[0], axis=axis, origin_m=tuple(_dimension(float(x)) for x in origin)),
+            home=0.0,
         )
         for name, kind, axis, origin in parts
     )
@@ -55,16 +59,17 @@ def test_numbers_of_the_machine_stand_in_the_model(machine):
     model = compile_model(machine, 0.01)
     np.testing.assert_allclose(model.jnt_range, np.stack([machine.lower, machine.upper], 1))
     np.testing.assert_allclose(
-        [model.body(f"{j.name}_link").mass[0] for j in machine.joints], [j.mass_kg.value for j in machine.joints]
+        [model.body(f"{j.name}_link").mass[0] for j in machine.joints], [body.mass_kg.value for body in machine.bodies]
     )
-    np.testing.assert_allclose(model.actuator_gainprm[:, 0], [j.stiffness.value for j in machine.joints])
-    np.testing.assert_allclose(model.actuator_forcerange[:, 1], [j.yield_force.value for j in machine.joints])
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], [body.stiffness.value for body in machine.bodies])
+    np.testing.assert_allclose(model.actuator_forcerange[:, 1], [body.yield_force.value for body in machine.bodies])
     assert [model.actuator(i).name for i in range(model.nu)] == list(machine.joint_names)
 
 
 def test_a_longer_boom_is_drawn_longer(machine):
     joints = list(machine.joints)
-    joints[2] = dataclasses.replace(joints[2], origin_m=(_dimension(3.0), _dimension(0.0), _dimension(0.0)))
+    longer = dataclasses.replace(joints[2].body, origin_m=(_dimension(3.0), _dimension(0.0), _dimension(0.0)))
+    joints[2] = dataclasses.replace(joints[2], body=longer)
     longer = dataclasses.replace(machine, joints=tuple(joints))
     plain, drawn = compile_model(machine, 0.01, visual=True), compile_model(longer, 0.01, visual=True)
     boom = next(i for i in range(plain.ngeom) if plain.geom_bodyid[i] == plain.body("q2_link").id)

@@ -141,7 +141,7 @@ def test_a_blocked_joint_pushes_no_harder_than_its_relief_valve_and_does_not_win
     held = torch.stack([_settle(world) for _ in range(20)]).max()
     # 30 kNm of q2 at 2.35 m are 12.8 kN, and no joint pushes harder than that on the tip
     assert 1_000 < held < 14_000
-    leash = torch.tensor([j.yield_force.value / j.stiffness.value for j in machine.joints])
+    leash = torch.tensor([body.yield_force.value / body.stiffness.value for body in machine.bodies])
     assert ((world._drive.reference - world._qpos).abs() <= leash + 0.02).all()
     kinematics = Kinematics(machine)
     pressed = kinematics.pose(world.q).tip_in_base_m[0, 2]
