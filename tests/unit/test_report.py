@@ -1,0 +1,116 @@
+"""The page: whole, escaped, self-contained."""
+
+from __future__ import annotations
+
+import base64
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+from brokk_rl.errors import StorageError
+from brokk_rl.report import Cell, Page
+
+matplotlib.use("Agg")
+from matplotlib import pyplot
+
+NASTY = "<script>alert('a & b')</script> \"quoted\""
+VOID = {"meta", "img"}
+
+
+class Reader(HTMLParser):
+    """Reads a page back: texts, attributes, and whether every tag that opens also closes."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def figure() -> pyplot.Figure:
+    drawn, axis = pyplot.subplots()
+    axis.plot([0, 1], [1, 0])
+    pyplot.close(drawn)
+    return drawn
+
+
+def nasty_page() -> Page:
+    page = Page(NASTY, NASTY, "good")
+    page.heading(NASTY)
+    page.text(NASTY, "bad")
+    page.items([NASTY])
+    page.code(NASTY)
+    page.table([NASTY, "b"], [[NASTY, Cell(NASTY, note=NASTY)]], NASTY)
+    page.facts({NASTY: NASTY})
+    with page.details(NASTY):
+        page.picture(figure(), NASTY, NASTY)
+    return page
+
+
+def test_whatever_is_given_is_text_and_never_markup() -> None:
+    read = Reader(nasty_page().html())
+    assert not {"script", "link", "iframe"} & {tag for tag, _ in read.tags}
+    assert sum(NASTY in text for text in read.texts) == 16  # once for each place above, and twice for the title
+    assert [attributes["alt"] for tag, attributes in read.tags if tag == "img"] == [NASTY]
+
+
+def test_a_page_needs_nothing_from_elsewhere() -> None:
+    read = Reader(nasty_page().html())
+    addresses = [value for _, attributes in read.tags for key, value in attributes.items() if key in ("src", "href", "srcset")]
+    assert addresses and all(value and value.startswith("data:") for value in addresses)
+    policies = [attributes["content"] for _, attributes in read.tags if attributes.get("http-equiv") == "Content-Security-Policy"]
+    assert policies and "default-src 'none'" in str(policies[0])
+
+
+def test_a_picture_file_is_in_the_page_byte_by_byte(tmp_path: Path) -> None:
+    figure().savefig(tmp_path / "a.png")
+    page = Page("a")
+    page.picture(tmp_path / "a.png")
+    (source,) = (attributes["src"] for tag, attributes in Reader(page.html()).tags if tag == "img")
+    assert source is not None
+    kind, data = source.split(",")
+    assert kind == "data:image/png;base64" and base64.b64decode(data) == (tmp_path / "a.png").read_bytes()
+
+
+def test_columns_of_figures_are_aligned_and_the_best_is_marked() -> None:
+    page = Page("a")
+    page.table(["joint", "error", "why"], [["q1", Cell(0.012345, best=True), "x"], ["q2", None, "y"], ["q3", "0.50", "z"]])
+    cells = [attributes.get("class") for tag, attributes in Reader(page.html()).tags if tag == "td"]
+    assert cells == ["number best", None, "number", None, "number", None]
+    assert ">0.0123<" in page.html() and ">–<" in page.html()
+
+
+def test_rows_of_another_length_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected 2 cells"):
+        Page("a").table(["a", "b"], [["only one"]])
+
+
+def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
+    page = Page("new")
+    with pytest.raises(StorageError, match="cannot write"):
+        page.write(tmp_path / "missing" / "page.html")
+    (tmp_path / "page.html").write_text("old")
+    page.write(tmp_path / "page.html")
+    assert "new" in (tmp_path / "page.html").read_text() and [p.name for p in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_a_missing_picture_is_said(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="cannot read picture"):
+        Page("a").picture(tmp_path / "none.png")
+    with pytest.raises(StorageError, match="expected one of"):
+        Page("a").picture(tmp_path / "none.bmp")
