@@ -111,7 +111,11 @@ PER_JOINT = tuple(name for name, hint in Hydraulic.__annotations__.items() if hi
 
 
 class HydraulicModel:
-    """The plant at work in `N` environments; see the module for its equations."""
+    """The plant at work in `N` environments; see the module for its equations.
+
+    Attributes:
+        parameters: Numbers by name, `(N, J)`; write in place to simulate `N` candidates side by side.
+    """
 
     def __init__(self, config: Hydraulic, machine: Machine, num_envs: int, device: torch.device) -> None:
         nominal = {name: per_joint(getattr(config, name), machine, f"actuator.{name}") for name in PER_JOINT}
@@ -119,6 +123,7 @@ class HydraulicModel:
         longest_s = nominal["transport_s"].max() * (1.0 + config.spread.get("transport_s", 0.0))
         check_dead_time(float(longest_s), machine, "actuator.transport_s")
         self._parameters = Parameters(nominal, config.spread, num_envs, device, "actuator.spread")
+        self.parameters = self._parameters.value
         self._config = config
         self._period_s = machine.period_s
         self._num_substeps = max(1, round(machine.period_s / config.substep_s))
@@ -134,7 +139,7 @@ class HydraulicModel:
         shape = (num_envs, machine.num_joints)
         self._state = {name: torch.zeros(shape, device=device) for name in ("pilot", "spool", "spool_rate", "speed", "force")}
         self._state["oil_c"] = torch.zeros(num_envs, device=device)
-        self._state["at_rest"] = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self._state["fresh"] = torch.ones(num_envs, dtype=torch.bool, device=device)
         self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
 
     @property
@@ -143,16 +148,16 @@ class HydraulicModel:
         return {**self._state, **self._parameters.state}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Puts the environments of `mask`, shape `(N,)` bool, at rest; the cylinders take up the weight at the next step."""
+        """Lets the environments of `mask`, shape `(N,)` bool, go on from their history at the next step."""
         for name in ("pilot", "spool", "spool_rate", "speed", "force"):
             self._state[name].masked_fill_(mask[:, None], 0.0)
         self._state["oil_c"].masked_fill_(mask, self._config.oil_start_c)
-        self._state["at_rest"].logical_or_(mask)
+        self._state["fresh"].logical_or_(mask)
         self._parameters.redraw(mask)
 
     def step(self, history: History) -> torch.Tensor:
         """Returns the joint positions one control period later, shape `(N, J)`."""
-        state, p, config = self._state, self._parameters.value, self._config
+        state, p, config = self._state, self.parameters, self._config
         q, dt = history.q[:, -1], self._period_s / self._num_substeps
         weight = self._gravity.load(q)
         warm = 1.0 + config.thermal_gain * (state["oil_c"] - config.oil_reference_c)[:, None]
@@ -175,11 +180,24 @@ class HydraulicModel:
         )  # below 1 % of full speed friction grows with speed: no stick-slip chatter at this time step
         rub = dt * supply / inertia
 
-        pilot, spool, spool_rate, speed = state["pilot"], state["spool"], state["spool_rate"], state["speed"]
-        force = torch.where(state["at_rest"][:, None], -weight, state["force"])
+        def rubbing(speed: torch.Tensor) -> torch.Tensor:
+            """Friction force over supply force and speed."""
+            fast = speed.abs()
+            return (p["coulomb"] + excess * torch.exp(-fast / knee)) / (fast + still) + viscous
+
+        # a free run may begin in the middle of a motion, which the history shows; the spool trails its command by 2 damping / omega
+        trail_s = p["spool_damping"] / (math.pi * p["spool_hz"])
+        trailing, _, _ = commands_in_force(history.u, (p["transport_s"] + trail_s) / self._period_s)
+        measured = (q - history.q[:, -2]) / self._period_s
+        begun = {"pilot": earlier, "spool": trailing, "spool_rate": torch.zeros_like(q), "speed": measured}
+        begun["force"] = supply * rubbing(measured) * measured - weight
+        pilot, spool, spool_rate, speed, force = (
+            torch.where(state["fresh"][:, None], begun[name], state[name])
+            for name in ("pilot", "spool", "spool_rate", "speed", "force")
+        )
         demand = torch.zeros_like(q)
         for i in range(self._num_substeps):
-            u = torch.where(part * self._num_substeps > i + 0.5, earlier, later)
+            u = torch.lerp(later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0))  # smooth in the delay
             pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
             spool_rate = spool_rate + pull[0] * (pilot - spool) - pull[1] * spool_rate
             spool = (spool + dt * spool_rate).clamp(-1.0, 1.0)
@@ -191,16 +209,14 @@ class HydraulicModel:
             flow_speed = opening * head * torch.where(opening > 0, extend_speed, retract_speed)
             force = force + dt * (self._stiffness * (flow_speed - speed) - p["leak_hz"] * force)
             force = torch.minimum(torch.maximum(force, -supply), supply)  # relief valves
-            fast = speed.abs()
-            friction = (p["coulomb"] + excess * torch.exp(-fast / knee)) / (fast + still) + viscous
-            speed = (speed + dt * (force + weight) / inertia) / (1.0 + rub * friction)
+            speed = (speed + dt * (force + weight) / inertia) / (1.0 + rub * rubbing(speed))
             moved = q + dt * speed
             q = moved.clamp(self._lower, self._upper)
             speed = speed.masked_fill(q != moved, 0.0)
 
         for name, value in (("pilot", pilot), ("spool", spool), ("spool_rate", spool_rate), ("speed", speed), ("force", force)):
             state[name].copy_(value)
-        state["at_rest"].fill_(False)
+        state["fresh"].fill_(False)
         work = demand.sum(1).clamp(max=1.0)
         settled_c = config.oil_ambient_c + config.oil_rise_c * work
         state["oil_c"].add_((settled_c - state["oil_c"]) * (1.0 - math.exp(-self._period_s / config.oil_time_s)))

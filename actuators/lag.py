@@ -40,7 +40,12 @@ class Lag:
 
 
 class LagModel:
-    """Exact solution of `time_constant * v' + v = v_full * opened(u(t - dead_time))` over each part of the control period."""
+    """Exact solution of `time_constant * v' + v = v_full * opened(u(t - dead_time))` over each part of the control period.
+
+    Attributes:
+        parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N` candidates side by side; gradients
+            flow to an entry that wants them until the next `reset`.
+    """
 
     def __init__(self, config: Lag, machine: Machine, num_envs: int, device: torch.device) -> None:
         names = ("dead_band_extend", "dead_band_retract", "gain", "time_constant_s")
@@ -55,28 +60,35 @@ class LagModel:
         longest_s = nominal["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
         check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
         self._parameters = Parameters(nominal, config.spread, num_envs, device, "actuator.spread")
+        self.parameters = self._parameters.value
         self._period_s = machine.period_s
         self._max_speed = torch.as_tensor(machine.max_speed, dtype=torch.float32, device=device)
         self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
         self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
         self._speed = torch.zeros(num_envs, machine.num_joints, device=device)
+        self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
         self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
-        """`speed` `(N, J)` in rad/s or m/s, and what was drawn at reset."""
-        return {"speed": self._speed, **self._parameters.state}
+        """`speed` `(N, J)` in rad/s or m/s, whether it is still to be read off the history, and what was drawn at reset."""
+        return {"speed": self._speed, "fresh": self._fresh, **self._parameters.state}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Stops the environments of `mask`, shape `(N,)` bool, and draws their parameters anew."""
+        """Lets the environments of `mask`, shape `(N,)` bool, go on from their history; draws their parameters; cuts gradients."""
+        if self._speed.requires_grad:
+            self._speed.detach_()
         self._speed.masked_fill_(mask[:, None], 0.0)
+        self._fresh.logical_or_(mask)
         self._parameters.redraw(mask)
 
     def step(self, history: History) -> torch.Tensor:
         """Returns the joint positions one control period later, shape `(N, J)`."""
-        value = self._parameters.value
+        value = self.parameters
         earlier, later, part = commands_in_force(history.u, value["dead_time_s"] / self._period_s)
-        q, speed = history.q[:, -1], self._speed
+        q = history.q[:, -1]
+        # a free run may begin in the middle of a motion; at rest the history is level
+        speed = torch.where(self._fresh.clone()[:, None], (q - history.q[:, -2]) / self._period_s, self._speed)
         for u, duration_s in ((earlier, part * self._period_s), (later, (1.0 - part) * self._period_s)):
             target = opened(u, value["dead_band_extend"], value["dead_band_retract"]) * value["gain"] * self._max_speed
             time_constant_s = value["time_constant_s"].clamp(min=1e-6)  # 0 would divide by zero; a microsecond is as good
@@ -85,4 +97,5 @@ class LagModel:
             speed = target + (speed - target) * decay
         held = q.clamp(self._lower, self._upper)
         self._speed.copy_(speed.masked_fill(held != q, 0.0))  # a joint at its stop has no speed left
+        self._fresh.fill_(False)
         return held
