@@ -16,14 +16,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from brokk_rl.errors import RecordingError, StorageError, choices
+from brokk_rl import breaches
+from brokk_rl.breaches import SCHEMA, Breach
+from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
-
-SCHEMA = "1"
-RATE_TOLERANCE = 0.2
-"""Largest relative deviation of a period from the stated rate."""
-COMMAND_TOLERANCE = 1e-6
-"""Rounding of float32 that is still no command outside [-1, 1]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,37 +110,57 @@ def read(path: Path, machine: Machine) -> Recording:
         RecordingError: the file is missing or truncated, was made on another machine, lacks a column, or breaks a rule of the
             format; the message names file, row and column.
     """
+    recording, found = examine(path, machine)
+    if recording is None or found:
+        raise RecordingError(f"{path}: {found[0]}")
+    return recording
+
+
+def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach]]:
+    """Reads what can be read of the recording at `path`.
+
+    Returns:
+        The recording, with NaN in place of what is missing and the machine's rate where none is stated, `None` where nothing can
+        be read; and every place where it breaks a rule of the format.
+    """
     try:
         table = pq.read_table(path)
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path}: no such recording") from error
+    except FileNotFoundError:
+        return None, [Breach("no such recording")]
     except (pa.ArrowException, OSError) as error:
-        raise RecordingError(f"{path}: truncated or not a Parquet file ({error})") from error
+        return None, [Breach(f"truncated or not a Parquet file ({error})")]
     metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     metadata = {key.removeprefix("brokk."): value for key, value in metadata.items() if key.startswith("brokk.")}
-    rate_hz = _checked_metadata(metadata, machine, path)
     units = tuple(joint.unit for joint in machine.joints)
     commands = [command_column(name) for name in machine.joint_names]
     positions = [position_column(name, unit) for name, unit in zip(machine.joint_names, units, strict=True)]
     required = ["t_s", *commands, *positions]
-    for name in required:
+    found = [*breaches.of_metadata(metadata, machine.name), *breaches.of_names(required, table.column_names)]
+    columns: dict[str, np.ndarray] = {}
+    for name in [*required, *(name for name in table.column_names if name not in required)]:
         if name not in table.column_names:
-            raise RecordingError(f"{path}: column '{name}' is missing; {choices(name, table.column_names)}")
-    columns = {name: _numbers(table.column(name), name, path) for name in table.column_names}
+            continue
+        column = table.column(name)
+        if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
+            columns[name] = column.cast(pa.float64()).to_numpy()  # an empty cell becomes NaN
+        else:
+            found.append(Breach(f"column '{name}' holds {column.type}, expected numbers", name))
+    rate_hz = breaches.rate_hz(metadata) or 1.0 / machine.period_s
+    found += breaches.of_columns(columns, required, rate_hz)
+    missing = np.full(table.num_rows, np.nan)
     recording = Recording(
-        machine=metadata["machine"],
+        machine=metadata.get("machine", machine.name),
         joints=machine.joint_names,
         units=units,
         rate_hz=rate_hz,
-        t_s=columns["t_s"].astype(np.float64),
-        u=np.stack([columns[name] for name in commands], 1).astype(np.float32),
-        q=np.stack([columns[name] for name in positions], 1).astype(np.float32),
+        t_s=columns["t_s"] if "t_s" in columns else np.arange(table.num_rows) / rate_hz,
+        u=np.stack([columns.get(name, missing) for name in commands], 1).astype(np.float32),
+        q=np.stack([columns.get(name, missing) for name in positions], 1).astype(np.float32),
         extra={name: values.astype(np.float32) for name, values in columns.items() if name not in required},
         metadata={key: value for key, value in metadata.items() if key not in ("schema", "machine", "rate_hz")},
         path=Path(path),
     )
-    check(recording, str(path))
-    return recording
+    return recording, found
 
 
 def read_all(patterns: str | Sequence[str], machine: Machine) -> list[Recording]:
@@ -153,11 +169,20 @@ def read_all(patterns: str | Sequence[str], machine: Machine) -> list[Recording]
     Raises:
         RecordingError: nothing matches, or one of them cannot be used.
     """
+    return [read(path, machine) for path in matching(patterns, "recording")]
+
+
+def matching(patterns: str | Sequence[str], what: str) -> list[Path]:
+    """Returns the files that match a glob or any of several, in order of their names; `what` they are goes into the message.
+
+    Raises:
+        RecordingError: nothing matches.
+    """
     patterns = [patterns] if isinstance(patterns, str) else list(patterns)
     paths = sorted({name for pattern in patterns for name in glob(pattern, recursive=True)})
     if not paths:
-        raise RecordingError(f"no recording matches {', '.join(patterns)} (seen from {Path.cwd()})")
-    return [read(Path(name), machine) for name in paths]
+        raise RecordingError(f"no {what} matches {', '.join(patterns)} (seen from {Path.cwd()})")
+    return [Path(name) for name in paths]
 
 
 def check(recording: Recording, where: str) -> None:
@@ -169,32 +194,13 @@ def check(recording: Recording, where: str) -> None:
     for name, values in (("u", recording.u), ("q", recording.q)):
         if values.shape != shape:
             raise RecordingError(f"{where}: {name} has shape {values.shape}, expected {shape} (samples, joints)")
-    if recording.num_samples < 2:
-        raise RecordingError(f"{where}: {recording.num_samples} rows; a recording has at least 2")
     columns = {"t_s": recording.t_s}
     for j, (joint, unit) in enumerate(zip(recording.joints, recording.units, strict=True)):
         columns[command_column(joint)] = recording.u[:, j]
         columns[position_column(joint, unit)] = recording.q[:, j]
-    for name, values in (columns | dict(recording.extra)).items():
-        if len(values) != recording.num_samples:
-            raise RecordingError(f"{where}: column '{name}' has {len(values)} rows, t_s has {recording.num_samples}")
-        if name in columns and (row := _first(~np.isfinite(values))) is not None:
-            raise RecordingError(f"{where}: row {row}, column '{name}': {values[row]} is not a number")
-    for name in map(command_column, recording.joints):
-        if (row := _first(np.abs(columns[name]) > 1.0 + COMMAND_TOLERANCE)) is not None:
-            raise RecordingError(f"{where}: row {row}, column '{name}': command {columns[name][row]:g} lies outside [-1, 1]")
-    period_s = np.diff(recording.t_s)
-    if (row := _first(period_s <= 0)) is not None:
-        raise RecordingError(
-            f"{where}: row {row + 1}, column 't_s': time does not increase ({recording.t_s[row]:g} s, then "
-            f"{recording.t_s[row + 1]:g} s)"
-        )
-    if (row := _first(np.abs(period_s * recording.rate_hz - 1.0) > RATE_TOLERANCE)) is not None:
-        raise RecordingError(
-            f"{where}: row {row + 1}, column 't_s': {period_s[row]:g} s after the row before, but brokk.rate_hz = "
-            f"{recording.rate_hz:g} means {1.0 / recording.rate_hz:g} s (20 % are allowed); split the recording at the gap or "
-            "state its rate"
-        )
+    required = list(columns)
+    for breach in breaches.of_columns(columns | dict(recording.extra), required, recording.rate_hz):
+        raise RecordingError(f"{where}: {breach}")
 
 
 def now() -> str:
@@ -210,36 +216,3 @@ def later(created: str, elapsed_s: float) -> str:
 def stamp(machine: Machine) -> str:
     """Returns the machine's fingerprint as `brokk.fingerprint` holds it: JSON."""
     return json.dumps(machine.fingerprint())
-
-
-def _checked_metadata(metadata: Mapping[str, str], machine: Machine, path: Path) -> float:
-    """Returns the rate in Hz, after schema, machine and rate have been checked."""
-    for key in ("schema", "machine", "rate_hz"):
-        if key not in metadata:
-            raise RecordingError(f"{path}: metadata 'brokk.{key}' is missing; not a recording, or one made by another program")
-    if metadata["schema"] != SCHEMA:
-        raise RecordingError(f"{path}: brokk.schema is '{metadata['schema']}', this version reads '{SCHEMA}'")
-    if metadata["machine"] != machine.name:
-        raise RecordingError(
-            f"{path}: unknown machine '{metadata['machine']}', expected '{machine.name}'; choose it with machine=…"
-        )
-    try:
-        rate_hz = float(metadata["rate_hz"])
-    except ValueError:
-        rate_hz = 0.0
-    if not 0.0 < rate_hz < float("inf"):
-        raise RecordingError(f"{path}: brokk.rate_hz is '{metadata['rate_hz']}', expected a positive number")
-    return rate_hz
-
-
-def _numbers(column: pa.ChunkedArray, name: str, path: Path) -> np.ndarray:
-    """Returns a column as an array; an empty cell becomes NaN."""
-    if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-        raise RecordingError(f"{path}: column '{name}' holds {column.type}, expected numbers")
-    return column.cast(pa.float64()).to_numpy()
-
-
-def _first(condition: np.ndarray) -> int | None:
-    """Returns the first row where `condition` holds, or `None`."""
-    rows = np.flatnonzero(condition)
-    return int(rows[0]) if len(rows) else None

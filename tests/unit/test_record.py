@@ -95,6 +95,20 @@ def test_a_bad_cell_is_refused_by_name(path: Path, machine: Machine, column: str
         record.read(changed(path, column, row, value), machine)
 
 
+def test_every_breach_is_found_with_its_row_and_column(path: Path, machine: Machine) -> None:
+    for column, row, value in [("u_q3", 7, 1.2), ("u_q3", 8, 1.3), ("u_q3", 20, -4.0), ("q_q1_rad", 3, np.nan), ("t_s", 30, 1.45)]:
+        changed(path, column, row, value)
+    table = pq.read_table(path)
+    pq.write_table(table.drop_columns("q_q5_rad"), path)
+    recording_, found = record.examine(path, machine)
+    assert recording_ is not None
+    assert np.isnan(recording_.q[:, 4]).all()
+    assert [(breach.column, breach.row, breach.num_rows) for breach in found] == [
+        ("q_q5_rad", None, 1), ("q_q1_rad", 3, 1), ("u_q3", 7, 2), ("u_q3", 20, 1), ("t_s", 30, 1), ("t_s", 31, 1),
+    ]  # fmt: skip
+    assert str(found[2]) == "row 7, column 'u_q3': command 1.2 lies outside [-1, 1] (2 such rows on end)"
+
+
 def test_a_missing_column_is_refused_with_the_nearest_names(path: Path, machine: Machine) -> None:
     table = pq.read_table(path)
     names = [name.replace("q_q4_rad", "q_q4_deg") for name in table.column_names]
