@@ -10,10 +10,15 @@ WARM_UP = 3
 """Calls before the capture: kernels are compiled and buffers allocated before anything is recorded."""
 
 
-@torch.no_grad()
-def capture(step: Callable[[], None], device: torch.device) -> torch.cuda.CUDAGraph:
-    """Returns a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses."""
-    with torch.cuda.device(device):
+def capture(step: Callable[[], None], device: torch.device, gradients: bool = False) -> torch.cuda.CUDAGraph:
+    """Returns a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses.
+
+    Args:
+        step: What to capture; called `WARM_UP` times before.
+        device: A CUDA device.
+        gradients: Whether `step` differentiates.
+    """
+    with torch.cuda.device(device), torch.set_grad_enabled(gradients):
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):

@@ -1,9 +1,11 @@
 """The Warp world on a CPU against the native world; kernels compile for half a minute at first use."""
 
+import mujoco_warp
 import pytest
 import torch
 
 from brokk_rl.errors import DeviceError
+from brokk_rl.sim import warp_world
 from brokk_rl.sim.auto import Auto
 from brokk_rl.sim.native import Native, NativeWorld
 from brokk_rl.sim.scene import nominal
@@ -57,6 +59,21 @@ def test_a_peak_of_force_is_the_same_in_both_worlds(machine):
             torch.maximum(peak, world.contact_force_n, out=peak)
     assert (peaks[0] > 1_000).all()
     torch.testing.assert_close(peaks[1], peaks[0], rtol=1e-2, atol=1.0)
+
+
+@pytest.mark.slow
+def test_the_stages_left_out_change_nothing(machine, monkeypatch):
+    """Against MuJoCo Warp's own step, in the air and pressed onto the ground."""
+    ours, whole = (WARP.build(machine, "cpu") for _ in range(2))
+    pressed = 0.0
+    for increment in _motion(machine, steps=40, push=0.006):
+        ours.step(increment)
+        with monkeypatch.context() as patch:
+            patch.setattr(warp_world, "_advance", mujoco_warp.step)
+            whole.step(increment)
+        pressed = max(pressed, float(ours.contact_force_n.amax()))
+        assert torch.equal(ours.q, whole.q)
+    assert pressed > 1_000.0
 
 
 @pytest.mark.slow

@@ -1,0 +1,154 @@
+"""rsl-rl's PPO with the whole update on the device.
+
+rsl-rl reads the divergence and three losses back to the host after each mini-batch, and launches a few hundred small kernels for
+it; on a GPU that takes longer than the arithmetic. Here the learning rate and the losses stay on the device, and a mini-batch is
+one replay of a CUDA graph.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from torch import nn
+
+from brokk_rl.rl.graph import capture
+
+LOWEST_RATE, HIGHEST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
+"""Bounds and step of the adaptive learning rate, as in rsl-rl."""
+FIGURES = ("value", "surrogate", "entropy")
+
+
+class DevicePPO(PPO):
+    """PPO for feed-forward networks; on a CPU, on several GPUs, and with curiosity or symmetry it is rsl-rl's own."""
+
+    _graph: torch.cuda.CUDAGraph | None = None
+    _rows: torch.Tensor
+    _advantages: torch.Tensor
+    _rate: torch.Tensor
+    _sums: torch.Tensor
+
+    def update(self) -> dict[str, float]:
+        """Learns from the stored steps and returns mean losses; see `rsl_rl.algorithms.PPO.update`."""
+        recurrent = self.actor.is_recurrent or self.critic.is_recurrent
+        if torch.device(self.device).type != "cuda" or self.is_multi_gpu or self.rnd or self.symmetry or recurrent:
+            return super().update()
+        return self.update_on_device()
+
+    def update_on_device(self) -> dict[str, float]:
+        """Does what `update` does with one read-back at the end; the same numbers up to rounding."""
+        storage = self.storage
+        used = self._batch_size() * self.num_mini_batches
+        order = torch.randperm(used, device=self.device)
+        if not hasattr(self, "_rows"):
+            self._prepare()
+        self._advantages.copy_(storage.advantages)
+        if torch.device(self.device).type == "cuda" and self._graph is None:
+            self._rows.copy_(order[: len(self._rows)])
+            self._graph = self._captured()
+        self._sums.zero_()
+        for _ in range(self.num_learning_epochs):
+            for rows in order.split(len(self._rows)):
+                self._rows.copy_(rows)
+                if self._graph is None:
+                    self._mini_batch()
+                else:
+                    self._graph.replay()
+        observations = storage.observations.flatten(0, 1)
+        self.actor.update_normalization(observations)  # type: ignore[arg-type]
+        self.critic.update_normalization(observations)  # type: ignore[arg-type]
+        storage.clear()
+        *sums, self.learning_rate = torch.cat((self._sums, self._rate[None])).tolist()
+        updates = self.num_learning_epochs * self.num_mini_batches
+        return {name: value / updates for name, value in zip(FIGURES, sums, strict=True)}
+
+    def save(self) -> dict[str, Any]:
+        """Returns the state without what is special to this device, so that it can be loaded on any."""
+        saved = super().save()
+        optimizer = saved["optimizer_state_dict"]
+        plain = {"lr": self.learning_rate, "capturable": False, "fused": None}
+        return saved | {"optimizer_state_dict": optimizer | {"param_groups": [g | plain for g in optimizer["param_groups"]]}}
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Loads a state; the graph is captured anew at the next update, because the optimiser's tensors are others now."""
+        self._graph = None
+        if hasattr(self, "_rows"):
+            del self._rows
+        return super().load(loaded_dict, load_cfg, strict)
+
+    def _batch_size(self) -> int:
+        return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
+
+    def _prepare(self) -> None:
+        """Makes the tensors that the graph reads and writes, and lets the optimiser read its rate from one of them."""
+        self._rows = torch.zeros(self._batch_size(), dtype=torch.int64, device=self.device)
+        self._advantages = torch.zeros_like(self.storage.values)
+        self._rate = torch.tensor(self.learning_rate, device=self.device)
+        self._sums = torch.zeros(len(FIGURES), device=self.device)
+        on_gpu = torch.device(self.device).type == "cuda"
+        for group in self.optimizer.param_groups:
+            group.update(lr=self._rate, capturable=on_gpu, fused=on_gpu or None)
+        for state in self.optimizer.state.values():  # loaded for a host that counts steps itself
+            if on_gpu:
+                state["step"] = state["step"].to(self.device, torch.float32)
+
+    def _captured(self) -> torch.cuda.CUDAGraph:
+        """Returns the graph of a mini-batch; the calls before the capture leave no trace."""
+        parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        kept = [(p, p.detach().clone()) for p in parameters] + [(self._rate, self._rate.clone())]
+        moments = [(value, value.clone()) for state in self.optimizer.state.values() for value in state.values()]
+        graph = capture(self._mini_batch, torch.device(self.device), gradients=True)
+        with torch.no_grad():
+            for value, before in kept + moments:
+                value.copy_(before)
+            if not moments:  # a fresh optimiser made them meanwhile
+                for state in self.optimizer.state.values():
+                    for value in state.values():
+                        value.zero_()
+        return graph
+
+    def _mini_batch(self) -> None:
+        """One step of the optimiser on the stored steps `_rows`; Schulman et al. 2017, equations 7 and 9, as rsl-rl weighs them."""
+        storage, rows = self.storage, self._rows
+        observations = storage.observations.flatten(0, 1)[rows]
+        old_values, returns, advantages, old_log_prob, actions = (
+            value.flatten(0, 1)[rows]
+            for value in (storage.values, storage.returns, self._advantages, storage.actions_log_prob, storage.actions)
+        )
+        old_parameters = tuple(value.flatten(0, 1)[rows] for value in storage.distribution_params or ())
+        if self.normalize_advantage_per_mini_batch:
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        kind = torch.device(self.device).type
+        with torch.autocast(device_type=kind, dtype=torch.bfloat16, enabled=self.use_mixed_precision):
+            self.actor(observations, stochastic_output=True)  # type: ignore[arg-type]
+            log_prob, entropy = self.actor.get_output_log_prob(actions), self.actor.output_entropy.mean()
+            values = self.critic(observations)  # type: ignore[arg-type]
+            self._adapt_rate(old_parameters)
+            ratio = torch.exp(log_prob - old_log_prob.squeeze(1))
+            gain = advantages.squeeze(1)
+            clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+            surrogate_loss = torch.max(-gain * ratio, -gain * clipped).mean()
+            value_loss = (values - returns).square()
+            if self.use_clipped_value_loss:
+                near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
+                value_loss = torch.max(value_loss, (near - returns).square())
+            value_loss = value_loss.mean()
+            loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        self.optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        self._sums.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
+
+    @torch.no_grad()
+    def _adapt_rate(self, old_parameters: tuple[torch.Tensor, ...]) -> None:
+        """Raises the learning rate where the policy moves less than `desired_kl`, lowers it where it moves more."""
+        if self.desired_kl is None or self.schedule != "adaptive":
+            return
+        divergence = self.actor.get_kl_divergence(old_parameters, self.actor.output_distribution_params).mean()
+        lower, higher = (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE), (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE)
+        too_near = (divergence < self.desired_kl / 2.0) & (divergence > 0.0)
+        rate = torch.where(divergence > self.desired_kl * 2.0, lower, torch.where(too_near, higher, self._rate))
+        self._rate.copy_(rate)

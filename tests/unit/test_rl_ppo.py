@@ -1,0 +1,99 @@
+"""PPO on the device against rsl-rl's own."""
+
+import copy
+
+import pytest
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+from brokk_rl.rl.ppo import DevicePPO
+
+NUM_ENVS, STEPS, GROUPS = 16, 6, {"actor": ["policy"], "critic": ["policy"]}
+GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 0.3, "std_type": "log"}
+
+
+def _algorithm(kind: type[PPO], device: str = "cpu", **changes: object) -> PPO:
+    torch.manual_seed(0)
+    obs = TensorDict({"policy": torch.randn(NUM_ENVS, 7, device=device)}, batch_size=[NUM_ENVS])
+    actor = MLPModel(obs, GROUPS, "actor", 3, (16, 16), obs_normalization=True, distribution_cfg=copy.deepcopy(GAUSSIAN))
+    critic = MLPModel(obs, GROUPS, "critic", 1, (16, 16))
+    storage = RolloutStorage("rl", NUM_ENVS, STEPS, obs, [3], device)
+    settings = {"num_learning_epochs": 3, "num_mini_batches": 4, "desired_kl": 0.01, "device": device, "entropy_coef": 0.01}
+    return kind(actor, critic, storage, **(settings | changes))
+
+
+def _iteration(algorithm: PPO, seed: int) -> dict[str, float]:
+    """Fills the storage with made-up steps of the algorithm's own policy, and learns from them."""
+    device = algorithm.device
+    torch.manual_seed(seed)
+    draws = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=draws).to(device)
+
+    def seen() -> TensorDict:
+        return TensorDict({"policy": random(NUM_ENVS, 7)}, batch_size=[NUM_ENVS])
+
+    with torch.inference_mode():
+        for _ in range(STEPS):
+            algorithm.act(seen())
+            algorithm.process_env_step(seen(), random(NUM_ENVS), random(NUM_ENVS) > 1.5, {})
+        algorithm.compute_returns(seen())
+    torch.manual_seed(seed)  # the order of mini-batches
+    return algorithm.update_on_device() if isinstance(algorithm, DevicePPO) else algorithm.update()
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"schedule": "fixed"}, {"normalize_advantage_per_mini_batch": True, "use_clipped_value_loss": False}]
+)
+def test_it_learns_the_same_as_rsl_rls_own(changes: dict) -> None:
+    ours, theirs = _algorithm(DevicePPO, **changes), _algorithm(PPO, **changes)
+    for seed in range(4):
+        assert _iteration(ours, seed) == pytest.approx(_iteration(theirs, seed), rel=1e-4, abs=1e-6)
+        assert ours.learning_rate == pytest.approx(theirs.learning_rate, rel=1e-5)
+    for mine, other in zip(
+        (*ours.actor.parameters(), *ours.critic.parameters()),
+        (*theirs.actor.parameters(), *theirs.critic.parameters()),
+        strict=True,
+    ):
+        torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(ours.actor.obs_normalizer.mean, theirs.actor.obs_normalizer.mean)
+
+
+def test_the_learning_rate_moves_both_ways() -> None:
+    """Otherwise the comparison above would not see the rule."""
+    rates = []
+    for kl in (1e-6, 10.0):
+        algorithm = _algorithm(DevicePPO, desired_kl=kl)
+        _iteration(algorithm, 0)
+        rates.append(algorithm.learning_rate)
+    assert rates[0] < 0.001 < rates[1]
+
+
+def test_it_goes_on_exactly_from_a_saved_state() -> None:
+    whole, first = _algorithm(DevicePPO), _algorithm(DevicePPO)
+    for seed in range(4):
+        _iteration(whole, seed)
+    for seed in range(2):
+        _iteration(first, seed)
+    second = _algorithm(DevicePPO)
+    second.load(copy.deepcopy(first.save()), None, strict=True)
+    assert all(group["lr"] == first.learning_rate for group in first.save()["optimizer_state_dict"]["param_groups"])
+    for seed in range(2, 4):
+        _iteration(second, seed)
+    for mine, other in zip(second.actor.parameters(), whole.actor.parameters(), strict=True):
+        assert torch.equal(mine, other)
+
+
+@pytest.mark.gpu
+def test_the_graph_learns_what_the_eager_update_learns() -> None:
+    captured, eager = _algorithm(DevicePPO, "cuda"), _algorithm(PPO, "cuda")
+    for seed in range(3):
+        figures = _iteration(captured, seed)
+        assert figures == pytest.approx(_iteration(eager, seed), rel=1e-3, abs=1e-5)
+    assert captured._graph is not None
+    for mine, other in zip(captured.actor.parameters(), eager.actor.parameters(), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-5)
