@@ -1,0 +1,286 @@
+"""What is in a recording before any physics: rates, ranges, noise, and stretches that no model of the machine could explain.
+
+Axes: `T` time, `J` joints. Recordings may be broken: what is missing is NaN and takes no part.
+"""
+
+import warnings
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from brokk_rl.breaches import runs
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.spec import spec
+
+Kind = Literal["no motion", "no command", "frozen", "repeated rows", "beyond limit", "exclusive"]
+KINDS: dict[Kind, str] = {
+    "no motion": "command without motion: interlock, dead-man, dead band, or a load too heavy",
+    "no command": "motion without command: sinking, or moved by something that is not logged",
+    "frozen": "equal samples, then a jump, or equal samples of a sensor with noise: it did not measure",
+    "repeated rows": "all joints repeat the row before while one of them moves: lost frames",
+    "beyond limit": "measured beyond the limits of the machine's file",
+    "exclusive": "an exclusive joint is commanded together with others",
+}
+"""Kinds of findings and what each of them means."""
+CODE_REPEATS = 5
+"""A value measured so often is a step of the sensor and no coincidence."""
+STEP_QUANTILE = 0.05
+"""Neighbouring values of a coarse sensor lie one step apart or, where those between were not visited often, several."""
+JUMP = 1.5
+"""A sensor that has missed a sample jumps by two periods' worth of motion."""
+
+
+@spec
+class Thresholds:
+    """When a stretch of a recording is worth telling.
+
+    Attributes:
+        commanded: A smaller command counts as none.
+        driving: A larger command should move any joint: beyond the dead band.
+        still: A smaller speed counts as rest, as a part of the joint's full speed.
+        settle_s: Time beyond the dead time that a joint takes to start or to stop.
+        unanswered_s: Command without motion is told from this duration on.
+        drift: Motion without command is told from this part of the travel on, within one stretch without command.
+        equal_rows: Equal samples in a row that a sensor with noise does not show.
+        steps: A change of so many steps of the sensor, or of its noise, cannot hide in it.
+        at_limit: A joint so close to its limit, as a part of its travel, may stand at its stop.
+    """
+
+    commanded: float
+    driving: float
+    still: float
+    settle_s: float
+    unanswered_s: float
+    drift: float
+    equal_rows: int
+    steps: float
+    at_limit: float
+
+    def check(self) -> None:
+        if not 0 <= self.commanded <= self.driving <= 1:
+            raise ConfigError(f"thresholds: expected 0 <= commanded <= driving <= 1, got {self.commanded} and {self.driving}")
+        if self.equal_rows < 2:
+            raise ConfigError(f"thresholds.equal_rows: expected 2 or more, got {self.equal_rows}")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A stretch of a recording that wants an explanation.
+
+    Attributes:
+        kind: One of `KINDS`.
+        joint: Joint concerned, `None` where it is all of them.
+        row: First row.
+        num_rows: Rows on end.
+        t_s: Time of the first row.
+        duration_s: From the first row to the last.
+        text: What is there, with its size.
+    """
+
+    kind: Kind
+    joint: str | None
+    row: int
+    num_rows: int
+    t_s: float
+    duration_s: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What one recording holds.
+
+    Attributes:
+        timing: Rate and jitter of the file.
+        joints: Ranges, shares of time, noise and sensor step of each joint, by name.
+        findings: In order of time.
+    """
+
+    timing: dict[str, float | None]
+    joints: dict[str, dict[str, float | None]]
+    findings: list[Finding]
+
+
+def inspect(recording: Recording, machine: Machine, thresholds: Thresholds) -> Inspection:
+    """Returns what is in a recording of `machine`."""
+    with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
+        warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
+        look = _Look(recording, machine, thresholds)
+        findings = [*look.no_motion(), *look.no_command(), *look.frozen(), *look.repeated(), *look.beyond(), *look.exclusive()]
+        return Inspection(look.timing(), look.joints(), sorted(findings, key=lambda finding: finding.row))
+
+
+class _Look:
+    """One look at a recording: what the findings have in common."""
+
+    def __init__(self, recording: Recording, machine: Machine, thresholds: Thresholds) -> None:
+        self._machine, self._limits = machine, thresholds
+        self._t_s, self._u, self._q = recording.t_s, recording.u.astype(np.float64), recording.q.astype(np.float64)
+        self._period_s = 1.0 / recording.rate_hz
+        self._travel = machine.upper - machine.lower
+        self._reach = max(1, round(0.15 / self._period_s))
+        self._after, self._before = self._speed(self._reach, 0), self._speed(0, self._reach)
+        both = (self._after + self._before) / 2.0
+        self._v = np.where(np.isnan(self._after), self._before, np.where(np.isnan(self._before), self._after, both))
+        self._is_moving = np.abs(self._v) > thresholds.still * machine.max_speed
+        self._lead = round((machine.dead_time_s + thresholds.settle_s) / self._period_s)
+        self._idle = np.stack([_held(np.abs(u) < thresholds.commanded, self._lead) for u in self._u.T], 1)
+        self._noise = np.array([self._noise_of(j) for j in range(machine.num_joints)])
+        self._step = np.array([_step(q) for q in self._q.T])
+        self._visible = thresholds.steps * np.fmax(np.nan_to_num(self._step), np.nan_to_num(self._noise))
+
+    def timing(self) -> dict[str, float | None]:
+        """Returns duration, rate and jitter."""
+        period_s = np.diff(self._t_s)
+        period_s = period_s[np.isfinite(period_s)]
+        if not len(period_s):
+            return {"duration_s": 0.0, "rate_hz": None, "stated_rate_hz": 1.0 / self._period_s, "jitter_s": None, "longest_s": None}
+        median_s = float(np.median(period_s))
+        return {
+            "duration_s": _plain(np.nanmax(self._t_s) - np.nanmin(self._t_s)),
+            "rate_hz": 1.0 / median_s if median_s > 0 else None,
+            "stated_rate_hz": 1.0 / self._period_s,
+            "jitter_s": _plain(np.percentile(np.abs(period_s - median_s), 95)),
+            "longest_s": _plain(period_s.max()),
+        }
+
+    def joints(self) -> dict[str, dict[str, float | None]]:
+        """Returns the figures of each joint."""
+        size, found = np.abs(self._u), {}
+        margin = self._limits.at_limit * self._travel
+        at_limit = (self._q < self._machine.lower + margin) | (self._q > self._machine.upper - margin)
+        for j, name in enumerate(self._machine.joint_names):
+            found[name] = {
+                "lowest": _plain(np.nanmin(self._q[:, j])),
+                "highest": _plain(np.nanmax(self._q[:, j])),
+                "commanded": _plain(np.mean(size[:, j] > self._limits.commanded)),
+                "full_command": _plain(np.mean(size[:, j] > 0.99)),
+                "moving": _plain(np.mean(self._is_moving[:, j])),
+                "at_limit": _plain(np.mean(at_limit[:, j])),
+                "fastest": _plain(np.nanquantile(np.abs(self._v[:, j]), 0.99)),
+                "noise": _plain(self._noise[j]),
+                "step": _plain(self._step[j]),
+            }
+        return found
+
+    def no_motion(self) -> list[Finding]:
+        """Finds commands that should move a joint and do not, away from the stop that they lead to."""
+        found, margin = [], self._limits.at_limit * self._travel
+        for j, name in enumerate(self._machine.joint_names):
+            for sign in (1, -1):
+                driven = _held(sign * self._u[:, j] > self._limits.driving, self._lead)
+                stop = self._q[:, j] > self._machine.upper[j] - margin[j]
+                stop = stop if sign > 0 else self._q[:, j] < self._machine.lower[j] + margin[j]
+                for row, count in runs(driven & ~self._is_moving[:, j] & ~stop & np.isfinite(self._v[:, j])):
+                    if count * self._period_s >= self._limits.unanswered_s:
+                        mean = self._u[row : row + count, j].mean()
+                        found.append(self._finding("no motion", name, row, count, f"commanded {mean:+.2f}, does not move"))
+        return found
+
+    def no_command(self) -> list[Finding]:
+        """Finds stretches without command over which a joint goes elsewhere."""
+        found = []
+        for j, (name, unit) in enumerate(self._units()):
+            for row, count in runs(self._idle[:, j]):
+                ends = min(5, count)
+                moved = np.nanmedian(self._q[row + count - ends : row + count, j]) - np.nanmedian(self._q[row : row + ends, j])
+                if abs(moved) > max(self._limits.drift * self._travel[j], self._visible[j]):
+                    speed = moved / (count * self._period_s)
+                    text = f"moves {moved:+.3g} {unit} without command ({speed:+.2g} {unit}/s)"
+                    found.append(self._finding("no command", name, row, count, text))
+        return found
+
+    def frozen(self) -> list[Finding]:
+        """Finds equal samples amid motion, and at rest where the sensor is otherwise never still."""
+        found = []
+        for j, (name, unit) in enumerate(self._units()):
+            equal = np.append(False, np.diff(self._q[:, j]) == 0)
+            is_noisy = equal.mean() < 0.05
+            for row, count in runs(equal):
+                end = row + count  # first row with another value
+                jump = abs(self._q[end, j] - self._q[end - 1, j]) if end < len(equal) else 0.0
+                before, after = abs(self._before[row - 1, j]), abs(self._after[min(end, len(equal) - 1), j])
+                was_moving = before > self._limits.still * self._machine.max_speed[j]
+                if was_moving and jump > max(self._visible[j], JUMP * np.fmax(before, after) * self._period_s):
+                    text = f"{count + 1} equal samples, then a jump of {jump:.2g} {unit}"
+                elif is_noisy and count + 1 >= self._limits.equal_rows:
+                    text = f"{count + 1} equal samples of a sensor with noise"
+                else:
+                    continue
+                found.append(self._finding("frozen", name, row - 1, count + 1, text))
+        return found
+
+    def repeated(self) -> list[Finding]:
+        """Finds rows that repeat all positions of the row before although a joint moves visibly within a period."""
+        same = np.append(False, (np.diff(self._q, axis=0) == 0).all(1))
+        seen = (np.abs(self._v) * self._period_s > self._visible).any(1)
+        return [
+            self._finding("repeated rows", None, row, count, f"{count} rows repeat the one before")
+            for row, count in runs(same & seen)
+        ]
+
+    def beyond(self) -> list[Finding]:
+        """Finds positions outside the limits, by more than the sensor's own noise and step."""
+        found = []
+        for j, (name, unit) in enumerate(self._units()):
+            over = np.fmax(self._q[:, j] - self._machine.upper[j], self._machine.lower[j] - self._q[:, j])
+            for row, count in runs(over > self._visible[j]):
+                most = np.nanmax(over[row : row + count])
+                found.append(self._finding("beyond limit", name, row, count, f"up to {most:.2g} {unit} beyond its limit"))
+        return found
+
+    def exclusive(self) -> list[Finding]:
+        """Finds commands to an exclusive joint together with others."""
+        commanded, mask = np.abs(self._u) > self._limits.commanded, self._machine.is_exclusive
+        found = []
+        for j in np.flatnonzero(mask):
+            others = np.delete(commanded, j, axis=1).any(1)
+            for row, count in runs(commanded[:, j] & others):
+                name = self._machine.joint_names[j]
+                found.append(self._finding("exclusive", name, row, count, "commanded together with another joint"))
+        return found
+
+    def _finding(self, kind: Kind, joint: str | None, row: int, count: int, text: str) -> Finding:
+        begin_s, end_s = float(self._t_s[row]), float(self._t_s[row + count - 1])
+        return Finding(kind, joint, row, count, begin_s, end_s - begin_s, text)
+
+    def _units(self) -> list[tuple[str, str]]:
+        return [(joint.name, joint.unit) for joint in self._machine.joints]
+
+    def _speed(self, ahead: int, behind: int) -> np.ndarray:
+        """Returns the mean speed from `behind` rows before to `ahead` rows after each row, `(T, J)`; NaN near the ends."""
+        speed, span = np.full(self._q.shape, np.nan), ahead + behind
+        if len(self._q) > span:
+            change = (self._q[span:] - self._q[:-span]) / (self._t_s[span:] - self._t_s[:-span])[:, None]
+            speed[behind : len(self._q) - ahead] = change
+        return speed
+
+    def _noise_of(self, joint: int) -> float:
+        """Returns the standard deviation of the sensor at rest; white noise is in each of two samples that are subtracted."""
+        change = np.diff(self._q[:, joint])[self._idle[1:, joint] & ~self._is_moving[1:, joint]]
+        return float(np.nanstd(change) / np.sqrt(2.0)) if len(change) > 20 else np.nan
+
+
+def _held(condition: np.ndarray, num_rows: int) -> np.ndarray:
+    """Returns where `condition`, `(T,)`, has held for more than `num_rows` rows on end."""
+    held = np.zeros(len(condition), dtype=bool)
+    for row, count in runs(condition):
+        held[row + num_rows : row + count] = True
+    return held
+
+
+def _step(q: np.ndarray) -> float:
+    """Returns the step of a coarse sensor from the values that it repeats, NaN where it repeats too few to tell."""
+    values, counts = np.unique(q[np.isfinite(q)], return_counts=True)
+    codes = values[counts >= CODE_REPEATS]
+    if len(codes) < 10 or counts[counts >= CODE_REPEATS].sum() < 0.3 * len(q):
+        return np.nan
+    return float(np.quantile(np.diff(codes), STEP_QUANTILE))
+
+
+def _plain(value: Any) -> float | None:
+    """Returns a number as JSON knows it, `None` for NaN."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,188 @@
+"""Each kind of finding is planted in a sound recording and found where it was put; a sound recording has none."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hydra.utils import instantiate
+
+from brokk_rl import record
+from brokk_rl.inspection import Finding, Thresholds, inspect
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+PERIOD_S = 0.05
+DELAY = 11
+"""Periods of dead time."""
+NOISE = 0.0003
+
+
+@pytest.fixture(scope="module")
+def thresholds() -> Thresholds:
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        cfg = hydra.compose("config", overrides=["mode=inspect"])
+    return instantiate(cfg.thresholds)
+
+
+def sound(machine: Machine, seconds: float = 60.0) -> Recording:
+    """Returns a recording of q3 going to and fro at half speed with rests, all joints with the noise of their sensors."""
+    steps = round(seconds / PERIOD_S)
+    u = np.zeros((steps, 5))
+    u[:, 2] = np.repeat([0.0, 0.5, 0.0, -0.5], 80)[np.arange(steps) % 320]
+    moved = np.zeros((steps, 5))
+    moved[DELAY:] = u[:-DELAY] * machine.max_speed * PERIOD_S
+    q = machine.home + np.cumsum(moved, 0) + NOISE * np.random.default_rng(0).standard_normal((steps, 5))
+    return Recording(
+        machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(steps) * PERIOD_S,
+        u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": "sound", "created": "2026-11-20T10:00:00.000+00:00"},
+    )  # fmt: skip
+
+
+def found(recording: Recording, machine: Machine, thresholds: Thresholds) -> list[Finding]:
+    return inspect(recording, machine, thresholds).findings
+
+
+def changed(recording: Recording, u: np.ndarray | None = None, q: np.ndarray | None = None) -> Recording:
+    return replace(recording, u=recording.u if u is None else u, q=recording.q if q is None else q)
+
+
+def test_a_sound_recording_has_no_findings(machine: Machine, thresholds: Thresholds) -> None:
+    assert found(sound(machine), machine, thresholds) == []
+
+
+def test_its_figures_are_those_it_was_made_with(machine: Machine, thresholds: Thresholds) -> None:
+    seen = inspect(sound(machine), machine, thresholds)
+    assert seen.timing["rate_hz"] == pytest.approx(20.0)
+    assert seen.timing["jitter_s"] == pytest.approx(0.0, abs=1e-9)
+    joint = seen.joints["q3"]
+    assert joint["commanded"] == pytest.approx(0.5, abs=0.05)
+    assert joint["fastest"] == pytest.approx(0.5 * machine.max_speed[2], rel=0.03)
+    assert joint["noise"] == pytest.approx(NOISE, rel=0.1)
+    assert joint["step"] is None
+    assert seen.joints["q1"]["commanded"] == 0.0
+
+
+def test_the_step_of_a_coarse_sensor_is_found(machine: Machine, thresholds: Thresholds) -> None:
+    whole = sound(machine)
+    coarse = inspect(changed(whole, q=np.round(whole.q / 0.004) * np.float32(0.004)), machine, thresholds)
+    assert coarse.joints["q3"]["step"] == pytest.approx(0.004, rel=0.01)
+
+
+def test_a_command_that_moves_nothing_is_found(machine: Machine, thresholds: Thresholds) -> None:
+    whole = sound(machine)
+    u = whole.u.copy()
+    u[200:280, 3] = 0.8  # the interlock was open
+    (finding,) = found(changed(whole, u=u), machine, thresholds)
+    assert (finding.kind, finding.joint) == ("no motion", "q4")
+    # told from where the joint should long have moved: dead time and 0.3 s later
+    assert (finding.row, finding.row + finding.num_rows) == (200 + 17, 280)
+    assert finding.t_s == pytest.approx(217 * PERIOD_S)
+    assert finding.text == "commanded +0.80, does not move"
+
+
+def test_a_joint_that_is_pressed_against_its_stop_is_no_finding(machine: Machine, thresholds: Thresholds) -> None:
+    whole = sound(machine)
+    u, q = whole.u.copy(), whole.q.copy()
+    u[200:280, 3] = 0.8
+    q[:, 3] += machine.upper[3] - machine.home[3]
+    q[:, 3] = np.minimum(q[:, 3], machine.upper[3])
+    assert found(changed(whole, u=u, q=q), machine, thresholds) == []
+
+
+def test_a_joint_that_sinks_is_found_with_its_speed(machine: Machine, thresholds: Thresholds) -> None:
+    whole = sound(machine)
+    q = whole.q.copy()
+    q[:, 1] += 0.002 * whole.t_s
+    (finding,) = found(changed(whole, q=q), machine, thresholds)
+    assert (finding.kind, finding.joint) == ("no command", "q2")
+    assert "+0.002 rad/s" in finding.text
+    assert finding.duration_s == pytest.approx(60.0, abs=2.0)
+
+
+def test_a_frozen_sensor_is_found_amid_motion_and_at_rest(machine: Machine, thresholds: Thresholds) -> None:
+    whole = sound(machine)
+    q = whole.q.copy()
+    q[120:126, 2] = q[119, 2]  # q3 is moving
+    q[500:520, 0] = q[499, 0]  # q1 rests, but its noise is gone
+    moving, resting = found(changed(whole, q=q), machine, thresholds)
+    assert (moving.kind, moving.joint, moving.row, moving.num_rows) == ("frozen", "q3", 119, 7)
+    assert "7 equal samples, then a jump of 0.04" in moving.text  # 7 periods at 0.13 rad/s
+    assert (resting.kind, resting.joint, resting.row, resting.num_rows) == ("frozen", "q1", 499, 21)
+
+
+def test_a_coarse_sensor_at_rest_between_motions_is_not_frozen(machine: Machine, thresholds: Thresholds) -> None:
+    whole = sound(machine)
+    q = np.round((whole.q - machine.home) / 0.004) * np.float32(0.004) + machine.home
+    assert found(changed(whole, q=q.astype(np.float32)), machine, thresholds) == []
+
+
+def test_lost_frames_are_found(machine: Machine, thresholds: Thresholds) -> None:
+    whole = sound(machine)
+    q = whole.q.copy()
+    for row in (110, 111, 130):
+        q[row] = q[row - 1]
+    kinds = [(finding.kind, finding.row, finding.num_rows) for finding in found(changed(whole, q=q), machine, thresholds)]
+    assert [entry for entry in kinds if entry[0] == "repeated rows"] == [("repeated rows", 110, 2), ("repeated rows", 130, 1)]
+
+
+def test_positions_beyond_the_limits_and_exclusive_joints_in_company_are_found(machine: Machine, thresholds: Thresholds) -> None:
+    whole = sound(machine)
+    u, q = whole.u.copy(), whole.q.copy()
+    u[100:120, 1] = 0.2  # q2 while q3 is commanded
+    q[:, 4] += machine.upper[4] + 0.05 - machine.home[4]
+    exclusive, beyond = sorted(found(changed(whole, u=u, q=q), machine, thresholds), key=lambda finding: str(finding.joint))
+    assert (exclusive.kind, exclusive.joint, exclusive.row, exclusive.num_rows) == ("exclusive", "q2", 100, 20)
+    assert (beyond.kind, beyond.joint, beyond.num_rows) == ("beyond limit", "q5", whole.num_samples)
+    assert "up to 0.05" in beyond.text
+
+
+def test_inspect_from_the_command_lists_every_breach_and_fails_at_none(
+    brokk: Callable[..., object], machine: Machine, tmp_path: Path
+) -> None:
+    record.write(sound(machine), tmp_path / "a.parquet")
+    record.write(replace(sound(machine), metadata={}), tmp_path / "b.parquet")
+    table = pq.read_table(tmp_path / "b.parquet")
+    u = table.column("u_q2").to_numpy().copy()
+    u[[5, 6, 90]] = 1.5
+    table = table.set_column(table.column_names.index("u_q2"), "u_q2", [u]).drop_columns("q_q5_rad")
+    pq.write_table(table, tmp_path / "b.parquet")
+    (tmp_path / "c.parquet").write_bytes((tmp_path / "a.parquet").read_bytes()[:-300])
+    done = brokk("mode=inspect", "inspect.recordings=*.parquet", "session.out=out")
+    assert done.code == 0, done.err
+    for told in (
+        "b.parquet: column 'q_q5_rad' is missing", "b.parquet: row 5, column 'u_q2': command 1.5 lies outside [-1, 1] (2 such rows",
+        "b.parquet: row 90, column 'u_q2'", "c.parquet: truncated", "1 recordings do not say when they began",
+    ):  # fmt: skip
+        assert told in done.out, told
+    result = json.loads(Path("out/inspection.json").read_text())
+    assert [len(entry["breaches"]) for entry in result["recordings"]] == [0, 3, 1]
+    assert result["recordings"][0]["findings"] == []
+    assert result["recordings"][0]["run"] == "sound"
+    assert result["joints"]["q3"]["noise"] == pytest.approx(NOISE, rel=0.1)
+    page = Path("out/inspection.html").read_text()
+    assert "2 break the format" in page
+    for name in ("overview", "a", "b"):
+        assert Path(f"out/{name}.png").stat().st_size > 1000
+
+
+def test_parts_of_a_run_that_overlap_in_time_are_told(brokk: Callable[..., object], machine: Machine, tmp_path: Path) -> None:
+    first = sound(machine, 20.0)
+    later = record.later(first.metadata["created"], 15.0)
+    record.write(first, tmp_path / "a_0.parquet")
+    record.write(replace(first, metadata={**first.metadata, "created": later}), tmp_path / "a_1.parquet")
+    done = brokk("mode=inspect", "inspect.recordings=*.parquet", "session.out=out", "inspect.pictures=0")
+    assert done.code == 0, done.err
+    assert "run sound: a_1.parquet begins 5.0 s before a_0.parquet ends; look at the clock" in done.out  # 19.95 s - 15 s
+
+
+def test_inspecting_nothing_is_an_error(brokk: Callable[..., object]) -> None:
+    done = brokk("mode=inspect", "inspect.recordings=nothing/*.parquet")
+    assert done.code == 2
+    assert "no recording matches nothing/*.parquet" in done.err
