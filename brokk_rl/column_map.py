@@ -232,6 +232,8 @@ def _resampled(
 ) -> Recording:
     """Returns a piece at the machine's rate."""
     ends_s = t_s - t_s[0]
+    period_s = np.diff(t_s)
+    was = f"{1.0 / np.median(period_s):.1f} Hz, periods of {period_s.min():.3f} to {period_s.max():.3f} s"
     grid_s = np.arange(int(ends_s[-1] / machine.period_s + 1e-6) + 1) * machine.period_s
     newest = np.searchsorted(ends_s, grid_s + 1e-6 * machine.period_s, side="right") - 1
     return Recording(
@@ -243,5 +245,5 @@ def _resampled(
         u=u[newest].astype(np.float32),
         q=np.stack([np.interp(grid_s, ends_s, values) for values in q.T], 1).astype(np.float32),
         extra={name: np.interp(grid_s, ends_s, values).astype(np.float32) for name, values in extra.items()},
-        metadata={"source": f"log: {path.name}", "run": path.stem, "fingerprint": record.stamp(machine)},
+        metadata={"source": f"log: {path.name}", "run": path.stem, "fingerprint": record.stamp(machine), "resampled_from": was},
     )

@@ -99,7 +99,7 @@ class Inspect:
             "machine": self.machine.name,
             "delay_s": self._delays([one.recording for one in inspected if one.recording and not one.breaches]),
             "joints": self._overall(inspected),
-            "remarks": _clocks(inspected),
+            "remarks": [*_resampled(inspected), *_clocks(inspected)],
             "recordings": [one.plain() for one in inspected],
         }
         write_json(folder / "inspection.json", result)
@@ -149,7 +149,7 @@ class Inspect:
                     entry[key] = float(np.median(values[there]))
                 else:
                     entry[key] = float(np.average(values[there], weights=np.maximum(hours[there], 1e-9)))
-            counts = Counter(f.kind for one in known if one.inspection for f in one.inspection.findings if f.joint in (name, None))
+            counts = Counter(f.kind for one in known if one.inspection for f in one.inspection.findings if f.joint == name)
             table[name] = {**entry, **{f"num_{kind.replace(' ', '_')}": counts[kind] for kind in KINDS}}
         return table
 
@@ -171,9 +171,9 @@ class Inspect:
 
     def _counts(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         """Returns heading and cells of the table of findings by joint."""
-        keys = [f"num_{kind.replace(' ', '_')}" for kind in KINDS]
-        rows = [[name, *(str(entry[key] or "–") for key in keys)] for name, entry in result["joints"].items()]
-        return ["joint", *KINDS], rows
+        counts = Counter((f["joint"], f["kind"]) for entry in result["recordings"] for f in entry["findings"])
+        names = [*self.machine.joint_names, None]
+        return ["joint", *KINDS], [[name or "all at once", *(str(counts[name, kind] or "–") for kind in KINDS)] for name in names]
 
     def _show(self, result: dict[str, Any], inspected: Sequence[Inspected]) -> None:
         console = Console()
@@ -223,6 +223,12 @@ class Inspect:
                 with page.details(f"{len(rows)} findings"):
                     page.table(["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows)
         return page
+
+
+def _resampled(inspected: Sequence[Inspected]) -> list[str]:
+    """Returns at what rates logs of other programs were, whose recordings have even periods only since they were converted."""
+    rates = {one.recording.run: one.recording.metadata.get("resampled_from") for one in inspected if one.recording}
+    return [f"run {run}: resampled from {rate}" for run, rate in rates.items() if rate]
 
 
 def _clocks(inspected: Sequence[Inspected]) -> list[str]:
