@@ -45,7 +45,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a run that a scheduler stops ends like one stopped by hand
     try:
         with _hydra_raises():
-            extensions.register()
+            extensions.register(sys.argv[1:])
             hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")(job)()
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
@@ -91,7 +91,8 @@ def _run(cfg: DictConfig) -> float | None:
             return objective
     except Exception:
         if HydraConfig.get().mode is RunMode.MULTIRUN:
-            remove_empty([folder])  # made by Hydra; stays if the job has written into it
+            # made by Hydra, in several levels where an override holds a path; what the job or the sweep has written into stays
+            remove_empty([folder, *folder.parents])
         raise
 
 
@@ -121,6 +122,7 @@ def run_folder(cfg: DictConfig) -> Path:
     if out:
         return Path(out)
     name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
+    name = Path(name).stem if name else None  # an option may be a file, experiment=@<path>
     stem = "_".join(filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", _mode_name(cfg), name)))
     return Path("runs") / stem
 

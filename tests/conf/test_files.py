@@ -1,0 +1,115 @@
+"""`group=@<path>`: a file is an option, and nothing more than one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+LAG = """# A fitted actuator.
+_target_: actuators.lag.Lag
+dead_time_s: {q1: 0.5, other: 0.45}
+dead_band_extend: 0.1
+dead_band_retract: 0.1
+gain: 1.0
+time_constant_s: 0.02
+spread: {}
+"""
+EFFECTS = """stiction: {_target_: actuators.effects.command.Stiction, joints: [q3], start: 0.14, stop: 0.1}
+backlash: {_target_: actuators.effects.speed.Backlash, joints: [q3], gap_rad: 0.031}
+"""
+
+
+def composed(brokk: Callable[..., Any], *overrides: str) -> dict[str, Any]:
+    """Returns what the command would run with."""
+    done = brokk(*overrides, "--cfg", "job")
+    assert done.code == 0, done.err
+    return yaml.safe_load(done.out)
+
+
+@pytest.mark.parametrize("name", ["lag.yaml", "fits of today/lag.yaml", "../above/lag.yaml", "no_ending"])
+def test_a_file_is_an_option_of_its_group(name: str, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(LAG)
+    assert composed(brokk, "mode=train", f"actuator=@{name}")["actuator"] == yaml.safe_load(LAG)
+    changed = composed(brokk, "mode=train", f"actuator=@{path}", "actuator.gain=0.9")
+    assert changed["actuator"]["gain"] == 0.9
+
+
+def test_a_file_may_hold_several_effects_and_stand_in_a_list(brokk: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "found, today.yaml").write_text(EFFECTS)
+    (tmp_path / "one.yaml").write_text("_target_: actuators.effects.speed.FlowGain\njoints: all\ngain: [0.9, 1.1]\n")
+    effect = composed(brokk, "mode=train", 'effect=["@found, today.yaml", lag, @one.yaml]')["effect"]
+    assert list(effect) == ["stiction", "backlash", "lag", "flow_gain"]
+    assert effect["backlash"]["gap_rad"] == 0.031
+    assert effect["flow_gain"]["gain"] == [0.9, 1.1]
+    assert list(composed(brokk, "mode=train", "effect='@found, today.yaml'")["effect"]) == ["stiction", "backlash"]
+
+
+def test_a_file_replaces_a_part_of_another_option(brokk: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "lag.yaml").write_text(LAG)
+    fit = composed(brokk, "mode=identify", "fit=lag", "actuator@fit.actuator=@lag.yaml", "identify.recordings=x", "session.out=x")
+    assert fit["fit"]["actuator"]["dead_time_s"] == {"q1": 0.5, "other": 0.45}
+
+
+def test_an_experiment_may_be_a_file(brokk: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("defaults: [override /task: goal_pose]\nsession: {seed: 7}\n")
+    cfg = composed(brokk, "mode=train", "experiment=@mine.yaml")
+    assert cfg["session"]["seed"] == 7
+    assert "goal_pose" in cfg["task"]["_target_"]
+
+
+def test_a_sweep_takes_files_beside_options(brokk: Callable[..., Any], tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "fits").mkdir()
+    (tmp_path / "fits" / "lag.yaml").write_text(LAG)
+    done = brokk("-m", "mode=bench", "actuator=ideal,@fits/lag.yaml", "bench.num_envs=[0]", "session.out=sweep")
+    assert done.code == 2
+    for job in (0, 1):  # each was composed, and refused for its size alone
+        assert f"job {job} failed: bench.num_envs: expected one or more positive numbers" in caplog.text
+    assert not (tmp_path / "sweep").exists()
+
+
+@pytest.mark.parametrize(
+    ("group", "text", "told"),
+    [
+        ("actuator", "_target_: os.system\n", ("'_target_: os.system' is no actuator", "actuators.lag.Lag")),
+        ("actuator", "_target_: actuators.effects.speed.Backlash\ngap_rad: 0.1\n", ("is no actuator",)),
+        ("effect", "backlash: {_target_: os.system}\n", ("'backlash._target_: os.system' is no effect",)),
+        ("effect", "a: {_target_: actuators.effects.speed.Backlash, gap_rad: {_target_: os.getcwd}}\n", ("nothing of ours",)),
+        ("actuator", "_target_: actuators.ideal.Ideal\nspeed_scale: ${oc.env:HOME}\n", ("interpolation", "${oc.env:HOME}")),
+        ("actuator", '_target_: actuators.ideal.Ideal\nspeed_scale: "\\x24{now:}"\n', ("interpolation",)),
+        ("actuator", "_target_: actuators.ideal.Ideal\n_partial_: true\n", ("'_partial_' is a setting of Hydra's",)),
+        ("actuator", "# @package _global_\n_target_: actuators.ideal.Ideal\n", ("lies outside 'actuator'",)),
+        ("experiment", "hydra: {sweep: {dir: /}}\n", ("Hydra's own settings",)),
+        ("experiment", "defaults: [override /hydra/launcher: joblib]\n", ("Hydra's own settings",)),
+        ("actuator", "a: 1\nb: [2\nc: 3\n", ("line 3: no valid YAML",)),
+        ("actuator", "- a\n", ("expected a mapping",)),
+        ("actuator", "", ("expected a mapping",)),
+    ],
+)
+def test_a_file_that_does_more_than_name_values_is_refused(
+    group: str, text: str, told: tuple[str, ...], brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    (tmp_path / "given.yaml").write_text(text)
+    done = brokk("mode=train", f"{group}=@given.yaml")
+    assert done.code == 2
+    assert done.err.startswith(f"error: {group}=@given.yaml: ")
+    for part in told:
+        assert part in done.err
+    assert [path.name for path in tmp_path.iterdir()] == ["given.yaml"]
+
+
+def test_a_missing_file_is_named(brokk: Callable[..., Any], tmp_path: Path) -> None:
+    done = brokk("mode=train", "actuator=@lag.yaml")
+    assert done.code == 2
+    assert f"actuator=@lag.yaml: there is no such file (seen from {tmp_path})" in done.err
+    assert "cannot be read as text" in brokk("mode=train", "actuator=@.").err
+
+
+def test_a_value_that_begins_with_an_at_sign_is_no_file(brokk: Callable[..., Any]) -> None:
+    cfg = composed(brokk, "mode=identify", "identify.recordings=@home/*.parquet", "session.out=x")
+    assert cfg["identify"]["recordings"] == "@home/*.parquet"
