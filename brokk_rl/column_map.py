@@ -7,9 +7,11 @@ Rows in messages are those of the log's data, from 0 as in recordings, beside th
 """
 
 import csv
+import io
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -86,6 +88,7 @@ class ColumnMap:
 
     Attributes:
         delimiter: Between the cells of a line.
+        decimal: Decimal sign of its numbers.
         time: Time, to s; its zero does not matter.
         joints: Columns of each joint of the machine, by joint name.
         optional: Further columns, by their name in the recording (`ee_x_m`, `force_n`, …); interpolated like positions.
@@ -94,7 +97,8 @@ class ColumnMap:
         shortest_s: Shorter pieces are left out.
     """
 
-    delimiter: str
+    delimiter: Literal[",", ";", "\t", " "]
+    decimal: Literal[".", ","]
     time: Column
     joints: dict[str, JointColumns]
     optional: dict[str, Column]
@@ -103,6 +107,8 @@ class ColumnMap:
     shortest_s: float
 
     def check(self) -> None:
+        if self.delimiter == self.decimal:
+            raise ConfigError(f"column map: '{self.decimal}' cannot be both delimiter and decimal sign")
         if self.overrun < 0 or self.longest_gap_s <= 0 or self.shortest_s < 0:
             raise ConfigError("column map: expected overrun >= 0, longest_gap_s > 0 and shortest_s >= 0")
         if self.time.scale <= 0:
@@ -120,7 +126,7 @@ class ColumnMap:
                 f"import: the map names the joints {', '.join(self.joints)}, machine '{machine.name}' has "
                 f"{', '.join(machine.joint_names)}; choose machine=… and import=… that belong together"
             )
-        table = _Table(path, self.delimiter)
+        table = _Table(path, self.delimiter, self.decimal)
         t_s = table.numbers(self.time)
         if (row := _first(np.diff(t_s) <= 0)) is not None:
             where = table.where(row + 1, self.time.column)
@@ -167,8 +173,8 @@ class Cells:
 class _Table:
     """A CSV file whose cells become numbers when asked for."""
 
-    def __init__(self, path: Path, delimiter: str) -> None:
-        self._path = path
+    def __init__(self, path: Path, delimiter: str, decimal: str) -> None:
+        self._path, self._decimal = path, decimal
         self._cells = _cells(path, delimiter)
 
     def where(self, row: int, column: str) -> str:
@@ -180,12 +186,14 @@ class _Table:
         header = self._cells.header
         if column.column not in header:
             raise RecordingError(f"{self._path}: column '{column.column}' is missing; {choices(column.column, header)}")
+        if header.count(column.column) > 1:
+            raise RecordingError(f"{self._path}: {header.count(column.column)} columns are named '{column.column}'; rename them")
         at = header.index(column.column)
         values = np.empty(len(self._cells.rows))
         for row, cells in enumerate(self._cells.rows):
-            text = cells[at].strip()
+            text = cells[at]
             try:
-                values[row] = float(text or "nan") if empty else float(text)
+                values[row] = float(text.replace(self._decimal, ".") or ("nan" if empty else ""))
             except ValueError:
                 raise RecordingError(f"{self.where(row, column.column)}: '{text}' is not a number") from None
             if not (empty or np.isfinite(values[row])):
@@ -207,7 +215,7 @@ def _cells(path: Path, delimiter: str) -> Cells:
         raise RecordingError(f"{path}: no such log") from error
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: not a text file that can be read ({error})") from error
-    reader = csv.reader(text.splitlines(keepends=True), delimiter=delimiter)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     try:
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if cells]
     except csv.Error as error:

@@ -131,6 +131,21 @@ def test_a_missing_column_is_refused_with_the_nearest_name(tmp_path: Path, excav
         reader.read(path, excavator)
 
 
+def test_two_columns_of_one_name_are_refused(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
+    path = logged(tmp_path, [f"{line},1.0" for line in lines()], HEADER + ",Boom Ms")
+    with pytest.raises(RecordingError, match=r"dig\.csv: 2 columns are named 'Boom Ms'"):
+        reader.read(path, excavator)
+
+
+def test_a_log_with_decimal_commas_and_windows_line_ends_is_read(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
+    (expected,) = reader.read(logged(tmp_path, lines()), excavator)
+    text = "\n".join([HEADER, *lines()]).replace(",", ";").replace(".", ",").replace("\n", "\r\n") + "\r\n"
+    (tmp_path / "dig.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())  # as a spreadsheet saves it
+    (recording,) = replace(reader, delimiter=";", decimal=",").read(tmp_path / "dig.csv", excavator)
+    np.testing.assert_array_equal(recording.q, expected.q)
+    np.testing.assert_array_equal(recording.u, expected.u)
+
+
 def test_what_is_no_text_is_refused(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
     (tmp_path / "dig.csv").write_bytes(b"\xff\xfe\x00\x81" * 40)
     with pytest.raises(RecordingError, match=r"dig\.csv: not a text file"):
