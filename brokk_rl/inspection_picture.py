@@ -85,11 +85,11 @@ def overview(path: Path, lines: Mapping[str, Line]) -> None:
     longest_s = max((line.duration_s for line in lines.values()), default=0.0) or 1.0
     for place, line in enumerate(lines.values()):
         axis.barh(place, line.duration_s, height=0.7, color="0.9")
-        for finding in line.findings:
+        for finding in sorted(line.findings, key=lambda finding: -finding.duration_s):  # none hides a shorter one
             width_s = max(finding.duration_s, THINNEST * longest_s)
             axis.barh(place, width_s, left=finding.t_s, height=0.7, color=COLOURS[finding.kind])
         if line.num_breaches:
-            text = f" {line.num_breaches} breaches of the format"
+            text = f" breaks the format {line.num_breaches} ×" if line.num_breaches > 1 else " breaks the format"
             axis.text(line.duration_s, place, text, color=BREACH, va="center", fontsize=8)
     axis.set_yticks(range(len(lines)), list(lines), fontsize=8)
     axis.invert_yaxis()

@@ -209,16 +209,20 @@ class Inspect:
         page.items([f"{kind}: {meaning}" for kind, meaning in KINDS.items()])
         page.heading("Recordings")
         page.table(FILES, [_file_row(one) for one in inspected])
-        page.items(result["remarks"])
+        if result["remarks"]:
+            page.items(result["remarks"])
         for name, path in pictures.items():
-            page.picture(path, f"{name}: findings are shaded, breaches of the format drawn as vertical lines")
+            lines = "" if name == "overview" else ", breaches of the format are vertical lines"
+            page.picture(path, f"{name}: findings are shaded{lines}")
         for one in inspected:
             if one.num_remarks:
                 page.heading(one.path.name, 3)
+            if one.breaches:
                 page.items([str(breach) for breach in one.breaches])
+            if one.inspection and one.inspection.findings:
                 rows = [
                     [f.kind, f.joint or "all", str(f.row), str(f.num_rows), f"{f.t_s:.2f}", f"{f.duration_s:.2f}", f.text]
-                    for f in (one.inspection.findings if one.inspection else [])
+                    for f in one.inspection.findings
                 ]
                 with page.details(f"{len(rows)} findings"):
                     page.table(["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows)
