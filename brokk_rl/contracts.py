@@ -7,7 +7,7 @@ Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from brokk_rl.history import History
     from brokk_rl.machine import Machine
     from brokk_rl.record import Recording
+    from brokk_rl.session import Session
     from brokk_rl.signals import Borehole, Command, Frame, JointState
 
 
@@ -87,24 +88,50 @@ class Actuator(Protocol):
         ...
 
 
-class ExcitationProcess(Protocol):
-    """An excitation at work in `N` runs at once. Arrays are numpy: it also runs on the machine's computer."""
+@dataclass(frozen=True)
+class Segment:
+    """A piece of an excitation: a pose and the commands that are played from it. Pure data for one machine.
 
-    names: tuple[str, ...]
-    """What each run is, for its file name, e.g. `sine_q1_00`."""
+    Attributes:
+        name: What it is, different from all others of its plan, e.g. `ramps_q3_02`.
+        start: Joint positions from which it is played, `(J,)`, rad or m.
+        u: The program, `(T, J)` in [-1, 1]; row `k` is in force in control period `k`. Exclusive joints never together with others.
+        stops: What happens when a joint is about to come to rest closer to its stop than `stop_margin`. `home`: everything goes
+            back to `start` and waits until the program, which runs on by the clock, next passes zero. `inward`: this joint is
+            driven the other way until its program next passes zero.
+        stop_margin: Distance from the stops, as a part of the joint's travel.
+        repeat_of: Name of the segment that this one repeats exactly.
+    """
+
+    name: str
     start: np.ndarray
-    """Joint positions from which the runs start, `(N, J)`, rad or m."""
-
-    def command(self, q: np.ndarray) -> np.ndarray:
-        """Returns the commands for the coming control period, `(N, J)` in [-1, 1], at the measured positions `q`, `(N, J)`."""
-        ...
+    u: np.ndarray
+    stops: Literal["home", "inward"]
+    stop_margin: float
+    repeat_of: str | None = None
 
 
 class Excitation(Protocol):
-    """A spec in `conf/excitation`: commands that show what an actuator does."""
+    """A spec in `conf/excitation`: commands that show what an actuator does. Numpy only: it also runs on the machine's computer."""
 
-    def build(self, machine: Machine, num_runs: int, generator: np.random.Generator) -> ExcitationProcess:
-        """Returns the excitation for `num_runs` runs; never moves exclusive joints together with others."""
+    def weight(self, before: float) -> float:
+        """Returns its part of the time, relative to the others of the plan; those before it have `before` in all."""
+        ...
+
+    def segments(
+        self, machine: Machine, duration_s: float, generator: np.random.Generator, before: Sequence[Segment]
+    ) -> list[Segment]:
+        """Returns segments whose programs last `duration_s` in all, or as much of it as whole segments fill.
+
+        Args:
+            machine: Gives limits, speeds, weights, and the joints that never move together with others.
+            duration_s: Time for the programs, without the ways to their start poses.
+            generator: The only source of chance.
+            before: Segments that are already planned.
+
+        Raises:
+            ConfigError: not a single segment fits into `duration_s`.
+        """
         ...
 
 
@@ -280,10 +307,14 @@ class PerceptionBackend(Protocol):
 
 @runtime_checkable
 class Link(Protocol):
-    """The connection to a machine, real or simulated; a context manager."""
+    """The open connection to a machine, real or simulated; a context manager.
+
+    Arrays are `(J,)`, or `(N, J)` where a simulated link drives `N > 1` machines side by side. Leaving the context brings the
+    machine to a standstill. A link may have `extra() -> dict[str, float | array (N,)]`: more columns of the recording (`oil_c`).
+    """
 
     def read(self) -> JointState:
-        """Returns the newest measured state."""
+        """Returns the newest measured state; its `t_s` is the clock by which the control periods are counted."""
         ...
 
     def send(self, command: Command) -> Command:
@@ -293,3 +324,20 @@ class Link(Protocol):
     def __enter__(self) -> Link: ...
 
     def __exit__(self, *exc: Any) -> None: ...
+
+
+class Connection(Protocol):
+    """A spec in `conf/link`: how to reach a machine."""
+
+    @property
+    def source(self) -> str:
+        """What recordings say they come from."""
+        ...
+
+    def build(self, machine: Machine, num_runs: int, session: Session) -> Link:
+        """Returns a link, not yet opened, to `num_runs` machines side by side; its random numbers come from the session's streams.
+
+        Raises:
+            ConfigError: there are not as many machines.
+        """
+        ...

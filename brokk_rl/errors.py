@@ -32,6 +32,10 @@ class SimulationError(BrokkError):
     """The simulation lost too many worlds to divergence or overflow."""
 
 
+class LinkError(BrokkError):
+    """The link to a machine fell silent or said something that makes no sense."""
+
+
 class StorageError(BrokkError):
     """A file could not be written; nothing half-written is left behind."""
 

@@ -1,113 +1,144 @@
-"""`brokk mode=collect`: drives the simulated machine with an excitation and writes recordings."""
+"""`brokk mode=collect`: plans an excitation, shows the plan, drives a machine through it, and writes recordings."""
 
+import json
 import logging
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from rich.progress import Progress
 
 from brokk_rl import record
-from brokk_rl.contracts import Actuator, Excitation, ExcitationProcess
+from brokk_rl.breaches import RATE_TOLERANCE
+from brokk_rl.contracts import Connection, Excitation
 from brokk_rl.errors import ConfigError
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.session import Session
+from brokk_rl.plan import account, picture
+from brokk_rl.plan.account import Track
+from brokk_rl.plan.drive import Nominal, Sample, drive
+from brokk_rl.plan.guard import Guards, predicted_tool_speed
+from brokk_rl.plan.runner import Runner
+from brokk_rl.plan.schedule import Approach, Plan, schedule
+from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
 FOLDER = "recordings"
+CUT = 0.2
+"""Part of a program that may be missing at the end of a run without a warning."""
 
 
 @spec
 class Collection:
-    """How much to record.
+    """How much to record, and within which bounds.
 
     Attributes:
-        num_runs: Runs side by side, each on a machine of its own.
+        num_runs: Runs side by side, each on a machine of its own; a real machine has one.
         run_minutes: Length of each run; its oil warms up over this time.
         file_minutes: A run is cut into files of this length.
-        noise: Standard deviation of the measured position, rad or m.
+        flush_s: The file that grows is written again after this time, so that even a power failure costs no more.
+        only_plan: Stop after `plan.png` and `plan.json`, before anything moves.
+        approach: How start poses are taken up.
+        guards: Bounds that no program can exceed.
     """
 
     num_runs: int
     run_minutes: float
     file_minutes: float
-    noise: float
+    flush_s: float
+    only_plan: bool
+    approach: Approach
+    guards: Guards
 
     def check(self) -> None:
         if self.num_runs < 1:
             raise ConfigError(f"collect.num_runs: expected 1 or more, got {self.num_runs}")
         if not 0 < self.file_minutes <= self.run_minutes:
             raise ConfigError(f"collect: expected 0 < file_minutes <= run_minutes, got {self.file_minutes} and {self.run_minutes}")
-        if self.noise < 0:
-            raise ConfigError(f"collect.noise: expected 0 or more, got {self.noise}")
+        if self.flush_s <= 0:
+            raise ConfigError(f"collect.flush_s: expected more than 0, got {self.flush_s}")
 
 
 @spec
 class Collect:
-    """Drives a machine with an excitation and writes what was commanded and measured, as Parquet recordings."""
+    """Drives a machine, simulated or real, through a plan of excitations; writes what was commanded and measured, as recordings."""
 
     session: Session
     machine: Machine
-    actuator: Actuator
-    excitation: Excitation
+    link: Connection
+    excitation: dict[str, Excitation]
     collect: Collection
 
     def run(self) -> None:
-        """Writes `recordings/<run>_<part>.parquet` into the run folder.
+        """Writes `plan.png` and `plan.json`, then `recordings/<run>_<part>.parquet`, into the run folder.
 
         Raises:
+            ConfigError: the plan finds no room in a run.
+            LinkError: the link to the machine failed; what was recorded until then is kept.
             StorageError: a file could not be written.
         """
         self.session.seed_all()
-        generator = self.session.generator("collect")
-        process = self.excitation.build(self.machine, self.collect.num_runs, generator)
-        # a few dozen runs are faster on a CPU
-        device = torch.device("cpu") if self.session.device == "auto" else self.session.torch_device()
-        files = self._drive(process, generator, device)
-        minutes = self.collect.num_runs * self.collect.run_minutes
-        log.info("%d recordings of %.0f minutes in all in %s", files, minutes, self.session.folder / FOLDER)
-
-    def _drive(self, process: ExcitationProcess, generator: np.random.Generator, device: torch.device) -> int:
-        """Runs the machine through all periods and returns the number of files written."""
-        machine, num_runs = self.machine, self.collect.num_runs
-        total = round(self.collect.run_minutes * 60.0 / machine.period_s)
-        per_file = round(self.collect.file_minutes * 60.0 / machine.period_s)
-        model = self.actuator.build(machine, num_runs, device)
-        shape = (num_runs, machine.num_history, machine.num_joints)
-        history = History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
-        q = torch.as_tensor(process.start, dtype=torch.float32, device=device)
-        history.reset(torch.ones(num_runs, dtype=torch.bool, device=device), q)
-        oil_c = model.state.get("oil_c")
-        writer = _Writer(self, process, record.now())
-        with Progress(transient=True) as progress, torch.inference_mode():
-            task = progress.add_task(f"{num_runs} runs", total=total)
+        settings, run_s = self.collect, self.collect.run_minutes * 60.0
+        plan = schedule(
+            self.excitation, self.machine, settings.approach, settings.num_runs, run_s, self.session.generator("collect")
+        )
+        self._show(plan)
+        if settings.only_plan:
+            return
+        link = self.link.build(self.machine, settings.num_runs, self.session)
+        writer = Writer(self.machine, plan, self._folder, settings, self._metadata(plan))
+        with link as opened, Progress(transient=True) as progress:
+            task = progress.add_task(f"{settings.num_runs} runs", total=run_s)
             try:
-                for _ in range(total):
-                    measured = q.cpu().numpy() + self.collect.noise * generator.standard_normal((num_runs, machine.num_joints))
-                    u = process.command(measured)
-                    writer.add(u, measured, None if oil_c is None else oil_c.cpu().numpy().copy())
-                    history.push_u(torch.as_tensor(u, dtype=torch.float32, device=device))
-                    q = model.step(history)
-                    history.push_q(q)
-                    if writer.pending == per_file:
-                        writer.flush()
-                    progress.advance(task)
+                for sample in drive(opened, self._runner(plan), self.machine, settings.num_runs, run_s):
+                    writer.add(sample)
+                    progress.advance(task, self.machine.period_s)
             finally:
-                writer.flush()  # what was recorded before an interruption is kept
-        return writer.files
+                writer.close()  # what was recorded before an interruption is kept
+        log.info("%d recordings of %.1f minutes in all in %s", writer.files, writer.recorded_s / 60.0, self._folder)
+
+    @property
+    def _folder(self) -> Path:
+        return self.session.folder / FOLDER
+
+    def _runner(self, plan: Plan) -> Runner:
+        return Runner(plan, self.machine, self.collect.approach, self.collect.guards)
+
+    def _show(self, plan: Plan) -> None:
+        """Tries the plan out on a nominal machine; writes picture and figures."""
+        machine, count = self.machine, self.collect.num_runs
+        track = Track(drive(Nominal(machine, count), self._runner(plan), machine, count, plan.run_s))
+        summary = account.summary(plan, track, machine)
+        write_json(self.session.folder / "plan.json", summary)
+        picture.draw_plan(plan, track, machine, predicted_tool_speed(machine, track.q[:, 0]), self.session.folder / "plan.png")
+        unplayed = {entry["name"] for run in summary["runs"] for entry in run if entry["cut_s"] > CUT * entry["program_s"]}
+        if unplayed:
+            log.warning("plan: no time for %s in some of the runs; raise collect.run_minutes", ", ".join(sorted(unplayed)))
+        log.info("plan: %d segments in the first of %d runs; see %s", len(plan.runs[0]), count, self.session.folder / "plan.png")
+
+    def _metadata(self, plan: Plan) -> dict[str, str]:
+        return {
+            "source": f"{self.link.source}, excitation: {', '.join(plan.names)}",
+            "fingerprint": record.stamp(self.machine),
+            "seed": str(self.session.seed),
+        }
 
 
-class _Writer:
-    """Gathers the samples of all runs and writes them file by file."""
+class Writer:
+    """Cuts the samples of all runs into files and writes them; a file that grows is written again every now and then.
 
-    def __init__(self, mode: Collect, process: ExcitationProcess, created: str) -> None:
-        self._mode, self._names = mode, process.names
-        self._part, self._samples = 0, []
-        machine = mode.machine
+    Attributes:
+        files: Number of files written.
+        recorded_s: Time recorded, all runs together.
+    """
+
+    def __init__(self, machine: Machine, plan: Plan, folder: Path, settings: Collection, metadata: dict[str, str]) -> None:
+        self._plan, self._folder, self._period_s, self._flush_s = plan, folder, machine.period_s, settings.flush_s
+        self._per_file = max(2, round(settings.file_minutes * 60.0 / machine.period_s))
+        self._names = [f"{'-'.join(plan.names)}_{n:02d}" for n in range(len(plan.runs))]
+        self._created, self._begin_s = record.now(), 0.0
         self._template = record.Recording(
             machine=machine.name,
             joints=machine.joint_names,
@@ -116,46 +147,54 @@ class _Writer:
             t_s=np.empty(0),
             u=np.empty(0),
             q=np.empty(0),
-            metadata={
-                "source": f"simulator: {type(mode.actuator).__name__}, excitation: {type(mode.excitation).__name__}",
-                "fingerprint": record.stamp(machine),
-                "seed": str(mode.session.seed),
-            },
+            metadata=metadata,
         )
-        self._created, self._elapsed_s = created, 0.0
-        self.files = 0
+        self._part, self._samples, self._written = 0, [], time.monotonic()
+        self.files, self.recorded_s = 0, 0.0
 
-    @property
-    def pending(self) -> int:
-        """Number of samples not yet written."""
-        return len(self._samples)
+    def add(self, sample: Sample) -> None:
+        """Appends one sample of all runs; begins new files where the old ones are long enough, or time has a gap."""
+        if not self.files and not self._samples:
+            self._begin_s = sample.t_s
+        if self._samples:
+            late = abs((sample.t_s - self._samples[-1].t_s) / self._period_s - 1.0) > RATE_TOLERANCE
+            if late or len(self._samples) >= self._per_file:
+                self._finish()
+        self._samples.append(sample)
+        if time.monotonic() - self._written > self._flush_s:
+            self._write()
 
-    def add(self, u: np.ndarray, q: np.ndarray, oil_c: np.ndarray | None) -> None:
-        """Appends one sample of all runs."""
-        self._samples.append((u, q, oil_c))
+    def close(self) -> None:
+        """Writes what is pending."""
+        self._finish()
 
-    def flush(self) -> None:
-        """Writes one file a run with the pending samples; fewer than two are no recording and stay pending."""
+    def _finish(self) -> None:
+        """Writes the present files for the last time; a single sample is no recording and is left out."""
+        if len(self._samples) > 1:
+            self._write()
+            self._part += 1
+            self.files += len(self._names)
+            self.recorded_s += len(self._names) * len(self._samples) * self._period_s
+        self._samples = []
+
+    def _write(self) -> None:
+        """Writes one file a run."""
+        self._written = time.monotonic()
         if len(self._samples) < 2:
             return
-        u, q = (np.stack([sample[i] for sample in self._samples], 1) for i in (0, 1))
-        oil_c = None if self._samples[0][2] is None else np.stack([sample[2] for sample in self._samples], 1)
-        period_s = self._mode.machine.period_s
-        created = record.later(self._created, self._elapsed_s)
+        samples = self._samples
+        begin_s = samples[0].t_s
+        t_s = np.array([sample.t_s for sample in samples]) - begin_s
+        u, q = np.stack([sample.u for sample in samples], 1), np.stack([sample.q for sample in samples], 1)
+        extra = {name: np.stack([sample.extra[name] for sample in samples], 1) for name in samples[0].extra}
         for n, name in enumerate(self._names):
-            recording = replace(
-                self._template,
-                t_s=np.arange(len(self._samples)) * period_s,
-                u=u[n],
-                q=q[n],
-                extra={} if oil_c is None else {"oil_c": oil_c[n]},
-                metadata={**self._template.metadata, "created": created},
-            )
-            record.write(recording, self._path(name))
-        self.files += len(self._names)
-        self._elapsed_s += len(self._samples) * period_s
-        self._part += 1
-        self._samples.clear()
-
-    def _path(self, name: str) -> Path:
-        return self._mode.session.folder / FOLDER / f"{name}_{self._part:02d}.parquet"
+            notes = account.notes(samples, n, self._plan.runs[n], self._period_s)
+            metadata = {
+                **self._template.metadata,
+                "created": record.later(self._created, begin_s - self._begin_s),
+                "run": f"{name} {self._created}",
+                "excitation": json.dumps(notes),
+            }
+            columns = {key: values[n] for key, values in extra.items()}
+            recording = replace(self._template, t_s=t_s, u=u[n], q=q[n], extra=columns, metadata=metadata)
+            record.write(recording, self._folder / f"{name}_{self._part:02d}.parquet")

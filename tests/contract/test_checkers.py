@@ -13,7 +13,8 @@ import pytest
 import torch
 from composed import option
 
-from brokk_rl.checks import check_actuator, check_finder, check_link, check_task
+from brokk_rl.checks import check_actuator, check_excitation, check_finder, check_link, check_task
+from brokk_rl.contracts import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -163,6 +164,25 @@ def test_a_link_must_not_send_what_is_no_number(machine: Machine) -> None:
     check_link(Loopback(machine.num_joints, guarded=True), machine)
     with pytest.raises(AssertionError, match="no number"):
         check_link(Loopback(machine.num_joints, guarded=False), machine)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"u": np.ones((10, 5))}, "exclusive joint"),
+        ({"u": np.full((10, 5), 1.5)}, "outside"),
+        ({"u": np.zeros((10, 4))}, "shape"),
+        ({"u": np.zeros((100_000, 5))}, "over 300 s"),
+        ({"start": np.full(5, 9.0)}, "outside the limits"),
+        ({"repeat_of": "nothing"}, "repeats 'nothing'"),
+        ({"name": "before_00"}, "names repeat"),
+    ],
+)
+def test_a_broken_excitation_is_found(change: dict[str, Any], message: str, machine: Machine) -> None:
+    segment = Segment(name="a_00", start=machine.home, u=np.zeros((10, 5)), stops="home", stop_margin=0.1)
+    broken: Any = SimpleNamespace(weight=lambda before: 1.0, segments=lambda *_: [replace(segment, **change)])
+    with pytest.raises(AssertionError, match=message):
+        check_excitation(broken, machine)
 
 
 def test_the_truth_needs_a_unit_axis() -> None:

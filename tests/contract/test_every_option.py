@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
-from composed import every, option
+from composed import every, names, option
 
-from brokk_rl.checks import NUM_ENVS, check_actuator, check_effect, check_finder, check_task, check_world
+from brokk_rl.checks import (
+    NUM_ENVS,
+    check_actuator,
+    check_effect,
+    check_excitation,
+    check_finder,
+    check_link,
+    check_task,
+    check_world,
+)
 from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.sim.link import Simulated
 from brokk_rl.sim.scene import nominal
 
 
@@ -19,6 +32,19 @@ def test_it_is_an_actuator(name: str, machine: Machine) -> None:
 @every("effect")
 def test_it_is_an_effect(name: str, machine: Machine) -> None:
     check_effect(option("effect", name), machine)
+
+
+@every("excitation")
+def test_it_is_an_excitation(name: str, machine: Machine) -> None:
+    check_excitation(option("excitation", name), machine)
+
+
+@pytest.mark.parametrize("num_runs", [1, 3])
+@pytest.mark.parametrize("actuator", names("actuator"))
+def test_the_simulated_machine_is_a_link(actuator: str, num_runs: int, machine: Machine, tmp_path: Path) -> None:
+    connection = Simulated(actuator=option("actuator", actuator), noise=0.001)
+    session = Session(out=str(tmp_path), seed=0, device="cpu")
+    check_link(connection.build(machine, num_runs, session), machine, num_runs)
 
 
 @every("task")

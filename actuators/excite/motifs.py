@@ -1,0 +1,203 @@
+"""Motifs: short programs for one joint from one pose, each made to separate effects that look alike in random commands."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import count
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from actuators.excite.poses import poses
+from brokk_rl.contracts import Segment
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+class Motif:
+    """What the motifs share: in each of several poses of opposite load each program once, in random order, until time is over."""
+
+    share: float
+    stop_margin: float
+
+    def weight(self, before: float) -> float:
+        """Returns `share`."""
+        return self.share
+
+    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+        """Returns name and program `(T, J)` of all that is played in one pose."""
+        raise NotImplementedError
+
+    def segments(
+        self, machine: Machine, duration_s: float, generator: np.random.Generator, before: Sequence[Segment]
+    ) -> list[Segment]:
+        """Returns as many segments as fit into `duration_s`."""
+        return filled(type(self).__name__.lower(), self._candidates(machine, generator), duration_s, machine)
+
+    def _candidates(self, machine: Machine, generator: np.random.Generator) -> Iterator[Segment]:
+        number = count()
+        for start in poses(machine, self.stop_margin, generator):
+            found = self.programs(machine, generator)
+            for i in generator.permutation(len(found)):
+                name, u = found[i]
+                yield Segment(
+                    name=f"{name}_{next(number):02d}", start=start, u=u, stops="inward", stop_margin=self.stop_margin
+                )  # fmt: skip
+
+
+def filled(name: str, candidates: Iterable[Segment], duration_s: float, machine: Machine) -> list[Segment]:
+    """Returns segments as long as they fit into `duration_s`.
+
+    Raises:
+        ConfigError: the first one does not fit.
+    """
+    found, left = [], int(duration_s / machine.period_s + 1e-6)
+    for segment in candidates:
+        left -= len(segment.u)
+        if left < 0:
+            break
+        found.append(segment)
+    if not found:
+        raise ConfigError(
+            f"excitation={name}: its part of a run, {duration_s:.0f} s, does not hold its first segment; raise collect.run_minutes "
+            "(or its share), or leave it out"
+        )
+    return found
+
+
+def for_each_joint(name: str, machine: Machine, program: Callable[[int], np.ndarray]) -> list[tuple[str, np.ndarray]]:
+    """Returns name and `(T, J)` of `program(joint)`, `(T,)`, for each joint, the others at rest."""
+    found = []
+    for joint, joint_name in enumerate(machine.joint_names):
+        commands = program(joint)
+        u = np.zeros((len(commands), machine.num_joints))
+        u[:, joint] = commands
+        found.append((f"{name}_{joint_name}", u))
+    return found
+
+
+def held(levels: ArrayLike, holds_s: ArrayLike, period_s: float) -> np.ndarray:
+    """Returns each level held for its time, `(T,)`."""
+    return np.repeat(np.asarray(levels, dtype=float), np.maximum(1, np.round(np.asarray(holds_s) / period_s).astype(int)))
+
+
+@spec
+class Ramps(Motif):
+    """Slow ramps through zero on one joint, three slopes, both signs: dead band, friction and hysteresis differ here.
+
+    Attributes:
+        share: Part of the time, relative to the others of the plan.
+        slopes_per_s: Change of the command per second.
+        highest: Highest command.
+        reach: Largest way to either side, as a part of the joint's travel, at the machine's nominal speed; lowers the peaks.
+        stop_margin: As in `levels`.
+    """
+
+    share: float
+    slopes_per_s: tuple[float, ...]
+    highest: float
+    reach: float
+    stop_margin: float
+
+    def check(self) -> None:
+        if not self.slopes_per_s or min(self.slopes_per_s) <= 0:
+            raise ConfigError(f"excitation: slopes_per_s: expected one or more above 0, got {list(self.slopes_per_s)}")
+
+    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+        """Returns a ramp up, through zero to the other side, and back, for each joint and slope; the first side is random."""
+        way = self.reach * (machine.upper - machine.lower) / machine.max_speed
+
+        def ramp(slope_per_s: float) -> Callable[[int], np.ndarray]:
+            def program(joint: int) -> np.ndarray:
+                # a triangle of height h and slope s takes the joint h^2 / s of its full speed further
+                height = min(self.highest, np.sqrt(slope_per_s * way[joint]))
+                rise = max(1, round(height / slope_per_s / machine.period_s))
+                up, down = np.linspace(0.0, height, rise + 1), np.linspace(height, -height, 2 * rise + 1)
+                return generator.choice([-1.0, 1.0]) * np.concatenate([up, down[1:], -up[::-1][1:]])
+
+            return program
+
+        return [found for slope_per_s in self.slopes_per_s for found in for_each_joint("ramps", machine, ramp(slope_per_s))]
+
+
+@spec
+class Holds(Motif):
+    """Zero command for half a minute under different loads: leaks, drift of sensors, noise and quantisation.
+
+    Attributes:
+        share: Part of the time, relative to the others of the plan.
+        hold_s: Length of a hold; 20 s or more show a leak.
+        stop_margin: As in `levels`.
+    """
+
+    share: float
+    hold_s: float
+    stop_margin: float
+
+    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+        """Returns one hold: the way to each pose does the rest."""
+        return [("holds", np.zeros((max(1, round(self.hold_s / machine.period_s)), machine.num_joints)))]
+
+
+@spec
+class Reversals(Motif):
+    """Small reversals of one joint, of several speeds and lengths: play that must be taken up shows as motion that is missing.
+
+    Attributes:
+        share: Part of the time, relative to the others of the plan.
+        levels: Commands to and fro.
+        holds_s: Times for which they are held.
+        num_cycles: Reversals of each kind.
+        pause_s: Rest after each kind.
+        stop_margin: As in `levels`.
+    """
+
+    share: float
+    levels: tuple[float, ...]
+    holds_s: tuple[float, ...]
+    num_cycles: int
+    pause_s: float
+    stop_margin: float
+
+    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+        """Returns all reversals of a joint in one program."""
+        parts = []
+        for level in self.levels:
+            for hold_s in self.holds_s:
+                cycle = held([level, -level], [hold_s, hold_s], machine.period_s)
+                parts += [np.tile(cycle, self.num_cycles), held([0.0], [self.pause_s], machine.period_s)]
+        commands = np.concatenate(parts)
+        return for_each_joint("reversals", machine, lambda joint: commands)
+
+
+@spec
+class Staircase(Motif):
+    """Held levels of one joint, up and down, to and fro: flow curve, dead band, saturation, and what differs by direction.
+
+    Attributes:
+        share: Part of the time, relative to the others of the plan.
+        levels: Rising commands; each is held forward, then backward, so that the joint stays where it is in the long run.
+        hold_s: Time for which a level is held.
+        reach: Largest way of one level, as a part of the joint's travel, at the machine's nominal speed; shortens the holds.
+        stop_margin: As in `levels`.
+    """
+
+    share: float
+    levels: tuple[float, ...]
+    hold_s: float
+    reach: float
+    stop_margin: float
+
+    def check(self) -> None:
+        if not self.levels or list(self.levels) != sorted(self.levels) or not 0 < self.levels[0] <= self.levels[-1] <= 1:
+            raise ConfigError(f"excitation: levels: expected rising commands in (0, 1], got {list(self.levels)}")
+
+    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+        """Returns the staircase of each joint."""
+        stairs = np.array([*self.levels, *self.levels[::-1]])
+
+        def program(joint: int) -> np.ndarray:
+            way_s = self.reach * (machine.upper[joint] - machine.lower[joint]) / machine.max_speed[joint] / stairs
+            holds_s = np.minimum(self.hold_s, way_s)
+            return held(np.stack([stairs, -stairs], 1).ravel(), np.repeat(holds_s, 2), machine.period_s)
+
+        return for_each_joint("staircase", machine, program)

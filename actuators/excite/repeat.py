@@ -1,0 +1,46 @@
+"""Identical repeats: the only honest noise floor."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from brokk_rl.contracts import Segment
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+@spec
+class Repeat:
+    """Everything before it in the plan once more, from the same poses with the same commands: what differs is noise.
+
+    Attributes:
+        times: How many repeats.
+    """
+
+    times: int
+
+    def check(self) -> None:
+        if self.times < 1:
+            raise ConfigError(f"excitation: times: expected 1 or more, got {self.times}")
+
+    def weight(self, before: float) -> float:
+        """Returns as much as all before it have, for each repeat.
+
+        Raises:
+            ConfigError: there is nothing before it.
+        """
+        if before <= 0:
+            raise ConfigError("excitation=repeat: nothing before it to repeat; put it last: excitation=[levels,holds,repeat]")
+        return self.times * before
+
+    def segments(
+        self, machine: Machine, duration_s: float, generator: np.random.Generator, before: Sequence[Segment]
+    ) -> list[Segment]:
+        """Returns the segments `before`, renamed; their length is what it is."""
+        return [
+            replace(segment, name=f"{segment.name}_repeat_{i}", repeat_of=segment.repeat_of or segment.name)
+            for i in range(1, self.times + 1)
+            for segment in before
+        ]

@@ -1,0 +1,71 @@
+"""The paper's excitation: one joint at a time, sines of random frequency and amplitude."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from brokk_rl.contracts import Segment
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+@spec
+class Sine:
+    """One joint at a time, sine commands of random frequency and amplitude, back home at the stops (the paper's excitation).
+
+    Attributes:
+        share: Part of the time, relative to the others of the plan.
+        lowest_hz: Lowest frequency; frequencies are drawn log-uniformly, anew for each full wave.
+        highest_hz: Highest frequency.
+        smallest: Smallest amplitude; amplitudes are drawn uniformly.
+        largest: Largest amplitude.
+        stop_margin: A joint that would come to rest this close to its stop, as a part of its travel, is brought home.
+    """
+
+    share: float
+    lowest_hz: float
+    highest_hz: float
+    smallest: float
+    largest: float
+    stop_margin: float
+
+    def check(self) -> None:
+        if not 0 < self.lowest_hz <= self.highest_hz:
+            raise ConfigError(f"excitation: expected 0 < lowest_hz <= highest_hz, got {self.lowest_hz} and {self.highest_hz}")
+        if not 0 < self.smallest <= self.largest <= 1:
+            raise ConfigError(f"excitation: expected 0 < smallest <= largest <= 1, got {self.smallest} and {self.largest}")
+
+    def weight(self, before: float) -> float:
+        """Returns `share`."""
+        return self.share
+
+    def segments(
+        self, machine: Machine, duration_s: float, generator: np.random.Generator, before: Sequence[Segment]
+    ) -> list[Segment]:
+        """Returns one segment a joint, from home, each of the same length, the joints in random order."""
+        steps = int(duration_s / machine.num_joints / machine.period_s)
+        if steps * machine.period_s < 1.0 / self.highest_hz:
+            raise ConfigError(
+                f"excitation=sine: {duration_s:.1f} s for {machine.num_joints} joints do not hold a wave of {self.highest_hz:g} "
+                "Hz; raise collect.run_minutes"
+            )
+        found = []
+        for joint in generator.permutation(machine.num_joints):
+            u = np.zeros((steps, machine.num_joints))
+            u[:, joint] = self._waves(steps, machine.period_s, generator)
+            name = f"sine_{machine.joint_names[joint]}"
+            found.append(Segment(name=name, start=machine.home, u=u, stops="home", stop_margin=self.stop_margin))
+        return found
+
+    def _waves(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
+        """Returns full waves, each from a command of zero, one after the other; the last one ends with the program. `(T,)`."""
+        u, at = np.zeros(steps), 0
+        shortest = max(2, round(1.0 / self.highest_hz / period_s))
+        while steps - at >= shortest:
+            hz = np.exp(generator.uniform(np.log(self.lowest_hz), np.log(self.highest_hz)))
+            amplitude = generator.uniform(self.smallest, self.largest) * generator.choice([-1.0, 1.0])  # may start either way
+            count = min(max(round(1.0 / hz / period_s), shortest), steps - at)
+            u[at : at + count] = amplitude * np.sin(2.0 * np.pi * np.arange(count) / count)
+            at += count
+        return u

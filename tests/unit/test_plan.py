@@ -1,0 +1,270 @@
+"""A plan is played within its guards, on the machine as it is believed to be and on one that differs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from composed import option
+from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
+
+from brokk_rl.contracts import Segment
+from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.plan import account, picture
+from brokk_rl.plan.account import Track
+from brokk_rl.plan.drive import Nominal, drive
+from brokk_rl.plan.guard import Guards, predicted_tool_speed
+from brokk_rl.plan.runner import DONE, PLAY, Runner
+from brokk_rl.plan.schedule import Approach, Plan, schedule
+from brokk_rl.signals import Command, JointState
+
+OPEN = Guards(max_command=1.0, max_tool_speed_m_s=None)
+
+
+@pytest.fixture(scope="module")
+def approach() -> Approach:
+    with initialize_config_module("conf", version_base="1.3"):
+        return instantiate(compose("config", overrides=["mode=collect"]).collect.approach)
+
+
+def constant(joints: dict[int, float], seconds: float, start: np.ndarray, **fields: Any) -> Segment:
+    u = np.zeros((round(seconds * 20), 5))
+    for joint, level in joints.items():
+        u[:, joint] = level
+    return Segment(**({"name": "a_00", "start": start, "u": u, "stops": "inward", "stop_margin": 0.05} | fields))
+
+
+def played(
+    runs: Sequence[Sequence[Segment]],
+    machine: Machine,
+    approach: Approach,
+    guards: Guards = OPEN,
+    link: Any = None,
+    run_s: float = 120.0,
+) -> Track:
+    plan = Plan(runs=tuple(map(tuple, runs)), run_s=run_s, names=("a",))
+    link = link or Nominal(machine, len(runs))
+    return Track(drive(link, Runner(plan, machine, approach, guards), machine, len(runs), run_s))
+
+
+def anywhere(machine: Machine, seed: int) -> np.ndarray:
+    margin = 0.1 * (machine.upper - machine.lower)
+    return np.random.default_rng(seed).uniform(machine.lower + margin, machine.upper - margin)
+
+
+def with_speed(machine: Machine, scale: float) -> Machine:
+    speed = [replace(joint.max_speed, value=joint.max_speed.value * scale) for joint in machine.joints]
+    return replace(machine, joints=tuple(replace(joint, max_speed=s) for joint, s in zip(machine.joints, speed, strict=True)))
+
+
+def test_a_program_is_played_unchanged_from_its_start_pose(machine: Machine, approach: Approach) -> None:
+    generator = np.random.default_rng(0)
+    start = np.stack([anywhere(machine, seed) for seed in range(4)])
+    runs = [[constant({}, 1.0, s, u=0.05 * generator.uniform(-1, 1, (100, 5)) * (np.arange(5) != 1))] for s in start]
+    track = played(runs, machine, approach)
+    for n, (segment,) in enumerate(runs):
+        inside = track.stage[:, n] == account.PLAYING
+        assert (track.u[inside, n] == segment.u).all()
+        assert (np.abs(track.q[inside, n][0] - segment.start) <= 0.04 * (machine.upper - machine.lower)).all()
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 1.5])
+def test_approaches_arrive_on_machines_slower_or_faster_than_their_file(
+    scale: float, machine: Machine, approach: Approach, caplog: pytest.LogCaptureFixture
+) -> None:
+    runs = [[constant({}, 1.0, anywhere(machine, 10 * n + i), name=f"a_{i}") for i in range(3)] for n in range(5)]
+    track = played(runs, machine, approach, link=Nominal(with_speed(machine, scale), 5))
+    assert not caplog.records and (track.stage[-1] == account.PLAYING).any() and track.segment[-1].tolist() == [2] * 5
+    for n in range(5):
+        for i in range(3):
+            begin = np.flatnonzero((track.segment[:, n] == i) & (track.stage[:, n] == account.PLAYING))[0]
+            assert (np.abs(track.q[begin, n] - runs[n][i].start) < 0.05 * (machine.upper - machine.lower)).all()
+
+
+def test_exclusive_joints_never_move_together_with_others_on_the_way_either(machine: Machine, approach: Approach) -> None:
+    together = constant({1: 0.5, 3: 0.5}, 2.0, anywhere(machine, 0))  # no excitation may ask for this; the runner drops q2
+    track = played([[constant({}, 1.0, anywhere(machine, n)), together] for n in range(6)], machine, approach)
+    alone, others = track.u[:, :, 1] != 0, (np.delete(track.u, 1, axis=2) != 0).any(2)
+    assert alone.any() and others.any() and not (alone & others).any()
+
+
+def test_the_stops_are_kept_although_the_command_acts_late(machine: Machine, approach: Approach) -> None:
+    for scale in (1.0, 1.4):
+        for sign in (-1.0, 1.0):
+            segments = [constant({0: sign, 2: sign, 3: sign, 4: sign}, 30.0, machine.home)]
+            track = played([segments], machine, approach, link=Nominal(with_speed(machine, scale), 1))
+            closest = np.minimum(track.q - machine.lower, machine.upper - track.q).min((0, 1)) / (machine.upper - machine.lower)
+            assert (np.delete(closest, 1) > 0.0).all(), f"speed x {scale}: {closest}"
+            assert (np.delete(closest, 1) < 0.06).all(), "and they are reached"
+
+
+def test_inward_turns_a_joint_back_until_its_program_passes_zero(machine: Machine, approach: Approach) -> None:
+    u = np.zeros((500, 5))
+    u[:, 4] = 0.8
+    u[400:, 4] = -0.8
+    (track,) = [played([[constant({}, 0.0, machine.home, u=u)]], machine, approach)]
+    inside = track.stage[:, 0] == account.PLAYING
+    sent = track.u[inside, 0, 4]
+    assert set(np.abs(sent)) == {0.8}
+    assert (np.diff(sent) != 0).sum() <= 3, "no chatter at the stop"
+    assert (sent[400:420] == -0.8).all()
+
+
+def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(machine: Machine, approach: Approach) -> None:
+    u = np.zeros((2000, 5))
+    u[:, 2] = np.where(np.arange(2000) // 500 % 2 == 0, 0.9, -0.2)  # drives into the stop, then slowly back
+    track = played([[constant({}, 0.0, machine.home, u=u, stops="home")]], machine, approach)
+    stage = track.stage[:, 0]
+    begin = np.flatnonzero(stage != account.BEFORE)[0]
+    away = np.flatnonzero(stage == account.AWAY) - begin
+    assert 100 < away[0] < 200, "1.4 rad from home to the margin at 0.9 * 0.26 rad/s"
+    back = away[np.flatnonzero(np.diff(away) > 1)[0]] + 1
+    assert back == 500 and track.u[begin + 500, 0, 2] == -0.2
+    assert abs(track.q[begin + 499, 0, 2] - machine.home[2]) < 0.1
+    assert (stage != account.BEFORE).sum() == 2000, "a segment lasts as long as its program"
+
+
+def test_commands_keep_to_the_largest(machine: Machine, approach: Approach) -> None:
+    guards = Guards(max_command=0.3, max_tool_speed_m_s=None)
+    track = played([[constant({0: 1.0, 3: -1.0}, 3.0, anywhere(machine, 1))]], machine, approach, guards)
+    assert np.abs(track.u).max() == 0.3
+
+
+def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(machine: Machine, approach: Approach) -> None:
+    segment = constant({0: 1.0, 3: 0.5}, 4.0, machine.home)
+    free, slow = (
+        played([[segment]], machine, approach, Guards(max_command=1.0, max_tool_speed_m_s=bound)) for bound in (None, 0.4)
+    )
+    fast, guarded = (predicted_tool_speed(machine, track.q[:, 0]) for track in (free, slow))
+    assert fast is not None and guarded is not None
+    assert fast.max() > 0.8 and 0.35 < guarded.max() < 0.42
+    u = slow.u[(slow.stage[:, 0] == account.PLAYING), 0]
+    assert u[:, 3] == pytest.approx(0.5 * u[:, 0]) and u[:, 0].max() < 1.0
+
+
+def test_the_tool_speed_is_that_of_the_kinematics(machine: Machine) -> None:
+    import torch
+
+    q = machine.home + np.linspace(0, 0.2, 41)[:, None] * np.array([1.0, 0, 0, 0, 0])  # 0.1 rad/s about the vertical
+    radius_m = float(Kinematics(machine).pose(torch.as_tensor(machine.home, dtype=torch.float32)).tip_in_base_m[:2].norm())
+    assert predicted_tool_speed(machine, q) == pytest.approx(np.full(41, 0.1 * radius_m), rel=1e-3)
+
+
+def test_a_machine_without_bodies_has_no_tool_speed_to_bound(machine: Machine, approach: Approach) -> None:
+    bare = replace(machine, joints=tuple(replace(joint, body=None) for joint in machine.joints), tool_m=None, mjcf=None)
+    assert predicted_tool_speed(bare, np.zeros((3, 5))) is None
+    with pytest.raises(ConfigError, match="max_tool_speed_m_s"):
+        played([[constant({}, 1.0, bare.home)]], bare, approach, Guards(max_command=1.0, max_tool_speed_m_s=0.5))
+
+
+class Stuck(Nominal):
+    """One joint does not move."""
+
+    def send(self, command: Command) -> Command:
+        u = np.array(command.u)
+        u[:, 3] = 0.0
+        super().send(Command(u))
+        return command
+
+
+def test_an_approach_that_does_not_arrive_is_given_up_and_said(
+    machine: Machine, approach: Approach, caplog: pytest.LogCaptureFixture
+) -> None:
+    start = machine.home.copy()
+    start[3] += 0.8
+    track = played([[constant({0: 0.3}, 1.0, start)]], machine, approach, link=Stuck(machine, 1))
+    assert (track.u[track.stage[:, 0] == account.PLAYING, 0, 0] == 0.3).all()
+    assert "start of a_00 given up, out of place: q4" in caplog.text
+
+
+class Silent(Nominal):
+    """Says nothing new after a second."""
+
+    def send(self, command: Command) -> Command:
+        return command if self.read().t_s > 1.0 else super().send(command)
+
+
+class Broken(Nominal):
+    """Loses its sensors."""
+
+    def read(self) -> JointState:
+        state = super().read()
+        return JointState(state.t_s, state.q * np.nan if state.t_s > 1.0 else state.q)
+
+
+@pytest.mark.parametrize(("link", "message"), [(Silent, "no state after"), (Broken, "finite positions")])
+def test_a_link_that_fails_is_an_error(
+    link: type[Nominal], message: str, machine: Machine, approach: Approach, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("brokk_rl.plan.drive.SILENCE_S", 0.05)
+    with pytest.raises(LinkError, match=message):
+        played([[constant({0: 0.3}, 5.0, machine.home)]], machine, approach, link=link(machine, 1))
+
+
+def test_a_plan_fills_its_time_and_repeats_with_its_seed(machine: Machine, approach: Approach) -> None:
+    chosen = {name: option("excitation", name) for name in ("levels", "ramps", "holds", "repeat")}
+    plan, again, other = (schedule(chosen, machine, approach, 2, 600.0, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    link = Nominal(machine, 2)
+    runner = Runner(plan, machine, approach, OPEN)
+    track = Track(drive(link, runner, machine, 2, 600.0))
+    assert runner.done and len(track.t_s) > 0.75 * 600 * 20, "neither cut nor left empty"
+    for run, same in zip(plan.runs, again.runs, strict=True):
+        assert [segment.name for segment in run] == [segment.name for segment in same]
+        assert all((a.u == b.u).all() and (a.start == b.start).all() for a, b in zip(run, same, strict=True))
+        half = len(run) // 2
+        assert [segment.repeat_of for segment in run[half:]] == [segment.name for segment in run[:half]]
+        assert {segment.name.split("_")[0] for segment in run} == {"levels", "ramps", "holds"}
+    assert (plan.runs[0][0].start != plan.runs[1][0].start).any() and (plan.runs[0][0].start != other.runs[0][0].start).any()
+
+
+def test_no_excitation_is_an_error(machine: Machine, approach: Approach) -> None:
+    with pytest.raises(ConfigError, match="none chosen"):
+        schedule({}, machine, approach, 1, 60.0, np.random.default_rng(0))
+
+
+def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach) -> None:
+    u = np.zeros((600, 5))
+    u[:, 2] = np.where(np.arange(600) < 500, 0.9, -0.2)
+    first = constant({}, 0.0, machine.home, u=u, stops="home")
+    second = constant({}, 2.0, anywhere(machine, 3), name="a_01", repeat_of="a_00")
+    plan = Plan(runs=((first, second),), run_s=120.0, names=("a",))
+    samples = list(drive(Nominal(machine, 1), Runner(plan, machine, approach, OPEN), machine, 1, 120.0))
+    notes = account.notes(samples, 0, plan.runs[0], 0.05)
+    assert [(note["name"], note["part"]) for note in notes] == [
+        ("a_00", "approach"), ("a_00", "program"), ("a_01", "approach"), ("a_01", "program"),
+    ]  # fmt: skip
+    assert notes[0]["start_s"] == 0.0 and notes[1]["end_s"] - notes[1]["start_s"] == pytest.approx(30.0)
+    assert all(one["end_s"] == next_["start_s"] for one, next_ in pairwise(notes))
+    ((away, back),) = notes[1]["away_s"]
+    assert away < back == pytest.approx(notes[1]["start_s"] + 25.0)
+    assert notes[3]["repeat_of"] == "a_00"
+    playing = [k for k, sample in enumerate(samples) if sample.phase[0] == PLAY and sample.segment[0] == 0]
+    later = account.notes(samples[playing[0] + 100 :], 0, plan.runs[0], 0.05)
+    assert later[0]["offset_s"] == 5.0 and later[0]["start_s"] == 0.0
+    assert not any(sample.phase[0] == DONE for sample in samples)
+
+
+def test_summary_and_picture_of_a_plan(machine: Machine, approach: Approach, tmp_path: Path) -> None:
+    first, second = constant({0: 0.5}, 4.0, machine.home), constant({1: 0.2}, 100.0, anywhere(machine, 3), name="a_01")
+    third = constant({}, 1.0, machine.home, name="a_02")
+    plan = Plan(runs=((first, second, third),), run_s=60.0, names=("a",))
+    track = played(plan.runs, machine, approach, run_s=60.0)
+    found = account.summary(plan, track, machine)
+    json.dumps(found, allow_nan=False)
+    one, two, three = found["runs"][0]
+    assert one["end_s"] - one["start_s"] == pytest.approx(4.0) and one["cut_s"] == 0.0 and one["joints"]["q1"]["commanded"] == 1.0
+    # 4 s at half of 0.4 rad/s, less what the dead time leaves for later
+    assert one["joints"]["q1"]["travel_rad"] == pytest.approx(0.2 * (4.0 - 0.55), abs=0.02)
+    assert two["cut_s"] > 40.0 and three["start_s"] is None and three["cut_s"] == 1.0
+    assert found["run_time_unused_s"] == [0.0]
+    picture.draw_plan(plan, track, machine, predicted_tool_speed(machine, track.q[:, 0]), tmp_path / "plan.png")
+    assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
