@@ -26,6 +26,6 @@ def capture(step: Callable[[], None], device: torch.device, gradients: bool = Fa
                 step()
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        with torch.cuda.graph(graph, stream=stream):  # gradients remember the stream on which they were first added up
             step()
     return graph

@@ -55,9 +55,8 @@ class DevicePPO(PPO):
                     self._mini_batch()
                 else:
                     self._graph.replay()
-        observations = storage.observations.flatten(0, 1)
-        self.actor.update_normalization(observations)  # type: ignore[arg-type]
-        self.critic.update_normalization(observations)  # type: ignore[arg-type]
+        for model in (self.actor, self.critic):
+            self._normalise(model)
         storage.clear()
         *sums, self.learning_rate = torch.cat((self._sums, self._rate[None])).tolist()
         updates = self.num_learning_epochs * self.num_mini_batches
@@ -108,10 +107,18 @@ class DevicePPO(PPO):
                         value.zero_()
         return graph
 
+    def _normalise(self, model: nn.Module) -> None:
+        """Updates a model's normalisation in place: rsl-rl binds a new tensor, which the graph would not see."""
+        held = [(module, name, value) for module in model.modules() for name, value in module._buffers.items()]
+        model.update_normalization(self.storage.observations.flatten(0, 1))  # type: ignore[operator]
+        for module, name, value in held:
+            if value is not None and module._buffers[name] is not value:
+                module._buffers[name] = value.copy_(module._buffers[name])  # type: ignore[arg-type]
+
     def _mini_batch(self) -> None:
         """One step of the optimiser on the stored steps `_rows`; Schulman et al. 2017, equations 7 and 9, as rsl-rl weighs them."""
         storage, rows = self.storage, self._rows
-        observations = storage.observations.flatten(0, 1)[rows]
+        observations = {name: value.flatten(0, 1)[rows] for name, value in storage.observations.items()}
         old_values, returns, advantages, old_log_prob, actions = (
             value.flatten(0, 1)[rows]
             for value in (storage.values, storage.returns, self._advantages, storage.actions_log_prob, storage.actions)
@@ -121,7 +128,8 @@ class DevicePPO(PPO):
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         kind = torch.device(self.device).type
         with torch.autocast(device_type=kind, dtype=torch.bfloat16, enabled=self.use_mixed_precision):
-            self.actor(observations, stochastic_output=True)  # type: ignore[arg-type]
+            # not by calling the actor: that would draw actions, and torch's check of their spread asks the host
+            self.actor.distribution.update(self.actor.mlp(self.actor.get_latent(observations)))  # type: ignore
             log_prob, entropy = self.actor.get_output_log_prob(actions), self.actor.output_entropy.mean()
             values = self.critic(observations)  # type: ignore[arg-type]
             self._adapt_rate(old_parameters)
