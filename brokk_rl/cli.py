@@ -80,6 +80,7 @@ def job(cfg: DictConfig) -> float | None:
 
 def _run(cfg: DictConfig) -> float | None:
     """Instantiates the mode and runs it within its session, where it has one."""
+    cfg = _taken_in(cfg)
     if "session" not in cfg:
         return instantiate(cfg, _convert_="all").run()
     folder = run_folder(cfg)
@@ -94,6 +95,20 @@ def _run(cfg: DictConfig) -> float | None:
             # made by Hydra, in several levels where an override holds a path; what the job or the sweep has written into stays
             remove_empty([folder, *folder.parents])
         raise
+
+
+def _taken_in(cfg: DictConfig) -> DictConfig:
+    """Returns the configuration without groups that are only taken in by another node (`actuator: ${actuator}`), not by the mode.
+
+    So an option can bring groups of its own, such as `link=simulated` the actuator that it simulates, to be chosen like any other.
+    """
+    taken = {name for name in re.findall(r"\$\{(\w+)\}", OmegaConf.to_yaml(cfg)) if name in cfg}
+    if not taken:
+        return cfg
+    taken -= set(getattr(get_class(str(cfg._target_)), "__dataclass_fields__", ()))
+    whole = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(whole, dict)
+    return OmegaConf.create({key: value for key, value in whole.items() if key not in taken})
 
 
 def _facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
@@ -189,9 +204,10 @@ def _no_such_option(error: MissingConfigException) -> str:
     group, _, name = str(error.missing_cfg_file).rpartition("/")
     if not group:
         return str(error).split("\nConfig search path")[0]
-    if not error.options:
+    offered = error.options or [option.name for option in registry.options() if option.group == group]  # Hydra: none for a list
+    if not offered:
         return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
-    return f"there is no {group}={name}; {choices(name, error.options)}"
+    return f"there is no {group}={name}; {choices(name, offered)}"
 
 
 def _bad_node(error: InstantiationException) -> str:
@@ -219,7 +235,13 @@ def _bad_override(error: ConfigCompositionException) -> str:
     text = str(error)
     found = re.search(r"(?:In '([^']+)': )?Could not override '([^']+)'", text)
     if not found:
-        return "\n".join(filter(None, (text, str(error.__cause__ or ""))))
+        text = "\n".join(filter(None, (text, str(error.__cause__ or ""))))
+        if mixed := re.search(r"override ([\w.]+)=.*Cannot merge (?:Dict|List)Config with (?:Dict|List)Config", text, re.DOTALL):
+            return (
+                f"{mixed[1]} holds a list and you gave a table, or the reverse; Hydra puts neither in the place of the other. Take "
+                f"the old value away, '~{mixed[1]}' '+{mixed[1]}=…', or give the option as a file, <group>=@<path>."
+            )
+        return text
     where, key = found[1], found[2].split("@")[0]
     source = f"{where} changes" if where and where != "config" else "you gave"
     with contextlib.suppress(Exception):  # the mode itself may not compose; then the short answer must do

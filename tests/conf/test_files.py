@@ -113,3 +113,12 @@ def test_a_missing_file_is_named(brokk: Callable[..., Any], tmp_path: Path) -> N
 def test_a_value_that_begins_with_an_at_sign_is_no_file(brokk: Callable[..., Any]) -> None:
     cfg = composed(brokk, "mode=identify", "identify.recordings=@home/*.parquet", "session.out=x")
     assert cfg["identify"]["recordings"] == "@home/*.parquet"
+
+
+def test_a_table_in_the_place_of_a_range_is_explained(brokk: Callable[..., Any]) -> None:
+    table = "{q1: [0.05, 0.1], other: 0.12}"
+    done = brokk("mode=train", "effect=[stiction]", f"effect.stiction.start={table}")
+    assert done.code == 2
+    assert "effect.stiction.start holds a list and you gave a table" in done.err
+    effect = composed(brokk, "mode=train", "effect=[stiction]", "~effect.stiction.start", f"+effect.stiction.start={table}")
+    assert effect["effect"]["stiction"]["start"] == {"q1": [0.05, 0.1], "other": 0.12}
