@@ -12,6 +12,7 @@ import numpy as np
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.split import by_run
 
 KNOTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7)
 """Commands at which the static curve bends, on either side."""
@@ -34,13 +35,22 @@ class Delay:
 
     Attributes:
         value_s: Best delay.
-        ci95_s: 95 % interval from resampling whole recordings.
+        ci95_s: 95 % interval from resampling whole runs; at least the two neighbours in resolution.
         explained: Part of the variance of the increments that the delayed static curve explains.
+        tried_s: Delays that were tried, shape `(D,)`.
+        left: Part of the variance that each of them leaves unexplained, shape `(D,)`.
     """
 
     value_s: float
     ci95_s: tuple[float, float]
     explained: float
+    tried_s: np.ndarray
+    left: np.ndarray
+
+    @property
+    def is_found(self) -> bool:
+        """False where the best delay is the longest that was tried: the true one may be longer, or the joint does not follow."""
+        return self.value_s < float(self.tried_s[-1]) - RESOLUTION_S / 2
 
 
 def delays(recordings: Sequence[Recording], machine: Machine, generator: np.random.Generator) -> dict[str, Delay | None]:
@@ -62,14 +72,18 @@ def _delay(
     moving = [recording for recording in recordings if (np.abs(recording.u[:, joint]) > KNOTS[1]).any()]
     if sum(int((np.abs(recording.u[:, joint]) > KNOTS[1]).sum()) for recording in moving) < MIN_MOVING:
         return None
-    moments = np.stack([_moments(recording, joint, grid_s, machine) for recording in moving])  # (R, D, F + 1, F + 1)
+    runs = by_run(moving).values()
+    moments = np.stack(
+        [np.sum([_moments(part, joint, grid_s, machine) for part in parts], 0) for parts in runs]
+    )  # (R, D, F + 1, F + 1)
     value = _best(moments.sum(0))
-    picks = (generator.integers(len(moving), size=len(moving)) for _ in range(RESAMPLED))
+    picks = (generator.integers(len(moments), size=len(moments)) for _ in range(RESAMPLED))
     again = grid_s[[_best(moments[pick].sum(0)) for pick in picks]]
     low, high = np.percentile(again, (2.5, 97.5))
     total = moments.sum(0)
-    left = _residual(total)[value] / total[value, -1, -1]
-    return Delay(float(grid_s[value]), (float(low), float(high)), float(1.0 - left))
+    left = _residual(total) / total[:, -1, -1]
+    interval = max(0.0, min(low, grid_s[value] - RESOLUTION_S / 2)), max(high, grid_s[value] + RESOLUTION_S / 2)
+    return Delay(float(grid_s[value]), (float(interval[0]), float(interval[1])), float(1.0 - left[value]), grid_s, left)
 
 
 def _moments(recording: Recording, joint: int, grid_s: np.ndarray, machine: Machine) -> np.ndarray:

@@ -1,7 +1,10 @@
 """Free runs: an actuator model is given the recorded commands and its own predictions, never the recorded positions.
 
 One-step errors hardly separate models (a machine at 20 Hz moves little in a step); what counts is where a free run ends up.
+Axes: `W` windows, `K` steps, `J` joints, `L` samples before the free run, of which `H` are the first history.
 """
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,102 +13,120 @@ import numpy as np
 import torch
 
 from brokk_rl.contracts import Actuator
-from brokk_rl.errors import RecordingError
+from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.split import by_run
+
+WARM_UP_S = 1.0
+"""Before a free run a model sees recorded positions for so long: a model with a state of its own (spool, pressure, commands on
+their way) would else begin each window as a machine at rest, although the recorded one is moving."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows of recordings for free runs.
+    """Windows of recordings for free runs; where the recording ends within a window, positions are NaN from there on.
 
     Attributes:
-        u: Commands, shape `(W, H - 1 + K, J)`: the history, then those of the `K` steps to come; step `k` sees them
-            up to `u[:, H - 1 + k]`.
-        q: Positions, shape `(W, H + K, J)`; the free run starts at `q[:, H - 1]`.
-        group: Recording that each window comes from, shape `(W,)`; windows of one recording are not independent.
+        u: Commands, shape `(W, L - 1 + K, J)`: those before, then those of the `K` steps to come; step `k` sees them up to
+            `u[:, L - 1 + k]`.
+        q: Positions, shape `(W, L + K, J)`; the free run starts at `q[:, L - 1]`.
+        run: Run that each window comes from, shape `(W,)`; windows of one run are not independent.
         num_history: `H`.
+        num_before: `L`.
     """
 
     u: np.ndarray
     q: np.ndarray
-    group: np.ndarray
+    run: np.ndarray
     num_history: int
+    num_before: int
 
     @property
     def measured(self) -> np.ndarray:
-        """Measured positions after each step, shape `(W, K, J)`."""
-        return self.q[:, self.num_history :]
+        """Measured positions after each step, shape `(W, K, J)`, NaN after the end of the recording."""
+        return self.q[:, self.num_before :]
 
 
-def windows(recordings: Sequence[Recording], machine: Machine, horizon_s: float, stride_s: float) -> Windows:
-    """Cuts recordings into windows of `horizon_s` after their history, one every `stride_s`.
+def longest_s(recordings: Sequence[Recording], machine: Machine) -> float:
+    """Returns the longest free run that fits into one of the recordings, s; not above 0 where none does."""
+    longest = max((recording.num_samples for recording in recordings), default=0)
+    return (longest - num_before(machine)) * machine.period_s
+
+
+def num_before(machine: Machine) -> int:
+    """Returns the number of samples before a free run, `L`."""
+    return machine.num_history + round(WARM_UP_S / machine.period_s)
+
+
+def windows(
+    recordings: Sequence[Recording], machine: Machine, horizon_s: float, stride_s: float, shortest_s: float | None = None
+) -> Windows:
+    """Cuts recordings into windows of `horizon_s` after what comes before, one every `stride_s`.
+
+    Args:
+        recordings: Where from.
+        machine: Gives period and history.
+        horizon_s: Length of the free runs.
+        stride_s: Distance between two beginnings.
+        shortest_s: A window may end early with its recording, but not before this; `None`: all are whole.
 
     Raises:
         RecordingError: no recording is long enough.
     """
-    history, steps = machine.num_history, round(horizon_s / machine.period_s)
+    before, steps = num_before(machine), round(horizon_s / machine.period_s)
+    least = steps if shortest_s is None else min(steps, round(shortest_s / machine.period_s))
     stride = max(1, round(stride_s / machine.period_s))
-    u, q, group = [], [], []
-    for number, recording in enumerate(recordings):
-        for start in range(0, recording.num_samples - history - steps + 1, stride):
-            u.append(recording.u[start : start + history + steps - 1])
-            q.append(recording.q[start : start + history + steps])
-            group.append(number)
+    u, q, run = [], [], []
+    for name, parts in by_run(recordings).items():
+        for recording in parts:
+            for start in range(0, recording.num_samples - before - least + 1, stride):
+                end = min(start + before + steps, recording.num_samples)
+                missing = ((0, start + before + steps - end), (0, 0))
+                u.append(np.pad(recording.u[start : end - 1], missing))
+                q.append(np.pad(recording.q[start:end], missing, constant_values=np.nan))
+                run.append(name)
     if not u:
-        longest_s = max((recording.duration_s for recording in recordings), default=0.0)
-        needed_s = (history + steps) * machine.period_s
+        found_s = max((recording.duration_s for recording in recordings), default=0.0)
         raise RecordingError(
-            f"too little data: a free run of {horizon_s:g} s needs {needed_s:g} s of recording, the longest of {len(recordings)} "
-            f"has {longest_s:.1f} s"
+            f"too little data: a free run of {least * machine.period_s:g} s needs {(before + least) * machine.period_s:g} s of "
+            f"recording, the longest of {len(recordings)} has {found_s:.1f} s"
         )
-    return Windows(np.stack(u), np.stack(q), np.array(group), history)
+    return Windows(np.stack(u), np.stack(q), np.array(run), machine.num_history, before)
+
+
+def joined(cuts: Sequence[Windows]) -> Windows:
+    """Returns the windows of several cuts of the same shape as one, in their order."""
+    u, q, run = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("u", "q", "run"))
+    return Windows(u, q, run, cuts[0].num_history, cuts[0].num_before)
 
 
 def free_run(actuator: Actuator, machine: Machine, cut: Windows, device: torch.device) -> np.ndarray:
-    """Returns the positions of free runs through all windows at once, shape `(W, K, J)`."""
-    count, steps = len(cut.q), cut.measured.shape[1]
+    """Returns the positions of free runs through all windows at once, shape `(W, K, J)`.
+
+    Raises:
+        BrokkError: the model ran into NaN.
+    """
+    count, size, before = len(cut.q), cut.num_history, cut.num_before
     model = actuator.build(machine, count, device)
     u = torch.as_tensor(cut.u, dtype=torch.float32, device=device)
-    q = torch.as_tensor(cut.q[:, : cut.num_history], dtype=torch.float32, device=device)
-    history = History(q=q.clone(), u=u[:, : cut.num_history].roll(1, 1))  # before the first push_u the newest command is one back
+    q = torch.as_tensor(cut.q[:, :before], dtype=torch.float32, device=device)
+    history = History(q=q[:, :size].clone(), u=u[:, :size].roll(1, 1))  # before the first push_u the newest command is one back
     path = []
     with torch.inference_mode():
         model.reset(torch.ones(count, dtype=torch.bool, device=device))
-        for k in range(steps):
-            history.push_u(u[:, cut.num_history - 1 + k])
+        for k in range(size, u.shape[1] + 1):
+            history.push_u(u[:, k - 1])
             position = model.step(history)
-            history.push_q(position)
-            path.append(position)
-    return torch.stack(path, 1).cpu().numpy()
-
-
-def errors(
-    predicted: np.ndarray, cut: Windows, machine: Machine, horizons_s: Sequence[float], generator: np.random.Generator
-) -> dict[str, dict[str, dict[str, float | list[float]]]]:
-    """Returns the errors of free runs by joint and horizon.
-
-    For each joint and horizon: `rmse` of the position at the end of the horizon, rad or m, with `ci95` from resampling whole
-    recordings; `percent` of the joint's travel; `path_mean` and `end_mean`, the mean absolute error along the path and at its end.
-    """
-    error = np.abs(predicted - cut.measured)
-    groups = [np.flatnonzero(cut.group == number) for number in np.unique(cut.group)]
-    resampled = [np.concatenate([groups[i] for i in generator.integers(len(groups), size=len(groups))]) for _ in range(200)]
-    table = {}
-    for j, name in enumerate(machine.joint_names):
-        rows = {}
-        for horizon_s in horizons_s:
-            step = round(horizon_s / machine.period_s) - 1
-            end = error[:, step, j]
-            rmse = float(np.sqrt(np.mean(end**2)))
-            spread = [np.sqrt(np.mean(end[rows_] ** 2)) for rows_ in resampled]
-            rows[f"{horizon_s:g}"] = {
-                "rmse": rmse,
-                "ci95": [float(bound) for bound in np.percentile(spread, (2.5, 97.5))],
-                "percent": 100.0 * rmse / float(machine.upper[j] - machine.lower[j]),
-                "path_mean": float(error[:, : step + 1, j].mean()),
-                "end_mean": float(end.mean()),
-            }
-        table[name] = rows
-    return table
+            if k < before:
+                history.push_q(q[:, k])
+            else:
+                history.push_q(position)
+                path.append(position)
+    found = torch.stack(path, 1).cpu().numpy()
+    if not np.isfinite(found).all():
+        raise BrokkError(
+            f"{type(actuator).__name__} ran into NaN in a free run; look at its fit, or fit it again with another seed"
+        )
+    return found

@@ -34,6 +34,8 @@ MISSING = "–"
 PICTURE_TYPES = {".png": "image/png", ".svg": "image/svg+xml", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 FIGURE = re.compile(r"\s*[<>±≈]?\s*[-+−]?\d")
 """How text begins that is read as a figure."""
+MARK = "▸ "
+"""Before the best of a kind; before, so that figures stay aligned at the right."""
 DPI = 150
 STYLE = """
 :root { color-scheme: light dark; --ink: #1a1d21; --dim: #5c6570; --paper: #ffffff; --panel: #f4f6f8; --line: #d7dce1;
@@ -57,7 +59,7 @@ caption { padding-bottom: .3rem; }
 th, td { padding: .22rem .7rem; text-align: left; vertical-align: baseline; border-bottom: 1px solid var(--line); }
 th { font-weight: 600; white-space: nowrap; } thead th { border-bottom: 2px solid var(--line); vertical-align: bottom; }
 .number { text-align: right; white-space: nowrap; }
-.best { font-weight: 700; color: var(--good); } .best::after { content: " ◂"; }
+.best { font-weight: 700; color: var(--good); }
 .note { display: block; color: var(--dim); font-size: .8rem; font-weight: 400; }
 figure { margin: 1.2rem 0; } figcaption { margin-top: .3rem; max-width: 46rem; }
 img { display: block; max-width: 100%; height: auto; background: #fff; border: 1px solid var(--line); border-radius: .3rem; }
@@ -227,4 +229,4 @@ def _cell(cell: Cell, is_numeric: bool, is_name: bool, digits: int) -> str:
     attribute = f' class="{classes}"' if classes else ""
     note = f'<span class="note">{escape(cell.note)}</span>' if cell.note else ""
     tag = 'th scope="row"' if is_name else "td"
-    return f"<{tag}{attribute}>{escape(text)}{note}</{tag[:2]}>"
+    return f"<{tag}{attribute}>{MARK if cell.best else ''}{escape(text)}{note}</{tag[:2]}>"

@@ -92,7 +92,7 @@ def test_columns_of_figures_are_aligned_and_the_best_is_marked() -> None:
     page.table(["joint", "error", "why"], [["q1", Cell(0.012345, best=True), "x"], ["q2", None, "y"], ["q3", "0.50", "z"]])
     cells = [attributes.get("class") for tag, attributes in Reader(page.html()).tags if tag == "td"]
     assert cells == ["number best", None, "number", None, "number", None]
-    assert ">0.0123<" in page.html() and ">–<" in page.html()
+    assert ">▸ 0.0123<" in page.html() and ">–<" in page.html()
 
 
 def test_rows_of_another_length_are_refused() -> None:
