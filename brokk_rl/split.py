@@ -44,8 +44,8 @@ def split(runs: Mapping[str, Sequence[Recording]], shares: Mapping[str, float]) 
     """Distributes runs over sets such that each joint is commanded in each set for about its share of the time.
 
     The joint that is commanded in the fewest runs comes first; its longest run goes to the set that lacks it, or else to the one
-    that, over all joints that the run commands, is furthest from its share. Where names alone could decide, a hash of them does: the last runs of a collection are often
-    the warmest, and must not all be in the same set. The same names always give the same split.
+    that, over all joints of the run, is furthest from its share. Where names alone could decide, a hash of them does: the last runs
+    of a collection are often the warmest, and must not all be in the same set. The same names always give the same split.
 
     Source: iterative stratification, Sechidis et al. 2011, with seconds in place of labels.
 
