@@ -183,12 +183,10 @@ class Writer:
         if len(self._samples) < 2:
             return
         samples = self._samples
-        begin_s = samples[0].t_s
-        t_s = np.array([sample.t_s for sample in samples]) - begin_s
-        u, q = np.stack([sample.u for sample in samples], 1), np.stack([sample.q for sample in samples], 1)
+        track, begin_s = Track(samples), samples[0].t_s
         extra = {name: np.stack([sample.extra[name] for sample in samples], 1) for name in samples[0].extra}
         for n, name in enumerate(self._names):
-            notes = account.notes(samples, n, self._plan.runs[n], self._period_s)
+            notes = account.notes(track, n, self._plan.runs[n], self._period_s)
             metadata = {
                 **self._template.metadata,
                 "created": record.later(self._created, begin_s - self._begin_s),
@@ -196,5 +194,7 @@ class Writer:
                 "excitation": json.dumps(notes),
             }
             columns = {key: values[n] for key, values in extra.items()}
-            recording = replace(self._template, t_s=t_s, u=u[n], q=q[n], extra=columns, metadata=metadata)
+            recording = replace(
+                self._template, t_s=track.t_s - begin_s, u=track.u[:, n], q=track.q[:, n], extra=columns, metadata=metadata
+            )
             record.write(recording, self._folder / f"{name}_{self._part:02d}.parquet")

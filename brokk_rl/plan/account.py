@@ -26,6 +26,7 @@ class Track:
         u: Commands, `(T, N, J)`.
         stage: `BEFORE`, `PLAYING`, `AWAY` or `AFTER`, `(T, N)`.
         segment: Number of the segment, `(T, N)`.
+        played: Control periods since its program began, `(T, N)`.
     """
 
     def __init__(self, samples: Iterable[Sample]) -> None:
@@ -34,19 +35,17 @@ class Track:
         self.q, self.u = np.stack([sample.q for sample in kept]), np.stack([sample.u for sample in kept])
         self.stage = STAGE[np.stack([sample.phase for sample in kept])]
         self.segment = np.stack([sample.segment for sample in kept])
+        self.played = np.stack([sample.played for sample in kept])
 
 
-def notes(samples: Iterable[Sample], run: int, segments: tuple[Segment, ...], period_s: float) -> list[dict[str, Any]]:
-    """Returns what one run did in these samples, in order, as plain JSON data; times count from the first sample.
+def notes(track: Track, run: int, segments: tuple[Segment, ...], period_s: float) -> list[dict[str, Any]]:
+    """Returns what one run did on this track, in order, as plain JSON data; times count from the first sample.
 
     Each entry: `name` of the segment; `part`: `approach` (with the rest after it) or `program`; `start_s` and `end_s`; for programs
     `offset_s`, how far the program was at `start_s` (0 unless a file begins in the middle), `away_s`, pairs of times between which
     the machine was brought home instead, and `repeat_of` where it repeats another segment.
     """
-    kept = list(samples)
-    t_s = np.array([sample.t_s for sample in kept]) - kept[0].t_s
-    stage = STAGE[[sample.phase[run] for sample in kept]]
-    number = np.array([sample.segment[run] for sample in kept])
+    t_s, stage, number = track.t_s - track.t_s[0], track.stage[:, run], track.segment[:, run]
     ends_s = np.append(t_s[1:], t_s[-1] + period_s)
     found = []
     for begin, end in stretches(number * 2 + (stage != BEFORE)):
@@ -56,7 +55,7 @@ def notes(samples: Iterable[Sample], run: int, segments: tuple[Segment, ...], pe
         entry: dict[str, Any] = {"name": segment.name, "part": "approach" if stage[begin] == BEFORE else "program"}
         entry |= {"start_s": _ms(t_s[begin]), "end_s": _ms(ends_s[end - 1])}
         if stage[begin] != BEFORE:
-            entry["offset_s"] = _ms(kept[begin].played[run] * period_s)
+            entry["offset_s"] = _ms(track.played[begin, run] * period_s)
             away = [(begin + i, begin + k) for i, k in stretches(stage[begin:end] == AWAY) if stage[begin + i] == AWAY]
             entry["away_s"] = [[_ms(t_s[i]), _ms(ends_s[k - 1])] for i, k in away]
             if segment.repeat_of:

@@ -84,7 +84,7 @@ def schedule(
     for name, excitation in excitations.items():
         weights[name] = excitation.weight(sum(weights.values()))
         if weights[name] <= 0:
-            raise ConfigError(f"excitation.{name}: its share of the time is {weights[name]:g}; expected more than 0, or leave it out")
+            raise ConfigError(f"excitation.{name}: its share is {weights[name]:g}; expected more than 0, or leave it out")
     parts = {name: weight / sum(weights.values()) for name, weight in weights.items()}
     runs = []
     for seed in generator.integers(2**63, size=num_runs):

@@ -238,7 +238,7 @@ def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach
     second = constant({}, 2.0, anywhere(machine, 3), name="a_01", repeat_of="a_00")
     plan = Plan(runs=((first, second),), run_s=120.0, names=("a",))
     samples = list(drive(Nominal(machine, 1), Runner(plan, machine, approach, OPEN), machine, 1, 120.0))
-    notes = account.notes(samples, 0, plan.runs[0], 0.05)
+    notes = account.notes(Track(samples), 0, plan.runs[0], 0.05)
     assert [(note["name"], note["part"]) for note in notes] == [
         ("a_00", "approach"), ("a_00", "program"), ("a_01", "approach"), ("a_01", "program"),
     ]  # fmt: skip
@@ -248,7 +248,7 @@ def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach
     assert away < back == pytest.approx(notes[1]["start_s"] + 25.0)
     assert notes[3]["repeat_of"] == "a_00"
     playing = [k for k, sample in enumerate(samples) if sample.phase[0] == PLAY and sample.segment[0] == 0]
-    later = account.notes(samples[playing[0] + 100 :], 0, plan.runs[0], 0.05)
+    later = account.notes(Track(samples[playing[0] + 100 :]), 0, plan.runs[0], 0.05)
     assert later[0]["offset_s"] == 5.0 and later[0]["start_s"] == 0.0
     assert not any(sample.phase[0] == DONE for sample in samples)
 
