@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 import torch
+from torch.nn.utils.rnn import pad_sequence
 
+from actuators.draw import hashed
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-
-COMMANDED = 0.02
-"""A joint whose command stays below this is at rest, whatever its dead band."""
+from brokk_rl.split import COMMANDED
 
 
 class Windows:
@@ -25,6 +25,7 @@ class Windows:
     Attributes:
         u: Commands of all recordings, `(J, T)`.
         q: Positions of all recordings, `(J, T)`.
+        starts: Samples at which a window may begin, `(S,)`.
 
     Raises:
         RecordingError: no recording is long enough for a single window, or a joint is never commanded.
@@ -45,41 +46,50 @@ class Windows:
         if not len(self.starts):
             longest = max((recording.num_samples for recording in recordings), default=0)
             raise RecordingError(
-                f"too little data: the longest of {len(recordings)} recordings has {longest} samples, one window needs "
+                f"too little data: the longest of {len(recordings)} recordings {purpose} has {longest} samples, one window needs "
                 f"{self._length} ({machine.num_history} of history and {horizon} to predict)"
             )
-        self._moving = [self._active(u) for u in self.u]
-        for joint, moving in zip(machine.joint_names, self._moving, strict=True):
-            if not len(moving):
+        moving = [self._within(u.abs() > COMMANDED) for u in self.u]
+        for joint, found in zip(machine.joint_names, moving, strict=True):
+            if not len(found):
                 raise RecordingError(
-                    f"too little data: joint {joint} is never commanded in the {len(recordings)} recordings to fit to"
+                    f"too little data: joint {joint} is never commanded in the {len(recordings)} recordings {purpose}"
                 )
+        self._moving = pad_sequence(moving, batch_first=True)  # (J, most)
+        self._num_moving = torch.tensor([[len(found)] for found in moving], device=device)
+        self._joint = torch.arange(len(self.u), device=device)[:, None]
 
-    def _active(self, u: torch.Tensor) -> torch.Tensor:
-        """Returns the starts of windows in which a joint with the commands `u` `(T,)` is commanded at some time."""
-        count = torch.cat([torch.zeros(1, dtype=torch.int64, device=u.device), (u.abs() > COMMANDED).cumsum(0)])
-        within = count[self.starts + self._length] - count[self.starts]
-        return self.starts[within > 0]
-
-    def draw(self, batch: int, still_share: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draws windows for each joint, mostly of times at which it is commanded.
+    def draw(self, batch: int, still_share: float, key: torch.Tensor, together: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draws windows for each joint, mostly of times at which it is commanded. Fixed shapes, no host: a CUDA graph may hold it.
 
         Args:
-            batch: Number of windows a joint, `B`.
+            batch: Number of windows drawn a joint.
             still_share: Part drawn from all times instead.
-            generator: On the CPU.
+            key: Names the draw, int64 of shape `()`: the same key gives the same windows.
+            together: Each joint gets the windows of all, so that `B` is `J` times `batch`; else its own ones.
 
         Returns:
             Commands and positions, each `(J, B, H + K)`.
         """
+        index = self._index(batch, still_share, key)
+        index = index.flatten()[None] if together else index
+        return (self.u.unfold(1, self._length, 1)[self._joint, index], self.q.unfold(1, self._length, 1)[self._joint, index])
+
+    def _index(self, batch: int, still_share: float, key: torch.Tensor) -> torch.Tensor:
         still = round(batch * still_share)
-        rows = []
-        for moving in self._moving:
-            picks = [
-                source[torch.randint(len(source), (count,), generator=generator).to(source.device)]
-                for source, count in ((self.starts, still), (moving, batch - still))
-            ]
-            rows.append(torch.cat(picks))
-        index = torch.stack(rows)  # (J, B)
-        joint = torch.arange(len(rows), device=index.device)[:, None]
-        return self.u.unfold(1, self._length, 1)[joint, index], self.q.unfold(1, self._length, 1)[joint, index]
+        place = torch.arange(len(self.u) * batch, device=key.device)
+        chance = hashed(key * 1_048_576 + place).view(-1, batch)
+
+        def pick(chance: torch.Tensor, count: torch.Tensor | int) -> torch.Tensor:
+            return (chance.double() * count).long()
+
+        rows = (
+            self.starts[pick(chance[:, :still], len(self.starts))],
+            self._moving.gather(1, pick(chance[:, still:], self._num_moving)),
+        )
+        return torch.cat(rows, 1)
+
+    def _within(self, condition: torch.Tensor) -> torch.Tensor:
+        """Returns the starts of windows in which `condition`, `(T,)` bool, holds at some time."""
+        count = torch.cat([torch.zeros(1, dtype=torch.int64, device=condition.device), condition.cumsum(0)])
+        return self.starts[count[self.starts + self._length] > count[self.starts]]

@@ -20,17 +20,17 @@ class Mlp:
 
     checkpoint: str
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "MlpModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "NetworkModel":
         """Returns a model for any number of environments on `device`.
 
         Raises:
             CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds NaN.
         """
-        return MlpModel(load(self.checkpoint, machine).to(device), machine, device)
+        return NetworkModel(load(self.checkpoint, "mlp", machine).to(device), machine, device)
 
 
-class MlpModel:
-    """The networks at work. Has no memory beyond the history."""
+class NetworkModel:
+    """Actuator networks at work, separate or coupled. Has no memory beyond the history."""
 
     def __init__(self, networks: JointNetworks, machine: Machine, device: torch.device) -> None:
         self._networks = networks.requires_grad_(False)
@@ -52,15 +52,15 @@ class MlpModel:
         return (history.q[:, -1] + networks.increment(output).T).clamp(self._lower, self._upper)
 
 
-def load(name: str, machine: Machine) -> JointNetworks:
-    """Returns the networks of a checkpoint, on the CPU.
+def load(name: str, kind: str, machine: Machine) -> JointNetworks:
+    """Returns the networks of a checkpoint, on the CPU; `kind` is `mlp` (separate) or `coupled`.
 
     Raises:
         CheckpointError: as for `Mlp.build`.
     """
     path = checkpoint.found(name)
-    tensors, header = checkpoint.read(path, "mlp", machine)
-    networks = JointNetworks(machine.num_joints, machine.num_history, int(header.get("width", 0)))
+    tensors, header = checkpoint.read(path, kind, machine)
+    networks = JointNetworks(machine.num_joints, machine.num_history, int(header.get("width", 0)), coupled=kind == "coupled")
     try:
         networks.load_state_dict(tensors)
     except RuntimeError as error:

@@ -1,8 +1,10 @@
-"""The paper's actuator network, one per joint, all joints computed as one.
+"""Actuator networks: a perceptron a joint, all joints computed as one.
 
 The paper feeds 13 commands and 13 positions. Here the 13 positions of a joint enter as its newest position and the 12 increments
 between them: the same information in another basis, so that the network sees speeds at full resolution instead of small
 differences of large numbers, and what it learns in one place holds in another unless the data say otherwise.
+
+Axes: `J` joints, `B` batch, `H` history, `K` steps.
 """
 
 from itertools import pairwise
@@ -10,9 +12,54 @@ from itertools import pairwise
 import torch
 from torch import nn
 
+FLOW_WIDTH = 16
+"""Hidden units a joint of `SharedFlow`; a curve of the command with a delay needs few."""
+
+
+class SharedFlow(nn.Module):
+    """What is left of each joint's flow when together they ask for more than the pump gives.
+
+    Each joint's demand is a small perceptron of its own commands, at least 0, in units of the pump's flow. All joints get the part
+    `min(1, 1 / sum of demands)`, with a rounded corner whose sharpness is learned. A bottleneck like that of the machine: from few
+    moments of shortage, in which only some joints take part, it holds for all combinations of joints.
+
+    Args:
+        num_joints: Number of joints, `J`.
+        num_history: Samples of commands, `H`.
+        generator: Draws the initial weights.
+    """
+
+    def __init__(self, num_joints: int, num_history: int, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.weight = nn.ParameterList(
+            [
+                nn.Parameter(_uniform(num_joints, num_history, FLOW_WIDTH, generator=generator)),
+                # summed up, full commands ask for about half of the pump: close enough to a shortage to learn from it
+                nn.Parameter(torch.full((num_joints, FLOW_WIDTH, 1), 2.0 / FLOW_WIDTH)),
+            ]
+        )
+        self.bias = nn.ParameterList(
+            [
+                nn.Parameter(_uniform(num_joints, 1, FLOW_WIDTH, fan_in=num_history, generator=generator)),
+                nn.Parameter(torch.zeros(num_joints, 1, 1)),
+            ]
+        )
+        self.log_sharpness = nn.Parameter(torch.full((1, 1, 1), 1.6))
+
+    def forward(self, commands: torch.Tensor) -> torch.Tensor:
+        """Returns the part of their flow that joints get, `(B,)` in (0, 1], for normalised commands `(J, B, H)`."""
+        hidden = torch.relu(torch.baddbmm(self.bias[0], commands, self.weight[0]))
+        demand = torch.relu(torch.baddbmm(self.bias[1], hidden, self.weight[1])).sum(0).squeeze(1)
+        sharpness = self.log_sharpness.exp().view(())
+        # (1 + demand^s)^(-1/s): min(1, 1 / demand) with a rounded corner
+        return torch.exp(-nn.functional.softplus(sharpness * torch.log(demand + 1e-3)) / sharpness)
+
 
 class JointNetworks(nn.Module):
     """For each joint a perceptron with two hidden ReLU layers, from `2 H` inputs to the next increment (paper, section III-A).
+
+    Coupled networks differ in two things: each joint also sees the newest positions of the others, so that it can learn how the
+    pose loads it, and all outputs are multiplied by what `SharedFlow` makes of the commands of all.
 
     The last layer is followed by a dead zone of half width `quiet`: an increment smaller than the noise of the measurement is none.
     A machine at rest therefore stays at rest, however long the model runs on its own predictions.
@@ -20,7 +67,8 @@ class JointNetworks(nn.Module):
     Args:
         num_joints: Number of joints, `J`.
         num_history: Samples of commands and positions, `H`.
-        width: Units in each hidden layer.
+        width: Units a joint in each hidden layer.
+        coupled: Whether joints know of each other.
         generator: Draws the initial weights.
 
     Buffers:
@@ -33,45 +81,40 @@ class JointNetworks(nn.Module):
     position_scale: torch.Tensor
     quiet: torch.Tensor
 
-    def __init__(self, num_joints: int, num_history: int, width: int, generator: torch.Generator | None = None) -> None:
+    def __init__(
+        self, num_joints: int, num_history: int, width: int, coupled: bool = False, generator: torch.Generator | None = None
+    ) -> None:
         super().__init__()
-
-        def uniform(*shape: int, fan_in: int) -> nn.Parameter:
-            values = torch.rand(num_joints, *shape, generator=generator) * 2.0 - 1.0
-            return nn.Parameter(values / fan_in**0.5)  # as torch.nn.Linear draws them
-
+        self.num_history, self.coupled = num_history, coupled
         sizes = (2 * num_history, width, width, 1)
-        self.num_history, self.width = num_history, width
-        self.weight = nn.ParameterList([uniform(m, n, fan_in=m) for m, n in pairwise(sizes)])
-        self.bias = nn.ParameterList([uniform(1, n, fan_in=m) for m, n in pairwise(sizes)])
+        weight = [_uniform(num_joints, m, n, generator=generator) for m, n in pairwise(sizes)]
+        bias = [_uniform(num_joints, 1, n, fan_in=m, generator=generator) for m, n in pairwise(sizes)]
+        if coupled:
+            own, position = weight[0].split((2 * num_history - 1, 1), 1)
+            weight[0] = torch.cat([own, torch.eye(num_joints)[..., None] * position], 1)  # of the others nothing at first
+        self.weight = nn.ParameterList([nn.Parameter(value) for value in weight])
+        self.bias = nn.ParameterList([nn.Parameter(value) for value in bias])
+        self.flow = SharedFlow(num_joints, num_history, generator) if coupled else None
         for name in ("command_scale", "increment_scale", "position_center", "position_scale", "quiet"):
             self.register_buffer(name, torch.zeros(num_joints) if name in ("position_center", "quiet") else torch.ones(num_joints))
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Returns normalised increments `(J, B)` before the dead zone, for normalised inputs `(J, B, 2 H)`."""
-        hidden = torch.relu(torch.baddbmm(self.bias[0], inputs, self.weight[0]))
-        return self.head(hidden)
-
-    def head(self, hidden: torch.Tensor) -> torch.Tensor:
-        """Returns normalised increments `(J, B)` before the dead zone, from the first hidden layer `(J, B, width)`."""
-        hidden = torch.relu(torch.baddbmm(self.bias[1], hidden, self.weight[1]))
-        return torch.baddbmm(self.bias[2], hidden, self.weight[2]).squeeze(2)
+        """Returns normalised increments `(J, B)` before the dead zone, for normalised inputs `(J, B, F)`."""
+        output = self._head(torch.baddbmm(self.bias[0], inputs, self.weight[0]))
+        return output if self.flow is None else output * self.flow(inputs[..., : self.num_history])
 
     def increment(self, output: torch.Tensor) -> torch.Tensor:
         """Returns increments `(J, B)` in rad or m, after the dead zone, for the network's output `(J, B)`."""
-        physical = output * self.increment_scale[:, None]
-        quiet = self.quiet[:, None]
-        return torch.relu(physical - quiet) - torch.relu(-physical - quiet)
+        return self._moved(output) * self.increment_scale[:, None]
 
     def inputs(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Returns normalised inputs `(J, B, 2 H)`: commands, increments, newest position, for `u` and `q` of shape `(J, B, H)`."""
+        """Returns normalised inputs `(J, B, F)`: commands, increments, newest position, for `u` and `q` of shape `(J, B, H)`.
+
+        `F` is `2 H`, or `2 H - 1 + J` where a joint sees the positions of all.
+        """
         commands = u / self.command_scale[:, None, None]
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
-        return torch.cat([commands, increments, self.position(q[..., -1:])], 2)
-
-    def position(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns normalised positions, `(J, B, 1)`."""
-        return (q - self.position_center[:, None, None]) / self.position_scale[:, None, None]
+        return torch.cat([commands, increments, self._position(q[..., -1])], 2)
 
     def roll_out(self, u: torch.Tensor, q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
         """Runs freely on its own predictions.
@@ -87,20 +130,40 @@ class JointNetworks(nn.Module):
         Returns:
             Positions after each of the `K` steps, `(J, B, K)`.
         """
-        num_joints, batch, _ = q.shape
-        size = self.num_history
+        (num_joints, batch, _), size = q.shape, self.num_history
+        of_command, of_state = self.weight[0][:, :size], self.weight[0][:, size:]
         seen = (u / self.command_scale[:, None, None]).unfold(2, size, 1)  # (J, B, K, H)
         steps = seen.shape[2]
-        from_commands = torch.bmm(seen.reshape(num_joints, batch * steps, size), self.weight[0][:, :size])
-        from_commands = (from_commands + self.bias[0]).view(num_joints, batch, steps, self.width).unbind(2)
-        of_state = self.weight[0][:, size:]
+        seen = seen.reshape(num_joints, batch * steps, size)
+        from_commands = torch.baddbmm(self.bias[0], seen, of_command).view(num_joints, batch, steps, -1).unbind(2)
+        shares = None if self.flow is None else self.flow(seen).view(batch, steps).unbind(1)
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
         at, path = q[..., -1], []
         for k in range(steps):
-            state = torch.cat([increments, self.position(at[..., None])], 2)
-            hidden = torch.relu(torch.baddbmm(from_commands[k], state, of_state))
-            moved = self.increment(self.head(hidden))
-            at = torch.minimum(torch.maximum(at + moved, lower[:, None]), upper[:, None])
-            increments = torch.cat([increments[..., 1:], (moved / self.increment_scale[:, None])[..., None]], 2)
+            state = torch.cat([increments, self._position(at)], 2)
+            output = self._head(torch.baddbmm(from_commands[k], state, of_state))
+            moved = self._moved(output if shares is None else output * shares[k])
+            at = torch.addcmul(at, moved, self.increment_scale[:, None]).clamp(lower[:, None], upper[:, None])
+            increments = torch.cat([increments[..., 1:], moved[..., None]], 2)
             path.append(at)
         return torch.stack(path, 2)
+
+    def _head(self, hidden: torch.Tensor) -> torch.Tensor:
+        """Returns what the last layer says, `(J, B)`, from the first before its ReLU, `(J, B, width)`."""
+        hidden = torch.relu(torch.baddbmm(self.bias[1], torch.relu(hidden), self.weight[1]))
+        return torch.baddbmm(self.bias[2], hidden, self.weight[2]).squeeze(2)
+
+    def _moved(self, output: torch.Tensor) -> torch.Tensor:
+        """Returns normalised increments `(J, B)` after the dead zone."""
+        quiet = (self.quiet / self.increment_scale)[:, None]
+        return output - output.clamp(-quiet, quiet)
+
+    def _position(self, q: torch.Tensor) -> torch.Tensor:
+        """Returns the normalised positions that each joint sees, `(J, B, 1)` or `(J, B, J)`, for `q` `(J, B)`."""
+        position = (q - self.position_center[:, None]) / self.position_scale[:, None]
+        return position.T.expand(len(q), -1, -1) if self.coupled else position[..., None]
+
+
+def _uniform(num_joints: int, *shape: int, fan_in: int | None = None, generator: torch.Generator | None) -> torch.Tensor:
+    """Draws weights `(J, …)` as `torch.nn.Linear` does."""
+    return (torch.rand(num_joints, *shape, generator=generator) * 2.0 - 1.0) / (fan_in or shape[0]) ** 0.5

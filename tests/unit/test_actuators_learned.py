@@ -13,8 +13,9 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from actuators import checkpoint
+from actuators.coupled import Coupled
 from actuators.mlp import Mlp, load
-from actuators.network import JointNetworks
+from actuators.network import FLOW_WIDTH, JointNetworks, SharedFlow
 from brokk_rl.errors import CheckpointError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -22,8 +23,8 @@ from brokk_rl.machine import Machine
 CPU = torch.device("cpu")
 
 
-def networks(seed: int = 0) -> JointNetworks:
-    return JointNetworks(5, 13, 32, torch.Generator().manual_seed(seed))
+def networks(seed: int = 0, coupled: bool = False) -> JointNetworks:
+    return JointNetworks(5, 13, 32, coupled, torch.Generator().manual_seed(seed))
 
 
 def written(path: Path, machine: Machine, **tensors: torch.Tensor) -> Path:
@@ -57,21 +58,54 @@ def test_inputs_are_commands_increments_and_the_newest_position() -> None:
     torch.testing.assert_close(made.inputs(u, q), expected)
 
 
-def test_a_free_run_in_one_go_is_step_by_step(machine: Machine, tmp_path: Path) -> None:
-    made = networks(3)
+@pytest.mark.parametrize("kind", ["mlp", "coupled"])
+def test_a_free_run_in_one_go_is_step_by_step(kind: str, machine: Machine, tmp_path: Path) -> None:
+    made = networks(3, kind == "coupled")
     made.increment_scale.fill_(0.01)
     lower, upper = (torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper))
     generator = torch.Generator().manual_seed(1)
     u = torch.rand(5, 4, 12 + 30, generator=generator) * 2.0 - 1.0
     q = (0.03 * torch.rand(5, 4, 13, generator=generator)).cumsum(2) - 0.3
     path = made.roll_out(u, q, lower, upper)
-    checkpoint.write(tmp_path / "a.safetensors", "mlp", machine, made.state_dict(), {"width": 32})
-    model = Mlp(checkpoint=str(tmp_path / "a.safetensors")).build(machine, 4, CPU)
+    checkpoint.write(tmp_path / "a.safetensors", kind, machine, made.state_dict(), {"width": 32})
+    model = {"mlp": Mlp, "coupled": Coupled}[kind](checkpoint=str(tmp_path / "a.safetensors")).build(machine, 4, CPU)
     history = History(q=q.permute(1, 2, 0).clone(), u=u[..., :13].roll(1, 2).permute(1, 2, 0).clone())
     for k in range(30):
         history.push_u(u[..., 12 + k].T)
         history.push_q(model.step(history))
         torch.testing.assert_close(history.q[:, -1].T, path[..., k], atol=2e-5, rtol=0)
+
+
+def test_joints_share_a_flow_when_they_ask_for_more_than_there_is() -> None:
+    flow = SharedFlow(3, 4)
+    with torch.no_grad():
+        for value in flow.parameters():
+            value.zero_()
+        flow.log_sharpness.fill_(5.0)  # a corner as good as sharp
+        share = torch.tensor([0.4, 0.8, 0.6])  # of the pump, at full command
+        for unit, sign in enumerate((1.0, -1.0)):
+            flow.weight[0][:, 1, unit] = sign  # the command two samples before the newest
+            flow.weight[1][:, unit, 0] = share
+    commands = torch.zeros(3, 5, 4)
+    commands[0, 0, 1] = 1.0  # alone: 0.4
+    commands[:, 1, 1] = torch.tensor([1.0, -1.0, 0.0])  # 1.2
+    commands[:, 2, 1] = torch.tensor([-1.0, 1.0, 1.0])  # 1.8
+    commands[:, 3, 2] = 1.0  # at another time: nothing
+    torch.testing.assert_close(flow(commands), torch.tensor([1.0, 1 / 1.2, 1 / 1.8, 1.0, 1.0]), atol=2e-3, rtol=0)
+    assert flow.weight[0].shape[2] == FLOW_WIDTH
+
+
+def test_coupled_joints_see_the_pose_and_separate_ones_do_not() -> None:
+    u, q = torch.zeros(5, 1, 13), torch.zeros(5, 1, 13)
+    other = q.clone()
+    other[3] += 0.5
+    for coupled in (False, True):
+        made = networks(1, coupled)
+        with torch.no_grad():
+            made.weight[0].add_(0.1)
+        moved = made(made.inputs(u, other)) - made(made.inputs(u, q))
+        assert moved[3].abs() > 1e-4
+        assert bool((moved[[0, 1, 2, 4]].abs() > 1e-4).all()) is coupled
 
 
 def test_increments_below_the_noise_are_none() -> None:
@@ -81,8 +115,9 @@ def test_increments_below_the_noise_are_none() -> None:
     torch.testing.assert_close(made.increment(output)[0], torch.tensor([-0.003, 0.0, 0.0, 0.0, 0.002]))
 
 
-def test_the_shipped_machine_at_rest_stays_at_rest(machine: Machine) -> None:
-    actuator, num_envs = option("actuator", "mlp"), 64
+@pytest.mark.parametrize("name", ["mlp"])
+def test_the_shipped_machine_at_rest_stays_at_rest(name: str, machine: Machine) -> None:
+    actuator, num_envs = option("actuator", name), 64
     generator = torch.Generator().manual_seed(0)
     lower, upper = (torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper))
     q = lower + (upper - lower) * torch.rand(num_envs, 5, generator=generator)
@@ -96,8 +131,9 @@ def test_the_shipped_machine_at_rest_stays_at_rest(machine: Machine) -> None:
         assert (history.q[:, -1] - q).abs().max() < 0.002, f"command {level}"
 
 
-def test_the_shipped_model_reaches_a_target_and_stays(machine: Machine) -> None:
-    model = option("actuator", "mlp").build(machine, 1, CPU)
+@pytest.mark.parametrize("name", ["mlp", "coupled"])
+def test_the_shipped_model_reaches_a_target_and_stays(name: str, machine: Machine) -> None:
+    model = option("actuator", name).build(machine, 1, CPU)
     home = torch.as_tensor(machine.home, dtype=torch.float32)[None]
     target = home + torch.tensor([[0.5, 0.0, 0.4, -0.4, 0.5]])
     history = History(q=torch.zeros(1, 13, 5), u=torch.zeros(1, 13, 5))
@@ -114,7 +150,7 @@ def test_the_shipped_model_reaches_a_target_and_stays(machine: Machine) -> None:
 
 def test_a_missing_checkpoint_names_what_ships(machine: Machine) -> None:
     with pytest.raises(CheckpointError, match=r"no file 'nowhere\.safetensors'.*brokk170\.safetensors.*mode=identify"):
-        load("nowhere.safetensors", machine)
+        load("nowhere.safetensors", "mlp", machine)
 
 
 @pytest.mark.parametrize("keep", [0, 5, 200, -100])
@@ -122,19 +158,19 @@ def test_a_truncated_checkpoint_is_refused(tmp_path: Path, machine: Machine, kee
     path = written(tmp_path / "a.safetensors", machine)
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(CheckpointError, match=r"a\.safetensors: corrupt or truncated"):
-        load(str(path), machine)
+        load(str(path), "mlp", machine)
 
 
 def test_nan_weights_are_refused(tmp_path: Path, machine: Machine) -> None:
     path = written(tmp_path / "a.safetensors", machine, quiet=torch.tensor([0.0, 0.0, float("nan"), 0.0, 0.0]))
     with pytest.raises(CheckpointError, match=r"tensor 'quiet' holds NaN"):
-        load(str(path), machine)
+        load(str(path), "mlp", machine)
 
 
 def test_a_checkpoint_of_another_machine_names_what_differs(tmp_path: Path, machine: Machine) -> None:
     other = dataclasses.replace(machine, name="brokk400", period_s=0.06)
     with pytest.raises(CheckpointError, match="made for another machine: name, control differ"):
-        load(str(written(tmp_path / "a.safetensors", other)), machine)
+        load(str(written(tmp_path / "a.safetensors", other)), "mlp", machine)
 
 
 def test_tensors_of_another_network_are_refused(tmp_path: Path, machine: Machine) -> None:
@@ -143,16 +179,16 @@ def test_tensors_of_another_network_are_refused(tmp_path: Path, machine: Machine
     header = {"brokk": json.dumps(checkpoint.read(path, "mlp", machine)[1] | {"width": 16})}
     save_file(tensors, path, metadata=header)
     with pytest.raises(CheckpointError, match="do not fit the network"):
-        load(str(path), machine)
+        load(str(path), "mlp", machine)
 
 
 def test_weights_of_others_are_refused(tmp_path: Path, machine: Machine) -> None:
     save_file({"a": torch.zeros(1)}, tmp_path / "a.safetensors")
     with pytest.raises(CheckpointError, match="not an actuator of ours"):
-        load(str(tmp_path / "a.safetensors"), machine)
+        load(str(tmp_path / "a.safetensors"), "mlp", machine)
 
 
 def test_another_kind_of_actuator_is_refused(tmp_path: Path, machine: Machine) -> None:
     checkpoint.write(tmp_path / "a.safetensors", "arx", machine, {"weight": torch.zeros(5, 38)}, {})
     with pytest.raises(CheckpointError, match="holds a 'arx' of schema 1, expected a 'mlp'"):
-        load(str(tmp_path / "a.safetensors"), machine)
+        load(str(tmp_path / "a.safetensors"), "mlp", machine)

@@ -1,0 +1,180 @@
+"""Fits on a machine small enough to know the answer: they repeat, go on where they stopped, and say what they lack."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+from safetensors.torch import load_file
+
+from actuators import fit, survey
+from actuators.dataset import Windows
+from actuators.fit import NetworkFit
+from brokk_rl.errors import CheckpointError, RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+Runs = tuple[list[Recording], list[Recording]]
+CPU = torch.device("cpu")
+TINY: dict[str, Any] = {
+    "one_step_updates": 30, "one_step_batch": 32, "horizons_s": (0.2, 0.4), "updates": 20, "batch": 8, "validate_every": 10,
+    "validation_s": 1.0, "save_every_s": 0.0, "width": 8,
+}  # fmt: skip
+
+
+def recording(machine: Machine, seed: int = 0, minutes: float = 1.0, noise: float = 3e-4) -> Recording:
+    """Returns a recording of joints that follow their commands after 0.5 s, each slowed down by the commands of all."""
+    generator = np.random.default_rng(seed)
+    count = round(minutes * 60.0 / machine.period_s)
+    levels = generator.uniform(-1.0, 1.0, (count // 20 + 1, machine.num_joints)) * (generator.random((count // 20 + 1, 1)) > 0.3)
+    u = np.repeat(levels, 20, 0)[:count]
+    speed = (
+        0.2 * np.vstack([np.zeros((10, machine.num_joints)), u])[:count] / np.maximum(1.0, np.abs(u).sum(1, keepdims=True) / 2.0)
+    )
+    middle, half = (machine.lower + machine.upper) / 2.0, (machine.upper - machine.lower) / 2.0
+    q = middle + half * np.sin(np.cumsum(speed, 0) * machine.period_s / half) * 0.9
+    q += noise * generator.standard_normal(q.shape)
+    return Recording(
+        machine=machine.name, joints=machine.joint_names, units=tuple(joint.unit for joint in machine.joints), rate_hz=20.0,
+        t_s=np.arange(count) * machine.period_s, u=u.astype(np.float32), q=q.astype(np.float32),
+    )  # fmt: skip
+
+
+def tiny(name: str, **changes: Any) -> NetworkFit:
+    return dataclasses.replace(option("fit", name), **{**TINY, **changes})
+
+
+def weights(folder: Path, name: str) -> dict[str, torch.Tensor]:
+    return load_file(folder / f"{name}.safetensors")
+
+
+@pytest.fixture(scope="module")
+def runs(machine: Machine) -> Runs:
+    """Recordings to fit to and to stop by."""
+    return [recording(machine, seed) for seed in range(2)], [recording(machine, 9)]
+
+
+class KilledError(Exception):
+    """Stands for whatever ends a process in the middle of an update."""
+
+
+@pytest.mark.parametrize(("name", "after"), [("mlp", 17), ("coupled", 41), ("mlp", 70)])
+def test_an_interrupted_fit_goes_on_as_if_it_had_not_stopped(
+    name: str, after: int, machine: Machine, runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tiny(name)
+    config.fit(machine, *runs, tmp_path / "whole", 3, CPU)
+    step, count = fit.Descent._update, 0
+
+    def killed(self: Any, u: torch.Tensor, q: torch.Tensor) -> None:
+        nonlocal count
+        count += 1
+        if count == after:
+            self.networks.weight[0].data.fill_(7.0)  # half an update
+            raise KilledError
+        step(self, u, q)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit.Descent, "_update", killed)
+        with pytest.raises(KilledError):
+            config.fit(machine, *runs, tmp_path / "part", 3, CPU)
+    assert [path.name for path in (tmp_path / "part").iterdir()] == [f"{name}.partial.safetensors"]
+    config.fit(machine, *runs, tmp_path / "part", 3, CPU)
+    assert [path.name for path in (tmp_path / "part").iterdir()] == [f"{name}.safetensors"]
+    first, second = weights(tmp_path / "whole", name), weights(tmp_path / "part", name)
+    assert first.keys() == second.keys()
+    for key, value in first.items():
+        assert torch.equal(value, second[key]), key
+
+
+def test_a_fit_repeats_with_its_seed(machine: Machine, runs: Runs, tmp_path: Path) -> None:
+    for folder, seed in (("a", 1), ("b", 1), ("c", 2)):
+        tiny("mlp", save_every_s=60.0).fit(machine, *runs, tmp_path / folder, seed, CPU)
+    a, b, c = (weights(tmp_path / folder, "mlp") for folder in "abc")
+    assert all(torch.equal(a[key], b[key]) for key in a)
+    assert not torch.equal(a["weight.0"], c["weight.0"])
+
+
+def test_an_interrupted_fit_with_other_settings_or_data_says_what_differs(
+    machine: Machine, runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(self: Any) -> bool:
+        raise KilledError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit._Fitting, "_validate", killed)
+        with pytest.raises(KilledError):
+            tiny("mlp").fit(machine, *runs, tmp_path, 0, CPU)
+    partial = tmp_path / "mlp.partial.safetensors"
+    before = partial.read_bytes()
+    with pytest.raises(CheckpointError, match=r"these differ: fit\.batch \(was 8, is 9\); seed \(was 0, is 1\)\. Fit with"):
+        tiny("mlp", batch=9).fit(machine, *runs, tmp_path, 1, CPU)
+    with pytest.raises(CheckpointError, match=r"these differ: train \(was"):
+        tiny("mlp").fit(machine, runs[0][:1], runs[1], tmp_path, 0, CPU)
+    assert partial.read_bytes() == before
+    partial.write_bytes(before[:200])
+    with pytest.raises(CheckpointError, match=r"mlp\.partial\.safetensors: corrupt"):
+        tiny("mlp").fit(machine, *runs, tmp_path, 0, CPU)
+
+
+def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine: Machine) -> None:
+    parts = [recording(machine, seed, minutes=0.2) for seed in range(3)]
+    marked = [dataclasses.replace(part, q=np.full_like(part.q, number)) for number, part in enumerate(parts)]
+    windows = Windows(marked, machine, 7, CPU)
+    draws = [windows.draw(64, 0.5, torch.tensor(key)) for key in (5, 5, 6)]
+    assert draws[0][0].shape == draws[0][1].shape == (5, 64, 13 + 7)
+    assert torch.equal(draws[0][0], draws[1][0])
+    assert not torch.equal(draws[0][0], draws[2][0])
+    q = draws[0][1]
+    assert (q == q[..., :1]).all()
+    assert set(q.unique().tolist()) == {0.0, 1.0, 2.0}
+    moving = draws[0][0][:, 32:].abs() > 0.02
+    assert moving.any(2).all()
+
+
+def test_windows_drawn_together_are_the_same_times_for_all_joints(machine: Machine) -> None:
+    part = recording(machine)
+    clock = np.repeat(np.arange(part.num_samples, dtype=np.float32)[:, None], 5, 1)
+    _, q = Windows([dataclasses.replace(part, q=clock)], machine, 7, CPU).draw(16, 0.2, torch.tensor(1), together=True)
+    assert q.shape == (5, 80, 20)
+    assert (q == q[:1]).all()
+    assert len(q[0, :, 0].unique()) > 60
+
+
+@pytest.mark.parametrize(("noise", "step"), [(3e-4, 0.0), (1e-5, 0.002), (0.0, 0.004)])
+def test_the_noise_of_a_resting_joint_is_that_of_its_sensor(machine: Machine, noise: float, step: float) -> None:
+    made = recording(machine, minutes=10.0, noise=noise)
+    u = made.u.copy()
+    u[: u.shape[0] // 2] = 0.0
+    q = made.q.copy()
+    q[: len(q) // 2] = q[0] + noise * np.random.default_rng(1).standard_normal((len(q) // 2, 5))
+    if step:
+        q = np.round(q / step) * step
+    found = survey.resting_noise([dataclasses.replace(made, u=u, q=q.astype(np.float32))], machine)
+    assert found == pytest.approx(step / 6**0.5 if step else noise * 2**0.5, rel=0.05)
+
+
+def test_too_little_data_says_how_much_and_of_which_joint(machine: Machine) -> None:
+    part = recording(machine, minutes=2.0)
+    u = part.u.copy()
+    u[:, 2] = np.minimum(u[:, 2], 0.0)
+    with pytest.raises(
+        RecordingError, match=r"too little data: q3 0\.0 min forth and 0\.\d min back commanded .* needed are 0\.25 min"
+    ):
+        survey.check_enough([dataclasses.replace(part, u=u)], machine)
+
+
+def test_thin_data_is_warned_of(machine: Machine, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        survey.check_enough([recording(machine, minutes=4.0)], machine)
+    assert "thin data: q1 1." in caplog.text
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        survey.check_enough([recording(machine, seed, minutes=4.0) for seed in range(5)], machine)
+    assert not caplog.text
