@@ -156,7 +156,7 @@ def test_what_the_recordings_do_not_show_is_said(machine: Machine, tmp_path: Pat
     cells = json.loads((tmp_path / "lag.json").read_text())["parameters"]
     for joint in machine.joint_names:
         assert not cells["dead_band_retract"][joint]["told"]
-        assert cells["dead_band_retract"][joint]["ci95"] == [0.0, 0.4]
+        assert cells["dead_band_retract"][joint]["ci95"] == [0.0, 0.8]
         assert cells["dead_time_s"][joint]["told"]
     assert "dead_band_retract: the recordings do not tell it for q1, q2, q3, q4, q5" in caplog.text
 
