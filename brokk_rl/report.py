@@ -52,10 +52,9 @@ p { margin: .5rem 0; max-width: 46rem; overflow-wrap: anywhere; }
 .summary { font-size: 1.1rem; }
 .good, .bad, .warn { border-left: .3rem solid; padding: .35rem .8rem; background: var(--panel); }
 .good { border-color: var(--good); } .bad { border-color: var(--bad); } .warn { border-color: var(--warn); }
-.scroll { overflow-x: auto; margin: .8rem 0; }
+.scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums lining-nums; font-size: .92rem; }
-caption, figcaption, footer { color: var(--dim); font-size: .88rem; text-align: left; }
-caption { padding-bottom: .3rem; }
+figcaption, footer { color: var(--dim); font-size: .88rem; }
 th, td { padding: .22rem .7rem; text-align: left; vertical-align: baseline; border-bottom: 1px solid var(--line); }
 th { font-weight: 600; white-space: nowrap; } thead th { border-bottom: 2px solid var(--line); vertical-align: bottom; }
 .number { text-align: right; white-space: nowrap; }
@@ -143,8 +142,8 @@ class Page:
             "<tr>" + "".join(_cell(row[i], numeric[i], i == 0, digits) for i in range(len(row))) + "</tr>" for row in cells
         )
         top = f"<thead><tr>{head}</tr></thead>" if any(columns) else ""
-        title = f"<caption>{escape(caption)}</caption>" if caption else ""
-        self._parts.append(f'<div class="scroll"><table>{title}{top}<tbody>{body}</tbody></table></div>')
+        title = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""  # outside of what scrolls sideways on a phone
+        self._parts.append(f'<figure>{title}<div class="scroll"><table>{top}<tbody>{body}</tbody></table></div></figure>')
 
     def facts(self, facts: dict[str, str | float | None]) -> None:
         """Adds names and what is known of them, one a line."""

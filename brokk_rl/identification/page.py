@@ -34,7 +34,7 @@ def write(
     page = Page(f"{result['model']}, actuator model of {machine.name}", findings[0].text, findings[0].tone)
     for finding in findings[1:]:
         page.text(finding.text, finding.tone)
-    _use(page, result)
+    _use(page, result, machine)
     page.heading("Measured and predicted")
     caption = (
         "Free runs on runs the model has not seen: it is given the recorded commands (grey, below) and its own predictions. "
@@ -50,12 +50,16 @@ def write(
     page.write(folder / PAGE)
 
 
-def _use(page: Page, result: Mapping[str, Any]) -> None:
+def _use(page: Page, result: Mapping[str, Any], machine: Machine) -> None:
     page.heading("Use it")
     if not result["use"]:
         page.text(f"No option of the group actuator loads {result['model']}: it is there to compare with.")
         return
     use = result["use"]
+    if machine.mjcf is None:
+        page.text(
+            f"{machine.name} is known by its joints only; with a model of its bodies (mjcf) policies can be trained through this:"
+        )
     page.code(f"brokk mode=train {use}\nbrokk mode=evaluate policy.folder=<run folder> {use}\nbrokk mode=bench {use}")
 
 

@@ -213,7 +213,7 @@ def _frame(axis: Axes, measured: np.ndarray, predicted: np.ndarray, machine: Mac
 
 def _panels(machine: Machine, shared: str) -> tuple[Figure, list[Axes]]:
     """Returns a figure with one panel a joint, in rows of three at most, with the same scale along the axes in `shared`."""
-    columns = min(3, machine.num_joints)
+    columns = 2 if machine.num_joints in (2, 4) else min(3, machine.num_joints)
     rows = -(-machine.num_joints // columns)
     figure = Figure(figsize=(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows + 0.6), layout="constrained")
     first = figure.add_subplot(rows, columns, 1)
