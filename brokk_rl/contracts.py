@@ -100,7 +100,7 @@ class Segment:
             back to `start` and waits until the program, which runs on by the clock, next passes zero. `inward`: this joint is
             driven the other way until its program next passes zero.
         stop_margin: Distance from the stops, as a part of the joint's travel.
-        repeat_of: Name of the segment that this one repeats exactly.
+        repeat_of: Name of an earlier segment of the same length, of which this one repeats what was really sent.
     """
 
     name: str

@@ -13,7 +13,7 @@ from brokk_rl.spec import spec
 
 @spec
 class Repeat:
-    """Everything before it in the plan once more, from the same poses with the same commands: what differs is noise.
+    """Everything before it in the plan once more, from the same poses with the commands really sent: what differs is noise.
 
     Attributes:
         times: How many repeats.

@@ -5,7 +5,8 @@
                                         near a stop   v  | program passes zero     (segments that go `home` at the stops)
                                                     return --arrived--> wait
 
-A program runs on by the clock while its joint is brought home, so a segment always lasts as long as its program.
+A program runs on by the clock while its joint is brought home, so a segment always lasts as long as its program. A segment that
+repeats another plays the commands that were really sent then, turns at the stops included: only so are the two comparable.
 """
 
 import logging
@@ -19,6 +20,8 @@ from brokk_rl.plan.schedule import Approach, Plan
 
 log = logging.getLogger(__name__)
 
+REPEAT_MARGIN = 0.25
+"""Stop margin of a repeat, of that of the original: the small difference of their starts must not turn it back earlier."""
 SPEED_WINDOW = 4
 """Control periods over which the measured speed is taken; one period alone would be mostly noise."""
 
@@ -88,6 +91,7 @@ class Runner:
         """Is told the commands that were really sent, `(N, J)`, and moves on by one control period."""
         self._in_flight = np.concatenate([self._in_flight[:, 1:], u[:, None]], 1)
         inside = INSIDE[self.phase]
+        self._sent[self._rows[inside], self._index[inside]] = u[inside]
         self._index += inside
         self._left -= 1
         over = inside & (self._index >= self._end[self._rows, self.segment])
@@ -98,6 +102,8 @@ class Runner:
         if following.any():
             assert self._seen is not None
             self._left[following] = self._patience(self._seen[-1])[following]
+            for n in np.flatnonzero(following).tolist():
+                self._take_up_repeat(n, self.segment[n])
 
     @property
     def played(self) -> np.ndarray:
@@ -108,6 +114,13 @@ class Runner:
     def done(self) -> bool:
         """True when every run has played all its segments."""
         return bool((self.phase == DONE).all())
+
+    def _take_up_repeat(self, n: int, segment: int) -> None:
+        """Makes what was sent in the original the program of a repeat; of any other segment the program stays."""
+        original = self._original[n, segment]
+        if original >= 0:
+            there, here = (slice(self._begin[n, i], self._end[n, i]) for i in (original, segment))
+            self._program[n, here] = self._sent[n, there]
 
     def _advance(self, q: np.ndarray, far: np.ndarray) -> None:
         """Goes on from approach to rest to play, and from return to wait to play."""
@@ -169,13 +182,14 @@ class Runner:
             raise ConfigError("plan: a run has no segments")
         length = max(sum(len(segment.u) for segment in run) for run in runs)
         self._program = np.zeros((count, length, machine.num_joints))
+        self._sent = np.zeros_like(self._program)
         self._at_zero = np.zeros((count, length), dtype=bool)
         self._start = np.tile(machine.home, (count, most, 1))
         self._low, self._high = np.zeros_like(self._start), np.zeros_like(self._start)
         self._begin, self._end = np.zeros((count, most), dtype=int), np.zeros((count, most), dtype=int)
-        self._goes_home = np.zeros((count, most), dtype=bool)
+        self._goes_home, self._original = np.zeros((count, most), dtype=bool), np.full((count, most), -1)
         for n, run in enumerate(runs):
-            end = 0
+            end, names = 0, [segment.name for segment in run]
             for i, segment in enumerate(run):
                 begin, end = end, end + len(segment.u)
                 self._program[n, begin:end] = segment.u
@@ -185,4 +199,7 @@ class Runner:
                 self._start[n, i], self._begin[n, i], self._end[n, i] = segment.start, begin, end
                 self._goes_home[n, i] = segment.stops == "home"
                 margin = segment.stop_margin * self._travel
+                if segment.repeat_of in names[:i]:
+                    self._original[n, i] = names.index(segment.repeat_of)
+                    margin = margin * REPEAT_MARGIN
                 self._low[n, i], self._high[n, i] = machine.lower + margin, machine.upper - margin

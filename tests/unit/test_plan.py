@@ -133,6 +133,28 @@ def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(machine: Machine
     assert (stage != account.BEFORE).sum() == 2000, "a segment lasts as long as its program"
 
 
+class Noisy(Nominal):
+    """Measures with noise."""
+
+    def read(self) -> JointState:
+        state = super().read()
+        return JointState(state.t_s, state.q + 0.0003 * np.random.default_rng(round(state.t_s * 20)).standard_normal(state.q.shape))
+
+
+def test_a_repeat_plays_what_was_sent_although_the_stops_came_in_between(machine: Machine, approach: Approach) -> None:
+    levels = option("excitation", "levels").segments(machine, 240.0, np.random.default_rng(0), [])
+    run = [*levels, *option("excitation", "repeat").segments(machine, 240.0, np.random.default_rng(0), levels)]
+    track = played([run], machine, approach, link=Noisy(machine, 1), run_s=900.0)
+    turned = 0
+    for i, segment in enumerate(levels):
+        first, again = (
+            track.u[(track.segment[:, 0] == k) & (track.stage[:, 0] != account.BEFORE), 0] for k in (i, i + len(levels))
+        )
+        assert (first == again).all()
+        turned += (first != segment.u).any()
+    assert turned, "or this shows nothing"
+
+
 def test_commands_keep_to_the_largest(machine: Machine, approach: Approach) -> None:
     guards = Guards(max_command=0.3, max_tool_speed_m_s=None)
     track = played([[constant({0: 1.0, 3: -1.0}, 3.0, anywhere(machine, 1))]], machine, approach, guards)
@@ -235,7 +257,7 @@ def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach
     u = np.zeros((600, 5))
     u[:, 2] = np.where(np.arange(600) < 500, 0.9, -0.2)
     first = constant({}, 0.0, machine.home, u=u, stops="home")
-    second = constant({}, 2.0, anywhere(machine, 3), name="a_01", repeat_of="a_00")
+    second = constant({}, 2.0, anywhere(machine, 3), name="a_01", repeat_of="elsewhere")
     plan = Plan(runs=((first, second),), run_s=120.0, names=("a",))
     samples = list(drive(Nominal(machine, 1), Runner(plan, machine, approach, OPEN), machine, 1, 120.0))
     notes = account.notes(Track(samples), 0, plan.runs[0], 0.05)
@@ -246,7 +268,7 @@ def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach
     assert all(one["end_s"] == next_["start_s"] for one, next_ in pairwise(notes))
     ((away, back),) = notes[1]["away_s"]
     assert away < back == pytest.approx(notes[1]["start_s"] + 25.0)
-    assert notes[3]["repeat_of"] == "a_00"
+    assert notes[3]["repeat_of"] == "elsewhere"
     playing = [k for k, sample in enumerate(samples) if sample.phase[0] == PLAY and sample.segment[0] == 0]
     later = account.notes(Track(samples[playing[0] + 100 :]), 0, plan.runs[0], 0.05)
     assert later[0]["offset_s"] == 5.0 and later[0]["start_s"] == 0.0
