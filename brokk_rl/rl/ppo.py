@@ -1,8 +1,8 @@
-"""rsl-rl's PPO with the whole update on the device.
+"""rsl-rl's PPO without the host in its loops.
 
 rsl-rl reads the divergence and three losses back to the host after each mini-batch, and launches a few hundred small kernels for
-it; on a GPU that takes longer than the arithmetic. Here the learning rate and the losses stay on the device, and a mini-batch is
-one replay of a CUDA graph.
+it, some seventy more in each control step; on a GPU that takes longer than the arithmetic. Here the learning rate and the losses
+stay on the device, and acting, storing and a mini-batch are one replay of a CUDA graph each.
 """
 
 from __future__ import annotations
@@ -11,9 +11,12 @@ from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.modules.distribution import GaussianDistribution
+from tensordict import TensorDict
 from torch import nn
 
 from brokk_rl.rl.graph import capture
+from brokk_rl.rl.rollout import Rollout
 
 LOWEST_RATE, HIGHEST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
 """Bounds and step of the adaptive learning rate, as in rsl-rl."""
@@ -23,18 +26,32 @@ FIGURES = ("value", "surrogate", "entropy")
 class DevicePPO(PPO):
     """PPO for feed-forward networks; on a CPU, on several GPUs, and with curiosity or symmetry it is rsl-rl's own."""
 
+    _rollout: Rollout | None = None
     _graph: torch.cuda.CUDAGraph | None = None
     _rows: torch.Tensor
     _advantages: torch.Tensor
     _rate: torch.Tensor
     _sums: torch.Tensor
 
+    def act(self, obs: TensorDict) -> torch.Tensor:
+        """Draws actions; see `rsl_rl.algorithms.PPO.act`."""
+        if not (self._on_device and isinstance(self.actor.distribution, GaussianDistribution)):
+            return super().act(obs)
+        self._rollout = self._rollout or Rollout(self)
+        return self._rollout.act(obs)
+
+    def process_env_step(
+        self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, torch.Tensor]
+    ) -> None:
+        """Stores a step; see `rsl_rl.algorithms.PPO.process_env_step`."""
+        if self._rollout is None:
+            super().process_env_step(obs, rewards, dones, extras)
+        else:
+            self._rollout.store(rewards, dones, extras.get("time_outs", torch.zeros_like(rewards)))
+
     def update(self) -> dict[str, float]:
         """Learns from the stored steps and returns mean losses; see `rsl_rl.algorithms.PPO.update`."""
-        recurrent = self.actor.is_recurrent or self.critic.is_recurrent
-        if torch.device(self.device).type != "cuda" or self.is_multi_gpu or self.rnd or self.symmetry or recurrent:
-            return super().update()
-        return self.update_on_device()
+        return self.update_on_device() if self._on_device else super().update()
 
     def update_on_device(self) -> dict[str, float]:
         """Does what `update` does with one read-back at the end; the same numbers up to rounding."""
@@ -75,6 +92,11 @@ class DevicePPO(PPO):
         if hasattr(self, "_rows"):
             del self._rows
         return super().load(loaded_dict, load_cfg, strict)
+
+    @property
+    def _on_device(self) -> bool:
+        plain = not (self.is_multi_gpu or self.rnd or self.symmetry or self.actor.is_recurrent or self.critic.is_recurrent)
+        return plain and torch.device(self.device).type == "cuda"
 
     def _batch_size(self) -> int:
         return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches

@@ -10,6 +10,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from brokk_rl.rl.ppo import DevicePPO
+from brokk_rl.rl.rollout import Rollout
 
 NUM_ENVS, STEPS, GROUPS = 16, 6, {"actor": ["policy"], "critic": ["policy"]}
 GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 0.3, "std_type": "log"}
@@ -25,8 +26,8 @@ def _algorithm(kind: type[PPO], device: str = "cpu", **changes: object) -> PPO:
     return kind(actor, critic, storage, **(settings | changes))
 
 
-def _iteration(algorithm: PPO, seed: int) -> dict[str, float]:
-    """Fills the storage with made-up steps of the algorithm's own policy, and learns from them."""
+def _roll_out(algorithm: PPO, seed: int) -> TensorDict:
+    """Fills the storage with made-up steps of the algorithm's own policy; returns what is seen at the end."""
     device = algorithm.device
     torch.manual_seed(seed)
     draws = torch.Generator().manual_seed(seed)
@@ -40,10 +41,19 @@ def _iteration(algorithm: PPO, seed: int) -> dict[str, float]:
     with torch.inference_mode():
         for _ in range(STEPS):
             algorithm.act(seen())
-            algorithm.process_env_step(seen(), random(NUM_ENVS), random(NUM_ENVS) > 1.5, {})
-        algorithm.compute_returns(seen())
+            algorithm.process_env_step(seen(), random(NUM_ENVS), random(NUM_ENVS) > 1.5, {"time_outs": random(NUM_ENVS) > 2.0})
+    return seen()
+
+
+def _learn(algorithm: PPO, seed: int, last: TensorDict) -> dict[str, float]:
+    with torch.inference_mode():
+        algorithm.compute_returns(last)
     torch.manual_seed(seed)  # the order of mini-batches
     return algorithm.update_on_device() if isinstance(algorithm, DevicePPO) else algorithm.update()
+
+
+def _iteration(algorithm: PPO, seed: int) -> dict[str, float]:
+    return _learn(algorithm, seed, _roll_out(algorithm, seed))
 
 
 @pytest.mark.parametrize(
@@ -88,12 +98,50 @@ def test_it_goes_on_exactly_from_a_saved_state() -> None:
         assert torch.equal(mine, other)
 
 
+def _check_storage(algorithm: PPO, rollout: Rollout, device: str) -> None:
+    """Rolls out and checks what is stored against rsl-rl's own functions."""
+    seen, rewards = torch.randn(STEPS, NUM_ENVS, 7, device=device), torch.randn(STEPS, NUM_ENVS, device=device)
+    ends = torch.rand(2, STEPS, NUM_ENVS, device=device) > 0.7
+    for t in range(STEPS):
+        rollout.act({"policy": seen[t]})
+        rollout.store(rewards[t], ends[0, t] | ends[1, t], ends[1, t])
+    storage, actor = algorithm.storage, algorithm.actor
+    obs = TensorDict({"policy": seen}, batch_size=[STEPS, NUM_ENVS])
+    with torch.no_grad():
+        values = algorithm.critic(obs)
+        actor(obs, stochastic_output=True)
+        torch.testing.assert_close(storage.actions_log_prob[..., 0], actor.get_output_log_prob(storage.actions))
+        for stored, wanted in zip(storage.distribution_params, actor.output_distribution_params, strict=True):
+            torch.testing.assert_close(stored, wanted)
+    torch.testing.assert_close(storage.observations["policy"], seen)
+    torch.testing.assert_close(storage.values, values)
+    torch.testing.assert_close(storage.rewards[..., 0], rewards + algorithm.gamma * values[..., 0] * ends[1])
+    assert torch.equal(storage.dones[..., 0].bool(), ends[0] | ends[1])
+    drawn = (storage.actions - storage.distribution_params[0]) / storage.distribution_params[1]
+    assert abs(float(drawn.mean())) < 0.2 and 0.85 < float(drawn.std()) < 1.15  # 288 draws
+    assert len(drawn.unique()) == drawn.numel()
+    with pytest.raises(OverflowError, match="full"):
+        rollout.store(rewards[0], ends[0, 0], ends[1, 0])
+
+
+def test_a_rollout_stores_what_rsl_rl_would_store() -> None:
+    algorithm = _algorithm(PPO)
+    _check_storage(algorithm, Rollout(algorithm), "cpu")
+
+
+@pytest.mark.gpu
+def test_a_captured_rollout_stores_what_rsl_rl_would_store() -> None:
+    algorithm = _algorithm(PPO, "cuda")
+    _check_storage(algorithm, Rollout(algorithm), "cuda")
+
+
 @pytest.mark.gpu
 def test_the_graph_learns_what_the_eager_update_learns() -> None:
     captured, eager = _algorithm(DevicePPO, "cuda"), _algorithm(PPO, "cuda")
     for seed in range(3):
-        figures = _iteration(captured, seed)
-        assert figures == pytest.approx(_iteration(eager, seed), rel=1e-3, abs=1e-5)
-    assert captured._graph is not None
+        last = _roll_out(captured, seed)
+        eager.storage = copy.deepcopy(captured.storage)
+        assert _learn(captured, seed, last) == pytest.approx(_learn(eager, seed, last), rel=1e-3, abs=1e-5)
+    assert captured._graph is not None and captured._rollout is not None
     for mine, other in zip(captured.actor.parameters(), eager.actor.parameters(), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-5)
