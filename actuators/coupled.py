@@ -1,4 +1,4 @@
-"""One network for all joints: each sees commands and motion of all, and so learns how they share the pump and load each other."""
+"""Networks that know of each other: a network a joint, one pump for all, and loads that depend on the pose of all joints."""
 
 import torch
 
@@ -9,7 +9,7 @@ from brokk_rl.spec import spec
 
 @spec
 class Coupled:
-    """Perceptrons whose first layer sees all joints: learns pump sharing and loads that depend on the pose, which `mlp` cannot.
+    """A perceptron a joint, slowed down where joints ask for more than the pump gives and by the load of the pose (`mlp`: neither).
 
     Attributes:
         checkpoint: A file, or the name of one that ships with the package.

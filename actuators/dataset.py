@@ -57,26 +57,30 @@ class Windows:
                 )
         self._moving = pad_sequence(moving, batch_first=True)  # (J, most)
         self._num_moving = torch.tensor([[len(found)] for found in moving], device=device)
+        self._busy = self._busiest()
         self._joint = torch.arange(len(self.u), device=device)[:, None]
 
-    def draw(self, batch: int, still_share: float, key: torch.Tensor, together: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+    def draw(
+        self, batch: int, still_share: float, busy_share: float, key: torch.Tensor, together: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draws windows for each joint, mostly of times at which it is commanded. Fixed shapes, no host: a CUDA graph may hold it.
 
         Args:
             batch: Number of windows drawn a joint.
             still_share: Part drawn from all times instead.
+            busy_share: Part drawn from the tenth of all times in which most is commanded at once.
             key: Names the draw, int64 of shape `()`: the same key gives the same windows.
             together: Each joint gets the windows of all, so that `B` is `J` times `batch`; else its own ones.
 
         Returns:
             Commands and positions, each `(J, B, H + K)`.
         """
-        index = self._index(batch, still_share, key)
+        index = self._index(batch, still_share, busy_share, key)
         index = index.flatten()[None] if together else index
         return (self.u.unfold(1, self._length, 1)[self._joint, index], self.q.unfold(1, self._length, 1)[self._joint, index])
 
-    def _index(self, batch: int, still_share: float, key: torch.Tensor) -> torch.Tensor:
-        still = round(batch * still_share)
+    def _index(self, batch: int, still_share: float, busy_share: float, key: torch.Tensor) -> torch.Tensor:
+        still, busy = round(batch * still_share), round(batch * busy_share)
         place = torch.arange(len(self.u) * batch, device=key.device)
         chance = hashed(key * 1_048_576 + place).view(-1, batch)
 
@@ -85,7 +89,8 @@ class Windows:
 
         rows = (
             self.starts[pick(chance[:, :still], len(self.starts))],
-            self._moving.gather(1, pick(chance[:, still:], self._num_moving)),
+            self._busy[pick(chance[:, still : still + busy], len(self._busy))],
+            self._moving.gather(1, pick(chance[:, still + busy :], self._num_moving)),
         )
         return torch.cat(rows, 1)
 
@@ -93,3 +98,8 @@ class Windows:
         """Returns the starts of windows in which `condition`, `(T,)` bool, holds at some time."""
         count = torch.cat([torch.zeros(1, dtype=torch.int64, device=condition.device), condition.cumsum(0)])
         return self.starts[count[self.starts + self._length] > count[self.starts]]
+
+    def _busiest(self) -> torch.Tensor:
+        """Returns the tenth of the starts in whose windows the sum of all commands rises highest."""
+        total = self.u.abs().sum(0).unfold(0, self._length, 1).amax(1)[self.starts]
+        return self.starts[total.argsort(descending=True, stable=True)[: max(1, len(total) // 10)]]

@@ -54,11 +54,11 @@ class Descent:
             found |= {f"adam.{number}.{name}": value for name, value in self._adam.state[parameter].items()}
         return found
 
-    def updater(self, windows: Windows, batch: int, still_share: float) -> Callable[[], None]:
+    def updater(self, windows: Windows, batch: int, still_share: float, busy_share: float) -> Callable[[], None]:
         """Returns one update on `batch` windows a joint as a function; capturing it, on a GPU, leaves the state as it was."""
 
         def update() -> None:
-            self._update(*windows.draw(batch, still_share, self._key, together=self.networks.coupled))
+            self._update(*windows.draw(batch, still_share, busy_share, self._key, together=self.networks.coupled))
 
         if self._device.type != "cuda":
             return update

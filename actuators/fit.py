@@ -30,6 +30,9 @@ log = logging.getLogger(__name__)
 VALIDATED = 512
 """Windows on which the weights of a network are chosen."""
 
+BEYOND_DEAD_BAND = 0.1
+"""Commands from which increments count for their normalisation."""
+
 
 @spec
 class NetworkFit:
@@ -48,7 +51,9 @@ class NetworkFit:
         updates: Updates at each of the horizons.
         batch: Windows a joint in each of them; with `coupled` each window is one of all joints.
         learning_rate: Of Adam, at the start; falls along a cosine.
-        still_share: Part of the windows drawn from all times, the others are times at which the joint is commanded.
+        still_share: Part of the windows drawn from all times; most others are times at which the joint is commanded.
+        busy_share: Part of the windows drawn from the tenth of all times in which most is commanded at once: joints hinder each
+            other rarely, and where recordings of single joints abound hardly ever.
         average: Decay of the running average of the weights, which is what is validated and kept.
         validate_every: Updates between two validations.
         validation_s: Horizon of the free run on which the weights are chosen.
@@ -68,6 +73,7 @@ class NetworkFit:
     batch: int
     learning_rate: float
     still_share: float
+    busy_share: float
     average: float
     validate_every: int
     validation_s: float
@@ -79,8 +85,8 @@ class NetworkFit:
             raise ConfigError("fit.horizons_s: loss=rollout needs at least one horizon")
         if min(self.width, self.batch, self.one_step_batch, self.validate_every, self.patience) < 1:
             raise ConfigError("fit: width, batches, validate_every and patience must be 1 or more")
-        if not 0 <= self.still_share < 1:
-            raise ConfigError(f"fit.still_share: expected 0 to below 1, got {self.still_share}")
+        if min(self.still_share, self.busy_share) < 0 or self.still_share + self.busy_share >= 1:
+            raise ConfigError("fit: still_share and busy_share must leave room for times at which a joint is commanded")
 
     def fit(
         self,
@@ -102,6 +108,8 @@ class NetworkFit:
             StorageError: a file could not be written.
         """
         survey.check_enough(train, machine)
+        if self.network == "coupled":
+            survey.check_together(train)
         stamp = {
             "fit": {**dataclasses.asdict(self), "save_every_s": None}, "machine": machine.fingerprint(), "seed": seed,
             "device": device.type, "train": digest(train), "validation": digest(validation),
@@ -176,7 +184,7 @@ class _Fitting:
         self._best = torch.full((joints,), math.inf, device=device)
         held = Windows(validation, machine, self._steps(config.validation_s), device, "held out to stop the fit by")
         batch = max(1, VALIDATED // joints) if coupled else VALIDATED
-        self._held = held.draw(batch, 0.2, torch.zeros((), dtype=torch.int64, device=device), together=coupled)
+        self._held = held.draw(batch, 0.2, config.busy_share, torch.zeros((), dtype=torch.int64, device=device), together=coupled)
         self._stages = [_Stage(0.0, config.one_step_updates, config.one_step_batch)]
         if config.loss == "rollout":
             self._stages += [_Stage(horizon_s, config.updates, config.batch) for horizon_s in config.horizons_s]
@@ -203,7 +211,7 @@ class _Fitting:
         """Runs what is left of the stage at `place`."""
         config, stage = self._config, self._stages[place.stage]
         windows = Windows(self._train, self._machine, max(1, self._steps(stage.horizon_s)), self._device)
-        update = self._descent.updater(windows, stage.batch, config.still_share)
+        update = self._descent.updater(windows, stage.batch, config.still_share, config.busy_share)
         before, total = sum(earlier.updates for earlier in self._stages[: place.stage]), progress.tasks[task].total or 1
         began = saved = time.monotonic()
         spent_s = place.seconds
@@ -248,8 +256,9 @@ class _Fitting:
     def _normalise(self, networks: JointNetworks) -> None:
         """Sets the normalisation from the training data (increments, commands, noise) and from the machine (positions)."""
         for joint in range(self._machine.num_joints):
-            moved = np.concatenate([np.diff(r.q[:, joint])[np.abs(r.u[1:, joint]) > 0.1] for r in self._train])
-            commands = np.concatenate([r.u[:, joint] for r in self._train])
+            commands = np.concatenate([r.u[1:, joint] for r in self._train])
+            moved = np.concatenate([np.diff(r.q[:, joint]) for r in self._train])
+            moved = moved[np.abs(commands) > min(BEYOND_DEAD_BAND, 0.5 * np.abs(commands).max())]
             networks.increment_scale[joint] = max(1e-6, float(np.sqrt(np.mean(np.square(moved, dtype=np.float64)))))
             commands = commands[np.abs(commands) > COMMANDED]
             networks.command_scale[joint] = float(np.sqrt(np.mean(np.square(commands, dtype=np.float64))))

@@ -7,21 +7,23 @@ differences of large numbers, and what it learns in one place holds in another u
 Axes: `J` joints, `B` batch, `H` history, `K` steps.
 """
 
+import math
 from itertools import pairwise
 
 import torch
 from torch import nn
 
-FLOW_WIDTH = 16
-"""Hidden units a joint of `SharedFlow`; a curve of the command with a delay needs few."""
+COUPLING_WIDTH = 16
+"""Hidden units a joint of `SharedFlow` and `Load`: a delayed curve of the command and a smooth function of the pose need few."""
 
 
 class SharedFlow(nn.Module):
     """What is left of each joint's flow when together they ask for more than the pump gives.
 
-    Each joint's demand is a small perceptron of its own commands, at least 0, in units of the pump's flow. All joints get the part
-    `min(1, 1 / sum of demands)`, with a rounded corner whose sharpness is learned. A bottleneck like that of the machine: from few
-    moments of shortage, in which only some joints take part, it holds for all combinations of joints.
+    Each joint's demand is a small perceptron of its own commands, in units of the pump's flow. Its last weights are positive (by
+    their logarithm): a ReLU in their place dies where recordings of single joints, which never lack flow, abound. All joints get
+    the part `min(1, 1 / sum of demands)`, with a rounded corner whose sharpness is learned. A bottleneck like that of the machine:
+    from few moments of shortage, in which only some joints take part, it holds for all combinations of joints.
 
     Args:
         num_joints: Number of joints, `J`.
@@ -31,35 +33,48 @@ class SharedFlow(nn.Module):
 
     def __init__(self, num_joints: int, num_history: int, generator: torch.Generator | None = None) -> None:
         super().__init__()
-        self.weight = nn.ParameterList(
-            [
-                nn.Parameter(_uniform(num_joints, num_history, FLOW_WIDTH, generator=generator)),
-                # summed up, full commands ask for about half of the pump: close enough to a shortage to learn from it
-                nn.Parameter(torch.full((num_joints, FLOW_WIDTH, 1), 2.0 / FLOW_WIDTH)),
-            ]
-        )
-        self.bias = nn.ParameterList(
-            [
-                nn.Parameter(_uniform(num_joints, 1, FLOW_WIDTH, fan_in=num_history, generator=generator)),
-                nn.Parameter(torch.zeros(num_joints, 1, 1)),
-            ]
-        )
+        self.weight = nn.Parameter(_uniform(num_joints, num_history, COUPLING_WIDTH, generator=generator))
+        self.bias = nn.Parameter(_uniform(num_joints, 1, COUPLING_WIDTH, fan_in=num_history, generator=generator))
+        # summed up, a full command asks for about half of the pump: close enough to a shortage to learn from it
+        self.log_share = nn.Parameter(torch.full((num_joints, COUPLING_WIDTH, 1), math.log(2.0 / COUPLING_WIDTH)))
         self.log_sharpness = nn.Parameter(torch.full((1, 1, 1), 1.6))
 
     def forward(self, commands: torch.Tensor) -> torch.Tensor:
         """Returns the part of their flow that joints get, `(B,)` in (0, 1], for normalised commands `(J, B, H)`."""
-        hidden = torch.relu(torch.baddbmm(self.bias[0], commands, self.weight[0]))
-        demand = torch.relu(torch.baddbmm(self.bias[1], hidden, self.weight[1])).sum(0).squeeze(1)
+        hidden = torch.relu(torch.baddbmm(self.bias, commands, self.weight))
+        demand = torch.bmm(hidden, self.log_share.exp()).sum(0).squeeze(1)
         sharpness = self.log_sharpness.exp().view(())
         # (1 + demand^s)^(-1/s): min(1, 1 / demand) with a rounded corner
         return torch.exp(-nn.functional.softplus(sharpness * torch.log(demand + 1e-3)) / sharpness)
 
 
+class Load(nn.Module):
+    """How much faster or slower each joint moves each way in a pose, because of the weight it carries there.
+
+    A factor, so that no pose can move a joint that rests.
+
+    Args:
+        num_joints: Number of joints, `J`.
+        generator: Draws the initial weights.
+    """
+
+    def __init__(self, num_joints: int, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(_uniform(num_joints, num_joints, COUPLING_WIDTH, generator=generator))
+        self.bias = nn.Parameter(_uniform(num_joints, 1, COUPLING_WIDTH, fan_in=num_joints, generator=generator))
+        self.out = nn.Parameter(torch.zeros(num_joints, COUPLING_WIDTH, 2))
+
+    def forward(self, position: torch.Tensor) -> torch.Tensor:
+        """Returns the factors forth and back, `(J, B, 2)` in (0, 2), for normalised positions `(J, B)`."""
+        seen = position.T.expand(len(position), -1, -1)
+        return 2.0 * torch.sigmoid(torch.bmm(torch.tanh(torch.baddbmm(self.bias, seen, self.weight)), self.out))
+
+
 class JointNetworks(nn.Module):
     """For each joint a perceptron with two hidden ReLU layers, from `2 H` inputs to the next increment (paper, section III-A).
 
-    Coupled networks differ in two things: each joint also sees the newest positions of the others, so that it can learn how the
-    pose loads it, and all outputs are multiplied by what `SharedFlow` makes of the commands of all.
+    Where they are coupled, their outputs are multiplied by what `SharedFlow` makes of the commands of all joints, and by what
+    `Load` makes of the positions of all.
 
     The last layer is followed by a dead zone of half width `quiet`: an increment smaller than the noise of the measurement is none.
     A machine at rest therefore stays at rest, however long the model runs on its own predictions.
@@ -89,32 +104,28 @@ class JointNetworks(nn.Module):
         sizes = (2 * num_history, width, width, 1)
         weight = [_uniform(num_joints, m, n, generator=generator) for m, n in pairwise(sizes)]
         bias = [_uniform(num_joints, 1, n, fan_in=m, generator=generator) for m, n in pairwise(sizes)]
-        if coupled:
-            own, position = weight[0].split((2 * num_history - 1, 1), 1)
-            weight[0] = torch.cat([own, torch.eye(num_joints)[..., None] * position], 1)  # of the others nothing at first
         self.weight = nn.ParameterList([nn.Parameter(value) for value in weight])
         self.bias = nn.ParameterList([nn.Parameter(value) for value in bias])
         self.flow = SharedFlow(num_joints, num_history, generator) if coupled else None
+        self.load = Load(num_joints, generator) if coupled else None
         for name in ("command_scale", "increment_scale", "position_center", "position_scale", "quiet"):
             self.register_buffer(name, torch.zeros(num_joints) if name in ("position_center", "quiet") else torch.ones(num_joints))
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Returns normalised increments `(J, B)` before the dead zone, for normalised inputs `(J, B, F)`."""
+        """Returns normalised increments `(J, B)` before the dead zone, for normalised inputs `(J, B, 2 H)`."""
         output = self._head(torch.baddbmm(self.bias[0], inputs, self.weight[0]))
-        return output if self.flow is None else output * self.flow(inputs[..., : self.num_history])
+        share = None if self.flow is None else self.flow(inputs[..., : self.num_history])
+        return self._hindered(output, inputs[..., -1], share)
 
     def increment(self, output: torch.Tensor) -> torch.Tensor:
         """Returns increments `(J, B)` in rad or m, after the dead zone, for the network's output `(J, B)`."""
         return self._moved(output) * self.increment_scale[:, None]
 
     def inputs(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Returns normalised inputs `(J, B, F)`: commands, increments, newest position, for `u` and `q` of shape `(J, B, H)`.
-
-        `F` is `2 H`, or `2 H - 1 + J` where a joint sees the positions of all.
-        """
+        """Returns normalised inputs `(J, B, 2 H)`: commands, increments, newest position, for `u` and `q` of shape `(J, B, H)`."""
         commands = u / self.command_scale[:, None, None]
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
-        return torch.cat([commands, increments, self._position(q[..., -1])], 2)
+        return torch.cat([commands, increments, self._position(q[..., -1])[..., None]], 2)
 
     def roll_out(self, u: torch.Tensor, q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
         """Runs freely on its own predictions.
@@ -140,9 +151,10 @@ class JointNetworks(nn.Module):
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
         at, path = q[..., -1], []
         for k in range(steps):
-            state = torch.cat([increments, self._position(at)], 2)
+            position = self._position(at)
+            state = torch.cat([increments, position[..., None]], 2)
             output = self._head(torch.baddbmm(from_commands[k], state, of_state))
-            moved = self._moved(output if shares is None else output * shares[k])
+            moved = self._moved(self._hindered(output, position, None if shares is None else shares[k]))
             at = torch.addcmul(at, moved, self.increment_scale[:, None]).clamp(lower[:, None], upper[:, None])
             increments = torch.cat([increments[..., 1:], moved[..., None]], 2)
             path.append(at)
@@ -153,15 +165,21 @@ class JointNetworks(nn.Module):
         hidden = torch.relu(torch.baddbmm(self.bias[1], torch.relu(hidden), self.weight[1]))
         return torch.baddbmm(self.bias[2], hidden, self.weight[2]).squeeze(2)
 
+    def _hindered(self, output: torch.Tensor, position: torch.Tensor, share: torch.Tensor | None) -> torch.Tensor:
+        """Returns what flow (`share`, `(B,)`) and load leave of outputs `(J, B)` at normalised positions `(J, B)`."""
+        if self.load is None:
+            return output
+        forth, back = self.load(position).unbind(2)
+        return share * (torch.relu(output) * forth - torch.relu(-output) * back)
+
     def _moved(self, output: torch.Tensor) -> torch.Tensor:
         """Returns normalised increments `(J, B)` after the dead zone."""
         quiet = (self.quiet / self.increment_scale)[:, None]
         return output - output.clamp(-quiet, quiet)
 
     def _position(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns the normalised positions that each joint sees, `(J, B, 1)` or `(J, B, J)`, for `q` `(J, B)`."""
-        position = (q - self.position_center[:, None]) / self.position_scale[:, None]
-        return position.T.expand(len(q), -1, -1) if self.coupled else position[..., None]
+        """Returns normalised positions, `(J, B)`."""
+        return (q - self.position_center[:, None]) / self.position_scale[:, None]
 
 
 def _uniform(num_joints: int, *shape: int, fan_in: int | None = None, generator: torch.Generator | None) -> torch.Tensor:

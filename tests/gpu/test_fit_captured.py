@@ -49,7 +49,7 @@ def test_a_captured_update_is_the_update(coupled: bool, horizon: int, machine: M
             networks = JointNetworks(5, 13, 32, coupled, torch.Generator().manual_seed(0))
             networks.increment_scale.fill_(0.01)
             at_work = Descent(networks.cuda(), machine, 3)
-            update = at_work.updater(Windows([recording(machine, 0)], machine, horizon, torch.device("cuda")), 32, 0.2)
+            update = at_work.updater(Windows([recording(machine, 0)], machine, horizon, torch.device("cuda")), 32, 0.2, 0.2)
             assert all((value == 0).all() for name, value in at_work.state().items() if name.startswith("adam"))
             for number in range(10):
                 at_work.steer(number, 0.003, 0.9)

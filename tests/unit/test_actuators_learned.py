@@ -15,7 +15,7 @@ from torch import nn
 from actuators import checkpoint
 from actuators.coupled import Coupled
 from actuators.mlp import Mlp, load
-from actuators.network import FLOW_WIDTH, JointNetworks, SharedFlow
+from actuators.network import JointNetworks, SharedFlow
 from brokk_rl.errors import CheckpointError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -84,28 +84,33 @@ def test_joints_share_a_flow_when_they_ask_for_more_than_there_is() -> None:
         flow.log_sharpness.fill_(5.0)  # a corner as good as sharp
         share = torch.tensor([0.4, 0.8, 0.6])  # of the pump, at full command
         for unit, sign in enumerate((1.0, -1.0)):
-            flow.weight[0][:, 1, unit] = sign  # the command two samples before the newest
-            flow.weight[1][:, unit, 0] = share
+            flow.weight[:, 1, unit] = sign  # the command two samples before the newest
+            flow.log_share[:, unit, 0] = share.log()
     commands = torch.zeros(3, 5, 4)
     commands[0, 0, 1] = 1.0  # alone: 0.4
     commands[:, 1, 1] = torch.tensor([1.0, -1.0, 0.0])  # 1.2
     commands[:, 2, 1] = torch.tensor([-1.0, 1.0, 1.0])  # 1.8
     commands[:, 3, 2] = 1.0  # at another time: nothing
     torch.testing.assert_close(flow(commands), torch.tensor([1.0, 1 / 1.2, 1 / 1.8, 1.0, 1.0]), atol=2e-3, rtol=0)
-    assert flow.weight[0].shape[2] == FLOW_WIDTH
 
 
-def test_coupled_joints_see_the_pose_and_separate_ones_do_not() -> None:
-    u, q = torch.zeros(5, 1, 13), torch.zeros(5, 1, 13)
+def test_the_pose_changes_the_speed_of_coupled_joints_only_and_moves_none_that_rests() -> None:
+    generator = torch.Generator().manual_seed(0)
+    u, q = torch.rand(5, 8, 13, generator=generator) * 2.0 - 1.0, torch.zeros(5, 8, 13)
     other = q.clone()
     other[3] += 0.5
     for coupled in (False, True):
         made = networks(1, coupled)
+        if made.load is not None:
+            torch.nn.init.normal_(made.load.out, generator=generator)
+        here, there = made(made.inputs(u, q)), made(made.inputs(u, other))
+        assert (here[3] != there[3]).all()
+        changed = (here != there)[[0, 1, 2, 4]]
+        assert changed.all() if coupled else not changed.any()
         with torch.no_grad():
-            made.weight[0].add_(0.1)
-        moved = made(made.inputs(u, other)) - made(made.inputs(u, q))
-        assert moved[3].abs() > 1e-4
-        assert bool((moved[[0, 1, 2, 4]].abs() > 1e-4).all()) is coupled
+            made.weight[2].zero_()
+            made.bias[2].zero_()
+        assert (made(made.inputs(u, other)) == 0).all()
 
 
 def test_increments_below_the_noise_are_none() -> None:
@@ -115,7 +120,7 @@ def test_increments_below_the_noise_are_none() -> None:
     torch.testing.assert_close(made.increment(output)[0], torch.tensor([-0.003, 0.0, 0.0, 0.0, 0.002]))
 
 
-@pytest.mark.parametrize("name", ["mlp"])
+@pytest.mark.parametrize("name", ["mlp", "coupled"])
 def test_the_shipped_machine_at_rest_stays_at_rest(name: str, machine: Machine) -> None:
     actuator, num_envs = option("actuator", name), 64
     generator = torch.Generator().manual_seed(0)

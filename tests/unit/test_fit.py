@@ -127,7 +127,7 @@ def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine
     parts = [recording(machine, seed, minutes=0.2) for seed in range(3)]
     marked = [dataclasses.replace(part, q=np.full_like(part.q, number)) for number, part in enumerate(parts)]
     windows = Windows(marked, machine, 7, CPU)
-    draws = [windows.draw(64, 0.5, torch.tensor(key)) for key in (5, 5, 6)]
+    draws = [windows.draw(64, 0.25, 0.25, torch.tensor(key)) for key in (5, 5, 6)]
     assert draws[0][0].shape == draws[0][1].shape == (5, 64, 13 + 7)
     assert torch.equal(draws[0][0], draws[1][0])
     assert not torch.equal(draws[0][0], draws[2][0])
@@ -141,10 +141,19 @@ def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine
 def test_windows_drawn_together_are_the_same_times_for_all_joints(machine: Machine) -> None:
     part = recording(machine)
     clock = np.repeat(np.arange(part.num_samples, dtype=np.float32)[:, None], 5, 1)
-    _, q = Windows([dataclasses.replace(part, q=clock)], machine, 7, CPU).draw(16, 0.2, torch.tensor(1), together=True)
+    _, q = Windows([dataclasses.replace(part, q=clock)], machine, 7, CPU).draw(16, 0.2, 0.2, torch.tensor(1), together=True)
     assert q.shape == (5, 80, 20)
     assert (q == q[:1]).all()
     assert len(q[0, :, 0].unique()) > 60
+
+
+def test_busy_windows_are_those_in_which_most_is_commanded_at_once(machine: Machine) -> None:
+    u = np.zeros((400, 5), dtype=np.float32)
+    u[:, 0] = 0.3
+    u[100:120] = 0.4  # all joints: 39 of 381 windows hold some of it
+    part = dataclasses.replace(recording(machine, minutes=400 / 1200), u=u)
+    found, _ = Windows([part], machine, 7, CPU).draw(40, 0.0, 1.0, torch.tensor(1))
+    assert (found[1:].amax(2) == torch.tensor(0.4)).all()
 
 
 @pytest.mark.parametrize(("noise", "step"), [(3e-4, 0.0), (1e-5, 0.002), (0.0, 0.004)])
@@ -178,3 +187,15 @@ def test_thin_data_is_warned_of(machine: Machine, caplog: pytest.LogCaptureFixtu
     with caplog.at_level(logging.WARNING):
         survey.check_enough([recording(machine, seed, minutes=4.0) for seed in range(5)], machine)
     assert not caplog.text
+
+
+def test_joints_that_never_move_together_are_warned_of(machine: Machine, caplog: pytest.LogCaptureFixture) -> None:
+    part = recording(machine, minutes=8.0)
+    u = np.zeros_like(part.u)
+    u[:, 1] = part.u[:, 1]
+    with caplog.at_level(logging.WARNING):
+        survey.check_together([dataclasses.replace(part, u=u)])
+        assert "several joints are commanded at once for 0.0 min" in caplog.text
+        caplog.clear()
+        survey.check_together([part])
+        assert not caplog.text
