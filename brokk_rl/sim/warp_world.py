@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import torch
 import warp as wp
 
@@ -16,40 +17,13 @@ from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import Drive
 from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.scene import Placement, nominal
+from brokk_rl.sim.warp_solver import MAX_DOFS, Solver
 
 if TYPE_CHECKING:
     from brokk_rl.sim.warp import Warp
 
-# Too few iterations leave a slightly soft contact; what is lost to a full buffer is lost, and that is a fault.
-_LOST = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
 
-
-_CONTACT = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
-"""Constraints of this type and those after it are contacts."""
-
-
-@wp.kernel(enable_backward=False)
-def _keep_peak(
-    num_rows: wp.array[int],
-    kind: wp.array2d[int],
-    contact: wp.array2d[int],
-    force: wp.array2d[float],
-    first_row: wp.array2d[int],
-    peak: wp.array[float],
-):
-    """Raises each world's peak to the sum of the normal forces of its contacts, the first row of each in an elliptic cone.
-
-    The same as the sum of the touch sensors (`sim.native` reads those), for one launch instead of eight.
-    """
-    world = wp.tid()
-    total = wp.float32(0.0)  # a plain literal would be a constant to Warp
-    for row in range(wp.min(num_rows[world], kind.shape[1])):
-        if kind[world, row] >= _CONTACT and first_row[contact[world, row], 0] == row:
-            total += force[world, row]
-    peak[world] = wp.max(peak[world], total)
-
-
-def _advance(model: mjw.Model, data: mjw.Data) -> None:
+def _advance(model: mjw.Model, data: mjw.Data, solve: Solver) -> None:
     """One substep: `mjw.step` for a chain of bodies, without its stages for cameras, deformable bodies, tendons and sensors.
 
     Between contacts the GPU waits for launches, not for arithmetic: every stage that a model does not need costs time.
@@ -63,13 +37,21 @@ def _advance(model: mjw.Model, data: mjw.Data) -> None:
     mjw.fwd_velocity(model, data)
     mjw.fwd_actuation(model, data)
     mjw.fwd_acceleration(model, data, factorize=True)
-    mjw.solve(model, data)
+    solve()
     mjw.implicit(model, data)
 
 
 def _check_is_chain(model: mujoco.MjModel, machine: Machine) -> None:
     """Raises a `ConfigError` for what `_advance` leaves out."""
-    left_out = {"tendons": model.ntendon, "equalities": model.neq, "deformable bodies": model.nflex, "plugins": model.nplugin}
+    left_out = {
+        "tendons": model.ntendon,
+        "equalities": model.neq,
+        "deformable bodies": model.nflex,
+        "plugins": model.nplugin,
+        "friction in joints": model.dof_frictionloss.any(),
+        "torsional friction (condim above 3)": (np.concatenate([model.geom_condim, model.pair_dim]) > 3).any(),
+        f"more than {MAX_DOFS} joints": model.nv > MAX_DOFS,
+    }
     if found := [name for name, count in left_out.items() if count]:
         raise ConfigError(
             f"machine {machine.name}: sim=warp simulates chains of bodies, but its MJCF has {', '.join(found)}; remove them, or "
@@ -110,12 +92,10 @@ class WarpWorld:
         self._views |= {name: wp.to_torch(getattr(model, name)) for name in ("geom_size", "geom_pos")}
         self._placement = Placement(self.model, device, torch.float32)
         self._drive = Drive(self.model, machine, num_worlds, device, torch.float32)
-        rows = data.efc
-        self._forces = [data.nefc, rows.type, rows.id, rows.force, data.contact.efc_address]
         self.q = torch.zeros(num_worlds, machine.num_joints, device=device)
         self.contact_force_n = torch.zeros(num_worlds, device=device)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        self._peak = wp.from_torch(self.contact_force_n)
+        self._solve = Solver(model, data, wp.from_torch(self.contact_force_n))
         home = torch.tensor(machine.home, dtype=torch.float32, device=device).expand(num_worlds, -1)
         self.reset(torch.ones_like(self.faults), home, nominal(num_worlds, device))
 
@@ -126,10 +106,9 @@ class WarpWorld:
         self.contact_force_n.zero_()
         with self._on_torch_stream():
             for _ in range(self._substeps):
-                _advance(self._model, self._data)
-                wp.launch(_keep_peak, self.num_worlds, self._forces, [self._peak])
+                _advance(self._model, self._data, self._solve)
         self.q.copy_(view["qpos"])
-        self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_((view["overflow"] & _LOST) != 0)
+        self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_(view["overflow"] != 0)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.World`."""
@@ -170,6 +149,7 @@ class WarpWorld:
         option = self._model.opt
         option.iterations, option.ls_iterations = spec.iterations, spec.linesearch_iterations
         option.tolerance.fill_(spec.tolerance)
+        option.run_qacc_smooth = False  # our solver has no use for it
         option.warn_overflow = 0  # read on the device into `faults`, not printed from it
 
     @contextlib.contextmanager

@@ -1,0 +1,190 @@
+"""The contact solver of the Warp worlds against MuJoCo C in double precision; kernels compile for some seconds at first use."""
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import warp as wp
+
+from brokk_rl.sim.warp_solver import Solver
+
+NUM_WORLDS = 64
+TOLERANCE = 1e-6
+CONTACTS = (mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS, mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
+ZONES = {mujoco.mjtConstraintState.mjCNSTRSTATE_SATISFIED, mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC}
+ZONES |= {mujoco.mjtConstraintState.mjCNSTRSTATE_CONE}
+
+
+def _arm(num_joints):
+    """An arm whose links end in balls, each with its own friction and one without, above a floor."""
+    opened = [
+        f'<body pos="{0.4 if i else 0} 0 {0 if i else 0.5}"><joint axis="{"0 1 0" if i % 2 else "0 0 1"}" range="-1 1"/>'
+        f'<geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.05" mass="{20 - 2 * i}" contype="0" conaffinity="0"/>'
+        f'<geom type="sphere" pos="0.4 0 0" size="0.1" mass="3" condim="{1 if i == 2 else 3}" friction="{0.2 + 0.2 * i} 0 0"/>'
+        f'<geom type="sphere" pos="0.4 0.2 0" size="0.1" mass="3" friction="{0.8 - 0.1 * i} 0 0"/>'
+        for i in range(num_joints)
+    ]
+    # the floor takes the friction and the dimension of what touches it
+    floor = '<geom type="plane" size="9 9 1" priority="-1" contype="0" conaffinity="1" condim="1"/>'
+    option = '<option cone="elliptic" timestep="0.01" tolerance="0" iterations="200"/>'
+    return mujoco.MjModel.from_xml_string(
+        f'<mujoco><compiler autolimits="true" angle="radian"/>{option}<default><geom contype="1" conaffinity="0"/></default>'
+        f"<worldbody>{floor}{''.join(opened)}{'</body>' * num_joints}</worldbody></mujoco>"
+    )
+
+
+class Problem:
+    """Random states of an arm on a floor, up to where the solver begins; `reference` holds them in MuJoCo C, solved."""
+
+    def __init__(self, num_joints, iterations=30):
+        random = np.random.default_rng(num_joints)
+        self.model = _arm(num_joints)
+        self.reference = []
+        with wp.ScopedDevice("cpu"):
+            self.warp_model = mjw.put_model(self.model)
+            self.data = mjw.make_data(self.model, NUM_WORLDS, nconmax=16, njmax=40)
+        option = self.warp_model.opt
+        option.iterations, option.ls_iterations, option.warn_overflow = iterations, 20, 0
+        option.tolerance.fill_(TOLERANCE)
+        for world in range(NUM_WORLDS):
+            data = mujoco.MjData(self.model)
+            data.qpos = random.uniform(-1.1, 1.1, num_joints)
+            data.qpos[1::2] = random.uniform(-0.2, 1.1, data.qpos[1::2].shape)  # down
+            data.qvel = random.normal(scale=random.choice([0.1, 2.0]), size=num_joints)
+            data.qfrc_applied = random.normal(scale=50.0, size=num_joints)
+            data.qacc_warmstart = random.normal(scale=10.0, size=num_joints)
+            for name in ("qpos", "qvel", "qfrc_applied", "qacc_warmstart"):
+                wp.to_torch(getattr(self.data, name))[world] = wp.to_torch(wp.array(getattr(data, name), dtype=float, device="cpu"))
+            mujoco.mj_forward(self.model, data)
+            self.reference.append(data)
+        self.peak = wp.zeros(NUM_WORLDS, dtype=float, device="cpu")
+        self.solve = Solver(self.warp_model, self.data, self.peak)
+        self.prepare()
+
+    def prepare(self):
+        mjw.fwd_position(self.warp_model, self.data)
+        mjw.fwd_velocity(self.warp_model, self.data)
+        mjw.fwd_actuation(self.warp_model, self.data)
+        mjw.fwd_acceleration(self.warp_model, self.data)
+
+    def found(self):
+        """Solves and returns accelerations, forces of the rows and of the joints, and iterations."""
+        self.solve()
+        data = self.data
+        arrays = (data.qacc, data.efc.force, data.qfrc_constraint, data.solver_niter, self.peak)
+        return [array.numpy().copy() for array in arrays]
+
+
+def _cost(data, acceleration):
+    """MuJoCo's primal cost over its scale (documentation, "Primal problem"), in double precision from what `data` holds."""
+    model = data.model
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    away = acceleration - data.qacc_smooth
+    cost = np.zeros(1)
+    residual = data.efc_J.reshape(-1, model.nv) @ acceleration - data.efc_aref
+    mujoco.mj_constraintUpdate(model, data, residual, cost, 0)
+    return (0.5 * away @ inertia @ away + cost[0]) / np.trace(inertia)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return Problem(num_joints=5)
+
+
+def test_the_problems_cover_every_zone_of_the_cone_with_limits_and_without_any_constraint(problem):
+    seen = {(data.efc_type[row], data.efc_state[row]) for data in problem.reference for row in range(data.nefc)}
+    assert {(CONTACTS[1], zone) for zone in ZONES} <= seen
+    assert CONTACTS[0] in {kind for kind, _ in seen}
+    both = [{*data.efc_type} for data in problem.reference]
+    assert sum({mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, CONTACTS[1]} <= kinds for kinds in both) > 5
+    assert sum(data.nefc == 0 for data in problem.reference) > 2
+
+
+@pytest.mark.parametrize("num_joints", [3, 5, 8])
+def test_accelerations_and_forces_are_those_of_mujoco_c(num_joints):
+    problem = Problem(num_joints)
+    acceleration, _, force, _, peak = problem.found()
+    for world, data in enumerate(problem.reference):
+        np.testing.assert_allclose(acceleration[world], data.qacc, rtol=2e-3, atol=2e-3 * np.abs(data.qacc).max())
+        np.testing.assert_allclose(force[world], data.qfrc_constraint, rtol=2e-3, atol=2e-3 * np.abs(data.qfrc_constraint).max())
+        normal = [data.efc_force[c.efc_address] for c in data.contact if c.efc_address >= 0]
+        np.testing.assert_allclose(peak[world], sum(normal), rtol=5e-3, atol=0.1)
+
+
+def test_rows_and_accelerations_are_those_of_mujoco_warp(problem):
+    """The same rows, so that forces can be compared one by one; only several contacts of a link may share theirs otherwise."""
+    ours = problem.found()
+    mjw.solve(problem.warp_model, problem.data)
+    theirs = [array.numpy() for array in (problem.data.qacc, problem.data.efc.force)]
+    num_rows = problem.data.nefc.numpy()
+    for world in range(NUM_WORLDS):
+        scale = np.abs(theirs[0][world]).max()
+        np.testing.assert_allclose(ours[0][world], theirs[0][world], atol=2e-3 * scale)
+        if 0 < num_rows[world] <= problem.model.nv:
+            rows = slice(num_rows[world])
+            largest = np.abs(theirs[1][world, rows]).max()
+            np.testing.assert_allclose(ours[1][world, rows], theirs[1][world, rows], atol=5e-3 * largest)
+
+
+def test_the_cost_is_within_the_tolerance_of_its_minimum(problem):
+    found, _, _, iterations, _ = problem.found()
+    assert iterations.max() < 15
+    for acceleration, data in zip(found, problem.reference, strict=True):
+        least = _cost(data, data.qacc)
+        assert _cost(data, acceleration.astype(float)) - least < 2.0 * TOLERANCE + 1e-9 * least  # float32 gets no closer
+
+
+def test_from_the_solution_no_iteration_is_needed(problem):
+    before = problem.data.qacc_warmstart.numpy().copy()
+    problem.found()
+    wp.copy(problem.data.qacc_warmstart, problem.data.qacc)
+    *_, iterations, _ = problem.found()
+    problem.data.qacc_warmstart.assign(before)
+    assert iterations.max() <= 1 and np.median(iterations) == 0
+
+
+def test_the_same_problem_gives_the_same_bits_on_one_thread_and_on_a_warp_nearly(problem, monkeypatch):
+    first, again = problem.found(), problem.found()
+    assert all(np.array_equal(a, b) for a, b in zip(first[:4], again[:4], strict=True))
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    shared = problem.found()
+    np.testing.assert_allclose(shared[0], first[0], rtol=1e-3, atol=1e-3 * np.abs(first[0]).max())
+    problem.peak.zero_()
+    np.testing.assert_allclose(problem.found()[4], first[4], rtol=1e-3, atol=0.1)
+
+
+def test_nan_stays_in_its_world():
+    problem = Problem(num_joints=3)
+    sound = problem.found()
+    wp.to_torch(problem.data.qacc_warmstart)[7] = float("nan")
+    wp.to_torch(problem.data.qfrc_smooth)[9] = float("nan")
+    ill = problem.found()
+    others = np.delete(np.arange(NUM_WORLDS), [7, 9])
+    assert np.isnan(ill[0][9]).all()
+    for a, b in zip(sound[:4], ill[:4], strict=True):
+        assert np.array_equal(a[others], b[others])
+
+
+def test_too_few_iterations_stop_the_loop_and_are_counted():
+    *_, iterations, _ = Problem(num_joints=5, iterations=2).found()
+    assert iterations.max() == 2
+
+
+def test_a_stopped_slide_takes_the_mean_of_what_it_would_and_what_the_stop_wants_by_their_weights():
+    """A mass m pulled to x0 behind its stop, which wants a with weight D: x = (m x0 + D a) / (m + D)."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><compiler autolimits="true"/><option gravity="0 0 0" cone="elliptic"/><worldbody><body>'
+        '<joint type="slide" axis="1 0 0" range="0 1"/><geom size="0.1" mass="4"/></body></worldbody></mujoco>'
+    )
+    with wp.ScopedDevice("cpu"):
+        warp_model, data = mjw.put_model(model), mjw.make_data(model, 2, nconmax=1, njmax=4)
+        warp_model.opt.tolerance.fill_(TOLERANCE)
+        data.qpos.fill_(-0.01)
+        data.qfrc_applied.assign([[-8.0], [800_000.0]])
+        for stage in (mjw.fwd_position, mjw.fwd_velocity, mjw.fwd_actuation, mjw.fwd_acceleration):
+            stage(warp_model, data)
+        Solver(warp_model, data, wp.zeros(2, dtype=float))()
+    weight, target = data.efc.D.numpy()[0, 0], data.efc.aref.numpy()[0, 0]
+    np.testing.assert_allclose(data.qacc.numpy(), [[(4.0 * -2.0 + weight * target) / (4.0 + weight)], [200_000.0]], rtol=1e-5)
+    np.testing.assert_allclose(data.efc.force.numpy()[:, 0], [weight * (target - data.qacc.numpy()[0, 0]), 0.0], rtol=1e-5)
