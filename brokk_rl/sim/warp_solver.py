@@ -22,11 +22,10 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from brokk_rl.sim.warp_algebra import algebra
+
 NUM_LANES = 32
 """Threads a world. A block that is one warp sums without waiting; an arm has fewer constraints than that."""
-
-MAX_DOFS = 16
-"""Up to here Warp unrolls the loops over degrees of freedom, so that matrices need no memory."""
 
 _SLOPE_LEFT = wp.constant(0.01)
 """The line search ends where the slope is this part of the slope at its start."""
@@ -89,40 +88,21 @@ def _cone(residual: wp.vec3, stiffness: wp.vec3, mu: float, friction: wp.vec2) -
 
 @functools.cache
 def _kernel(num_dofs: int) -> wp.Kernel:
-    """Returns the solver's kernel for `num_dofs` degrees of freedom: so small that all matrices stay in registers."""
+    """Returns the solver's kernel for `num_dofs` degrees of freedom."""
     n = num_dofs
-    Vector = wp.types.vector(n, wp.float32)
-    Matrix = wp.types.matrix((n, n), wp.float32)
+    Vector, Matrix, inertia_at, solved = algebra(n)
     Rows = wp.types.matrix((3, n), wp.float32)
     System = wp.types.matrix((n, n + 1), wp.float32)
 
     @wp.func
     def system(matrix: Matrix, right: Vector) -> System:
-        """Returns `[matrix | right]`."""
+        """Returns `[matrix | right]`, so that both are summed at once."""
         joined = System()
         for i in range(n):
             for j in range(n):
                 joined[i, j] = matrix[i, j]
             joined[i, n] = right[i]
         return joined
-
-    @wp.func
-    def solved(given: System) -> Vector:
-        """Returns the solution of `[A | b]`; a positive definite A needs no pivots."""
-        rows = System(given)
-        for k in range(n - 1):
-            for i in range(k + 1, n):
-                factor = rows[i, k] / rows[k, k]
-                for j in range(k + 1, n + 1):
-                    rows[i, j] = rows[i, j] - factor * rows[k, j]
-        x = Vector()
-        for back in range(n):
-            k = n - 1 - back
-            left = rows[k, n]
-            for j in range(k + 1, n):
-                left -= rows[k, j] * x[j]
-            x[k] = left / rows[k, k]
-        return x
 
     @wp.func
     def rows_at(constraints: Constraints, world: int, row: int, span: int) -> tuple[Rows, wp.vec3, wp.vec3]:
@@ -177,9 +157,43 @@ def _kernel(num_dofs: int) -> wp.Kernel:
                 total += wp.vec2(-wp.dot(force, along), wp.dot(along, curvature * along))
         return total
 
+    @wp.func
+    def searched(
+        constraints: Constraints,
+        world: int,
+        lane: int,
+        num_rows: int,
+        cone_width: float,
+        x: Vector,
+        step: Vector,
+        start: float,
+        bend: float,
+        descent: float,
+        num_searches: int,
+    ) -> float:
+        """Returns the length of step with the least cost, which is convex along it: Newton's method on its slope, bracketed.
+
+        Without constraints the slope is `start` + length `bend`; with them it begins at -`descent`.
+        """
+        low, high, alpha = wp.float32(0.0), wp.float32(wp.inf), wp.float32(1.0)  # plain literals would be constants to Warp
+        for _ in range(num_searches):
+            part = slope(constraints, world, lane, num_rows, cone_width, x, step, alpha)
+            sums = wp.tile_reduce(wp.add, wp.tile(part, preserve_type=True))[0]
+            first, second = sums[0] + start + alpha * bend, sums[1] + bend
+            if wp.abs(first) <= _SLOPE_LEFT * descent:
+                break
+            if first < 0.0:
+                low = alpha
+            else:
+                high = alpha
+            alpha = alpha - first / second
+            if alpha <= low or alpha >= high:
+                alpha = 0.5 * (low + high)
+        return alpha
+
     @wp.kernel(module="unique", enable_backward=False)
     def solver(
-        inertia_elements: wp.array2d[float],
+        elements: wp.array2d[float],
         element: wp.array2d[int],
         force: wp.array2d[float],
         warmstart: wp.array2d[float],
@@ -195,57 +209,42 @@ def _kernel(num_dofs: int) -> wp.Kernel:
         peak: wp.array[float],
     ):
         world, lane = wp.tid()
-        inertia = Matrix()
-        smooth, x = Vector(), Vector()
+        inertia = inertia_at(elements, element, world)
+        smooth, x, residual, gradient = Vector(), Vector(), Vector(), Vector()
         for i in range(n):
-            for j in range(i + 1):
-                if element[i, j] >= 0:
-                    inertia[i, j] = inertia_elements[world, element[i, j]]
-                    inertia[j, i] = inertia[i, j]
             smooth[i] = force[world, i]
             x[i] = warmstart[world, i]
         num_rows = wp.min(constraints.num_rows[world], constraints.kind.shape[1])
         width = cone_width[world % cone_width.shape[0]]
         bound = tolerance[world % tolerance.shape[0]] * wp.trace(inertia)
-        residual, gradient = Vector(), Vector()
-        taken = wp.int32(0)  # a plain literal would be a constant to Warp
+        taken = wp.int32(0)
         if num_rows == 0:
-            x = solved(system(inertia, smooth))
+            x = solved(inertia, smooth)
         else:
             for _ in range(num_iterations + 1):
                 part = expansion(constraints, world, lane, num_rows, width, x)
                 problem = wp.tile_reduce(wp.add, wp.tile(part, preserve_type=True))[0]
                 residual = inertia * x - smooth
-                problem += system(inertia, residual)
+                hessian = Matrix(inertia)
                 for i in range(n):
-                    gradient[i] = problem[i, n]
-                step = -solved(problem)
+                    for j in range(n):
+                        hessian[i, j] = hessian[i, j] + problem[i, j]
+                    gradient[i] = residual[i] + problem[i, n]
+                step = -solved(hessian, gradient)
                 descent = -wp.dot(gradient, step)
                 if wp.length(gradient) < bound or 0.5 * descent < bound or taken == num_iterations:
                     break
-                # along the step: convex, so that its slope brackets the minimum
                 start, bend = wp.dot(residual, step), wp.dot(step, inertia * step)
-                low, high, alpha = wp.float32(0.0), wp.float32(wp.inf), wp.float32(1.0)
-                for _search in range(num_searches):
-                    part_slope = slope(constraints, world, lane, num_rows, width, x, step, alpha)
-                    sums = wp.tile_reduce(wp.add, wp.tile(part_slope, preserve_type=True))[0]
-                    first, second = sums[0] + start + alpha * bend, sums[1] + bend
-                    if wp.abs(first) <= _SLOPE_LEFT * descent:
-                        break
-                    if first < 0.0:
-                        low = alpha
-                    else:
-                        high = alpha
-                    alpha = alpha - first / second
-                    if alpha <= low or alpha >= high:
-                        alpha = 0.5 * (low + high)
+                alpha = searched(constraints, world, lane, num_rows, width, x, step, start, bend, descent, num_searches)
                 x += alpha * step
                 taken += 1
-        normal = wp.float32(0.0)
-        for row in range(lane, num_rows, wp.block_dim()):
-            if constraints.kind[world, row] >= _FRICTIONLESS and _span(constraints, world, row, num_rows) > 0:
-                normal += constraints.force[world, row]
-        pressure = wp.tile_reduce(wp.add, wp.tile(normal))[0]
+            normal = wp.float32(0.0)
+            for row in range(lane, num_rows, wp.block_dim()):
+                if constraints.kind[world, row] >= _FRICTIONLESS and _span(constraints, world, row, num_rows) > 0:
+                    normal += constraints.force[world, row]
+            pressure = wp.tile_reduce(wp.add, wp.tile(normal))[0]
+            if lane == 0:
+                peak[world] = wp.max(peak[world], pressure)
         if lane == 0:
             moved = inertia * x
             for i in range(n):
@@ -253,7 +252,6 @@ def _kernel(num_dofs: int) -> wp.Kernel:
                 inertial_force[world, i] = moved[i]
                 constraint_force[world, i] = residual[i] - gradient[i]
             iterations[world] = taken
-            peak[world] = wp.max(peak[world], pressure)
 
     return solver
 

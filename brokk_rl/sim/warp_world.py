@@ -17,45 +17,46 @@ from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import Drive
 from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.scene import Placement, nominal
-from brokk_rl.sim.warp_solver import MAX_DOFS, Solver
+from brokk_rl.sim.warp_algebra import MAX_DOFS
+from brokk_rl.sim.warp_dynamics import Dynamics
+from brokk_rl.sim.warp_solver import Solver
 
 if TYPE_CHECKING:
     from brokk_rl.sim.warp import Warp
 
 
-def _advance(model: mjw.Model, data: mjw.Data, solve: Solver) -> None:
-    """One substep: `mjw.step` for a chain of bodies, without its stages for cameras, deformable bodies, tendons and sensors.
+def _advance(model: mjw.Model, data: mjw.Data, dynamics: Dynamics, solve: Solver) -> None:
+    """One substep: `mjw.step` for an arm of a few joints, driven by servos.
 
-    Between contacts the GPU waits for launches, not for arithmetic: every stage that a model does not need costs time.
+    The GPU waits for launches, not for arithmetic, so that every stage that such a model does not need costs time.
     """
     mjw.kinematics(model, data)
-    mjw.com_pos(model, data)
-    mjw.crb(model, data)
+    dynamics.before_contacts()
     mjw.collision(model, data)
     mjw.make_constraint(model, data)
-    mjw.transmission(model, data)
-    mjw.fwd_velocity(model, data)
-    mjw.fwd_actuation(model, data)
-    mjw.fwd_acceleration(model, data, factorize=True)
     solve()
-    mjw.implicit(model, data)
+    dynamics.after_contacts()
 
 
-def _check_is_chain(model: mujoco.MjModel, machine: Machine) -> None:
+def _check_is_arm(model: mujoco.MjModel, machine: Machine) -> None:
     """Raises a `ConfigError` for what `_advance` leaves out."""
+    passive = (model.jnt_stiffness, model.dof_damping, model.body_gravcomp, model.opt.density, model.opt.viscosity)
     left_out = {
         "tendons": model.ntendon,
         "equalities": model.neq,
         "deformable bodies": model.nflex,
         "plugins": model.nplugin,
+        "actuators": model.nu != machine.num_joints,
+        "branches": (model.dof_parentid != np.arange(-1, model.nv - 1)).any(),
         "friction in joints": model.dof_frictionloss.any(),
+        "springs, dampers or fluids": any(np.any(values) for values in passive),
         "torsional friction (condim above 3)": (np.concatenate([model.geom_condim, model.pair_dim]) > 3).any(),
         f"more than {MAX_DOFS} joints": model.nv > MAX_DOFS,
     }
     if found := [name for name, count in left_out.items() if count]:
         raise ConfigError(
-            f"machine {machine.name}: sim=warp simulates chains of bodies, but its MJCF has {', '.join(found)}; remove them, or "
-            "choose sim=native"
+            f"machine {machine.name}: sim=warp simulates arms that are one chain of links, but its MJCF has {', '.join(found)}; "
+            "remove them, or choose sim=native"
         )
 
 
@@ -78,7 +79,7 @@ class WarpWorld:
         self.supports_graphs = device.type == "cuda"
         self._substeps = spec.substeps
         self.model = compile_model(machine, machine.period_s / spec.substeps)
-        _check_is_chain(self.model, machine)
+        _check_is_arm(self.model, machine)
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
         self._warp_device = wp.device_from_torch(device)
@@ -95,6 +96,7 @@ class WarpWorld:
         self.q = torch.zeros(num_worlds, machine.num_joints, device=device)
         self.contact_force_n = torch.zeros(num_worlds, device=device)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self._dynamics = Dynamics(self.model, model, data)
         self._solve = Solver(model, data, wp.from_torch(self.contact_force_n))
         home = torch.tensor(machine.home, dtype=torch.float32, device=device).expand(num_worlds, -1)
         self.reset(torch.ones_like(self.faults), home, nominal(num_worlds, device))
@@ -106,7 +108,7 @@ class WarpWorld:
         self.contact_force_n.zero_()
         with self._on_torch_stream():
             for _ in range(self._substeps):
-                _advance(self._model, self._data, self._solve)
+                _advance(self._model, self._data, self._dynamics, self._solve)
         self.q.copy_(view["qpos"])
         self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_(view["overflow"] != 0)
 
@@ -149,7 +151,7 @@ class WarpWorld:
         option = self._model.opt
         option.iterations, option.ls_iterations = spec.iterations, spec.linesearch_iterations
         option.tolerance.fill_(spec.tolerance)
-        option.run_qacc_smooth = False  # our solver has no use for it
+        option.disableflags |= int(mjw.DisableBit.FRICTIONLOSS)  # there is none, see `_check_is_arm`
         option.warn_overflow = 0  # read on the device into `faults`, not printed from it
 
     @contextlib.contextmanager

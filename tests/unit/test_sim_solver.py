@@ -16,20 +16,21 @@ ZONES |= {mujoco.mjtConstraintState.mjCNSTRSTATE_CONE}
 
 
 def _arm(num_joints):
-    """An arm whose links end in balls, each with its own friction and one without, above a floor."""
+    """An arm whose links end in balls, each with its own friction, one without and some with more sideways, above a floor."""
     opened = [
         f'<body pos="{0.4 if i else 0} 0 {0 if i else 0.5}"><joint axis="{"0 1 0" if i % 2 else "0 0 1"}" range="-1 1"/>'
         f'<geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.05" mass="{20 - 2 * i}" contype="0" conaffinity="0"/>'
         f'<geom type="sphere" pos="0.4 0 0" size="0.1" mass="3" condim="{1 if i == 2 else 3}" friction="{0.2 + 0.2 * i} 0 0"/>'
-        f'<geom type="sphere" pos="0.4 0.2 0" size="0.1" mass="3" friction="{0.8 - 0.1 * i} 0 0"/>'
+        f'<geom name="side{i}" type="sphere" pos="0.4 0.2 0" size="0.1" mass="3" contype="0"/>'
         for i in range(num_joints)
     ]
+    pairs = "".join(f'<pair geom1="floor" geom2="side{i}" friction="0.3 {0.4 + 0.1 * i}"/>' for i in range(num_joints))
     # the floor takes the friction and the dimension of what touches it
-    floor = '<geom type="plane" size="9 9 1" priority="-1" contype="0" conaffinity="1" condim="1"/>'
-    option = '<option cone="elliptic" timestep="0.01" tolerance="0" iterations="200"/>'
+    floor = '<geom name="floor" type="plane" size="9 9 1" priority="-1" contype="0" conaffinity="1" condim="1"/>'
+    option = '<option cone="elliptic" impratio="2" timestep="0.01" tolerance="0" iterations="200"/>'
     return mujoco.MjModel.from_xml_string(
         f'<mujoco><compiler autolimits="true" angle="radian"/>{option}<default><geom contype="1" conaffinity="0"/></default>'
-        f"<worldbody>{floor}{''.join(opened)}{'</body>' * num_joints}</worldbody></mujoco>"
+        f"<worldbody>{floor}{''.join(opened)}{'</body>' * num_joints}</worldbody><contact>{pairs}</contact></mujoco>"
     )
 
 

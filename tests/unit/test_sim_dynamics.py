@@ -1,0 +1,129 @@
+"""Dynamics of an arm in the Warp worlds against MuJoCo C in double precision; kernels compile for some seconds at first use."""
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import warp as wp
+
+from brokk_rl.sim.warp_dynamics import Dynamics
+from brokk_rl.sim.warp_solver import Solver
+
+NUM_WORLDS = 16
+ARM = """
+<mujoco><compiler autolimits="true" angle="radian"/>
+  <option gravity="0 0 0" cone="elliptic" timestep="0.01" integrator="implicitfast" tolerance="1e-10" iterations="100"/>
+  <default><geom contype="0" conaffinity="0"/><default class="ball"><geom type="sphere" contype="1"/></default></default>
+  <worldbody><geom type="plane" size="9 9 1" conaffinity="1"/><body mocap="true" pos="0 9 0"><geom size="0.1"/></body>
+    <body pos="0 0 1"><geom type="box" size="0.3 0.2 0.1" mass="90"/>
+      <body pos="0.1 0 0.2"><joint axis="0 0 1" range="-9 9"/>
+        <geom type="box" size="0.3 0.1 0.1" pos="0.2 0.1 0" euler="0.2 0.4 0" mass="30"/>
+        <body pos="0.5 0 0.1" euler="0 0.3 0.1"><joint axis="0 1 0.2" pos="0.05 0 0.1" range="-9 9" armature="3"/>
+          <geom type="capsule" fromto="0 0 0 0.5 0 0.1" size="0.05" mass="20"/>
+          <body pos="0.5 0 0"><joint type="slide" axis="1 0 0.1" range="-9 9"/><geom type="box" size="0.2 0.05 0.1" mass="12"/>
+            <body pos="0.2 0.1 0"><geom class="ball" size="0.1" mass="5"/></body>
+            <body pos="0.4 0 0"><joint axis="0 1 0" range="-9 9"/>
+              <inertial pos="0.1 0.02 0" mass="8" fullinertia="0.4 0.3 0.2 0.01 0.02 0.03"/>
+              <geom class="ball" pos="0.4 0 0" size="0.15" mass="6"/></body></body></body></body></body></worldbody>
+  <actuator>{servos}</actuator></mujoco>
+"""
+
+
+class Arms:
+    """Random states of an arm with hinges, a slide and bodies welded on, on the device and in `reference`."""
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(ARM.format(servos=""))
+        names = [f"j{i}" for i in range(self.model.njnt)]
+        spec = mujoco.MjSpec.from_string(ARM.format(servos=""))
+        for name, joint in zip(names, spec.joints, strict=True):
+            joint.name = name
+            servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            servo.set_to_intvelocity(kp=4_000.0, kv=150.0)
+            servo.forcelimited, servo.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, (-900.0, 900.0)
+            servo.actlimited = servo.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        self.model = spec.compile()
+        random = np.random.default_rng(0)
+        with wp.ScopedDevice("cpu"):
+            self.device_model = mjw.put_model(self.model)
+            self.data = mjw.make_data(self.model, NUM_WORLDS, nconmax=16, njmax=40)
+            self.device_model.opt.iterations = 50
+            self.dynamics = Dynamics(self.model, self.device_model, self.data)
+            self.solve = Solver(self.device_model, self.data, wp.zeros(NUM_WORLDS, dtype=float))
+        self.reference = []
+        for world in range(NUM_WORLDS):
+            data = mujoco.MjData(self.model)
+            data.qpos, data.qvel = random.uniform(-1.0, 1.0, self.model.nq), random.normal(size=self.model.nv)
+            data.act, data.ctrl = data.qpos + random.normal(scale=0.2, size=self.model.na), random.normal(size=self.model.nu)
+            for name in ("qpos", "qvel", "act", "ctrl"):
+                wp.to_torch(getattr(self.data, name))[world] = wp.to_torch(wp.array(getattr(data, name), dtype=float, device="cpu"))
+            mujoco.mj_forward(self.model, data)
+            self.reference.append(data)
+
+    def prepare(self):
+        mjw.kinematics(self.device_model, self.data)
+        self.dynamics.before_contacts()
+
+    def step(self):
+        self.prepare()
+        mjw.collision(self.device_model, self.data)
+        mjw.make_constraint(self.device_model, self.data)
+        self.solve()
+        self.dynamics.after_contacts()
+
+
+@pytest.fixture
+def arms():
+    return Arms()
+
+
+def test_mass_matrix_and_forces_are_those_of_mujoco_c(arms):
+    arms.prepare()
+    rows, columns = np.tril_indices(arms.model.nv)
+    found = arms.data.M.numpy()[:, arms.device_model.M_elemid.numpy()[rows, columns]]
+    for world, data in enumerate(arms.reference):
+        inertia = np.zeros((arms.model.nv, arms.model.nv))
+        mujoco.mj_fullM(arms.model, data, inertia)
+        np.testing.assert_allclose(found[world], inertia[rows, columns], rtol=1e-5, atol=1e-5 * np.trace(inertia))
+        np.testing.assert_allclose(arms.data.qfrc_smooth.numpy()[world], data.qfrc_smooth, rtol=1e-4, atol=2e-3)
+    cut = np.abs(arms.data.actuator_force.numpy()) == 900.0
+    assert cut.any() and not cut.all()
+
+
+def test_the_motion_of_a_point_is_that_of_mujoco_c(arms):
+    """From `cdof` and the point that it is measured from, as contact Jacobians are made."""
+    arms.prepare()
+    last, root = arms.model.nbody - 1, arms.model.body_rootid[arms.model.nbody - 1]
+    motion = arms.data.cdof.numpy()
+    for world, data in enumerate(arms.reference):
+        point, expected = data.geom_xpos[-1], np.zeros((3, arms.model.nv))
+        mujoco.mj_jac(arms.model, data, expected, None, point, last)
+        to = point - arms.data.subtree_com.numpy()[world, root]
+        np.testing.assert_allclose((motion[world, :, 3:] + np.cross(motion[world, :, :3], to)).T, expected, atol=1e-5)
+
+
+def test_a_hundred_substeps_with_servos_at_their_limit_and_contact_are_those_of_mujoco_c(arms):
+    touched = 0
+    for _ in range(100):
+        arms.step()
+        for data in arms.reference:
+            mujoco.mj_step(arms.model, data)
+            touched += data.ncon > 0
+    assert touched > 20
+    apart = [np.abs(arms.data.qpos.numpy()[world] - data.qpos).max() for world, data in enumerate(arms.reference)]
+    assert np.median(apart) < 1e-4 and sum(a < 5e-3 for a in apart) >= NUM_WORLDS - 1
+    np.testing.assert_allclose(arms.data.act.numpy()[0], arms.reference[0].act, atol=1e-5)
+    np.testing.assert_allclose(arms.data.time.numpy(), 1.0, rtol=1e-5)
+    assert not arms.data.overflow.numpy().any()
+
+
+def test_rows_contacts_and_pairs_without_room_are_reported(arms):
+    data = arms.data
+    data.nefc.fill_(0)
+    data.nefc[3:4].fill_(data.njmax + 1)
+    arms.dynamics.after_contacts()
+    assert (data.overflow.numpy() == np.where(np.arange(NUM_WORLDS) == 3, int(mjw.OverflowType.NEFC), 0)).all()
+    data.nacon.fill_(data.naconmax + 1)
+    data.ncollision.fill_(data.naconmax + 1)
+    arms.dynamics.after_contacts()
+    assert (data.overflow.numpy() & int(mjw.OverflowType.NARROWPHASE | mjw.OverflowType.BROADPHASE) != 0).all()
