@@ -32,14 +32,24 @@ _SLOPE_LEFT = wp.constant(0.01)
 
 _FRICTIONLESS = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
 _ELLIPTIC = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC))
-
-
-_FRICTION = wp.types.vector(5, wp.float32)
+_FRICTION = wp.types.vector(5, wp.float32)  # what MuJoCo keeps of a contact: tangential (2), torsional, rolling (2)
 
 
 @wp.struct
 class Constraints:
-    """Rows of all worlds as `mujoco_warp.make_constraint` leaves them; the three rows of a contact follow each other."""
+    """Rows of all worlds as `mujoco_warp.make_constraint` leaves them; the three rows of a contact follow each other.
+
+    Attributes:
+        num_rows: Rows of each world that are wanted; there may be room for fewer.
+        kind: `mjtConstraint` of each row.
+        contact: Number of each row's contact, where it is of one.
+        first_row: First row of each contact, in column 0.
+        friction: Of each contact.
+        jacobian: J.
+        stiffness: D.
+        target: The acceleration a that each row wants.
+        force: Written: the force of each row.
+    """
 
     num_rows: wp.array[int]
     kind: wp.array2d[int]

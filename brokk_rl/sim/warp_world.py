@@ -64,8 +64,7 @@ class WarpWorld:
     """Fulfils `brokk_rl.contracts.World` on a GPU (or, for tests, on the CPU).
 
     All tensors are views of Warp's arrays. `step` and `reset` use torch's current stream and keep every address, so that the caller
-    may capture them together with its own torch operations inside `torch.cuda.graph`. Outside a capture the solver's loop asks the
-    host after each iteration, which is slow.
+    may capture them together with its own torch operations inside `torch.cuda.graph`.
 
     Args:
         spec: Sizes and solver settings.

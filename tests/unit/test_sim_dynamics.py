@@ -44,12 +44,11 @@ class Arms:
             servo.actlimited = servo.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
         self.model = spec.compile()
         random = np.random.default_rng(0)
-        with wp.ScopedDevice("cpu"):
-            self.device_model = mjw.put_model(self.model)
-            self.data = mjw.make_data(self.model, NUM_WORLDS, nconmax=16, njmax=40)
-            self.device_model.opt.iterations = 50
-            self.dynamics = Dynamics(self.model, self.device_model, self.data)
-            self.solve = Solver(self.device_model, self.data, wp.zeros(NUM_WORLDS, dtype=float))
+        self.device_model = mjw.put_model(self.model)
+        self.data = mjw.make_data(self.model, NUM_WORLDS, nconmax=16, njmax=40)
+        self.device_model.opt.iterations = 50
+        self.dynamics = Dynamics(self.model, self.device_model, self.data)
+        self.solve = Solver(self.device_model, self.data, wp.zeros(NUM_WORLDS, dtype=float))
         self.reference = []
         for world in range(NUM_WORLDS):
             data = mujoco.MjData(self.model)
@@ -70,6 +69,13 @@ class Arms:
         mjw.make_constraint(self.device_model, self.data)
         self.solve()
         self.dynamics.after_contacts()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _device():
+    """A GPU where there is one."""
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        yield
 
 
 @pytest.fixture

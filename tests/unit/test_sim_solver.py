@@ -41,9 +41,8 @@ class Problem:
         random = np.random.default_rng(num_joints)
         self.model = _arm(num_joints)
         self.reference = []
-        with wp.ScopedDevice("cpu"):
-            self.warp_model = mjw.put_model(self.model)
-            self.data = mjw.make_data(self.model, NUM_WORLDS, nconmax=16, njmax=40)
+        self.warp_model = mjw.put_model(self.model)
+        self.data = mjw.make_data(self.model, NUM_WORLDS, nconmax=16, njmax=40)
         option = self.warp_model.opt
         option.iterations, option.ls_iterations, option.warn_overflow = iterations, 20, 0
         option.tolerance.fill_(TOLERANCE)
@@ -58,7 +57,7 @@ class Problem:
                 wp.to_torch(getattr(self.data, name))[world] = wp.to_torch(wp.array(getattr(data, name), dtype=float, device="cpu"))
             mujoco.mj_forward(self.model, data)
             self.reference.append(data)
-        self.peak = wp.zeros(NUM_WORLDS, dtype=float, device="cpu")
+        self.peak = wp.zeros(NUM_WORLDS, dtype=float)
         self.solve = Solver(self.warp_model, self.data, self.peak)
         self.prepare()
 
@@ -86,6 +85,13 @@ def _cost(data, acceleration):
     residual = data.efc_J.reshape(-1, model.nv) @ acceleration - data.efc_aref
     mujoco.mj_constraintUpdate(model, data, residual, cost, 0)
     return (0.5 * away @ inertia @ away + cost[0]) / np.trace(inertia)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _device():
+    """A GPU where there is one: there a world has 32 threads."""
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -178,14 +184,13 @@ def test_a_stopped_slide_takes_the_mean_of_what_it_would_and_what_the_stop_wants
         '<mujoco><compiler autolimits="true"/><option gravity="0 0 0" cone="elliptic"/><worldbody><body>'
         '<joint type="slide" axis="1 0 0" range="0 1"/><geom size="0.1" mass="4"/></body></worldbody></mujoco>'
     )
-    with wp.ScopedDevice("cpu"):
-        warp_model, data = mjw.put_model(model), mjw.make_data(model, 2, nconmax=1, njmax=4)
-        warp_model.opt.tolerance.fill_(TOLERANCE)
-        data.qpos.fill_(-0.01)
-        data.qfrc_applied.assign([[-8.0], [800_000.0]])
-        for stage in (mjw.fwd_position, mjw.fwd_velocity, mjw.fwd_actuation, mjw.fwd_acceleration):
-            stage(warp_model, data)
-        Solver(warp_model, data, wp.zeros(2, dtype=float))()
+    warp_model, data = mjw.put_model(model), mjw.make_data(model, 2, nconmax=1, njmax=4)
+    warp_model.opt.tolerance.fill_(TOLERANCE)
+    data.qpos.fill_(-0.01)
+    data.qfrc_applied.assign([[-8.0], [800_000.0]])
+    for stage in (mjw.fwd_position, mjw.fwd_velocity, mjw.fwd_actuation, mjw.fwd_acceleration):
+        stage(warp_model, data)
+    Solver(warp_model, data, wp.zeros(2, dtype=float))()
     weight, target = data.efc.D.numpy()[0, 0], data.efc.aref.numpy()[0, 0]
     np.testing.assert_allclose(data.qacc.numpy(), [[(4.0 * -2.0 + weight * target) / (4.0 + weight)], [200_000.0]], rtol=1e-5)
     np.testing.assert_allclose(data.efc.force.numpy()[:, 0], [weight * (target - data.qacc.numpy()[0, 0]), 0.0], rtol=1e-5)
