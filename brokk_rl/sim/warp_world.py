@@ -6,65 +6,30 @@ import contextlib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-import mujoco
 import mujoco_warp as mjw
-import numpy as np
 import torch
 import warp as wp
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import Drive
 from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.scene import Placement, nominal
-from brokk_rl.sim.warp_algebra import MAX_DOFS
-from brokk_rl.sim.warp_dynamics import Dynamics
-from brokk_rl.sim.warp_solver import Solver
+from brokk_rl.sim.warp_substep import check, fused, staged
 
 if TYPE_CHECKING:
     from brokk_rl.sim.warp import Warp
 
 
-def _advance(model: mjw.Model, data: mjw.Data, dynamics: Dynamics, solve: Solver) -> None:
-    """One substep: `mjw.step` for an arm of a few joints, driven by servos.
-
-    The GPU waits for launches, not for arithmetic, so that every stage that such a model does not need costs time.
-    """
-    mjw.kinematics(model, data)
-    dynamics.before_contacts()
-    mjw.collision(model, data)
-    mjw.make_constraint(model, data)
-    solve()
-    dynamics.after_contacts()
-
-
-def _check_is_arm(model: mujoco.MjModel, machine: Machine) -> None:
-    """Raises a `ConfigError` for what `_advance` leaves out."""
-    passive = (model.jnt_stiffness, model.dof_damping, model.body_gravcomp, model.opt.density, model.opt.viscosity)
-    left_out = {
-        "tendons": model.ntendon,
-        "equalities": model.neq,
-        "deformable bodies": model.nflex,
-        "plugins": model.nplugin,
-        "actuators": model.nu != machine.num_joints,
-        "branches": (model.dof_parentid != np.arange(-1, model.nv - 1)).any(),
-        "friction in joints": model.dof_frictionloss.any(),
-        "springs, dampers or fluids": any(np.any(values) for values in passive),
-        "torsional friction (condim above 3)": (np.concatenate([model.geom_condim, model.pair_dim]) > 3).any(),
-        f"more than {MAX_DOFS} joints": model.nv > MAX_DOFS,
-    }
-    if found := [name for name, count in left_out.items() if count]:
-        raise ConfigError(
-            f"machine {machine.name}: sim=warp simulates arms that are one chain of links, but its MJCF has {', '.join(found)}; "
-            "remove them, or choose sim=native"
-        )
+# Too few iterations leave a slightly soft contact; what is lost to a full buffer is lost, and that is a fault.
+_LOST = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
 
 
 class WarpWorld:
     """Fulfils `brokk_rl.contracts.World` on a GPU (or, for tests, on the CPU).
 
     All tensors are views of Warp's arrays. `step` and `reset` use torch's current stream and keep every address, so that the caller
-    may capture them together with its own torch operations inside `torch.cuda.graph`.
+    may capture them together with its own torch operations inside `torch.cuda.graph`. Outside a
+    capture the solver's loop (`fused: false`) asks the host after each iteration, which is slow.
 
     Args:
         spec: Sizes and solver settings.
@@ -78,7 +43,7 @@ class WarpWorld:
         self.supports_graphs = device.type == "cuda"
         self._substeps = spec.substeps
         self.model = compile_model(machine, machine.period_s / spec.substeps)
-        _check_is_arm(self.model, machine)
+        check(self.model, machine, spec.fused)
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
         self._warp_device = wp.device_from_torch(device)
@@ -95,8 +60,8 @@ class WarpWorld:
         self.q = torch.zeros(num_worlds, machine.num_joints, device=device)
         self.contact_force_n = torch.zeros(num_worlds, device=device)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        self._dynamics = Dynamics(self.model, model, data)
-        self._solve = Solver(model, data, wp.from_torch(self.contact_force_n))
+        peak = wp.from_torch(self.contact_force_n)
+        self._substep = fused(self.model, model, data, peak) if spec.fused else staged(model, data, peak)
         home = torch.tensor(machine.home, dtype=torch.float32, device=device).expand(num_worlds, -1)
         self.reset(torch.ones_like(self.faults), home, nominal(num_worlds, device))
 
@@ -107,9 +72,9 @@ class WarpWorld:
         self.contact_force_n.zero_()
         with self._on_torch_stream():
             for _ in range(self._substeps):
-                _advance(self._model, self._data, self._dynamics, self._solve)
+                self._substep()
         self.q.copy_(view["qpos"])
-        self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_(view["overflow"] != 0)
+        self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_((view["overflow"] & _LOST) != 0)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.World`."""
@@ -150,7 +115,7 @@ class WarpWorld:
         option = self._model.opt
         option.iterations, option.ls_iterations = spec.iterations, spec.linesearch_iterations
         option.tolerance.fill_(spec.tolerance)
-        option.disableflags |= int(mjw.DisableBit.FRICTIONLOSS)  # there is none, see `_check_is_arm`
+        option.disableflags |= int(mjw.DisableBit.FRICTIONLOSS)  # there is none, see `check`
         option.warn_overflow = 0  # read on the device into `faults`, not printed from it
 
     @contextlib.contextmanager

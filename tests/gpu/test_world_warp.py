@@ -1,5 +1,7 @@
 """The Warp world on a real GPU: graphs, parity with MuJoCo C, faults."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -11,8 +13,20 @@ pytestmark = pytest.mark.gpu
 
 NUM_WORLDS = 64
 SPEC = Warp(
-    num_worlds=NUM_WORLDS, substeps=5, num_contacts=16, num_constraints=40, iterations=20, linesearch_iterations=20, tolerance=1e-6
+    num_worlds=NUM_WORLDS,
+    substeps=5,
+    num_contacts=16,
+    num_constraints=40,
+    iterations=20,
+    linesearch_iterations=20,
+    tolerance=1e-6,
+    fused=False,
 )
+
+
+@pytest.fixture(params=[False, True], ids=["staged", "fused"])
+def spec(request):
+    return dataclasses.replace(SPEC, fused=request.param)
 
 
 def _captured(world, increment):
@@ -27,8 +41,8 @@ def _captured(world, increment):
     return graph
 
 
-def test_a_captured_control_step_does_what_the_eager_one_does(machine):
-    eager, graphed = (SPEC.build(machine, "cuda") for _ in range(2))
+def test_a_captured_control_step_does_what_the_eager_one_does(machine, spec):
+    eager, graphed = (spec.build(machine, "cuda") for _ in range(2))
     generator = torch.Generator("cuda").manual_seed(0)
     increment = torch.zeros(NUM_WORLDS, machine.num_joints, device="cuda")
     start = graphed.state_dict()
@@ -43,8 +57,8 @@ def test_a_captured_control_step_does_what_the_eager_one_does(machine):
     torch.testing.assert_close(graphed.q, eager.q, atol=1e-6, rtol=0)
 
 
-def test_free_motion_agrees_with_mujoco_c_for_five_seconds(machine):
-    warp = SPEC.build(machine, "cuda")
+def test_free_motion_agrees_with_mujoco_c_for_five_seconds(machine, spec):
+    warp = spec.build(machine, "cuda")
     native = Native(num_worlds=NUM_WORLDS, substeps=5, num_threads=0).build(machine, "cpu")
     generator = torch.Generator().manual_seed(1)
     speed = torch.tensor(machine.max_speed, dtype=torch.float32)
@@ -64,8 +78,8 @@ def test_free_motion_agrees_with_mujoco_c_for_five_seconds(machine):
     torch.testing.assert_close(warp.q.cpu()[still], native.q[still], atol=1e-4, rtol=0)
 
 
-def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine):
-    world = SPEC.build(machine, "cuda")
+def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine, spec):
+    world = spec.build(machine, "cuda")
     increment = torch.zeros(NUM_WORLDS, machine.num_joints, device="cuda")
     increment[3, 1] = float("nan")
     start = world.q.clone()
