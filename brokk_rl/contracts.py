@@ -162,6 +162,38 @@ class Effect(Protocol):
         ...
 
 
+class FollowerModel(Protocol):
+    """From the command that the policy proposes to the one that is given, as a person at the levers does it, in `N` environments.
+
+    `step` works without a host synchronisation and without data-dependent shapes, so that it can be captured in a CUDA graph.
+    """
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Everything needed to go on exactly, by name, each `(N, …)`; written in place. Empty for a follower without memory."""
+        ...
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Puts a new person at the levers in the environments of `mask`, shape `(N,)` bool, who has seen nothing yet."""
+        ...
+
+    def step(self, proposed: torch.Tensor) -> torch.Tensor:
+        """Returns the command given during the coming control period, `(N, J)` in [-1, 1].
+
+        `proposed`, `(N, J)`, is what the policy shows from now on. Where no proposal moves an exclusive joint together with
+        others, what is given does not either.
+        """
+        ...
+
+
+class Follower(Protocol):
+    """A spec in `conf/follower`: builds what stands between policy and machine."""
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> FollowerModel:
+        """Returns followers for `num_envs` environments on `device`."""
+        ...
+
+
 class World(Protocol):
     """Parallel physics: the machine, pushed along by its drive, beside a block with a borehole.
 

@@ -183,7 +183,7 @@ class ToolPoseProcess:
         endings = (success if options.end_on_success else torch.zeros_like(success), failed, touching, fault, timed_out)
         for index in reversed(range(len(REASONS))):
             reason = torch.where(endings[index], float(index), reason)
-        self._count(seen, reward, success)
+        self._count(seen, history.u, reward, success)
         state["closeness"].copy_(verdict["closeness"])
         state["contact_force_n"].copy_(force_n)
         return Transition(reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason)
@@ -218,8 +218,8 @@ class ToolPoseProcess:
     def _start(self) -> dict[str, torch.Tensor]:
         return {name.removeprefix("start."): value for name, value in self.state.items() if name.startswith("start.")}
 
-    def _count(self, seen: ToolState, reward: torch.Tensor, success: torch.Tensor) -> None:
-        """Updates the figures of the running episode."""
+    def _count(self, seen: ToolState, given: torch.Tensor, reward: torch.Tensor, success: torch.Tensor) -> None:
+        """Updates the figures of the running episode; `given` are the commands in force, `(N, H, J)`."""
         episode, period_s = self.episode, self._machine.period_s
         new = success & (episode["success_strict"] == 0)
         episode["length"] += 1
@@ -230,7 +230,7 @@ class ToolPoseProcess:
         episode["success_strict"].copy_(torch.where(success, 1.0, episode["success_strict"]))
         episode["success_paper"].copy_(torch.where(seen.paper_success, 1.0, episode["success_paper"]))
         episode["peak_force_n"].copy_(torch.maximum(episode["peak_force_n"], seen.contact_force_n))
-        travel = (seen.u - seen.u_before).abs().sum(1) / period_s
+        travel = (given[:, -1] - given[:, -2]).abs().sum(1) / period_s  # what was given, not what was proposed
         episode["valve_travel"] += (travel - episode["valve_travel"]) / episode["length"]
 
     def _perceive(self, history: History, shift_m: torch.Tensor | None) -> None:

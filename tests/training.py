@@ -24,7 +24,7 @@ TIMES = ("seconds", "rate/env_steps_per_s", "rate/collect_s", "rate/learn_s")
 """Columns of `progress.csv` that differ from run to run."""
 
 
-def plant(machine: Machine, task: Any = None, sim: Any = None) -> Plant:
+def plant(machine: Machine, task: Any = None, sim: Any = None, follower: Any = None) -> Plant:
     """Returns what a small control loop is made of."""
     return Plant(
         machine=machine,
@@ -32,6 +32,7 @@ def plant(machine: Machine, task: Any = None, sim: Any = None) -> Plant:
         task=task or option("task", "borehole_insertion"),
         actuator=option("actuator", "lag"),
         effects={},
+        follower=follower or option("follower", "none"),
     )
 
 

@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from brokk_rl.contracts import Actuator, Effect, Simulator, Task
+from brokk_rl.contracts import Actuator, Effect, Follower, Simulator, Task
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.graph import capture
@@ -55,6 +55,7 @@ class Bench:
         task: Task.
         actuator: Actuator model.
         effect: Effects, by name.
+        follower: Who stands between policy and machine.
         rl: Training configuration.
         bench: What to measure.
     """
@@ -65,13 +66,16 @@ class Bench:
     task: Task
     actuator: Actuator
     effect: dict[str, Effect]
+    follower: Follower
     rl: Training
     bench: Sizes
 
     def run(self) -> float:
         """Measures; returns the training rate of the last row."""
         device = self.session.torch_device()
-        plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect)
+        plant = Plant(
+            machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect, follower=self.follower
+        )
         rows = []
         for num_envs in self.bench.num_envs:
             self.session.seed_all()

@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from brokk_rl.contracts import Actuator, Effect, Policy, Simulator, Task
+from brokk_rl.contracts import Actuator, Effect, Follower, Policy, Simulator, Task
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import Episode, evaluate
@@ -61,6 +61,7 @@ class Evaluate:
         task: What to do.
         actuator: How commands become motion.
         effect: Effects around the actuator model, by name.
+        follower: Who stands between policy and machine.
         policy: The policy in question.
         rivals: Policies beside it, by name.
         evaluation: How to evaluate.
@@ -72,13 +73,16 @@ class Evaluate:
     task: Task
     actuator: Actuator
     effect: dict[str, Effect]
+    follower: Follower
     policy: PolicySpec
     rivals: dict[str, PolicySpec]
     evaluation: Evaluation
 
     def run(self) -> float:
         """Evaluates; returns the strict success of the policy."""
-        plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect)
+        plant = Plant(
+            machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect, follower=self.follower
+        )
         policies = {type(self.policy).__name__.lower(): self.policy} | self.rivals
         results, _ = evaluate_policies(plant, self.evaluation, self.session, policies)
         return float(results["success_strict"]["mean"])
@@ -99,14 +103,17 @@ def evaluate_policies(
         The content of `evaluation.json`, and observation vectors `(B, O)` that the first policy met.
     """
     device = session.torch_device()
+    torch.manual_seed(evaluation.seed)  # from which effects and followers draw, too
     loop = plant.build(device, evaluation.episodes, evaluation.episodes, evaluation.seed)
     loop.capture()
     starts = {key: value.clone() for key, value in loop.starts.items()}
+    fresh = loop.state_dict()
     table: dict[str, Any] = {}
     recorded: dict[str, list[Episode]] = {}
     seen: dict[str, torch.Tensor] = {}
     for name, policy in policies.items():
         log.info("evaluating %s over %d episodes", name, evaluation.episodes)
+        loop.load_state_dict(fresh)  # every policy meets the same machines and persons
         acting = policy.build(loop, session.seed)
         table[name], recorded[name], seen[name] = evaluate(loop, acting, starts, evaluation.seed, evaluation.num_recorded)
     first = next(iter(policies))
@@ -114,6 +121,7 @@ def evaluate_policies(
         **table[first],
         "seed": evaluation.seed,
         "actuator": type(plant.actuator).__name__.lower(),
+        "follower": type(plant.follower).__name__.lower(),
         "policy": first,
         "policies": table,
     }

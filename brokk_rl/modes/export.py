@@ -8,8 +8,9 @@ from pathlib import Path
 import torch
 
 from brokk_rl.contracts import Actuator, Simulator, Task
+from brokk_rl.follower import Nobody
 from brokk_rl.machine import Machine
-from brokk_rl.modes.train import find_checkpoint
+from brokk_rl.modes.train import find_checkpoint, follower_of
 from brokk_rl.rl.evaluation import evaluate
 from brokk_rl.rl.export import export_onnx
 from brokk_rl.rl.policy import Network, make_actor, write_bundle
@@ -55,13 +56,14 @@ class Export:
         cpu = torch.device("cpu")
         content = read_checkpoint(path, cpu)
         self.machine.check_fingerprint(content.get("fingerprint", {}), str(path))
-        plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects={})
+        plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects={}, follower=Nobody())
         loop = plant.build(cpu, self.num_checked, self.num_checked, self.session.stream("starts"))
         config = self.rl.runner_config()
         actor = make_actor(config["actor"], config["obs_groups"], loop)
         actor.load_state_dict(content["actor_state_dict"])
         _, _, observations = evaluate(loop, Network(actor, loop), loop.starts, self.session.seed, 1)
         facts = {"checkpoint": str(path), "env_steps": content["book"]["env_steps"], "seconds": content["book"]["seconds"]}
+        facts["follower"] = follower_of(path.parent)
         contract = write_bundle(self.session.folder, actor, self.rl, loop, facts)
         largest = export_onnx(self.session.folder, actor, loop.task, contract, observations)
         log.info(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import torch
+import yaml
 
-from brokk_rl.contracts import Actuator, Effect, Simulator, Task
+from brokk_rl.contracts import Actuator, Effect, Follower, Simulator, Task
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import Evaluation, evaluate_policies
@@ -18,7 +20,7 @@ from brokk_rl.rl.policy import Classical, Trained, Untrained, write_bundle
 from brokk_rl.rl.runner import Runner, Training, checkpoints
 from brokk_rl.rl.tracking import Tracking
 from brokk_rl.rl.vec_env import Plant
-from brokk_rl.session import Session
+from brokk_rl.session import RESOLVED, Session
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -35,6 +37,7 @@ class Train:
         task: What to do.
         actuator: How commands become motion.
         effect: Effects around the actuator model, by name.
+        follower: Who stands between policy and machine.
         rl: How to train.
         tracking: Where figures go beside the run folder.
         evaluation: How to evaluate at the end.
@@ -47,6 +50,7 @@ class Train:
     task: Task
     actuator: Actuator
     effect: dict[str, Effect]
+    follower: Follower
     rl: Training
     tracking: Tracking
     evaluation: Evaluation
@@ -57,7 +61,9 @@ class Train:
         checkpoint = find_checkpoint(Path(self.resume)) if self.resume else None
         device, folder = self.session.torch_device(), self.session.folder
         self.session.seed_all()
-        plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect)
+        plant = Plant(
+            machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect, follower=self.follower
+        )
         loop = plant.build(device, self.rl.num_envs, self.rl.num_starts, self.session.stream("starts"))
         loop.capture(self.rl.fuse)
         state = "active" if loop.graph_active else "not used (they need sim=warp on a GPU)"
@@ -75,6 +81,7 @@ class Train:
             runner.run()
 
         facts = {"env_steps": book.env_steps, "seconds": book.seconds, "seed": self.session.seed, "device": str(device)}
+        facts["follower"] = follower_of(folder)
         actor = runner.alg.get_policy()
         contract = write_bundle(folder, actor, self.rl, loop, facts)
         draw_curves(folder / PROGRESS, folder / "learning_curves.png")
@@ -83,6 +90,12 @@ class Train:
         export_onnx(folder, actor, self.task.build(self.machine, 1, torch.device("cpu")), contract, observations)
         log.info("run folder: %s", folder)
         return float(results["success_strict"]["mean"])
+
+
+def follower_of(folder: Path) -> dict[str, Any] | None:
+    """Returns the `follower` of the run in `folder` as it was configured; `None` where no configuration lies there."""
+    resolved = folder / RESOLVED
+    return yaml.safe_load(resolved.read_text()).get("follower") if resolved.exists() else None
 
 
 def find_checkpoint(path: Path) -> Path:

@@ -1,8 +1,8 @@
 """The control loop of many simulated machines at once, as rsl-rl wants to see it.
 
-One control step is command → actuator model → drive and physics → judgement → resets → observation, all on the device, with fixed
-shapes and without a host synchronisation. Where the world allows it (Warp on a GPU) the whole step is captured once in a CUDA
-graph and replayed.
+One control step is command → follower → actuator model → drive and physics → judgement → resets → observation, all on the device,
+with fixed shapes and without a host synchronisation. Where the world allows it (Warp on a GPU) the whole step is captured once in a
+CUDA graph and replayed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,18 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from brokk_rl.contracts import Actuator, ActuatorModel, Effect, SensingModel, Simulator, Task, TaskProcess, World
+from brokk_rl.contracts import (
+    Actuator,
+    ActuatorModel,
+    Effect,
+    Follower,
+    FollowerModel,
+    SensingModel,
+    Simulator,
+    Task,
+    TaskProcess,
+    World,
+)
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.graph import capture
@@ -32,6 +43,7 @@ class Plant:
         task: Builds the task.
         actuator: Builds the actuator model.
         effects: Effects around the actuator model, by name.
+        follower: Who stands between policy and machine.
     """
 
     machine: Machine
@@ -39,6 +51,7 @@ class Plant:
     task: Task
     actuator: Actuator
     effects: dict[str, Effect]
+    follower: Follower
 
     def build(self, device: torch.device, num_envs: int | None, pool: int, seed: int) -> ControlLoop:
         """Returns the control loop on `device`.
@@ -54,9 +67,10 @@ class Plant:
         model = self.actuator.build(self.machine, num, device)
         for effect in self.effects.values():
             model = effect.wrap(model, self.machine, num, device)
+        follower = self.follower.build(self.machine, num, device)
         process = self.task.build(self.machine, num, device)
         starts = {key: value.to(device) for key, value in process.starts(pool, seed).items()}
-        return ControlLoop(self.machine, world, model, process, starts)
+        return ControlLoop(self.machine, world, model, follower, process, starts)
 
 
 class ControlLoop(VecEnv):
@@ -66,12 +80,15 @@ class ControlLoop(VecEnv):
         machine: The machine.
         world: Physics.
         actuator: Actuator model, effects included.
+        follower: What makes the command given of the one proposed.
         task: Task process.
         starts: Valid starts from which resets draw, each entry `(pool, …)`.
     """
 
-    def __init__(self, machine: Machine, world: World, actuator: ActuatorModel, task: TaskProcess, starts: Starts) -> None:
-        self.machine, self.world, self.actuator, self.task = machine, world, actuator, task
+    def __init__(
+        self, machine: Machine, world: World, actuator: ActuatorModel, follower: FollowerModel, task: TaskProcess, starts: Starts
+    ) -> None:
+        self.machine, self.world, self.actuator, self.follower, self.task = machine, world, actuator, follower, task
         self.num_envs = world.num_worlds
         self.device: torch.device = world.device
         self.num_actions = task.num_actions
@@ -96,7 +113,7 @@ class ControlLoop(VecEnv):
         self.end_q = torch.zeros_like(world.q)
         """Joint positions at the end of the last step, before finished environments began anew, `(N, J)`."""
         self.end_u = torch.zeros_like(world.q)
-        """Commands of the last step, `(N, J)`."""
+        """Commands given in the last step, `(N, J)`; the policy's own where nobody follows it."""
         self.end_force_n = torch.zeros_like(world.contact_force_n)
         """Peak contact force of the last step, likewise, `(N,)`."""
         self._total_names = (*task.episode, *(f"end/{reason}" for reason in task.reasons))
@@ -183,6 +200,7 @@ class ControlLoop(VecEnv):
         state |= {f"task.{name}": value for name, value in self.task.state.items()}
         state |= {f"episode.{name}": value for name, value in self.task.episode.items()}
         state |= {f"actuator.{name}": value for name, value in self.actuator.state.items()}
+        state |= {f"follower.{name}": value for name, value in self.follower.state.items()}
         state |= {f"group.{name}": value for name, value in self._groups.items()}
         return {"tensors": {name: value.clone() for name, value in state.items()}, "world": self.world.state_dict()}
 
@@ -193,7 +211,8 @@ class ControlLoop(VecEnv):
         self.history.u.copy_(tensors["history.u"])
         self.truth.q.copy_(tensors["truth.q"])
         self.truth.u.copy_(tensors["history.u"])
-        parts = {"task": self.task.state, "episode": self.task.episode, "actuator": self.actuator.state, "group": self._groups}
+        parts = {"task": self.task.state, "episode": self.task.episode, "actuator": self.actuator.state}
+        parts |= {"follower": self.follower.state, "group": self._groups}
         for prefix, part in parts.items():
             for name, value in part.items():
                 value.copy_(tensors[f"{prefix}.{name}"])
@@ -207,8 +226,9 @@ class ControlLoop(VecEnv):
         self._perceive(start)
 
     def _command(self) -> torch.Tensor:
-        """Puts the action into force; returns how far the drive shall move each joint, `(N, J)`."""
-        self.end_u.copy_(self.task.command(self._action))
+        """Puts what is given of the action into force; returns how far the drive shall move each joint, `(N, J)`."""
+        # histories hold what was given, as the machine's log does: it is all that policy and actuator model can know
+        self.end_u.copy_(self.follower.step(self.task.command(self._action)))
         self.truth.push_u(self.end_u)
         if self._sensing:
             self.history.push_u(self.end_u)
@@ -236,6 +256,7 @@ class ControlLoop(VecEnv):
         """Resets finished environments and observes all of them."""
         self.truth.reset(self.done, start["q"])
         self.actuator.reset(self.done)
+        self.follower.reset(self.done)
         if self._sensing:
             q = self._sensing.measure(self.truth.q[:, -1])
             self.history.push_q(q)

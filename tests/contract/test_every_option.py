@@ -14,6 +14,7 @@ from brokk_rl.checks import (
     check_effect,
     check_excitation,
     check_finder,
+    check_follower,
     check_link,
     check_task,
     check_world,
@@ -32,6 +33,11 @@ def test_it_is_an_actuator(name: str, machine: Machine) -> None:
 @every("effect")
 def test_it_is_an_effect(name: str, machine: Machine) -> None:
     check_effect(option("effect", name), machine)
+
+
+@every("follower")
+def test_it_is_a_follower(name: str, machine: Machine) -> None:
+    check_follower(option("follower", name), machine)
 
 
 @every("excitation")

@@ -254,7 +254,7 @@ def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
         (-0.5, 0.0, (0.3, 0.0, 0.5)),
     ]
     for command, force_n, at_m in script:
-        stage.process.command(torch.tensor([[command, 0.9, 0.0, 0.0, 0.0]]))  # q2 is masked: not positioning
+        stage.history.push_u(stage.process.command(torch.tensor([[command, 0.9, 0.0, 0.0, 0.0]])))  # q2 is masked: not positioning
         stage.world.contact_force_n.fill_(force_n)
         stage.target_below_tip(*at_m)
         stage.step()

@@ -1,0 +1,82 @@
+"""Checker of followers."""
+
+from __future__ import annotations
+
+import torch
+
+from brokk_rl.checks.exercise import NUM_ENVS, copies, in_place, own_randomness, places, require, require_rows, restore, same
+from brokk_rl.contracts import Follower, FollowerModel
+from brokk_rl.machine import Machine, exclusive_mask
+
+NUM_STEPS = 60
+
+
+def check_follower(follower: Follower, machine: Machine, device: torch.device | str = "cpu") -> None:
+    """Checks what `Follower.build` returns against `FollowerModel`."""
+    place = torch.device(device)
+    with own_randomness():
+        _check_model(follower.build(machine, NUM_ENVS, place), machine, place)
+
+
+def _check_model(model: FollowerModel, machine: Machine, device: torch.device) -> None:
+    everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=device)
+    model.reset(everywhere)
+    require_rows(model.state, "state")
+    place, begin = places(model.state), copies(model.state)
+
+    first = _follow(model, machine, device)
+    shape = (NUM_STEPS, NUM_ENVS, machine.num_joints)
+    require(first.shape == shape, f"step: expected commands of shape {shape[1:]}")
+    require(
+        first.dtype == torch.float32 and first.device.type == device.type, f"step: expected float32 on {device}, got {first.dtype}"
+    )
+    require(bool(first.isfinite().all()), "step: commands are not finite")
+    require(bool((first.abs() <= 1.0).all()), "step: commands leave [-1, 1]")
+    exclusive = torch.as_tensor(machine.is_exclusive, device=device)
+    both = (first[..., exclusive] != 0).any(-1) & (first[..., ~exclusive] != 0).any(-1)
+    require(not bool(both.any()), "step: an exclusive joint moves together with others")
+    require(bool((first != 0).any()), "step: nothing is ever given")
+    require(in_place(model.state, place), "state: a tensor moved or changed its shape; write it in place")
+
+    end = copies(model.state)
+    some = everywhere.clone()
+    some[1:] = False
+    model.reset(some)
+    for name, value in model.state.items():
+        require(same(value[1:], end[name][1:]), f"reset: state '{name}' changed in environments outside the mask")
+
+    restore(model.state, begin)
+    require(
+        same(_follow(model, machine, device), first),
+        "step: from the same state the same proposals lead elsewhere; all memory belongs in state",
+    )
+    restore(model.state, begin)
+    other = _follow(model, machine, device, alter_first=True)
+    require(same(other[:, 1:], first[:, 1:]), "step: what happens in environment 0 changes the others")
+
+    model.reset(everywhere)
+    still = torch.zeros(NUM_ENVS, machine.num_joints, device=device)
+    given = torch.stack([model.step(still).clone() for _ in range(NUM_STEPS)])
+    require(not bool(given.any()), "reset: a new person gives a command that nobody has proposed")
+
+
+def _follow(model: FollowerModel, machine: Machine, device: torch.device, alter_first: bool = False) -> torch.Tensor:
+    """Returns what is given, `(T, N, J)`, where proposals stay for a while, are full, random or none, and change sides."""
+    generator = torch.Generator().manual_seed(0)
+    exclusive = torch.as_tensor(machine.is_exclusive)
+    found = []
+    u = torch.zeros(NUM_ENVS, machine.num_joints)
+    for step in range(NUM_STEPS):
+        if step < 10 or step % 4 == 0:
+            u = torch.rand(u.shape, generator=generator) * 2 - 1
+            u = (u.sign(), u, torch.zeros_like(u))[step % 3]
+            positioning = torch.rand(NUM_ENVS, generator=generator) < 0.5
+            u = torch.where(exclusive_mask(exclusive, positioning), u, 0.0)
+        proposed = u.clone()
+        if alter_first:
+            proposed[0] = -proposed[0].roll(1)
+        proposed = proposed.to(device)
+        kept = proposed.clone()
+        found.append(model.step(proposed).clone())
+        require(same(proposed, kept), "step: changed the proposal")
+    return torch.stack(found)

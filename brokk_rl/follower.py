@@ -1,0 +1,35 @@
+"""Nobody between policy and machine: what is proposed is given.
+
+On the machine a person reads the proposed lever positions and moves the levers, late and imperfectly; such a follower is one of
+`conf/follower`. This is the neutral one, of which every other is a departure.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+@spec
+class Nobody:
+    """Nobody: the policy's command is given as it is, at once."""
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> Direct:
+        """Returns the follower that changes nothing; see `brokk_rl.contracts.Follower`."""
+        return Direct()
+
+
+class Direct:
+    """Gives what is proposed."""
+
+    def __init__(self) -> None:
+        self.state: dict[str, torch.Tensor] = {}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Has no memory."""
+
+    def step(self, proposed: torch.Tensor) -> torch.Tensor:
+        """Returns `proposed`, `(N, J)`."""
+        return proposed
