@@ -4,7 +4,8 @@ One control period, for a proposal `p` that is shown during it:
 
     attention    looks at the display every `attention_s` and goes on with what was seen last
     reaction     what was seen acts `delay_s` later; within the period where it changes, to the fraction
-    choice       an exclusive joint or the others, whichever is asked for more; of those the `joints_at_once` largest
+    choice       an exclusive joint or the others, whichever is asked for more; of those the `joints_at_once` largest, and a lever
+                 once taken is kept for `grip_s`: nobody changes hands twenty times a second
     hand         first-order lag `lag_s` towards it, integrated exactly; a lever that is let go springs back
     amplitude    gain, tremor, the lever's dead zone, the lever's stops
 
@@ -46,6 +47,7 @@ class Person:
         tremor: Standard deviation of the deflection, as a part of it; new in each control period.
         dead_zone: Deflection below which a lever commands nothing; a full one still commands fully. May be given by joint.
         joints_at_once: Levers moved at the same time, the largest first; `null`: all.
+        grip_s: Time for which a lever once taken is kept, as long as it is asked for, before a larger request draws the hand away.
     """
 
     delay_s: Range
@@ -55,6 +57,7 @@ class Person:
     tremor: Range
     dead_zone: Value
     joints_at_once: int | tuple[int, int] | None
+    grip_s: Range
 
     numbers: ClassVar = {
         "delay_s": Number("s", none=0.0, typical=0.3, bounds=(0.0, 2.0), per_joint=False),
@@ -63,6 +66,7 @@ class Person:
         "gain": Number("1", none=1.0, typical=0.85, bounds=(0.1, 3.0), per_joint=False),
         "tremor": Number("1", none=0.0, typical=0.03, bounds=(0.0, 1.0), per_joint=False),
         "dead_zone": Number("1", none=0.0, typical=0.05, bounds=(0.0, 0.5)),
+        "grip_s": Number("s", none=0.0, typical=0.5, bounds=(0.0, 5.0), per_joint=False),
     }
     """What is known about each number; `joints_at_once` is a count."""
 
@@ -112,6 +116,7 @@ class PersonModel:
         self.state = {
             "seen": torch.zeros((num_envs, num_seen, machine.num_joints), device=device),
             "hand": torch.zeros(shape, device=device),
+            "held_s": torch.zeros(shape, device=device),
             "since_look": torch.zeros((num_envs, 1), device=device),
             **self._ranges.state,
         }
@@ -122,6 +127,7 @@ class PersonModel:
         self._ranges.redraw(mask)
         self.state["seen"].masked_fill_(mask[:, None, None], 0.0)
         self.state["hand"].masked_fill_(mask[:, None], 0.0)
+        self.state["held_s"].masked_fill_(mask[:, None], 0.0)
         looking = self._ranges.value["attention_s"] / self._period_s
         self.state["since_look"].copy_(torch.where(mask[:, None], looking, self.state["since_look"]))
 
@@ -162,12 +168,16 @@ class PersonModel:
         free = exclusive_mask(self._exclusive, alone > among)
         if self._levers[0] >= asked.shape[1]:
             return free
-        mine = torch.where(free, priority, -1.0)[:, :, None]
+        taken, held_s = asked != 0, self.state["held_s"]
+        kept = taken & (held_s > 0) & (held_s < self._ranges.value["grip_s"] - 1e-6)
+        mine = torch.where(free, priority + 2.0 * kept, -1.0)[:, :, None]
         others = mine.transpose(1, 2)
         order = torch.arange(asked.shape[1], device=asked.device)
         before = (others > mine) | ((others == mine) & (order < order[:, None]))
         most = self._ranges.value["joints_at_once"].round().clamp(*self._levers)
-        return free & (before.sum(2) < most)
+        held = free & (before.sum(2) < most)
+        held_s.copy_(torch.where(held & taken, held_s + self._period_s, 0.0))
+        return held
 
     def _reach(self, hand: torch.Tensor, target: torch.Tensor, part: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns where the hand is after `part` of a period on its way to `target`, and what that adds to the period's mean."""

@@ -28,6 +28,7 @@ from brokk_rl.session import RESOLVED, Session
 CPU = torch.device("cpu")
 NEUTRAL: dict[str, Any] = {
     "delay_s": 0.0, "lag_s": 0.0, "attention_s": 0.0, "gain": 1.0, "tremor": 0.0, "dead_zone": 0.0, "joints_at_once": None,
+    "grip_s": 0.0,
 }  # fmt: skip
 
 
@@ -132,6 +133,19 @@ def test_few_levers_are_moved_at_once_the_largest_first(machine: Machine) -> Non
     assert torch.equal(follow(machine, proposed, joints_at_once=9), proposed)
 
 
+def test_a_lever_once_taken_is_kept_for_a_while_as_long_as_it_is_asked_for(machine: Machine) -> None:
+    proposed = torch.zeros(8, 5)
+    proposed[:, 0], proposed[1:, 2] = 0.4, 0.8
+    moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
+    assert moved[:, 0].tolist() == [True] * 4 + [False] * 4 and moved[:, 2].tolist() == [False] * 4 + [True] * 4
+    proposed[2, 0] = 0.0
+    moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
+    assert moved[:, 0].tolist() == [True] * 2 + [False] * 6, "what is no longer asked for is let go"
+    proposed[3:] = torch.tensor([0.0, 0.2, 0.0, 0.0, 0.0])
+    moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
+    assert moved[3:, 1].all() and not moved[3:, [0, 2, 3, 4]].any(), "nor is an exclusive joint kept waiting"
+
+
 def test_how_many_levers_is_drawn_evenly(machine: Machine) -> None:
     model = person(joints_at_once=(1, 4)).build(machine, 4000, CPU)
     moved = (model.step(torch.tensor([0.5, 0.0, 0.4, 0.3, 0.2]).expand(4000, 5)) != 0).sum(1)
@@ -150,7 +164,7 @@ def test_the_hand_changes_over_when_the_person_sees_it(machine: Machine) -> None
 @given(
     delay_s=st.floats(0.0, 0.5), lag_s=st.floats(0.0, 0.3), attention_s=st.floats(0.0, 0.5), gain=st.floats(0.5, 1.5),
     dead_zone=st.floats(0.0, 0.2), tremor=st.floats(0.0, 0.2), joints_at_once=st.integers(1, 5) | st.none(),
-    seed=st.integers(0, 99),
+    grip_s=st.floats(0.0, 1.0), seed=st.integers(0, 99),
 )  # fmt: skip
 def test_whoever_it_is_no_joint_moves_beside_an_exclusive_one_and_no_more_than_meant(
     machine: Machine, seed: int, **numbers: Any
