@@ -257,9 +257,26 @@ class Writes(Direct):
     ],
 )
 def test_a_broken_follower_is_found(broken: type[Direct], message: str, machine: Machine) -> None:
-    check_follower(SimpleNamespace(build=lambda *_: Direct()), machine)
+    def spec_of(kind: type[Direct]) -> Any:
+        return SimpleNamespace(build=lambda machine, num_envs, device: kind())
+
+    check_follower(spec_of(Direct), machine)
     with pytest.raises(AssertionError, match=message):
-        check_follower(SimpleNamespace(build=lambda *_: broken()), machine)
+        check_follower(spec_of(broken), machine)
+
+
+def test_a_step_asks_the_host_nothing_and_has_fixed_shapes(machine: Machine) -> None:
+    """Both would break the trace; a CUDA graph can hold what is left."""
+    proposed = exclusive_proposals(machine, 20, num=4)
+    torch.manual_seed(0)
+    plain, traced = (option("follower", "person").build(machine, 4, CPU) for _ in range(2))
+    step = torch.compile(traced.step, backend="eager", fullgraph=True, dynamic=False)
+    reset = torch.compile(traced.reset, backend="eager", fullgraph=True, dynamic=False)
+    for index, shown in enumerate(proposed):
+        assert torch.equal(plain.step(shown), step(shown))
+        mask = torch.arange(4) == index % 8
+        plain.reset(mask)
+        reset(mask)
 
 
 def loop_with(machine: Machine, follower: Any) -> ControlLoop:
