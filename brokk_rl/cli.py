@@ -11,6 +11,7 @@ import re
 import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -19,7 +20,6 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, HydraException, InstantiationException, MissingConfigException
-from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -27,9 +27,10 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 from rich.logging import RichHandler
 
-from brokk_rl import extensions, registry
-from brokk_rl.errors import BrokkError, choices
-from brokk_rl.session import missing_folders, remove_empty
+from brokk_rl import extensions, places, ranks, registry
+from brokk_rl.errors import BrokkError, ConfigError, choices
+from brokk_rl.session import earlier, remove_empty
+from brokk_rl.sweep import SweepFolder
 
 log = logging.getLogger(__name__)
 
@@ -42,13 +43,16 @@ def main() -> int:
     """Runs the command and returns its exit code: 0 done, 1 our own fault, 2 something the user can mend, 130 interrupted."""
     trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
     set_up_logging()
+    # our options of submitit's launchers bear its own names, as everyone knows them; Hydra warns of it three times
+    warnings.filterwarnings("ignore", message=r"\s*'hydra/launcher/\w+' is validated against ConfigStore schema")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a run that a scheduler stops ends like one stopped by hand
     try:
         with _hydra_raises():
             extensions.register(sys.argv[1:])
             hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")(job)()
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
+        if _speaks():
+            sys.stderr.write("interrupted\n")
         return 130
     except (Stopped, Exception) as error:
         SweepFolder.drop_if_unused()
@@ -56,7 +60,7 @@ def main() -> int:
         message = explain(cause)
         if trace or message is None:
             traceback.print_exception(cause)
-        if message is not None:
+        if message is not None and (_speaks() or not isinstance(cause, ConfigError)):  # the first has said what is wrong for all
             sys.stderr.write(f"error: {message}\n")
         return 1 if message is None else 2
     return 0
@@ -66,7 +70,8 @@ def job(cfg: DictConfig) -> float | None:
     """Runs one composed configuration: all of `brokk`, or one job of a sweep."""
     set_up_logging()  # a launcher may run the job in a process of its own
     try:
-        return _run(cfg)
+        with places.taken():
+            return _run(cfg)
     except Exception as error:
         if HydraConfig.get().mode is not RunMode.MULTIRUN:
             raise Stopped(error) from error
@@ -80,21 +85,37 @@ def job(cfg: DictConfig) -> float | None:
 
 def _run(cfg: DictConfig) -> float | None:
     """Instantiates the mode and runs it within its session, where it has one."""
-    cfg = _taken_in(cfg)
+    cfg, sweep = _taken_in(cfg), HydraConfig.get().mode is RunMode.MULTIRUN
     if "session" not in cfg:
+        ranks.check_together(get_class(str(cfg._target_)), sweep)
         return instantiate(cfg, _convert_="all").run()
-    folder = run_folder(cfg)
+    folder, resolved = run_folder(cfg), _resolved(cfg)
     try:
-        mode = instantiate(cfg, session={"out": str(folder)}, _convert_="all")
-        with mode.session.start(_resolved(cfg), _facts(cfg, mode), resume=bool(getattr(mode, "resume", None))) as record:
+        before = earlier(folder, resolved) if sweep else None
+        if before and before.get("outcome") == "finished":
+            log.info("job %s is done already: %s", HydraConfig.get().job.num, folder)
+            return before.get("objective")
+        again = {"resume": str(folder)} if before and "resume" in cfg and cfg.resume is None else {}
+        mode = instantiate(cfg, session={"out": str(folder)}, **again, _convert_="all")
+        ranks.check_together(type(mode), sweep)
+        resume = bool(before or getattr(mode, "resume", None))
+        with mode.session.start(resolved, _facts(cfg, mode), resume) as record:
             objective = mode.run()
             record.fields["objective"] = objective if objective is not None and math.isfinite(objective) else None
             return objective
     except Exception:
-        if HydraConfig.get().mode is RunMode.MULTIRUN:
+        if sweep:
             # made by Hydra, in several levels where an override holds a path; what the job or the sweep has written into stays
             remove_empty([folder, *folder.parents])
         raise
+
+
+def _speaks() -> bool:
+    """Whether this process shows a person how things go; of several only the first."""
+    try:
+        return ranks.own().first
+    except ConfigError:
+        return True
 
 
 def _taken_in(cfg: DictConfig) -> DictConfig:
@@ -145,26 +166,8 @@ def run_folder(cfg: DictConfig) -> Path:
 def set_up_logging() -> None:
     """Shows log records to a person, on stderr; does nothing where someone has set up logging already."""
     handler = RichHandler(console=Console(stderr=True), show_path=False, log_time_format="%H:%M:%S", omit_repeated_times=False)
-    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
+    logging.basicConfig(level=logging.INFO if _speaks() else logging.ERROR, format="%(message)s", handlers=[handler])
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # tells of its font cache otherwise
-
-
-class SweepFolder(Callback):
-    """Remembers the folder that Hydra makes for a sweep before it has composed a single job."""
-
-    new: tuple[Path, ...] = ()
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Called by Hydra before it makes the folder."""
-        type(self).new = tuple(missing_folders(Path(str(config.hydra.sweep.dir))))
-
-    @classmethod
-    def drop_if_unused(cls) -> None:
-        """Removes what Hydra made when no job has written into it."""
-        if cls.new and cls.new[0].is_dir() and {path.name for path in cls.new[0].iterdir()} <= {"multirun.yaml"}:
-            (cls.new[0] / "multirun.yaml").unlink(missing_ok=True)
-            remove_empty(cls.new)
-        cls.new = ()
 
 
 def explain(error: BaseException) -> str | None:
@@ -204,6 +207,8 @@ def _no_such_option(error: MissingConfigException) -> str:
     group, _, name = str(error.missing_cfg_file).rpartition("/")
     if not group:
         return str(error).split("\nConfig search path")[0]
+    if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
+        return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
     offered = error.options or [option.name for option in registry.options() if option.group == group]  # Hydra: none for a list
     if not offered:
         return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"

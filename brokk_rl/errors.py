@@ -32,6 +32,10 @@ class SimulationError(BrokkError):
     """The simulation lost too many worlds to divergence or overflow."""
 
 
+class DistributedError(BrokkError):
+    """Processes that train together lost each other, or no longer hold the same policy."""
+
+
 class LinkError(BrokkError):
     """The link to a machine fell silent or said something that makes no sense."""
 

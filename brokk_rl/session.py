@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brokk_rl import ranks
 from brokk_rl.errors import BrokkError, ConfigError, DeviceError, StorageError
 from brokk_rl.spec import spec
 
@@ -57,14 +58,19 @@ class Session:
         return Path(self.out)
 
     def torch_device(self) -> torch.device:
-        """Returns the device to compute on.
+        """Returns the device to compute on; of several processes each has the GPU of its local rank.
 
         Raises:
-            DeviceError: A GPU was asked for and is not there. `auto` never raises.
+            DeviceError: A GPU was asked for and is not there. `auto` never raises in a process that is alone.
         """
         import torch
 
         kind, _, index = self.device.partition(":")
+        rank = ranks.own()
+        if rank.count > 1:
+            if index:
+                raise DeviceError(f"session.device={self.device}: torchrun gives each process its own GPU; use cuda, cpu or auto")
+            index = str(rank.local)
         if kind == "cpu" or (kind == "auto" and not torch.cuda.is_available()):
             return torch.device("cpu")
         number = int(index or 0)
@@ -74,12 +80,20 @@ class Session:
                 "session.device=auto; `brokk mode=doctor` says what is missing."
             )
         if number >= torch.cuda.device_count():
-            raise DeviceError(f"session.device={self.device}: there are {torch.cuda.device_count()} GPUs, numbered from 0.")
+            raise DeviceError(
+                f"session.device={self.device}: there are {torch.cuda.device_count()} GPUs, numbered from 0"
+                + (f"; torchrun started a process for number {number}, start no more than there are GPUs" if rank.count > 1 else "")
+            )
         return torch.device("cuda", number)
 
     def stream(self, name: str) -> int:
-        """Returns the seed of the stream `name`, below 2**32: the same for the same session seed and name, unrelated otherwise."""
-        return int.from_bytes(hashlib.sha256(f"{self.seed}/{name}".encode()).digest()[:4], "little")
+        """Returns the seed of the stream `name`, below 2**32: the same for the same session seed and name, unrelated otherwise.
+
+        Of several processes the first has the streams of a process that is alone, each other one streams of its own.
+        """
+        rank = ranks.own().index
+        key = f"{self.seed}/{name}" + (f"/rank{rank}" if rank else "")
+        return int.from_bytes(hashlib.sha256(key.encode()).digest()[:4], "little")
 
     def generator(self, name: str) -> np.random.Generator:
         """Returns a numpy generator for the stream `name`, independent of how often any other stream is used."""
@@ -110,9 +124,14 @@ class Session:
             facts: Further fields of `session.json`: mode, choices, overrides, machine, fingerprint.
             resume: The folder may already hold a run, which goes on.
 
+        Of several processes only the first writes; the record of the others stays in memory.
+
         Raises:
             StorageError: The folder holds a run already and `resume` is false, or cannot be written.
         """
+        if not ranks.own().first:
+            yield Record(self.folder)
+            return
         before = read_record(self.folder) if self.folder.is_dir() else None
         if before and not resume:
             raise StorageError(
@@ -187,6 +206,27 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         return None
     except ValueError as error:
         raise StorageError(f"{folder / RECORD} is not readable as JSON: {error}") from error
+
+
+def earlier(folder: Path, resolved: str) -> dict[str, Any] | None:
+    """Returns what `session.json` says of the same job of the same sweep, run earlier; `None` where there is none.
+
+    So a sweep that is run again, into the same `session.out`, skips what is finished and goes on with the rest.
+
+    Args:
+        folder: The job's folder.
+        resolved: What its `resolved.yaml` should hold.
+
+    Raises:
+        StorageError: The folder holds another job.
+    """
+    before = read_record(folder)
+    if before and (folder / RESOLVED).is_file() and (folder / RESOLVED).read_text() != resolved:
+        raise StorageError(
+            f"{folder} already holds a job of another sweep: its {RESOLVED} differs. Run that sweep as it was, or give this one a "
+            "folder of its own with session.out=<folder>."
+        )
+    return before
 
 
 def write_json(path: Path, value: Any) -> None:

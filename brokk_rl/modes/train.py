@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import yaml
 
+from brokk_rl import ranks
 from brokk_rl.contracts import Actuator, Effect, Follower, Simulator, Task
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import Evaluation, evaluate_policies
 from brokk_rl.rl.curves import draw_curves
+from brokk_rl.rl.distributed import Group
 from brokk_rl.rl.export import export_onnx
 from brokk_rl.rl.logbook import PROGRESS, Logbook
 from brokk_rl.rl.policy import Classical, Trained, Untrained, write_bundle
 from brokk_rl.rl.runner import Runner, Training, checkpoints
-from brokk_rl.rl.tracking import Tracking
+from brokk_rl.rl.tracking import Off, Tracking
 from brokk_rl.rl.vec_env import Plant
 from brokk_rl.session import RESOLVED, Session
 from brokk_rl.spec import spec
@@ -56,9 +58,12 @@ class Train:
     evaluation: Evaluation
     resume: str | None
 
-    def run(self) -> float:
-        """Trains; returns the strict success of the trained policy."""
-        checkpoint = find_checkpoint(Path(self.resume)) if self.resume else None
+    together: ClassVar[bool] = True
+    """Several processes that `torchrun` starts train one policy."""
+
+    def run(self) -> float | None:
+        """Trains; returns the strict success of the trained policy, `None` in all processes but the first."""
+        checkpoint = self._checkpoint()
         device, folder = self.session.torch_device(), self.session.folder
         self.session.seed_all()
         plant = Plant(
@@ -67,18 +72,26 @@ class Train:
         loop = plant.build(device, self.rl.num_envs, self.rl.num_starts, self.session.stream("starts"))
         loop.capture(self.rl.fuse)
         state = "active" if loop.graph_active else "not used (they need sim=warp on a GPU)"
-        log.info("%d environments on %s, %s; CUDA graphs: %s", loop.num_envs, device, type(loop.world).__name__, state)
+        group = Group(device)
+        where = f"{device}, in each of {group.rank.count} processes" if group.together else str(device)
+        log.info("%d environments on %s, %s; CUDA graphs: %s", loop.num_envs, where, type(loop.world).__name__, state)
         self.session.seed_all()  # capturing has drawn random numbers
 
-        steps = loop.num_envs * int(self.rl.runner["num_steps_per_env"])
-        tracker = self.tracking.open(folder, {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed})
-        book = Logbook(folder, tracker, loop.statistics, steps, self.rl.max_fault_rate, self.rl.budget.share_spent)
-        with book:
-            runner = Runner(loop, self.rl, folder, device, book)
+        steps = loop.num_envs * int(self.rl.runner["num_steps_per_env"]) * group.rank.count
+        tracking = self.tracking if group.rank.first else Off()
+        tracker = tracking.open(folder, {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed})
+        book = Logbook(
+            folder, tracker, lambda: group.pooled(loop.statistics()), steps, self.rl.max_fault_rate, self.rl.budget.share_spent,
+            quiet=not group.rank.first,
+        )  # fmt: skip
+        with group, book:
+            runner = Runner(loop, self.rl, folder, device, book, group)
             if checkpoint:
                 runner.load(str(checkpoint))
                 log.info("going on from %s: %d control steps, %.0f s", checkpoint, book.env_steps, book.seconds)
             runner.run()
+        if not group.rank.first:
+            return None
 
         facts = {"env_steps": book.env_steps, "seconds": book.seconds, "seed": self.session.seed, "device": str(device)}
         facts["follower"] = follower_of(folder)
@@ -90,6 +103,17 @@ class Train:
         export_onnx(folder, actor, self.task.build(self.machine, 1, torch.device("cpu")), contract, observations)
         log.info("run folder: %s", folder)
         return float(results["success_strict"]["mean"])
+
+    def _checkpoint(self) -> Path | None:
+        """Returns where to go on from; a run that was stopped before its first checkpoint begins anew in its folder."""
+        if self.resume is None:
+            return None
+        folder = self.session.folder
+        if Path(self.resume).resolve() == folder.resolve() and not checkpoints(folder):
+            if ranks.own().first:
+                (folder / PROGRESS).unlink(missing_ok=True)
+            return None
+        return find_checkpoint(Path(self.resume))
 
 
 def follower_of(folder: Path) -> dict[str, Any] | None:

@@ -31,6 +31,7 @@ class Logbook:
         steps_per_iteration: Control steps of all environments (and ranks) in one iteration.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world.
         share_done: Returns how much of the run's budget is spent, 0 to 1, from control steps and seconds.
+        quiet: Count only, show and write nothing: of several processes the first writes for all.
     """
 
     def __init__(
@@ -41,12 +42,13 @@ class Logbook:
         steps_per_iteration: int,
         max_fault_rate: float,
         share_done: Callable[[int, float], float],
+        quiet: bool = False,
     ) -> None:
         self.log_dir = str(folder)
         self.writer: Tracker | None = tracker
         self.env_steps, self.seconds = 0, 0.0
         self._statistics, self._steps, self._max_fault_rate = statistics, steps_per_iteration, max_fault_rate
-        self._share_done = share_done
+        self._share_done, self._quiet = share_done, quiet
         self._path = folder / PROGRESS
         self._rows: list[dict[str, Any]] = []
         self._pending = 0
@@ -59,7 +61,7 @@ class Logbook:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._bar = Progress(*columns, console=Console(stderr=True), disable=quiet)
         self._job = self._bar.add_task("training", total=1.0, figures="")
 
     def __enter__(self) -> Logbook:
@@ -127,7 +129,7 @@ class Logbook:
 
     def flush(self) -> None:
         """Appends what is new to `progress.csv`; called with every checkpoint, so that both tell the same story."""
-        if not self._pending:
+        if not self._pending or self._quiet:
             return
         rows, self._pending = self._rows[-self._pending :], 0
         fresh = not self._path.exists()
@@ -144,7 +146,7 @@ class Logbook:
     def load_state_dict(self, state: dict[str, float]) -> None:
         """Restores what `state_dict` returned and drops rows of `progress.csv` that were written after it."""
         self.env_steps, self.seconds = int(state["env_steps"]), float(state["seconds"])
-        if not self._path.exists():
+        if not self._path.exists() or self._quiet:
             return
         with self._path.open(newline="") as file:
             rows = [row for row in csv.DictReader(file) if float(row["env_steps"]) <= self.env_steps]

@@ -15,6 +15,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl.errors import CheckpointError, ConfigError, StorageError
+from brokk_rl.rl.distributed import Group
 from brokk_rl.rl.logbook import Logbook
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.spec import spec
@@ -48,10 +49,10 @@ class Training:
     """How a policy is trained with rsl-rl's PPO.
 
     Attributes:
-        num_envs: Environments; `null` for what the simulator's configuration says.
+        num_envs: Environments, of each process where several train together; `null` for what the simulator's configuration says.
         num_starts: Number of valid starts from which resets draw.
         budget: When training ends.
-        save_interval: Iterations between checkpoints; a killed run loses no more.
+        save_interval: Iterations between checkpoints; a killed run loses no more. As often several processes prove that they agree.
         keep_checkpoints: Newest checkpoints kept.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world before the run stops with an error.
         fuse: On a GPU, let `torch.compile` fuse the small operations around the physics before the control step is captured:
@@ -81,6 +82,7 @@ class Runner(OnPolicyRunner):
 
     rsl-rl's own checkpoint lacks the environment, the random generators and the step count; ours holds all of them, so that a
     resumed run on a CPU goes on bit for bit. It is read with `weights_only=True`: a checkpoint from a stranger cannot run code.
+    Of several processes the first writes it, with what belongs to each of the others.
 
     Args:
         env: The control loop; a checkpoint of another machine than its own is refused.
@@ -88,11 +90,15 @@ class Runner(OnPolicyRunner):
         folder: Checkpoints go here.
         device: Where the networks live.
         logbook: Takes the place of rsl-rl's logger.
+        group: Those that train together, entered; `None` for a process that is alone.
     """
 
     env: ControlLoop
 
-    def __init__(self, env: ControlLoop, training: Training, folder: Path, device: torch.device, logbook: Logbook) -> None:
+    def __init__(
+        self, env: ControlLoop, training: Training, folder: Path, device: torch.device, logbook: Logbook, group: Group | None = None
+    ) -> None:
+        self.group = group or Group(device)
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
             super().__init__(env, training.runner_config(), log_dir=None, device=str(device))
@@ -104,21 +110,41 @@ class Runner(OnPolicyRunner):
         """Trains until the budget is spent, saving a checkpoint every `save_interval` iterations and at the end."""
         book: Logbook = self.logger  # type: ignore[assignment]
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
-        budget, first = self.training.budget, self.current_learning_iteration == 0
-        while budget.share_spent(book.env_steps, book.seconds) < 1.0:
-            rounds = self.training.save_interval
-            if budget.max_env_steps:
-                rounds = min(rounds, max(1, -(-(budget.max_env_steps - book.env_steps) // steps)))
-            if budget.max_seconds:
-                # the first round is short and shows how long one takes
-                left = (budget.max_seconds - book.seconds) * book.env_steps / book.seconds / steps if book.env_steps else 1
-                rounds = min(rounds, max(1, round(left)))
+        first = self.current_learning_iteration == 0
+        while rounds := self.group.from_first(self._rounds(book, steps)):
             with contextlib.redirect_stdout(io.StringIO()):
                 self.learn(rounds, init_at_random_ep_len=first and self.training.random_episode_lengths)
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
+            self.group.check_same(self._policy_state())
             self.checkpoint()
+
+    def _rounds(self, book: Logbook, steps: int) -> int:
+        """Returns how many iterations to do until the next checkpoint, 0 when the budget is spent."""
+        budget, rounds = self.training.budget, self.training.save_interval
+        if budget.share_spent(book.env_steps, book.seconds) >= 1.0:
+            return 0
+        if budget.max_env_steps:
+            rounds = min(rounds, max(1, -(-(budget.max_env_steps - book.env_steps) // steps)))
+        if budget.max_seconds:
+            # the first round is short and shows how long one takes
+            left = (budget.max_seconds - book.seconds) * book.env_steps / book.seconds / steps if book.env_steps else 1
+            rounds = min(rounds, max(1, round(left)))
+        return rounds
+
+    def _policy_state(self) -> dict[str, torch.Tensor]:
+        """Returns parameters and normalisers of actor and critic by name."""
+        models = {"actor": self.alg.actor, "critic": self.alg.critic}
+        return {f"{part}.{name}": value for part, model in models.items() for name, value in model.state_dict().items()}
+
+    def _configure_multi_gpu(self) -> None:
+        """Tells rsl-rl of the processes of `group`; its own way knows NCCL only and never ends the process group."""
+        rank = self.group.rank
+        self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = rank.count, rank.index, rank.local
+        self.is_distributed = self.group.together
+        numbers = {"global_rank": rank.index, "local_rank": rank.local, "world_size": rank.count}
+        self.cfg["multi_gpu"] = numbers if self.is_distributed else None
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Trains for some iterations; see `rsl_rl.runners.OnPolicyRunner`."""
@@ -131,16 +157,18 @@ class Runner(OnPolicyRunner):
         Raises:
             StorageError: The disk is full or the folder cannot be written; older checkpoints are untouched.
         """
-        if self.gpu_global_rank != 0:
+        own = {"env": self.env.state_dict(), "random": random_state(self.device)}
+        parts = self.group.gathered(own)
+        if not self.group.rank.first:
             return
         book: Logbook = self.logger  # type: ignore[assignment]
         book.flush()
         content = self.alg.save() | {
             "iter": self.current_learning_iteration,
             "learning_rate": self.alg.learning_rate,
-            "env": self.env.state_dict(),
+            **own,
+            "others": parts[1:],
             "book": book.state_dict(),
-            "random": random_state(self.device),
             "fingerprint": self.env.machine.fingerprint(),
         }
         path = self.folder / f"model_{self.current_learning_iteration}.pt"
@@ -171,10 +199,12 @@ class Runner(OnPolicyRunner):
         self.env.machine.check_fingerprint(content.get("fingerprint", {}), path)
         try:
             self.alg.load(content, None, strict=True)
-            self.env.load_state_dict(content["env"])
+            own = [content, *content.get("others", [])][self.group.rank.index :][:1]
+            for part in own:  # none where more processes go on than were stopped: the new ones start afresh
+                self.env.load_state_dict(part["env"])
+                set_random_state(part["random"], self.device)
             self.alg.learning_rate = content["learning_rate"]
             self.current_learning_iteration = content["iter"]
-            set_random_state(content["random"], self.device)
             book: Logbook = self.logger  # type: ignore[assignment]
             book.load_state_dict(content["book"])  # last: it rewrites progress.csv
         except (KeyError, RuntimeError) as error:

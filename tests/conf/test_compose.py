@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import registry
 
-OVERRIDES = ("experiment", "ablation", "preset")
+OVERRIDES = ("experiment", "ablation", "preset", "search")
 PARTS = [(entry.group, entry.name) for entry in registry.options() if entry.group not in (*OVERRIDES, "mode")]
 
 

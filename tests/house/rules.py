@@ -10,6 +10,7 @@ ROOMS = ("tasks", "actuators", "perception", "deploy")
 FLOORS = (
     ("brokk_rl.cli", 5),
     ("brokk_rl.extensions", 5),
+    ("brokk_rl.sweep", 5),
     ("conf", 5),
     ("brokk_rl.modes", 4),
     ("brokk_rl.diagnosis", 3),
@@ -22,8 +23,8 @@ FLOORS = (
 )
 """Floor of each package, the first that fits: roof, modes, rooms and diagnosis, sim and rl, bedrock, and ground for the rest."""
 DOORS = {
-    "hydra": ("brokk_rl.cli", "brokk_rl.extensions"),
-    "omegaconf": ("brokk_rl.cli", "brokk_rl.extensions"),
+    "hydra": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep"),
+    "omegaconf": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep"),
     "mujoco": ("brokk_rl.sim",),
     "mujoco_warp": ("brokk_rl.sim",),
     "warp": ("brokk_rl.sim",),

@@ -1,0 +1,131 @@
+"""Several processes that train one policy, one a GPU (or several on a CPU, to try it).
+
+rsl-rl averages gradients and normalisers over them; here is what goes around it: the process group, what the first decides for all,
+figures over all environments, and the proof that all still hold the same policy.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from brokk_rl import ranks
+from brokk_rl.errors import DistributedError
+
+
+class Group:
+    """The processes that train together, a context manager; in a process that is alone nothing here costs anything.
+
+    Args:
+        device: Where this process computes: NCCL between GPUs, gloo between CPUs and for what lies on the host.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device, self.rank = device, ranks.own()
+
+    @property
+    def together(self) -> bool:
+        """Whether there is more than one process."""
+        return self.rank.count > 1
+
+    def __enter__(self) -> Group:
+        if self.device.type == "cuda":
+            torch.cuda.set_device(self.device)
+        if self.together:
+            backend = "cpu:gloo,cuda:nccl" if self.device.type == "cuda" else "gloo"
+            dist.init_process_group(backend, rank=self.rank.index, world_size=self.rank.count)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if not self.together:
+            return
+        if error is None:
+            dist.barrier()
+            dist.destroy_process_group()
+        elif isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and _from_a_collective(str(error))):
+            # nothing is destroyed after an error: NCCL would wait for those that are gone
+            raise DistributedError(
+                f"rank {self.rank.index}: another process of this training has ended; its own message says why "
+                f"({str(error).splitlines()[0]})"
+            ) from error
+
+    def wait(self) -> None:
+        """Waits until all have come here."""
+        if self.together:
+            dist.barrier()
+
+    def from_first(self, value: Any) -> Any:
+        """Returns the first process's `value`: where a clock decides, one clock must decide for all."""
+        if not self.together:
+            return value
+        box = [value]
+        dist.broadcast_object_list(box, src=0)
+        return box[0]
+
+    def all(self, value: Any) -> list[Any]:
+        """Returns everyone's `value` (plain numbers and text), in the order of ranks."""
+        if not self.together:
+            return [value]
+        found: list[Any] = [None] * self.rank.count
+        dist.all_gather_object(found, value)
+        return found
+
+    def gathered(self, state: Any) -> list[Any]:
+        """Returns everyone's `state` (mappings of tensors, on the host) to the first process, to the others an empty list."""
+        if not self.together:
+            return [state]
+        found: list[Any] = [None] * self.rank.count
+        dist.gather_object(_on_host(state), found if self.rank.first else None, dst=0)
+        return found if self.rank.first else []
+
+    def pooled(self, figures: Mapping[str, float]) -> dict[str, float]:
+        """Returns the figures of all environments of all processes; see `ControlLoop.statistics`.
+
+        Means over episodes weigh by the number of episodes; the fault rate by control steps, which are as many everywhere.
+        """
+        parts = self.all(dict(figures))
+        episodes = sum(part["episodes"] for part in parts)
+        pooled = {name: sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes) for name in figures}
+        return pooled | {"episodes": episodes, "fault_rate": sum(part["fault_rate"] for part in parts) / len(parts)}
+
+    def check_same(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Proves that all processes hold the same numbers, bit for bit.
+
+        Raises:
+            DistributedError: They do not; the message says which ranks differ from the first.
+        """
+        if not self.together:
+            return
+        found = self.all(fingerprint(state))
+        other = [index for index, value in enumerate(found) if value != found[0]]
+        if other:
+            raise DistributedError(
+                f"the policy of rank {', '.join(map(str, other))} is no longer that of rank 0: parameters or normalisers differ. "
+                "Look for randomness or data-dependent code that runs on some ranks only, and for GPUs of different kinds."
+            )
+
+
+def fingerprint(state: Mapping[str, torch.Tensor]) -> str:
+    """Returns the SHA-256 of names and bytes of tensors."""
+    digest = hashlib.sha256()
+    for name, value in state.items():
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _on_host(state: Any) -> Any:
+    if isinstance(state, torch.Tensor):
+        return state.detach().cpu()
+    if isinstance(state, Mapping):
+        return {name: _on_host(value) for name, value in state.items()}
+    return state
+
+
+def _from_a_collective(text: str) -> bool:
+    """Whether a RuntimeError is the end of a connection: gloo has no class of its own for it."""
+    return any(word in text for word in ("gloo", "NCCL", "Connection closed by peer", "Connection reset by peer"))
