@@ -1,0 +1,177 @@
+"""Several processes and many jobs, as a person starts them: torchrun, local and Slurm sweeps, Optuna."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+pytestmark = pytest.mark.slow
+
+BIN = Path(sys.executable).parent
+SMALL = (
+    "session.device=cpu", "sim=native", "sim.num_worlds=16", "sim.num_threads=1", "actuator=lag", "rl.num_starts=32",
+    "rl.save_interval=2", "rl.runner.actor.obs_normalization=true", "rl.runner.critic.obs_normalization=true",
+    "rl.runner.actor.hidden_dims=[16]", "rl.runner.critic.hidden_dims=[16]", "evaluation.episodes=2",
+    "evaluation.num_recorded=1", "evaluation.video=false",
+)  # fmt: skip
+BENCH = (
+    "mode=bench", "session.device=cpu", "sim=native", "sim.num_threads=1", "actuator=lag", "rl.num_starts=16",
+    "bench.num_envs=[4]", "bench.seconds=0.05", "bench.iterations=1",
+)  # fmt: skip
+
+
+def started(folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        arguments, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"} | environment, capture_output=True, text=True, timeout=240
+    )
+
+
+def together(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Runs the command in two processes."""
+    return started(folder, str(BIN / "torchrun"), "--standalone", "--nproc-per-node=2", str(BIN / "brokk"), *arguments)
+
+
+def read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text())
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two processes: four iterations, checkpoints after the first, third and fourth."""
+    folder = tmp_path_factory.mktemp("together")
+    done = together(folder, "mode=train", "session.out=run", "rl.budget.max_env_steps=3072", *SMALL)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("evaluating trained") == 1, "the others are quiet"
+    return folder / "run"
+
+
+def test_two_processes_train_one_policy_and_one_writes(run: Path) -> None:
+    assert [path.name for path in run.parent.iterdir()] == ["run"]
+    rows = (run / "progress.csv").read_text().splitlines()[1:]
+    assert [float(row.split(",")[1]) for row in rows] == [768.0, 1536.0, 2304.0, 3072.0], "steps of both"
+    assert read(run / "session.json")["outcome"] == "finished" and (run / "policy.onnx").exists()
+
+
+def test_the_processes_see_different_worlds(run: Path) -> None:
+    content = torch.load(run / "model_4.pt", weights_only=True)
+    first, second = content["env"]["tensors"], content["others"][0]["env"]["tensors"]
+    assert first["history.q"].shape == second["history.q"].shape and not torch.equal(first["history.q"], second["history.q"])
+
+
+def test_two_processes_that_were_stopped_go_on_exactly(run: Path) -> None:
+    arguments = ("mode=train", "session.out=parts", *SMALL)
+    assert together(run.parent, *arguments, "rl.budget.max_env_steps=2304").returncode == 0
+    assert together(run.parent, *arguments, "rl.budget.max_env_steps=3072", "resume=parts").returncode == 0
+    whole, parts = (torch.load(folder / "model_4.pt", weights_only=True) for folder in (run, run.parent / "parts"))
+    for network in ("actor_state_dict", "critic_state_dict"):
+        assert all(torch.equal(whole[network][name], parts[network][name]) for name in whole[network])
+
+
+DIFFER = """
+import sys, torch
+from brokk_rl.errors import DistributedError
+from brokk_rl.rl.distributed import Group
+try:
+    with Group(torch.device("cpu")) as group:
+        group.check_same({"weight": torch.ones(3)})
+        group.check_same({"weight": torch.ones(3) + 1e-7 * group.rank.index})
+except DistributedError as error:
+    assert "rank 1" in str(error), error
+    sys.exit(7)
+"""
+
+
+def test_processes_that_no_longer_agree_stop(tmp_path: Path) -> None:
+    (tmp_path / "differ.py").write_text(DIFFER)
+    done = started(tmp_path, str(BIN / "torchrun"), "--standalone", "--nproc-per-node=2", "differ.py")
+    assert done.returncode == 1 and "exitcode  : 7" in done.stderr
+
+
+def test_a_process_that_fails_ends_the_others(run: Path) -> None:
+    done = together(run.parent, "mode=train", "session.out=run", *SMALL)  # the first finds its folder taken
+    assert done.returncode == 1 and done.stderr.count("already holds a run") == 1
+
+
+def test_the_bench_adds_up_what_two_processes_reach(tmp_path: Path) -> None:
+    assert together(tmp_path, *BENCH, "session.out=run").returncode == 0
+    found = read(tmp_path / "run" / "benchmark.json")
+    rates = [rank["train_env_steps_per_s"] for rank in found["per_rank"]]
+    assert found["ranks"] == len(rates) == 2 and found["train_env_steps_per_s"] == pytest.approx(sum(rates))
+
+
+def test_a_local_sweep_run_again_does_only_what_is_missing(tmp_path: Path) -> None:
+    sweep = (str(BIN / "brokk"), "-m", *BENCH, "hydra/launcher=submitit_local", "session.seed=0,1", "session.out=sweep")
+    assert started(tmp_path, *sweep, BROKK_PLACES="cpu,cpu").returncode == 0
+    jobs = sorted(path for path in (tmp_path / "sweep").iterdir() if path.is_dir() and path.name[0] in "01")
+    before = [read(job / "session.json") for job in jobs]
+    assert [record["outcome"] for record in before] == ["finished"] * 2 and before[0]["pid"] != before[1]["pid"]
+    (jobs[1] / "session.json").write_text(json.dumps(before[1] | {"outcome": "interrupted"}))
+    assert started(tmp_path, *sweep, BROKK_PLACES="cpu,cpu").returncode == 0
+    after = [read(job / "session.json") for job in jobs]
+    assert after[0] == before[0] and after[1]["outcome"] == "finished" and len(after[1]["resumed"]) == 1
+
+
+SBATCH = '#!/bin/sh\ncp "$1" "$KEPT"\necho "no cluster here" >&2\nexit 1\n'
+
+
+def test_a_sweep_for_slurm_asks_for_a_gpu_for_each_job(tmp_path: Path) -> None:
+    """A dry run: an sbatch that keeps its script and refuses it."""
+    (tmp_path / "bin").mkdir()
+    for name, text in (("sbatch", SBATCH), ("srun", "#!/bin/sh\n")):
+        (tmp_path / "bin" / name).write_text(text)
+        (tmp_path / "bin" / name).chmod(0o755)
+    sweep = (
+        "-m",
+        *BENCH,
+        "hydra/launcher=submitit_slurm",
+        "hydra.launcher.partition=gpu",
+        "session.seed=0,1,2",
+        "session.out=sweep",
+    )
+    path = f"{tmp_path / 'bin'}:{os.environ['PATH']}"
+    started(tmp_path, str(BIN / "brokk"), *sweep, PATH=path, KEPT=str(tmp_path / "kept.sh"))
+    script = (tmp_path / "kept.sh").read_text()
+    for line in ("--gpus-per-node=1", "--cpus-per-task=8", "--time=240", "--partition=gpu", "--array=0-2%3", "--nodes=1"):
+        assert f"#SBATCH {line}" in script
+    assert "srun" in script and "submitit.core._submit" in script
+
+
+def optuna() -> pytest.MarkDecorator:
+    there = util.find_spec("optuna") is not None
+    return pytest.mark.skipif(not there, reason="needs the extra: pip install 'brokk-rl[optuna]'")
+
+
+@optuna()
+def test_optuna_chooses_values_and_run_again_repeats_nothing(tmp_path: Path) -> None:
+    search = (
+        str(BIN / "brokk"), "search=learning_rate", "hydra/launcher=basic", "hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=1",
+        "rl.budget.max_env_steps=384", "session.out=sweep", *SMALL,
+    )  # fmt: skip
+    for _ in range(2):
+        done = started(tmp_path, *search)
+        assert done.returncode == 0, done.stderr
+        best = OmegaConf.load(tmp_path / "sweep" / "optimization_results.yaml")
+        records = [read(tmp_path / "sweep" / str(job) / "session.json") for job in range(2)]
+        assert best.best_value == max(record["objective"] for record in records)
+        assert all("resumed" not in record for record in records)
+    assert done.stderr.count("is done already") == 2
+
+
+def test_a_search_without_optuna_says_what_to_install(brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    if util.find_spec("optuna") is not None:
+        with hydra.initialize_config_module("conf", version_base="1.3"):
+            assert hydra.compose("config", overrides=["search=learning_rate"])
+        return
+    done = brokk("search=learning_rate")
+    assert done.code == 2 and "brokk-rl[optuna]" in done.err
