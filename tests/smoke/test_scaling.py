@@ -98,11 +98,6 @@ def test_processes_that_no_longer_agree_stop(tmp_path: Path) -> None:
     assert done.returncode == 1 and "exitcode  : 7" in done.stderr
 
 
-def test_a_process_that_fails_ends_the_others(run: Path) -> None:
-    done = together(run.parent, "mode=train", "session.out=run", *SMALL)  # the first finds its folder taken
-    assert done.returncode == 1 and done.stderr.count("already holds a run") == 1
-
-
 def test_the_bench_adds_up_what_two_processes_reach(tmp_path: Path) -> None:
     assert together(tmp_path, *BENCH, "session.out=run").returncode == 0
     found = read(tmp_path / "run" / "benchmark.json")
