@@ -11,9 +11,9 @@ from brokk_rl.checks.exercise import (
     own_randomness,
     places,
     require,
+    require_memory_in_state,
     require_rows,
     rest_history,
-    restore,
     same,
 )
 from brokk_rl.contracts import Actuator, ActuatorModel, Effect
@@ -52,21 +52,7 @@ def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.d
     require(bool(first.isfinite().all()), "step: positions are not finite under full and random commands")
     require(in_place(model.state, place), "state: a tensor moved or changed its shape; write it in place")
 
-    end = copies(model.state)
-    some = everywhere.clone()
-    some[1:] = False
-    model.reset(some)
-    for name, value in model.state.items():
-        require(same(value[1:], end[name][1:]), f"reset: state '{name}' changed in environments outside the mask")
-
-    restore(model.state, begin)
-    require(
-        same(_drive(model, machine, device), first),
-        "step: from the same state the same commands lead elsewhere; all memory belongs in state",
-    )
-    restore(model.state, begin)
-    other = _drive(model, machine, device, alter_first=True)
-    require(same(other[:, 1:], first[:, 1:]), "step: what happens in environment 0 changes the others")
+    require_memory_in_state(model, begin, first, lambda alter: _drive(model, machine, device, alter_first=alter))
 
     model.reset(everywhere)
     history = rest_history(machine, device)

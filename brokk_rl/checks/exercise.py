@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Protocol
 
 import torch
 
@@ -67,3 +68,39 @@ def restore(tensors: Mapping[str, torch.Tensor], kept: Mapping[str, torch.Tensor
 def same(a: torch.Tensor, b: torch.Tensor, tolerance: float = 0.0) -> bool:
     """Says whether two tensors hold the same numbers; NaN equals NaN."""
     return bool(torch.allclose(a.float(), b.float(), rtol=0.0, atol=tolerance, equal_nan=True))
+
+
+class Stateful(Protocol):
+    """What keeps its memory in `state` and forgets it by `reset`."""
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Memory by name, each `(N, …)`."""
+        ...
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Forgets in the environments of `mask`, `(N,)` bool."""
+        ...
+
+
+def require_memory_in_state(
+    model: Stateful, begin: Mapping[str, torch.Tensor], first: torch.Tensor, run: Callable[[bool], torch.Tensor]
+) -> None:
+    """Checks that a reset keeps to its mask, that all memory is in `state`, and that environments do not mix.
+
+    Args:
+        model: After the run that led to `first`.
+        begin: Copies of its state before that run.
+        first: What came of it, `(T, N, …)`.
+        run: Does it again; told whether to treat environment 0 otherwise.
+    """
+    end = copies(model.state)
+    some = torch.zeros(NUM_ENVS, dtype=torch.bool, device=first.device)
+    some[0] = True
+    model.reset(some)
+    for name, value in model.state.items():
+        require(same(value[1:], end[name][1:]), f"reset: state '{name}' changed in environments outside the mask")
+    restore(model.state, begin)
+    require(same(run(False), first), "step: from the same state the same commands lead elsewhere; all memory belongs in state")
+    restore(model.state, begin)
+    require(same(run(True)[:, 1:], first[:, 1:]), "step: what happens in environment 0 changes the others")

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import torch
 
-from brokk_rl.checks.exercise import NUM_ENVS, copies, in_place, own_randomness, places, require, require_rows, restore, same
+from brokk_rl.checks.exercise import (
+    NUM_ENVS,
+    copies,
+    in_place,
+    own_randomness,
+    places,
+    require,
+    require_memory_in_state,
+    require_rows,
+    same,
+)
 from brokk_rl.contracts import Follower, FollowerModel
 from brokk_rl.machine import Machine, exclusive_mask
 
@@ -38,21 +48,7 @@ def _check_model(model: FollowerModel, machine: Machine, device: torch.device) -
     require(bool((first != 0).any()), "step: nothing is ever given")
     require(in_place(model.state, place), "state: a tensor moved or changed its shape; write it in place")
 
-    end = copies(model.state)
-    some = everywhere.clone()
-    some[1:] = False
-    model.reset(some)
-    for name, value in model.state.items():
-        require(same(value[1:], end[name][1:]), f"reset: state '{name}' changed in environments outside the mask")
-
-    restore(model.state, begin)
-    require(
-        same(_follow(model, machine, device), first),
-        "step: from the same state the same proposals lead elsewhere; all memory belongs in state",
-    )
-    restore(model.state, begin)
-    other = _follow(model, machine, device, alter_first=True)
-    require(same(other[:, 1:], first[:, 1:]), "step: what happens in environment 0 changes the others")
+    require_memory_in_state(model, begin, first, lambda alter: _follow(model, machine, device, alter_first=alter))
 
     model.reset(everywhere)
     still = torch.zeros(NUM_ENVS, machine.num_joints, device=device)
