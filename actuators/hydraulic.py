@@ -23,10 +23,10 @@ import math
 import numpy as np
 import torch
 
-from actuators.gravity import Gravity
 from actuators.parameters import Parameters, PerJoint, per_joint
 from actuators.transport import check_dead_time, commands_in_force, opened
 from brokk_rl.errors import ConfigError
+from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec

@@ -10,8 +10,8 @@ import torch
 
 from actuators import draw
 from actuators.effects.ranges import CHANCE, Joints, Number, Ranges
-from actuators.gravity import Gravity
 from brokk_rl.contracts import ActuatorModel
+from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine

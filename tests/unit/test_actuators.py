@@ -11,12 +11,12 @@ import pytest
 import torch
 from composed import option
 
-from actuators.gravity import GRAVITY_M_S2, Gravity
 from actuators.hydraulic import Hydraulic
 from actuators.lag import Lag
 from actuators.parameters import per_joint
 from actuators.transport import commands_in_force, opened
 from brokk_rl.errors import ConfigError
+from brokk_rl.gravity import GRAVITY_M_S2, Gravity
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 

@@ -10,9 +10,9 @@ import torch
 from composed import option
 
 from actuators.excite.poses import load, poses
-from actuators.gravity import Gravity
 from brokk_rl.contracts import Segment
 from brokk_rl.errors import ConfigError
+from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from actuators.gravity import Gravity
 from actuators.lag import Lag
 from brokk_rl.checks import check_actuator
 from brokk_rl.errors import ConfigError
+from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.sim.model import compile_model
