@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import torch
 
-from brokk_rl.kinematics import Kinematics, ToolPose
+from brokk_rl.kinematics import Kinematics, ToolPose, product
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -171,8 +171,8 @@ class ClassicalController:
         wanted = wanted * (config.top_speed_m_s / wanted.norm(dim=1, keepdim=True).clamp(min=config.top_speed_m_s))
         turn = (turn * config.gain_1_s).clamp(-config.top_rate_rad_s, config.top_rate_rad_s)
         jacobian = torch.cat((tip_jacobian, pitch_jacobian[:, None]), 1) * (self.speed * (1.0 - self._exclusive))
-        square = jacobian @ jacobian.transpose(1, 2) + self._damping
-        share = (jacobian.transpose(1, 2) @ _solve_4(square, torch.cat((wanted, turn[:, None]), 1)[..., None]))[..., 0]
+        square = product(jacobian, jacobian.transpose(1, 2)) + self._damping
+        share = product(jacobian.transpose(1, 2), _solve_4(square, torch.cat((wanted, turn[:, None]), 1)[..., None]))[..., 0]
         # what one joint cannot do slows all of them alike, so that the tool keeps its direction
         return share / share.abs().amax(1, keepdim=True).clamp(min=1.0)
 
@@ -197,9 +197,9 @@ def _solve_4(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """
     p, q, s = a[:, :2, :2], a[:, :2, 2:], a[:, 2:, 2:]
     p_inverse = _inverse_2(p)
-    down = q.transpose(1, 2) @ p_inverse
-    low = _inverse_2(s - down @ q) @ (b[:, 2:] - down @ b[:, :2])
-    return torch.cat((p_inverse @ (b[:, :2] - q @ low), low), 1)
+    down = product(q.transpose(1, 2), p_inverse)
+    low = product(_inverse_2(s - product(down, q)), b[:, 2:] - product(down, b[:, :2]))
+    return torch.cat((product(p_inverse, b[:, :2] - product(q, low)), low), 1)
 
 
 def _inverse_2(m: torch.Tensor) -> torch.Tensor:
