@@ -26,6 +26,7 @@ def capture(step: Callable[[], None], device: torch.device, gradients: bool = Fa
                 step()
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=stream):  # gradients remember the stream on which they were first added up
+        # gradients remember the stream on which they were first added up; NCCL has a thread that asks for events meanwhile
+        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
             step()
     return graph

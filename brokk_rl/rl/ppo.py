@@ -2,14 +2,18 @@
 
 rsl-rl reads the divergence and three losses back to the host after each mini-batch, and launches a few hundred small kernels for
 it, some seventy more in each control step; on a GPU that takes longer than the arithmetic. Here the learning rate and the losses
-stay on the device, and acting, storing and a mini-batch are one replay of a CUDA graph each.
+stay on the device, and acting, storing and a mini-batch are one replay of a CUDA graph each. Where several processes train together
+a mini-batch is two graphs, and between them one sum over all processes of a single buffer: every gradient and the divergence.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import Any
 
 import torch
+import torch.distributed as dist
 from rsl_rl.algorithms import PPO
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
@@ -24,10 +28,13 @@ FIGURES = ("value", "surrogate", "entropy")
 
 
 class DevicePPO(PPO):
-    """PPO for feed-forward networks; on a CPU, on several GPUs, and with curiosity or symmetry it is rsl-rl's own."""
+    """PPO for feed-forward networks; on a CPU, and with curiosity or symmetry, it is rsl-rl's own."""
 
     _rollout: Rollout | None = None
-    _graph: torch.cuda.CUDAGraph | None = None
+    _mini_batch: Sequence[Callable[[], None]] | None = None
+    """What one step of the optimiser consists of."""
+    _gathered: torch.Tensor
+    """Gradients of all parameters, of which `grad` of each is a view, and at the end the divergence."""
     _rows: torch.Tensor
     _advantages: torch.Tensor
     _rate: torch.Tensor
@@ -58,20 +65,19 @@ class DevicePPO(PPO):
         storage = self.storage
         used = self._batch_size() * self.num_mini_batches
         order = torch.randperm(used, device=self.device)
-        if not hasattr(self, "_rows"):
+        fresh = self._mini_batch is None
+        if fresh:
             self._prepare()
         self._advantages.copy_(storage.advantages)
-        if torch.device(self.device).type == "cuda" and self._graph is None:
+        if fresh:
             self._rows.copy_(order[: len(self._rows)])
-            self._graph = self._captured()
+            self._mini_batch = self._parts()
         self._sums.zero_()
         for _ in range(self.num_learning_epochs):
             for rows in order.split(len(self._rows)):
                 self._rows.copy_(rows)
-                if self._graph is None:
-                    self._mini_batch()
-                else:
-                    self._graph.replay()
+                for part in self._mini_batch or ():
+                    part()
         for model in (self.actor, self.critic):
             self._normalise(model)
         storage.clear()
@@ -87,26 +93,28 @@ class DevicePPO(PPO):
         return saved | {"optimizer_state_dict": optimizer | {"param_groups": [g | plain for g in optimizer["param_groups"]]}}
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Loads a state; the graph is captured anew at the next update, because the optimiser's tensors are others now."""
-        self._graph = None
-        if hasattr(self, "_rows"):
-            del self._rows
+        """Loads a state; graphs are captured anew at the next update, because the optimiser's tensors are others now."""
+        self._mini_batch = None
         return super().load(loaded_dict, load_cfg, strict)
 
     @property
     def _on_device(self) -> bool:
-        plain = not (self.is_multi_gpu or self.rnd or self.symmetry or self.actor.is_recurrent or self.critic.is_recurrent)
+        plain = not (self.rnd or self.symmetry or self.actor.is_recurrent or self.critic.is_recurrent)
         return plain and torch.device(self.device).type == "cuda"
 
     def _batch_size(self) -> int:
         return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
 
     def _prepare(self) -> None:
-        """Makes the tensors that the graph reads and writes, and lets the optimiser read its rate from one of them."""
+        """Makes the tensors that graphs read and write, and lets the optimiser read its rate from one of them."""
         self._rows = torch.zeros(self._batch_size(), dtype=torch.int64, device=self.device)
         self._advantages = torch.zeros_like(self.storage.values)
         self._rate = torch.tensor(self.learning_rate, device=self.device)
         self._sums = torch.zeros(len(FIGURES), device=self.device)
+        parameters = list(chain(self.actor.parameters(), self.critic.parameters()))
+        self._gathered = torch.zeros(sum(p.numel() for p in parameters) + 1, device=self.device)
+        for parameter, part in zip(parameters, self._gathered[:-1].split([p.numel() for p in parameters]), strict=True):
+            parameter.grad = part.view_as(parameter)
         on_gpu = torch.device(self.device).type == "cuda"
         for group in self.optimizer.param_groups:
             group.update(lr=self._rate, capturable=on_gpu, fused=on_gpu or None)
@@ -114,12 +122,19 @@ class DevicePPO(PPO):
             if on_gpu:
                 state["step"] = state["step"].to(self.device, torch.float32)
 
-    def _captured(self) -> torch.cuda.CUDAGraph:
-        """Returns the graph of a mini-batch; the calls before the capture leave no trace."""
+    def _parts(self) -> Sequence[Callable[[], None]]:
+        """Returns what a mini-batch consists of, on a GPU captured; the calls before the capture leave no trace."""
+        device = torch.device(self.device)
+        if device.type != "cuda":
+            return (self._differentiate, self._sum_up, self._descend) if self.is_multi_gpu else (self._differentiate_and_descend,)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         kept = [(p, p.detach().clone()) for p in parameters] + [(self._rate, self._rate.clone())]
         moments = [(value, value.clone()) for state in self.optimizer.state.values() for value in state.values()]
-        graph = capture(self._mini_batch, torch.device(self.device), gradients=True)
+        if self.is_multi_gpu:  # the sum stays outside: it is the one part whose length others decide
+            graphs = [capture(part, device, gradients=True) for part in (self._differentiate, self._descend)]
+            captured = (graphs[0].replay, self._sum_up, graphs[1].replay)
+        else:
+            captured = (capture(self._differentiate_and_descend, device, gradients=True).replay,)
         with torch.no_grad():
             for value, before in kept + moments:
                 value.copy_(before)
@@ -127,7 +142,7 @@ class DevicePPO(PPO):
                 for state in self.optimizer.state.values():
                     for value in state.values():
                         value.zero_()
-        return graph
+        return captured
 
     def _normalise(self, model: nn.Module) -> None:
         """Updates a model's normalisation in place: rsl-rl binds a new tensor, which the graph would not see."""
@@ -137,8 +152,12 @@ class DevicePPO(PPO):
             if value is not None and module._buffers[name] is not value:
                 module._buffers[name] = value.copy_(module._buffers[name])  # type: ignore[arg-type]
 
-    def _mini_batch(self) -> None:
-        """One step of the optimiser on the stored steps `_rows`; Schulman et al. 2017, equations 7 and 9, as rsl-rl weighs them."""
+    def _differentiate_and_descend(self) -> None:
+        self._differentiate()
+        self._descend()
+
+    def _differentiate(self) -> None:
+        """Differentiates the loss of the stored steps `_rows`; Schulman et al. 2017, equations 7 and 9, as rsl-rl weighs them."""
         storage, rows = self.storage, self._rows
         observations = {name: value.flatten(0, 1)[rows] for name, value in storage.observations.items()}
         old_values, returns, advantages, old_log_prob, actions = (
@@ -154,7 +173,9 @@ class DevicePPO(PPO):
             self.actor.distribution.update(self.actor.mlp(self.actor.get_latent(observations)))  # type: ignore
             log_prob, entropy = self.actor.get_output_log_prob(actions), self.actor.output_entropy.mean()
             values = self.critic(observations)  # type: ignore[arg-type]
-            self._adapt_rate(old_parameters)
+            if self._is_adaptive:
+                with torch.no_grad():
+                    divergence = self.actor.get_kl_divergence(old_parameters, self.actor.output_distribution_params).mean()
             ratio = torch.exp(log_prob - old_log_prob.squeeze(1))
             gain = advantages.squeeze(1)
             clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
@@ -165,19 +186,32 @@ class DevicePPO(PPO):
                 value_loss = torch.max(value_loss, (near - returns).square())
             value_loss = value_loss.mean()
             loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
-        self.optimizer.zero_grad()
+        self._gathered.zero_()
         loss.backward()
+        if self._is_adaptive:
+            self._gathered[-1] = divergence
+        self._sums.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
+
+    def _sum_up(self) -> None:
+        """Adds up gradients and divergence of all processes, which then all hold the same; the host does not wait for it."""
+        dist.all_reduce(self._gathered)
+
+    def _descend(self) -> None:
+        """One step of the optimiser along the mean gradient of all processes."""
+        if self.is_multi_gpu:
+            self._gathered.div_(self.gpu_world_size)
+        if self._is_adaptive:
+            self._adapt_rate(self._gathered[-1])
         nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
         nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
         self.optimizer.step()
-        self._sums.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
 
-    @torch.no_grad()
-    def _adapt_rate(self, old_parameters: tuple[torch.Tensor, ...]) -> None:
+    @property
+    def _is_adaptive(self) -> bool:
+        return self.desired_kl is not None and self.schedule == "adaptive"
+
+    def _adapt_rate(self, divergence: torch.Tensor) -> None:
         """Raises the learning rate where the policy moves less than `desired_kl`, lowers it where it moves more."""
-        if self.desired_kl is None or self.schedule != "adaptive":
-            return
-        divergence = self.actor.get_kl_divergence(old_parameters, self.actor.output_distribution_params).mean()
         lower, higher = (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE), (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE)
         too_near = (divergence < self.desired_kl / 2.0) & (divergence > 0.0)
         rate = torch.where(divergence > self.desired_kl * 2.0, lower, torch.where(too_near, higher, self._rate))

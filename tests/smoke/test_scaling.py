@@ -98,6 +98,58 @@ def test_processes_that_no_longer_agree_stop(tmp_path: Path) -> None:
     assert done.returncode == 1 and "exitcode  : 7" in done.stderr
 
 
+LEARN = """
+import copy, sys, torch
+from test_rl_ppo import _algorithm, _learn, _roll_out
+from brokk_rl import ranks
+from brokk_rl.rl.distributed import Group
+from brokk_rl.rl.ppo import DevicePPO
+from rsl_rl.algorithms import PPO
+name = sys.argv[1] if sys.argv[1] == "cpu" else f"cuda:{ranks.own().local}"
+with Group(torch.device(name)) as group:
+    device, index = str(group.device), group.rank.index
+    numbers = {"global_rank": index, "local_rank": group.rank.local, "world_size": group.rank.count}
+    for changes in ({}, {"schedule": "fixed"}, {"normalize_advantage_per_mini_batch": True}):
+        ours, theirs = (_algorithm(kind, device, multi_gpu_cfg=numbers, **changes) for kind in (DevicePPO, PPO))
+        alone, rates = _algorithm(DevicePPO, device, **changes), []
+        for seed in range(4):
+            last = _roll_out(ours, 10 * seed + index)  # each process has steps of its own
+            theirs.load(copy.deepcopy(ours.save()), None, strict=True)
+            for other in (theirs, alone):
+                other.storage = copy.deepcopy(ours.storage)
+            for algorithm in (ours, theirs, alone):
+                _learn(algorithm, seed, last)
+            rates.append(ours.learning_rate)
+            assert abs(ours.learning_rate / theirs.learning_rate - 1.0) < 1e-5
+        assert (len(set(rates)) > 1) is (changes.get("schedule") != "fixed"), rates
+        for part in ("actor", "critic"):
+            mine, other, single = (getattr(algorithm, part).state_dict() for algorithm in (ours, theirs, alone))
+            for name in other:
+                torch.testing.assert_close(mine[name], other[name], rtol=1e-3, atol=1e-5)
+            group.check_same(mine)
+            assert any(not torch.allclose(mine[name], single[name], rtol=1e-2, atol=1e-4) for name in mine)
+"""
+
+
+def _learn_together(folder: Path, device: str) -> None:
+    (folder / "learn.py").write_text(LEARN)
+    tests = str(Path(__file__).parents[1] / "unit")
+    command = (str(BIN / "torchrun"), "--standalone", "--nproc-per-node=2", "learn.py", device)
+    done = started(folder, *command, PYTHONPATH=tests)
+    assert done.returncode == 0, done.stderr
+
+
+def test_two_processes_learn_together_what_rsl_rls_own_learn(tmp_path: Path) -> None:
+    """The parts of the update that a GPU captures, with gloo between them, against rsl-rl's own way over several processes."""
+    _learn_together(tmp_path, "cpu")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_two_gpus_learn_together_what_rsl_rls_own_learn(tmp_path: Path) -> None:
+    _learn_together(tmp_path, "cuda")
+
+
 def test_the_bench_adds_up_what_two_processes_reach(tmp_path: Path) -> None:
     assert together(tmp_path, *BENCH, "session.out=run").returncode == 0
     found = read(tmp_path / "run" / "benchmark.json")

@@ -142,6 +142,6 @@ def test_the_graph_learns_what_the_eager_update_learns() -> None:
         last = _roll_out(captured, seed)
         eager.storage = copy.deepcopy(captured.storage)
         assert _learn(captured, seed, last) == pytest.approx(_learn(eager, seed, last), rel=1e-3, abs=1e-5)
-    assert captured._graph is not None and captured._rollout is not None
+    assert captured._mini_batch is not None and captured._rollout is not None
     for mine, other in zip(captured.actor.parameters(), eager.actor.parameters(), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-5)
