@@ -8,6 +8,7 @@ command, for the machine).
 from __future__ import annotations
 
 import json
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ class Trained:
     """A trained policy.
 
     Attributes:
-        folder: Run folder of `mode=train`, or any folder with a policy bundle.
+        folder: Run folder of `mode=train`, any folder with a policy bundle, or `package:path` for one that ships with a package.
     """
 
     folder: str
@@ -73,7 +74,7 @@ class Trained:
         Raises:
             CheckpointError: The bundle is missing, corrupt, holds NaN, or was made for another machine or task.
         """
-        contract, weights = read_bundle(Path(self.folder), loop.machine)
+        contract, weights = read_bundle(located(self.folder), loop.machine)
         actor = make_actor(contract["network"]["actor"], contract["network"]["obs_groups"], loop)
         try:
             actor.load_state_dict(weights)
@@ -83,6 +84,23 @@ class Trained:
                 "evaluate with the task that the policy was trained for (task=…)"
             ) from error
         return Network(actor.to(loop.device), loop)
+
+
+def located(folder: str) -> Path:
+    """Returns the folder of a policy: a path, or `package:path` within an installed package.
+
+    Raises:
+        CheckpointError: There is no such package.
+    """
+    package, colon, inside = folder.partition(":")
+    if not colon or Path(folder).exists():
+        return Path(folder)
+    try:
+        return Path(str(resources.files(package))) / inside
+    except (ModuleNotFoundError, ValueError, TypeError) as error:
+        raise CheckpointError(
+            f"policy.folder={folder}: there is no package '{package}' ({error}); give a run folder, or package:path"
+        ) from error
 
 
 class _Classical:

@@ -19,7 +19,7 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import Encoder
 from brokk_rl.rl import export
-from brokk_rl.rl.policy import Network, Trained, make_actor, read_bundle, write_bundle
+from brokk_rl.rl.policy import Network, Trained, located, make_actor, read_bundle, write_bundle
 from brokk_rl.rl.vec_env import ControlLoop
 
 CPU = torch.device("cpu")
@@ -190,3 +190,15 @@ def test_a_file_that_says_something_else_is_not_left_behind(
     with pytest.raises(CheckpointError, match="differs from the network in"):
         export.export_onnx(copied, bundle.actor, task, bundle.contract, bundle.loop.get_observations()["policy"])
     assert sorted(path.name for path in copied.iterdir()) == ["policy.json", "policy.safetensors"]
+
+
+def test_a_policy_that_ships_is_named_by_package_and_path(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = copied.parent / "shipping"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    copied.rename(package / "mine")
+    monkeypatch.syspath_prepend(package.parent)
+    assert (located("shipping:mine") / "policy.json").exists()
+    assert located("runs/mine") == Path("runs/mine")
+    with pytest.raises(CheckpointError, match="no package 'missing'"):
+        located("missing:mine")
