@@ -127,8 +127,8 @@ class Answer:
     """The whole answer.
 
     Attributes:
-        verdict: `effects`; `none` when no effect earns its place; `unknown` when the gap is real and nothing of the library explains
-            it, or the recordings do not allow to tell.
+        verdict: `effects`; `none` when no effect earns its place; `unknown` when the gap is real and nothing of the library
+            explains it, or the recordings do not allow to tell.
         selected: Most probable first; empty unless the verdict is `effects`.
         ranking: All rivals worth naming, `none` and `unknown` among them, most probable first.
         where: Where the gap lies.
@@ -217,9 +217,9 @@ def _answer(found: dict[str, Any]) -> Answer:
         found["where"]["stage"],
         units,
     )
-    gap = found["gap"] and Gap(
-        *(found["gap"][name]["rmse_rad"] for name in ("before", "after", "floor")), _read_estimate(found["gap"]["closed"])
-    )
+    given = found["gap"]
+    errors = [given[name]["rmse_rad"] for name in ("before", "after", "floor")] if given else []
+    gap = Gap(errors[0], errors[1], errors[2], _read_estimate(given["closed"])) if given else None
     following = found.get("next_experiment")
     known = {"schema", *(one.name for one in dataclasses.fields(Answer))}
     return Answer(
@@ -227,7 +227,7 @@ def _answer(found: dict[str, Any]) -> Answer:
         selected=tuple(_read_selected(one) for one in found["selected"]),
         ranking=tuple(Ranked(one["effect"], tuple(one["joints"]), one["probability"]) for one in found["ranking"]),
         where=where,
-        gap=gap or None,
+        gap=gap,
         next_experiment=following
         and NextExperiment(following["excitation"], tuple(following["separates"]), following.get("why", "")),
         reason=found.get("reason", ""),
