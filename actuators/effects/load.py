@@ -24,6 +24,7 @@ class LoadDependence(EffectSpec):
     joints: Joints
     sensitivity: Value
     side = "speed"
+    weighed = True
     numbers: ClassVar = {"sensitivity": Number("1", none=0.0, typical=0.5, bounds=(0.0, 1.5))}
 
     def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
@@ -45,6 +46,7 @@ class Creep(EffectSpec):
     joints: Joints
     sink_rad_s: Value
     side = "speed"
+    weighed = True
     numbers: ClassVar = {"sink_rad_s": Number("rad/s", none=0.0, typical=0.004, bounds=(0.0, 0.1))}
 
     def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
@@ -75,4 +77,4 @@ class FlowSharing(EffectSpec):
 
 def _weight(now: Moment) -> torch.Tensor:
     """Returns the force with which the weight pushes each joint in its positive direction, over its yield force, `(N, J)`."""
-    return now.plant.gravity.load(now.history.q[:, -1]) / now.plant.yield_force
+    return now.plant.weight(now.history.q[:, -1]) if now.weight is None else now.weight

@@ -1,7 +1,8 @@
 """The numbers of an effect: a value or a range, for all joints or joint by joint, as tensors over environments."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -19,6 +20,8 @@ Joints = Literal["all"] | tuple[str, ...]
 
 CHANCE = 128
 """First column of the draws that are not for parameters."""
+PRESENT = 192
+"""First column of the draws that decide which effects there are."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Number:
 
 
 class Ranges:
-    """Parameters of an effect for all environments.
+    """Parameters of one effect or of several for all environments; what is drawn is drawn in one go.
 
     Attributes:
         value: `(N, J)` or `(N, 1)` by name. An entry may be written in place or replaced, by one that wants gradients for example;
@@ -50,15 +53,17 @@ class Ranges:
         state: Counter and drawn values; empty where nothing is random.
 
     Args:
-        fields: The effect's numbers as configured.
+        fields: Numbers as configured, by name; those of several effects as `effect.number`.
         numbers: What is known about them.
-        joints: Joints that the effect acts on; elsewhere each number is at its `none`.
+        joints: Joints that are acted on; elsewhere each number is at its `none`.
         machine: The machine.
         num_envs: Number of environments, `N`.
         device: Where the tensors live.
-        stochastic: Whether the effect draws in every step.
+        stochastic: Whether there are draws in every step.
         salt: Keeps the draws of several effects apart.
         where: Config node named in messages.
+        shares: Part of the environments that have an effect, by effect; all have those not named. The others have its numbers at
+            their `none`. Who has what is drawn at each reset.
 
     Raises:
         ConfigError: a number is out of bounds, a range upside down, or a joint unknown.
@@ -68,41 +73,87 @@ class Ranges:
         self,
         fields: Mapping[str, Value],
         numbers: Mapping[str, Number],
-        joints: Joints,
+        joints: Joints | Mapping[str, Joints],
         machine: Machine,
         num_envs: int,
         device: torch.device,
         stochastic: bool,
         salt: int,
         where: str,
+        shares: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
-        chosen = _chosen(joints, machine, f"{where}.joints")
         self.value: dict[str, torch.Tensor] = {}
-        self._drawn: dict[str, tuple[int, torch.Tensor, torch.Tensor, torch.Tensor]] = {}
+        drawn: dict[str, _Column] = {}
         for column, (name, number) in enumerate(numbers.items()):
-            low, high = (
-                torch.as_tensor(side, dtype=torch.float32, device=device)
-                for side in _sides(fields[name], number, chosen, machine, f"{where}.{name}")
-            )
-            self.value[name] = low.expand(num_envs, -1).clone()
-            if bool((low < high).any()):
-                self._drawn[name] = (column, self.value[name], low, high)
-        self._draw = draw.counter(num_envs, salt, device) if stochastic or self._drawn else None
-        drawn = {f"drawn.{name}": value for name, (_, value, _, _) in self._drawn.items()}
-        self.state = drawn if self._draw is None else {"draw": self._draw, **drawn}
+            effect, _, _ = name.rpartition(".")
+            acted_on = joints[effect] if isinstance(joints, Mapping) else joints
+            chosen = _chosen(acted_on, machine, ".".join(filter(None, (where, effect, "joints"))))
+            low, high = _sides(fields[name], number, chosen, machine, f"{where}.{name}")
+            neutral = low if number.none is None else np.full_like(low, number.none)
+            if (low < high).any() or (shares.get(effect, 1.0) < 1 and (low != neutral).any()):
+                drawn[name] = _Column(low, high, neutral, column * 256 + np.arange(len(low)), effect)
+            else:
+                self.value[name] = torch.as_tensor(low, dtype=torch.float32, device=device).expand(num_envs, -1).clone()
+        self._draw = draw.counter(num_envs, salt, device) if stochastic or drawn else None
+        self.state = {} if self._draw is None else {"draw": self._draw}
+        self._drawn = _Drawn(list(drawn.values()), shares, device) if drawn else None
+        if self._drawn is not None:
+            # one tensor, of which each number has its columns
+            self._all = self._drawn.low.expand(num_envs, -1).clone()
+            widths = [len(column.low) for column in drawn.values()]
+            for name, columns in zip(drawn, self._all.split(widths, 1), strict=True):
+                self.value[name] = self.state[f"drawn.{name}"] = columns
 
     def redraw(self, mask: torch.Tensor) -> None:
         """Draws the ranges anew in the environments of `mask`, shape `(N,)` bool."""
         if self._draw is None:
             return
         self._draw.add_(mask.to(torch.int64))
-        for column, value, low, high in self._drawn.values():
-            fresh = torch.minimum(low + (high - low) * draw.uniform(self._draw, column, value.shape[1]), high)
-            value.copy_(torch.where(mask[:, None], fresh, value))
+        if self._drawn is not None:
+            self._all.copy_(torch.where(mask[:, None], self._drawn.fresh(self._draw), self._all))
 
     def advance(self) -> torch.Tensor | None:
         """Moves on to the next draws of a stochastic effect and returns the counter, `(N,)`; `None` where nothing is random."""
         return None if self._draw is None else self._draw.add_(1)
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A number that is drawn: range, value where its effect is not there, keys of its draws, each `(J,)` or `(1,)`; its effect."""
+
+    low: np.ndarray
+    high: np.ndarray
+    none: np.ndarray
+    key: np.ndarray
+    effect: str
+
+
+class _Drawn:
+    """All numbers that are drawn, side by side in `W` columns: one draw costs as many launches as ten."""
+
+    def __init__(self, columns: Sequence[_Column], shares: Mapping[str, float], device: torch.device) -> None:
+        def tensor(parts: Sequence[np.ndarray], dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.as_tensor(np.concatenate(parts), dtype=dtype, device=device)
+
+        self.low = tensor([column.low for column in columns])
+        self.high = tensor([column.high for column in columns])
+        self._key = tensor([column.key for column in columns], torch.int64)
+        self._some = any(share < 1 for share in shares.values())
+        if self._some:
+            effects = list(dict.fromkeys(column.effect for column in columns))
+            self._none = tensor([column.none for column in columns])
+            self._share = torch.tensor([shares.get(effect, 1.0) for effect in effects], device=device)
+            self._share_key = 256 * PRESENT + torch.arange(len(effects), dtype=torch.int64, device=device)
+            self._effect = tensor([np.full(len(column.low), effects.index(column.effect)) for column in columns], torch.int64)
+
+    def fresh(self, counter: torch.Tensor) -> torch.Tensor:
+        """Returns fresh values, `(N, W)`, for the counter `(N,)`."""
+        counter = counter[:, None] * 65_536
+        value = torch.minimum(self.low + (self.high - self.low) * draw.hashed(counter + self._key), self.high)
+        if not self._some:
+            return value
+        there = draw.hashed(counter + self._share_key) < self._share
+        return torch.where(there.index_select(1, self._effect), value, self._none)
 
 
 def _chosen(joints: Joints, machine: Machine, where: str) -> np.ndarray:

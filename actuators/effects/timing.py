@@ -18,6 +18,7 @@ class _Delayed(EffectSpec):
 
     side = "command"
     stage = "timing"
+    delays = True
 
     def begin(self, now: Moment) -> Memory:
         """Before the history the command was what it is at its beginning."""
@@ -27,8 +28,7 @@ class _Delayed(EffectSpec):
     def _shifted(self, now: Moment, shift_s: torch.Tensor) -> tuple[torch.Tensor, Memory]:
         u = now.history.u
         known = torch.cat((now.memory["older"], u), 1)
-        places = torch.arange(u.shape[1] - 1, known.shape[1], device=u.device)[:, None]
-        return _at(known, places - (shift_s / now.plant.period_s)[:, None]), {"older": known[:, 1 : u.shape[1]]}
+        return _late(known, shift_s / now.plant.period_s, u.shape[1]), {"older": known[:, 1 : u.shape[1]]}
 
 
 @spec
@@ -37,12 +37,13 @@ class DeadTime(_Delayed):
 
     Attributes:
         joints: Joints it acts on, or `all`.
-        dead_time_s: Transport delay beyond that of the inner model.
+        dead_time_s: Transport delay beyond that of the inner model. A negative one shows the inner model commands ahead of time:
+            exact up to its own dead time.
     """
 
     joints: Joints
     dead_time_s: Value
-    numbers: ClassVar = {"dead_time_s": Number("s", none=0.0, typical=0.1, bounds=(0.0, 0.5))}
+    numbers: ClassVar = {"dead_time_s": Number("s", none=0.0, typical=0.1, bounds=(-0.3, 0.5))}
 
     def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
         """`u(t - dead_time)`."""
@@ -54,7 +55,7 @@ class ClockOffset(_Delayed):
     """Positions and commands are stamped by different clocks.
 
     In a recording a position stamped late looks like a command that acts late, and for a controller the loop is longer by as much;
-    so it is simulated as one. A negative offset shows the inner model commands ahead of time: exact up to its own dead time.
+    so it is simulated as one, see `DeadTime`.
 
     Attributes:
         joints: Joints it acts on, or `all`.
@@ -94,7 +95,7 @@ class DelayJitter(EffectSpec):
         """`u(t - delay)`, in which the delay grows by no more than one period a period."""
         u = now.history.u
         delay = torch.minimum(now.value["jitter_s"] / now.plant.period_s * now.chance, now.memory["delay"] + 1.0)
-        newest = _at(u, (u.shape[1] - 1.0 - delay)[:, None])[:, 0]
+        newest = _late(u, delay, 1)[:, 0]
         sent, memory = with_newest(now, newest)
         return sent, memory | {"delay": delay}
 
@@ -132,13 +133,13 @@ def with_newest(now: Moment, newest: torch.Tensor) -> tuple[torch.Tensor, Memory
     return u, {"sent": u[:, 1:]}
 
 
-def _at(u: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Returns commands `(N, T, J)` at fractional samples `place`, `(N, K, J)`, held beyond both ends."""
+def _late(u: torch.Tensor, periods: torch.Tensor, count: int) -> torch.Tensor:
+    """Returns the newest `count` of commands `(N, T, J)` as they are `periods`, `(N, J)`, later; held beyond both ends."""
     last = u.shape[1] - 1
-    behind = last - place
     # half a millionth of a period forgives 0.15 / 0.05 = 2.9999998
-    whole = torch.floor(behind + 5e-7)
-    part = (behind - whole).clamp(0.0, 1.0)
-    newest = last - whole.to(torch.int64)
-    later, earlier = (u.gather(1, (newest - back).clamp(0, last)) for back in (0, 1))
+    whole = torch.floor(periods + 5e-7)
+    part = (periods - whole).clamp(0.0, 1.0)[:, None]
+    place = torch.arange(last - count, last + 1, device=u.device)[:, None] - whole.to(torch.int64)[:, None]
+    found = u.gather(1, place.clamp(0, last))
+    earlier, later = found[:, :-1], found[:, 1:]
     return later + part * (earlier - later)

@@ -23,10 +23,17 @@ Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
 class Plant:
     """What effects need of the machine: `full_step` (way at full speed in one period) and the like, `(J,)`; weight; geometry.
 
-    Weight and geometry are made when an effect asks for them: most do not, and work on machines known by their joints only.
+    Weight and geometry are made when an effect asks for them: most do not, and work on machines known by their joints only. Those
+    that always do say so beforehand: a traced step can hold their work, but not their making.
+
+    Args:
+        machine: The machine.
+        device: Where the tensors live.
+        weighed: Whether the weight is asked for in every step.
+        placed: Whether the geometry is.
     """
 
-    def __init__(self, machine: Machine, device: torch.device) -> None:
+    def __init__(self, machine: Machine, device: torch.device, weighed: bool = False, placed: bool = False) -> None:
         def tensor(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
@@ -34,6 +41,10 @@ class Plant:
         self.full_step = tensor(machine.max_speed * machine.period_s)
         self.lower, self.upper = tensor(machine.lower), tensor(machine.upper)
         self._machine, self._device = machine, device
+        if weighed:
+            self.weight(torch.zeros(1, machine.num_joints, device=device))
+        if placed:
+            self.kinematics  # noqa: B018
 
     @cached_property
     def yield_force(self) -> torch.Tensor:
@@ -45,6 +56,10 @@ class Plant:
     def gravity(self) -> Gravity:
         """The weight on each joint."""
         return Gravity(self._machine, self._device)
+
+    def weight(self, q: torch.Tensor) -> torch.Tensor:
+        """Returns how hard the weight pushes each joint in its positive direction at `q`, over its yield force, `(N, J)`."""
+        return self.gravity.load(q) / self.yield_force
 
     @cached_property
     def kinematics(self) -> Kinematics:
@@ -63,6 +78,7 @@ class Moment:
         plant: The machine.
         moved: Increment of the inner model, `(N, J)`; speed side only.
         counter: Counter of random draws, `(N,)`; stochastic effects only.
+        weight: `plant.weight` here where someone has worked it out already.
     """
 
     value: dict[str, torch.Tensor]
@@ -71,6 +87,7 @@ class Moment:
     plant: Plant
     moved: torch.Tensor
     counter: torch.Tensor | None
+    weight: torch.Tensor | None = None
 
     @property
     def chance(self) -> torch.Tensor:
@@ -88,6 +105,8 @@ class EffectSpec:
         numbers: Unit, neutral value, typical size and bounds of each number.
         stochastic: Whether it draws random numbers in every step.
         smooth: Whether its numbers can be fitted by gradient.
+        delays: Whether it shifts all commands that the inner model sees, not only the newest.
+        weighed: Whether it asks for the weight on the joints.
     """
 
     side: ClassVar[Side]
@@ -95,6 +114,8 @@ class EffectSpec:
     numbers: ClassVar[dict[str, Number]]
     stochastic: ClassVar[bool] = False
     smooth: ClassVar[bool] = True
+    delays: ClassVar[bool] = False
+    weighed: ClassVar[bool] = False
 
     @classmethod
     def name(cls) -> str:
@@ -157,7 +178,7 @@ class Wrapped:
         where = f"effect.{name}"
         self._ranges = Ranges(given, effect.numbers, joints, machine, num_envs, device, effect.stochastic, salt, where)
         self.parameters = self._ranges.value
-        self.plant = Plant(machine, device)
+        self.plant = Plant(machine, device, weighed=effect.weighed, placed=effect.side == "kinematics")
         rest = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._memory = {key: value.clone() for key, value in self._begin(self._moment(History(q=rest, u=rest), None)).items()}
@@ -191,7 +212,7 @@ class Wrapped:
             history = History(q=history.q.clone(), u=history.u.clone())
         now = self._moment(history, self._ranges.advance() if self.effect.stochastic else None)
         begun, fresh = self._begin(now), self._fresh.clone()
-        memory = {key: torch.where(_rows(fresh, value), begun[key], value) for key, value in self._memory.items()}
+        memory = {key: torch.where(per_row(fresh, value), begun[key], value) for key, value in self._memory.items()}
         now = replace(now, memory=memory)
         result, memory = self._commanded(now) if self.effect.side == "command" else self._moved(now)
         for key, value in memory.items():
@@ -260,6 +281,6 @@ def _unchanged(value: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
     return value
 
 
-def _rows(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+def per_row(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
     """Returns `mask`, `(N,)`, so that it broadcasts over rows of `like`."""
     return mask.reshape(-1, *[1] * (like.dim() - 1))

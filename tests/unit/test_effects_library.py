@@ -1,0 +1,198 @@
+"""Machines that differ: each effect is there in its share of the environments, and does there what it does alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+
+from actuators.effects.library import Library
+from brokk_rl import dead_time
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+CPU = torch.device("cpu")
+EFFECTS = """
+dead_time dead_band stiction saturation rate_limit frame_loss delay_jitter flow_gain asymmetry lag thermal_drift load_dependence
+flow_sharing compliance creep backlash encoder_bias sensor_noise quantisation
+""".split()  # noqa: SIM905
+
+
+def fixed(name: str, **changes: float) -> Any:
+    """Returns an effect of the library at its typical size."""
+    spec = option("effect", "library").effects[name]
+    return replace(spec, **{key: number.typical for key, number in spec.numbers.items()} | changes)
+
+
+def library(share: float | dict[str, float], *specs: Any) -> Library:
+    return Library(share=share, effects={spec.name(): spec for spec in specs})
+
+
+def commands(machine: Machine, steps: int, num: int) -> torch.Tensor:
+    """Returns random commands that hold for five periods, `(T, N, J)`, some of them zero and some full."""
+    u = torch.rand(steps // 5, num, machine.num_joints, generator=torch.Generator().manual_seed(1)) * 3.0 - 1.5
+    return (u.clamp(-1.0, 1.0) * (u.abs() > 0.2)).repeat_interleave(5, 0)
+
+
+@torch.no_grad()
+def roll(model: Any, machine: Machine, u: torch.Tensor) -> torch.Tensor:
+    """Returns the positions from rest at home, `(T, N, J)`."""
+    num = u.shape[1]
+    shape = (num, machine.num_history, machine.num_joints)
+    history, path = History(q=torch.zeros(shape), u=torch.zeros(shape)), []
+    home = torch.as_tensor(machine.home, dtype=torch.float32)
+    history.reset(torch.ones(num, dtype=torch.bool), home.expand(num, -1))
+    for command in u:
+        history.push_u(command)
+        history.push_q(model.step(history))
+        path.append(history.q[:, -1].clone())
+    return torch.stack(path)
+
+
+def test_it_holds_the_effects_on_actuation_and_sensing(machine: Machine) -> None:
+    assert list(option("effect", "library").effects) == EFFECTS
+
+
+@pytest.mark.parametrize("name", [name for name in EFFECTS if name not in ("frame_loss", "delay_jitter", "sensor_noise")])
+def test_an_effect_does_in_the_library_what_it_does_alone(name: str, machine: Machine) -> None:
+    build, u, spec = option("actuator", "lag").build, commands(machine, 60, 3), fixed(name)
+    alone = spec.wrap(build(machine, 3, CPU), machine, 3, CPU)
+    together = library(1.0, spec).wrap(build(machine, 3, CPU), machine, 3, CPU)
+    assert torch.equal(roll(together, machine, u), roll(alone, machine, u))
+    assert torch.equal(together.measure(u[7]), alone.measure(u[7]))
+    assert torch.equal(together.truth(u[7]), alone.truth(u[7]))
+
+
+def test_all_together_are_one_around_the_other(machine: Machine) -> None:
+    chance = ("frame_loss", "delay_jitter", "sensor_noise")
+    build, u, specs = option("actuator", "lag").build, commands(machine, 100, 3), [fixed(n) for n in EFFECTS if n not in chance]
+    stacked = build(machine, 3, CPU)
+    for spec in specs:
+        stacked = spec.wrap(stacked, machine, 3, CPU)
+    together = library(1.0, *specs).wrap(build(machine, 3, CPU), machine, 3, CPU)
+    torch.testing.assert_close(roll(together, machine, u), roll(stacked, machine, u), rtol=0, atol=2e-6)
+    torch.testing.assert_close(together.measure(u[7]), stacked.measure(u[7]), rtol=0, atol=1e-6)
+    assert together.sides == {"speed", "measurement"}
+
+
+@pytest.mark.parametrize("actuator", ["mlp", "lag"])
+def test_where_no_effect_is_there_nothing_changes(actuator: str, machine: Machine) -> None:
+    build, u = option("actuator", actuator).build, commands(machine, 60, 3)
+    model = replace(option("effect", "library"), share=0.0).wrap(build(machine, 3, CPU), machine, 3, CPU)
+    assert torch.equal(roll(model, machine, u), roll(build(machine, 3, CPU), machine, u))
+    assert torch.equal(model.measure(u[0]), u[0])
+
+
+def test_each_effect_is_there_in_its_share_of_environments_independently_of_the_others(machine: Machine) -> None:
+    shipped = option("effect", "library")
+    model = shipped.wrap(option("actuator", "ideal").build(machine, 6000, CPU), machine, 6000, CPU)
+    there = {}
+    for name, spec in shipped.effects.items():
+        off = [(model.parameters[f"{name}.{key}"] == n.none).all(1) for key, n in spec.numbers.items() if n.none is not None]
+        there[name] = ~torch.stack(off).all(0)
+    assert there.pop("dead_time").all()
+    shares = torch.stack(list(there.values())).float()
+    assert shares.mean(1).tolist() == pytest.approx([0.15] * len(there), abs=0.015)
+    assert torch.corrcoef(shares).fill_diagonal_(0).abs().max() < 0.06
+    gain = model.parameters["flow_gain.gain"][there["flow_gain"]]
+    assert 0.85 <= gain.min() < 0.87 and 1.13 < gain.max() <= 1.15, "where it is there its range is drawn"
+    before = torch.stack(list(there.values()))
+    model.reset(torch.arange(6000) < 3000)
+    after = model.parameters["flow_gain.gain"] != 1.0
+    assert torch.equal(after[3000:].all(1), before[EFFECTS.index("flow_gain") - 1, 3000:])
+    assert (after[:3000].all(1) != before[EFFECTS.index("flow_gain") - 1, :3000]).any(), "another machine"
+
+
+def test_a_run_goes_on_exactly_from_its_state(machine: Machine) -> None:
+    def fresh() -> Any:
+        return replace(option("effect", "library"), share=0.5).wrap(
+            option("actuator", "lag").build(machine, 4, CPU), machine, 4, CPU
+        )
+
+    torch.manual_seed(0)
+    model, u = fresh(), commands(machine, 30, 4)
+    roll(model, machine, u)
+    kept = {key: value.clone() for key, value in model.state.items()}
+    on, seen = roll(model, machine, u), model.measure(u[0])
+    torch.manual_seed(1)
+    other = fresh()
+    for key, value in other.state.items():
+        value.copy_(kept[key])
+    assert torch.equal(roll(other, machine, u), on) and torch.equal(other.measure(u[0]), seen)
+
+
+def test_chances_of_one_effect_are_not_those_of_another(machine: Machine) -> None:
+    specs = [fixed("frame_loss", probability=0.5), fixed("delay_jitter", jitter_s=0.05)]
+    model = library(1.0, *specs).wrap(option("actuator", "ideal").build(machine, 3000, CPU), machine, 3000, CPU)
+    roll(model, machine, torch.ones(1, 3000, 5))
+    lost = (model.state["frame_loss.sent"][:, -1, 0] == 0).float()
+    pair = torch.stack((lost, model.state["delay_jitter.delay"][:, 0]))
+    assert lost.mean().item() > 0.4 and torch.corrcoef(pair)[0, 1].abs() < 0.06
+
+
+def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: Machine) -> None:
+    """Both would break the trace; a CUDA graph can hold what is left."""
+    u = commands(machine, 20, 4)
+    torch.manual_seed(0)
+    plain, traced = (
+        option("effect", "library").wrap(option("actuator", "lag").build(machine, 4, CPU), machine, 4, CPU) for _ in "ab"
+    )
+    step = torch.compile(traced.step, backend="eager", fullgraph=True, dynamic=False)
+    reset = torch.compile(traced.reset, backend="eager", fullgraph=True, dynamic=False)
+    history = History(q=torch.zeros(4, 13, 5), u=torch.zeros(4, 13, 5))
+    with torch.no_grad():
+        for index, command in enumerate(u):
+            history.push_u(command)
+            assert torch.equal(plain.step(history), step(history))
+            mask = torch.arange(4) == index % 8
+            plain.reset(mask)
+            reset(mask)
+    assert all(torch.equal(value, plain.state[name]) for name, value in traced.state.items())
+
+
+@pytest.mark.parametrize("actuator", ["mlp", "coupled"])
+@pytest.mark.parametrize("shift_s", [-0.05, -0.02, 0.03, 0.05])
+def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(actuator: str, shift_s: float, machine: Machine) -> None:
+    """Measured as from recordings of the machine; its resolution is 0.01 s."""
+    found = []
+    for added in (0.0, shift_s):
+        model = option("actuator", actuator).build(machine, 4, CPU)
+        model = library(1.0, fixed("dead_time", dead_time_s=added)).wrap(model, machine, 4, CPU)
+        generator = torch.Generator().manual_seed(0)
+        u = (torch.rand(150, 4, 5, generator=generator) * 1.4 - 0.7).repeat_interleave(8, 0) * (torch.arange(5) == 0)
+        q = torch.cat((torch.as_tensor(machine.home, dtype=torch.float32).expand(1, 4, 5), roll(model, machine, u)[:-1]))
+        t_s = machine.period_s * np.arange(len(u))
+        recordings = [
+            Recording(
+                machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=t_s, u=u[:, k].numpy(),
+                q=q[:, k].numpy(), metadata={"run": str(k)},
+            )
+            for k in range(4)
+        ]  # fmt: skip
+        delay = dead_time.delays(recordings, machine, np.random.default_rng(0))["q1"]
+        assert delay is not None
+        found.append(delay.value_s)
+    assert found[1] - found[0] == pytest.approx(shift_s, abs=0.0101)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"share": 1.5}, "expected 0 to 1, got 1.5"),
+        ({"share": {"backslash": 0.1, "other": 0.2}}, "did you mean 'backlash'"),
+        ({"effects": ["link_length"]}, "acts on kinematics; put it beside the library"),
+        ({"effects": ["dead_band", "dead_time"]}, "'dead_time' must come before dead_band"),
+        ({"effects": ["delay_jitter", "dead_band"]}, "'delay_jitter' must come behind dead_band"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(changes: dict[str, Any], message: str) -> None:
+    if isinstance(names := changes.get("effects"), list):
+        changes = {"effects": {name: option("effect", name) for name in names}, "share": 0.1}
+    with pytest.raises(ConfigError, match=message):
+        replace(option("effect", "library"), **changes)
