@@ -43,11 +43,12 @@ def blocks(field: FreeRuns, reference: FreeRuns) -> Blocks:
     few = comb(len(set(sides[0])) + len(set(sides[1])), len(set(sides[0]))) < FEWEST_PERMUTATIONS
     if not few:
         return Blocks(sides[0], sides[1], "recordings")
-    parts = [_parts(side) for side in (field, reference)]
-    return Blocks(parts[0], parts[1], f"parts of {PART_S:g} s, as there are too few recordings")
+    cut = [parts(side) for side in (field, reference)]
+    return Blocks(cut[0], cut[1], f"parts of {PART_S:g} s, as there are too few recordings")
 
 
-def _parts(runs: FreeRuns) -> np.ndarray:
+def parts(runs: FreeRuns) -> np.ndarray:
+    """Returns the number of the part of `PART_S` of a recording that each window lies in, `(W,)`."""
     begin_s = np.array([runs.recordings[s].t_s[r] - runs.recordings[s].t_s[0] for s, r in zip(runs.source, runs.row, strict=True)])
     return np.unique(np.stack([runs.source, begin_s // PART_S], 1), axis=0, return_inverse=True)[1].ravel()
 
