@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections.abc import Callable
+from pathlib import Path
+from statistics import median
 from typing import Any, ClassVar
 
 import torch
@@ -25,6 +28,11 @@ from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
+CALLS = 10
+"""Of one thing before it is the turn of the next."""
+RATES: tuple[str, ...] = ("batch_env_steps_per_s", "physics_env_steps_per_s", "env_steps_per_s", "train_env_steps_per_s")
+"""In the order of what each has to do: MuJoCo's own batch (CPU only), with drive and contacts, the control step, training."""
+
 
 @spec
 class Sizes:
@@ -34,11 +42,14 @@ class Sizes:
         num_envs: Numbers of environments, one row each; of each process where `torchrun` starts several.
         seconds: Least time of each measurement.
         iterations: Training iterations timed, after one to warm up.
+        against: `benchmark.json` of one process with the same numbers of environments, to compare several processes with; `null`
+            for no comparison.
     """
 
     num_envs: tuple[int, ...]
     seconds: float
     iterations: int
+    against: str | None
 
     def check(self) -> None:
         if not self.num_envs or min(self.num_envs) < 1:
@@ -76,12 +87,13 @@ class Bench:
 
     def run(self) -> float:
         """Measures; returns the training rate of the last row, that of all processes together."""
+        alone = _alone(self.bench)
         device = self.session.torch_device()
         plant = Plant(
             machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect, follower=self.follower
         )
         with Group(device) as group:
-            rows = self._rows(plant, device, group)
+            rows = [_compared(row, alone.get(row["num_envs"])) for row in self._rows(plant, device, group)]
         if group.rank.first:
             name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu, {torch.get_num_threads()} threads"
             results = {"device": name, "ranks": group.rank.count, **rows[-1], "versions": versions(), "rows": rows}
@@ -105,12 +117,13 @@ class Bench:
         still = torch.zeros(num, self.machine.num_joints, device=device)
         graphs = device.type == "cuda" and loop.world.supports_graphs
         physics = capture(lambda: loop.world.step(still), device).replay if graphs else lambda: loop.world.step(still)
-        group.wait()  # those of one computer share its processors and its power: measure them at the same time
-        physics_s = self._time(physics, device)
         loop.capture(self.rl.fuse)
         action = torch.zeros(num, loop.num_actions, device=device)
-        group.wait()
-        step_s = self._time(lambda: loop.step(action), device)
+        steps = {"physics_env_steps_per_s": physics, "env_steps_per_s": lambda: loop.step(action)}
+        if bare := getattr(loop.world, "bare_step", None):
+            steps["batch_env_steps_per_s"] = bare
+        group.wait()  # those of one computer share its processors and its power: measure them at the same time
+        seconds = self._in_turn(steps, loop, device)
         runner_steps = int(self.rl.runner["num_steps_per_env"])
         book = Logbook(
             self.session.folder, Off().open(self.session.folder, {}), loop.statistics, num * runner_steps, 1.0, lambda *_: 0.0
@@ -123,27 +136,32 @@ class Bench:
         runner.learn(self.bench.iterations)
         _wait(device)
         train_s = (time.perf_counter() - start) / (self.bench.iterations * runner_steps)
-        return {
-            "num_envs": num,
-            "physics_env_steps_per_s": num / physics_s,
-            "env_steps_per_s": num / step_s,
-            "train_env_steps_per_s": num / train_s,
-            "graph": loop.graph_active,
-        }
+        rates = {name: num / value for name, value in seconds.items()} | {"train_env_steps_per_s": num / train_s}
+        return {"num_envs": num, **{name: rates[name] for name in RATES if name in rates}, "graph": loop.graph_active}
 
-    def _time(self, step: Callable[[], object], device: torch.device) -> float:
-        """Returns the seconds that one call takes, the mean over at least `bench.seconds`."""
-        for _ in range(3):
-            step()
-        _wait(device)
-        calls, spent = 0, 0.0
-        while spent < self.bench.seconds:
-            start = time.perf_counter()
-            for _ in range(10):
-                step()
-            _wait(device)
-            calls, spent = calls + 10, spent + time.perf_counter() - start
-        return spent / calls
+    def _in_turn(self, steps: dict[str, Callable[[], object]], loop: ControlLoop, device: torch.device) -> dict[str, float]:
+        """Returns the seconds that one call of each takes, the median over at least `bench.seconds`.
+
+        A few calls of each at a time, so that what else the computer does meets all alike. What is no control step moves arms at
+        rest at their starts, and the control loop finds its worlds as it left them.
+        """
+        rest = loop.world.state_dict()
+        spent: dict[str, list[float]] = {name: [] for name in steps}
+        while min(map(sum, spent.values())) < self.bench.seconds:
+            for name, step in steps.items():
+                running = loop.world.state_dict()
+                if name != "env_steps_per_s":
+                    loop.world.load_state_dict(rest)
+                step()  # finds what it needs in the caches
+                _wait(device)
+                start = time.perf_counter()
+                for _ in range(CALLS):
+                    step()
+                _wait(device)
+                spent[name].append(time.perf_counter() - start)
+                if name != "env_steps_per_s":
+                    loop.world.load_state_dict(running)
+        return {name: median(values) / CALLS for name, values in spent.items()}
 
 
 def _over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -155,14 +173,50 @@ def _over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return rows[0] | {name: sum(row[name] for row in rows) for name in rates} | {"ranks": len(rows), "per_rank": per_rank}
 
 
+def _alone(sizes: Sizes) -> dict[int, dict[str, Any]]:
+    """Returns the rows of the one process that is compared with, by number of environments."""
+    if sizes.against is None:
+        return {}
+    try:
+        found = json.loads(Path(sizes.against).read_text())
+        rows = {row["num_envs"]: row for row in found["rows"]}
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"bench.against: {sizes.against} is no benchmark.json ({error!r})") from error
+    missing = [num for num in sizes.num_envs if num not in rows]
+    if found.get("ranks") != 1 or missing:
+        raise ConfigError(
+            f"bench.against: expected {sizes.against} to be of one process, with rows for {list(sizes.num_envs)} environments, "
+            f"got {found.get('ranks')} processes and {sorted(rows)}"
+        )
+    return rows
+
+
+def _compared(row: dict[str, Any], alone: dict[str, Any] | None) -> dict[str, Any]:
+    """Returns the row with what its rates are of those of MuJoCo's own batch, and of as many times one process alone."""
+    if batch := row.get("batch_env_steps_per_s"):
+        row = row | {"of_batch": {name: row[name] / batch for name in RATES[1:]}}
+    if alone is None:
+        return row
+    ranks = row.get("ranks", 1)
+    return row | {"weak_scaling": {name: row[name] / (ranks * alone[name]) for name in RATES if name in row and name in alone}}
+
+
 def _wait(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def _print(rows: list[dict[str, Any]]) -> None:
-    table = Table("environments", "physics /s", "control step /s", "training /s", "CUDA graph")
+    names = [name for name in RATES if name in rows[0]]
+    heads: dict[str, str] = dict(zip(RATES, ("mujoco.batch alone /s", "physics /s", "control step /s", "training /s"), strict=True))
+    table = Table("environments", *(heads[name] for name in names), "CUDA graph")
     for row in rows:
-        rates = [f"{row[name]:,.0f}" for name in ("physics_env_steps_per_s", "env_steps_per_s", "train_env_steps_per_s")]
-        table.add_row(f"{row['num_envs']:,}", *rates, "yes" if row["graph"] else "no")
+        texts = []
+        for name in names:
+            shares = [row[kind][name] for kind in ("of_batch", "weak_scaling") if name in row.get(kind, {})]
+            texts.append(" ".join([f"{row[name]:,.0f}", *(f"({share:.2f})" for share in shares)]))
+        table.add_row(f"{row['num_envs']:,}", *texts, "yes" if row["graph"] else "no")
+    notes = {"of_batch": "of mujoco.batch alone", "weak_scaling": "of one process times their number"}
+    told = [text for kind, text in notes.items() if kind in rows[0]]
+    table.caption = f"In brackets: rate {'; '.join(told)}." if told else None
     Console().print(table)

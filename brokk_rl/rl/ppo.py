@@ -21,6 +21,7 @@ from torch import nn
 
 from brokk_rl.rl.graph import capture
 from brokk_rl.rl.rollout import Rollout
+from brokk_rl.rl.threads import one_thread
 
 LOWEST_RATE, HIGHEST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
 """Bounds and step of the adaptive learning rate, as in rsl-rl."""
@@ -28,7 +29,7 @@ FIGURES = ("value", "surrogate", "entropy")
 
 
 class DevicePPO(PPO):
-    """PPO for feed-forward networks; on a CPU, and with curiosity or symmetry, it is rsl-rl's own."""
+    """PPO for feed-forward networks; on a CPU, and with curiosity or symmetry, it is rsl-rl's own, which acts on one thread."""
 
     _rollout: Rollout | None = None
     _mini_batch: Sequence[Callable[[], None]] | None = None
@@ -43,7 +44,8 @@ class DevicePPO(PPO):
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Draws actions; see `rsl_rl.algorithms.PPO.act`."""
         if not (self._on_device and isinstance(self.actor.distribution, GaussianDistribution)):
-            return super().act(obs)
+            with one_thread(self.device):
+                return super().act(obs)
         self._rollout = self._rollout or Rollout(self)
         return self._rollout.act(obs)
 
@@ -52,7 +54,8 @@ class DevicePPO(PPO):
     ) -> None:
         """Stores a step; see `rsl_rl.algorithms.PPO.process_env_step`."""
         if self._rollout is None:
-            super().process_env_step(obs, rewards, dones, extras)
+            with one_thread(self.device):
+                super().process_env_step(obs, rewards, dones, extras)
         else:
             self._rollout.store(rewards, dones, extras.get("time_outs", torch.zeros_like(rewards)))
 

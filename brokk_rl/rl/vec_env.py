@@ -13,6 +13,7 @@ from typing import Any, cast
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
+from torch._dynamo.exc import BackendCompilerFailed
 
 from brokk_rl.contracts import (
     Actuator,
@@ -26,9 +27,11 @@ from brokk_rl.contracts import (
     TaskProcess,
     World,
 )
+from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.graph import capture
+from brokk_rl.rl.threads import one_thread
 
 Starts = dict[str, torch.Tensor]
 
@@ -153,14 +156,29 @@ class ControlLoop(VecEnv):
         """Captures the control step in a CUDA graph where device and world allow it; a few steps are simulated on the way.
 
         Args:
-            fuse: First have `torch.compile` fuse the small operations around the physics, which takes a minute and a C compiler.
+            fuse: First have `torch.compile` fuse the small operations around the physics, on a GPU only for a graph.
+
+        Raises:
+            ConfigError: There is nothing here with which to compile.
         """
-        if self.device.type != "cuda" or not self.world.supports_graphs:
-            return
+        graphs = self.device.type == "cuda" and self.world.supports_graphs
+        fuse = fuse and (graphs or self.device.type == "cpu")
         if fuse:
-            for name in ("_command", "_judge", "_perceive"):
+            # not `_renew`: a library of effects draws so much there that compiling it takes minutes
+            for name in ("_command", "_judge", "_observe"):
                 setattr(self, name, torch.compile(getattr(self, name), fullgraph=True, dynamic=False))
-        self._graph = capture(self._advance, self.device)
+        try:
+            if graphs:
+                self._graph = capture(self._advance, self.device)
+            elif fuse:
+                self._launch()
+            else:
+                return
+        except BackendCompilerFailed as error:
+            raise ConfigError(
+                f"rl.fuse: cannot compile the control step ({str(error).splitlines()[0]}); install a C++ compiler (g++), or give "
+                "rl.fuse=false"
+            ) from error
         self.begin()
 
     def get_observations(self) -> TensorDict:
@@ -169,14 +187,14 @@ class ControlLoop(VecEnv):
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """Advances one control period; see `rsl_rl.env.VecEnv.step`."""
-        self._action.copy_(actions)
-        self._steps += 1
-        if self._graph is not None:
-            self._graph.replay()
-        else:
-            with torch.no_grad():
-                self._advance()
-        return self.get_observations(), self.reward, self.done, {"time_outs": self.timed_out}
+        with one_thread(self.device):
+            self._action.copy_(actions)
+            self._steps += 1
+            if self._graph is not None:
+                self._graph.replay()
+            else:
+                self._launch()
+            return self.get_observations(), self.reward, self.done, {"time_outs": self.timed_out}
 
     def statistics(self) -> dict[str, float]:
         """Returns means over the episodes finished since the last call, shares of their endings, and their number.
@@ -218,6 +236,11 @@ class ControlLoop(VecEnv):
                 value.copy_(tensors[f"{prefix}.{name}"])
         self.world.load_state_dict(state["world"])
 
+    def _launch(self) -> None:
+        # the same in and outside of rsl-rl's inference mode and at any number of threads: for each, torch would compile anew
+        with one_thread(self.device), torch.inference_mode(False), torch.no_grad():
+            self._advance()
+
     def _advance(self) -> None:
         """One control step on the device."""
         self.world.step(self._command())
@@ -254,9 +277,17 @@ class ControlLoop(VecEnv):
 
     def _perceive(self, start: Starts) -> None:
         """Resets finished environments and observes all of them."""
-        self.truth.reset(self.done, start["q"])
+        self._renew()
+        self._observe(start)
+
+    def _renew(self) -> None:
+        """Another machine and another person where an episode has ended."""
         self.actuator.reset(self.done)
         self.follower.reset(self.done)
+
+    def _observe(self, start: Starts) -> None:
+        """Begins the new episodes and observes all environments."""
+        self.truth.reset(self.done, start["q"])
         if self._sensing:
             q = self._sensing.measure(self.truth.q[:, -1])
             self.history.push_q(q)

@@ -91,6 +91,10 @@ class NativeWorld:
         self.q.copy_(self._qpos)
         self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(self._warning.flatten(1).any(1))
 
+    def bare_step(self) -> None:
+        """Does nothing but `mujoco.batch`: as many substeps, no drive, nothing read out; what `step` is held against."""
+        self._batch.step(nstep=self._substeps)
+
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.World`."""
         rows = mask.nonzero()[:, 0]

@@ -144,6 +144,7 @@ def test_bench_measures_physics_control_step_and_training(run: Path) -> None:
         found[name] == found["rows"][-1][name] for name in rates
     )
     assert found["physics_env_steps_per_s"] > found["env_steps_per_s"] > found["train_env_steps_per_s"]
+    assert found["of_batch"]["env_steps_per_s"] == found["env_steps_per_s"] / found["batch_env_steps_per_s"]
 
 
 def test_a_policy_of_another_task_is_refused_by_message(run: Path, brokk: Callable[..., Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +10,10 @@ import pytest
 import torch
 import training as runs
 from composed import option
+from torch import _inductor as inductor
+from torch._dynamo.exc import BackendCompilerFailed
 
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import evaluate
 from brokk_rl.rl.policy import Classical, Untrained
@@ -167,3 +171,50 @@ def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(m
         assert episode.q[0] == pytest.approx(starts["q"][row].numpy()) and (episode.u[0] == 0).all()
         assert len(episode.t_s) == len(episode.q) == len(episode.u) == len(episode.force_n) == 11
         assert abs(episode.q[1:] - episode.q[:-1]).max() <= 0.45 * 0.05 + 1e-6, "no jump: top speed is 0.45 rad/s"
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_a_control_step_leaves_the_cores_to_the_physics(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch, two_threads: None
+) -> None:
+    loop, found = make(machine), []
+    monkeypatch.setattr(loop.world, "step", lambda increment: found.append(torch.get_num_threads()))
+    loop.step(torch.zeros(8, 5))
+    assert found == [1] and torch.get_num_threads() == 2
+
+
+@pytest.mark.slow
+def test_a_fused_control_step_does_what_the_plain_one_does_and_repeats(machine: Machine, two_threads: None) -> None:
+    """With the draws of the plain one; on its own it draws other numbers."""
+    with inductor.config.patch(fallback_random=True):
+        plain, *fused = (make(machine) for _ in range(3))
+        for loop in fused:
+            loop.capture(fuse=True)
+        ends = []
+        for loop in (plain, *fused):
+            torch.manual_seed(1)
+            loop.begin()
+            for step in range(30):
+                with torch.inference_mode(step % 2 == 0):  # compiled for both
+                    obs, *_ = loop.step(torch.full((8, 5), 0.3))
+            ends.append({name: value.clone() for name, value in obs.items()})
+    for name, value in ends[0].items():
+        torch.testing.assert_close(ends[1][name], value, rtol=1e-3, atol=1e-3)
+        assert torch.equal(ends[1][name], ends[2][name])
+
+
+def test_without_a_compiler_it_says_what_to_do(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise BackendCompilerFailed(fail, RuntimeError("No working C++ compiler found"), None)
+
+    loop = make(machine)
+    monkeypatch.setattr(loop, "_launch", fail)
+    with pytest.raises(ConfigError, match=r"(?s)rl.fuse.*g\+\+"):
+        loop.capture(fuse=True)
