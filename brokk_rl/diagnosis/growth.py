@@ -54,7 +54,8 @@ class Growth:
 
     def plain(self) -> dict[str, Any]:
         """Returns it as plain JSON data."""
-        return {**self.__dict__, "meaning": READINGS[self.reading]}
+        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in self.__dict__.items()}
+        return plain | {"meaning": READINGS[self.reading]}
 
 
 def growth(runs: FreeRuns, reference: FreeRuns | None, machine: Machine, whole: FreeRuns | None) -> dict[str, Growth]:

@@ -140,6 +140,10 @@ class _Clues:
         u, regime = self._u[..., joint], self._regime[..., joint]
         moving, size = np.abs(u) > COMMANDED, np.abs(u)
         others = (np.abs(self._u) > COMMANDED).sum(2) - moving > 0
+        if self._load is not None and np.nanmax(np.abs(self._load[..., joint])) > 0.05:
+            yield "creep", -np.sign(self._load[..., joint]) * (regime == REGIMES.index("hold"))
+        if moving.sum() < FEWEST:
+            return
         yield "dead_time", speed
         yield "flow_gain", speed
         yield "asymmetry", np.abs(speed)
@@ -151,7 +155,6 @@ class _Clues:
         if self._load is not None and np.nanmax(np.abs(self._load[..., joint])) > 0.05:
             load = self._load[..., joint]
             yield "load_dependence", -np.sign(u) * load * np.abs(speed)
-            yield "creep", -np.sign(load) * (regime == REGIMES.index("hold"))
 
 
 def _change(values: np.ndarray, span: int) -> np.ndarray:

@@ -200,20 +200,21 @@ def _clock(recording: Recording) -> Iterator[Remark]:
 
 
 def _saturated(recording: Recording, machine: Machine, thresholds: Thresholds) -> Iterator[Remark]:
-    margin = thresholds.at_limit * (machine.upper - machine.lower)
+    margin, back = thresholds.at_limit * (machine.upper - machine.lower), round(machine.dead_time_s * recording.rate_hz)
     for j, name in enumerate(recording.joints):
-        q = recording.q[:, j]
+        q, acting = recording.q[:, j], np.roll(recording.u[:, j], back)
         if np.ptp(q) <= margin[j]:
             continue
-        for extreme, is_at_stop in (
-            (q.max(), q.max() > machine.upper[j] - margin[j]), (q.min(), q.min() < machine.lower[j] + margin[j])
-        ):  # fmt: skip
-            driven = np.abs(recording.u[:, j]) > thresholds.driving
-            stuck = [run for run in runs(q == extreme) if run[1] >= AT_EXTREME and driven[run[0] : sum(run)].sum() >= AT_EXTREME]
-            if stuck and not is_at_stop:
+        for extreme, outward in ((q.max(), 1.0), (q.min(), -1.0)):
+            stop = machine.upper[j] if outward > 0 else machine.lower[j]
+            if abs(stop - extreme) < margin[j]:
+                continue
+            driven = outward * acting > thresholds.driving
+            stuck = [run for run in runs((q == extreme) & driven) if run[1] >= AT_EXTREME]
+            if stuck:
                 rows = sum(count for _, count in stuck)
                 span_s = recording.t_s[stuck[0][0]], recording.t_s[sum(stuck[-1]) - 1]
-                text = f"{rows} samples at {extreme:.4g} {recording.units[j]} while commanded"
+                text = f"{rows} samples at {extreme:.4g} {recording.units[j]} while driven further"
                 yield _remark("saturated sensor", name, recording, span_s, len(stuck), text)
 
 

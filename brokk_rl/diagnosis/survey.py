@@ -1,4 +1,4 @@
-"""All that can be said about a gap before any effect is fitted: can the recordings be trusted, where does it lie, what points where."""
+"""All that can be said about a gap before any effect is fitted: are the recordings sound, where does it lie, what points where."""
 
 from __future__ import annotations
 

@@ -14,14 +14,10 @@ from brokk_rl.dead_time import Delay
 from brokk_rl.identification.regimes import REGIMES
 from brokk_rl.identification.scores import TAILS, Scores
 from brokk_rl.machine import Machine
+from brokk_rl.panels import BLUE, GREY, ORANGE, OTHERS, clean, legend, panels
 from brokk_rl.split import COMMANDED
 
-BLUE = "#0072b2"
-COLOURS = {"hold": "#8c8c8c", "arx": "#e69f00"}
-OTHERS = ("#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#5b4a9e")
-"""Okabe and Ito's colours, which those who see few colours can also tell apart; blue is the model's."""
-PANEL_INCHES = (3.9, 2.9)
-"""Width and height of a panel, inches."""
+COLOURS = {"hold": GREY, "arx": ORANGE}
 
 
 def colours(names: Sequence[str], model: str) -> dict[str, str]:
@@ -84,18 +80,18 @@ def prediction(scores: Scores, model: str) -> Figure:
             if j == machine.num_joints - 1:
                 below.set_xlabel("time of the free run [s]")
             for axis in (above, below):
-                _clean(axis)
-    _legend(figure, figure.axes[0])
+                clean(axis)
+    legend(figure, figure.axes[0])
     return figure
 
 
 def error_over_horizon(scores: Scores, model: str) -> Figure:
     """Draws the error of all models over the time of the free run, one panel a joint, with 95 % bands."""
     machine = scores.machine
-    figure, panels = _panels(machine, "xy")
+    figure, axes = panels(machine, "xy")
     colour = colours(list(scores.predicted), model)
     t_s = machine.period_s * np.arange(1, scores.cut.measured.shape[1] + 1)
-    for j, (axis, joint) in enumerate(zip(panels, machine.joints, strict=True)):
+    for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
         for name in sorted(scores.predicted, key=lambda name: name == model):
             rmse, again = (100.0 * values[..., j] / scores.travel[j] for values in scores.rmse(name))
             axis.plot(t_s, rmse, color=colour[name], lw=2.0 if name == model else 1.3, label=name)
@@ -113,19 +109,19 @@ def error_over_horizon(scores: Scores, model: str) -> Figure:
         axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
         axis.set_xlim(t_s[0], t_s[-1])
         axis.grid(which="major", alpha=0.3)
-        _clean(axis)
+        clean(axis)
     figure.supxlabel("time of the free run [s]; the left end is the one-step error", fontsize=10)
     figure.supylabel("RMSE [% of travel]", fontsize=10)
-    _legend(figure, panels[0])
+    legend(figure, axes[0])
     return figure
 
 
 def regimes(table: Mapping[str, Any], machine: Machine, model: str, names: Sequence[str]) -> Figure:
     """Draws how fast each model drifts in each regime, one panel a joint."""
-    figure, panels = _panels(machine, "x")
+    figure, axes = panels(machine, "x")
     colour = colours(names, model)
     travel = machine.upper - machine.lower
-    for j, (axis, joint) in enumerate(zip(panels, machine.joints, strict=True)):
+    for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
         rows = table[joint.name]
         for y, regime in enumerate(REGIMES):
             if regime not in rows:
@@ -152,19 +148,19 @@ def regimes(table: Mapping[str, Any], machine: Machine, model: str, names: Seque
         axis.set_ylim(len(REGIMES) - 0.5, -0.5)
         axis.grid(axis="x", which="major", alpha=0.3)
         axis.set_title(joint.name, loc="left", fontsize=10)
-        _clean(axis)
+        clean(axis)
     figure.supxlabel("drift: RMS of the error added within a second [% of travel]; in brackets the part of the time", fontsize=10)
-    _legend(figure, panels[0])
+    legend(figure, axes[0])
     return figure
 
 
 def dead_times(delays: Mapping[str, Delay | None], machine: Machine) -> Figure:
     """Draws what each delay leaves unexplained, one panel a joint; the band is the interval of the best one."""
-    figure, panels = _panels(machine, "xy")
+    figure, axes = panels(machine, "xy")
     history_s = machine.num_history * machine.period_s
-    for axis, (joint, delay) in zip(panels, delays.items(), strict=True):
+    for axis, (joint, delay) in zip(axes, delays.items(), strict=True):
         axis.set_title(joint, loc="left", fontsize=10)
-        _clean(axis)
+        clean(axis)
         if delay is None:
             axis.text(0.5, 0.5, "hardly commanded", transform=axis.transAxes, ha="center")
             continue
@@ -182,9 +178,9 @@ def dead_times(delays: Mapping[str, Delay | None], machine: Machine) -> Figure:
         axis.set_title(f"{joint}: {text}", loc="left", fontsize=10)
     figure.supxlabel("delay [s]", fontsize=10)
     figure.supylabel("variance of the motion left unexplained [%]", fontsize=10)
-    drawn = [axis for axis, delay in zip(panels, delays.values(), strict=True) if delay is not None]
+    drawn = [axis for axis, delay in zip(axes, delays.values(), strict=True) if delay is not None]
     if drawn:
-        _legend(figure, drawn[0])
+        legend(figure, drawn[0])
     return figure
 
 
@@ -209,26 +205,6 @@ def _frame(axis: Axes, measured: np.ndarray, predicted: np.ndarray, machine: Mac
     for limit in (machine.lower[joint], machine.upper[joint]):
         if abs(limit - middle) < half:
             axis.axhline(limit, color="#b3261e", lw=1.0, ls=":")
-
-
-def _panels(machine: Machine, shared: str) -> tuple[Figure, list[Axes]]:
-    """Returns a figure with one panel a joint, in rows of three at most, with the same scale along the axes in `shared`."""
-    columns = 2 if machine.num_joints in (2, 4) else min(3, machine.num_joints)
-    rows = -(-machine.num_joints // columns)
-    figure = Figure(figsize=(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows + 0.6), layout="constrained")
-    first = figure.add_subplot(rows, columns, 1)
-    share = {f"share{side}": first for side in shared}
-    return figure, [first, *(figure.add_subplot(rows, columns, number + 1, **share) for number in range(1, machine.num_joints))]
-
-
-def _legend(figure: Figure, axis: Axes) -> None:
-    handles, labels = axis.get_legend_handles_labels()
-    place = "outside upper center" if figure.get_layout_engine() else "upper center"
-    figure.legend(handles, labels, loc=place, ncols=len(labels), frameon=False)
-
-
-def _clean(axis: Axes) -> None:
-    axis.spines[["top", "right"]].set_visible(False)
 
 
 def _first(rows: Mapping[str, Any]) -> str:

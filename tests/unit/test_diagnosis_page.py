@@ -1,0 +1,115 @@
+"""The report says what the diagnosis says, opens without a network, and can be made again from what was saved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from composed import option
+
+from brokk_rl.diagnosis import outcome, page, wording
+from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Selected
+from brokk_rl.diagnosis.free_runs import FreeRuns
+from brokk_rl.diagnosis.outcome import Outcome
+from brokk_rl.diagnosis.survey import Survey, survey
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+GAIN = Selected(
+    effect="flow_gain", joints=("q4",), probability=0.97, parameters={"gain": {"q4": Estimate(0.81, (0.78, 0.84))}},
+    gap_closed=Estimate(0.86, (0.8, 0.9)), same_as=("encoder_scale",), decided_by="a measured tool point",
+)  # fmt: skip
+
+
+def runs(machine: Machine, count: int, seed: int, factor: float) -> FreeRuns:
+    """Returns free runs of a simulator whose q4 moves `factor` times as fast as the machine's."""
+    rng, recordings, row, source = np.random.default_rng(seed), [], [], []
+    for number in range(count):
+        u = np.repeat(rng.choice([-0.6, 0.0, 0.6], (30, 5)) * [1, 0, 1, 1, 1], 40, 0)
+        q = machine.home + 0.1 * np.cumsum(np.roll(u, 11, 0) * machine.max_speed * 0.05, 0)
+        recordings.append(
+            Recording(
+                machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(1200) * 0.05,
+                u=u.astype(np.float32), q=q, metadata={"run": f"<run> {seed}-{number}"},
+            )
+        )  # fmt: skip
+        row += range(40, 1140, 100)
+        source += [number] * 11
+    found = FreeRuns(recordings, np.array(source), np.array(row), np.zeros((len(row), 100, 5)))
+    start = np.stack([recordings[s].q[k - 1] for s, k in zip(source, row, strict=True)])[:, None]
+    way = np.where(np.arange(5) == 3, factor, 1.0) * (found.measured - start)
+    return replace(found, simulated=start + way + 2e-4 * rng.standard_normal(way.shape).cumsum(1))
+
+
+@pytest.fixture(scope="module")
+def seen(machine: Machine) -> tuple[Outcome, Survey]:
+    before, after, floor = runs(machine, 3, 0, 1.25), runs(machine, 3, 0, 1.01), runs(machine, 6, 1, 1.0)
+    thresholds = option("thresholds", "default")
+    found = survey(before, floor, after, machine, thresholds, np.full(5, 0.55), np.random.default_rng(0), before)
+    rivals = [{"name": "flow gain q4", "score": 40.0, "selected": True}, {"name": "backlash q3", "score": -1.0}]
+    answer = Answer(
+        verdict="effects", selected=(GAIN,), ranking=(), where=found.where(),
+        gap=Gap(0.03, 0.006, 0.004, Estimate(0.93, (0.88, 0.96))),
+        next_experiment=NextExperiment("brokk mode=collect excitation=[ramps]", ("flow_gain", "saturation"), "Slow ramps."),
+        more=found.more() | {"evidence": {"rivals": rivals, "threshold": 5.0, "null": [0.0, 1.0, 2.0]}},
+    )  # fmt: skip
+    return Outcome(answer, before, after, floor), found
+
+
+def test_the_report_says_verdict_gap_cause_place_and_what_to_do(
+    machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path
+) -> None:
+    page.write(seen[0], tmp_path, machine)
+    text = (tmp_path / "report.html").read_text()
+    for part in (
+        "The simulator lacks flow gain on q4 (probability 0.97); adding it closes 93 % of the gap (95 %: 88 to 96 %).",
+        "30.0 mrad before, 6.0 mrad after; the floor is 4.0 mrad",
+        "cannot tell flow gain on q4 from encoder scale", "a measured tool point", "0.81", "0.78 to 0.84", "Next experiment",
+        "brokk mode=collect excitation=[ramps]", "q4 moves +2", "% slower than simulated", "as flow gain does", "joint at rest",
+        "at the tool, mm", "by running time", "grows with the way",
+    ):  # fmt: skip
+        assert part in text, part
+    assert "https:" not in text and "<run>" not in text and "&lt;run&gt;" in text and "nan" not in text.split("base64")[0]
+    assert text.count("data:image/png;base64,") == 6
+
+
+def test_the_survey_finds_the_joint_and_the_stage(seen: tuple[Outcome, Survey]) -> None:
+    where = seen[1].where()
+    assert where.joints["q4"].share > 0.9 and where.stage == "actuation" and where.regimes[0].joint == "q4"
+    assert seen[1].budget is not None and seen[1].budget.before.joint_part["q4"] > 0.7
+    assert sum(joint.share for joint in where.joints.values()) == pytest.approx(1.0)
+    assert seen[1].budget.floor is not None
+
+
+def test_what_a_report_is_made_of_is_saved_and_read_again(machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path) -> None:
+    seen[0].save(tmp_path)
+    again = outcome.load(tmp_path, machine)
+    assert again.answer.to_json() == seen[0].answer.to_json()
+    assert again.before.error == pytest.approx(seen[0].before.error, abs=1e-6) and again.after is not None
+    (tmp_path / "diagnosis.npz").write_bytes(b"half")
+    with pytest.raises(RecordingError, match="cannot be read"):
+        outcome.load(tmp_path, machine)
+
+
+@pytest.mark.parametrize("verdict", ["none", "unknown"])
+def test_an_answer_without_effects_is_said_in_plain_words(
+    machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path, verdict
+) -> None:
+    answer = replace(
+        seen[0].answer, verdict=verdict, selected=(), gap=Gap(0.012, 0.012, 0.01, None), next_experiment=None, reason="Few data."
+    )
+    bare = replace(answer, more={key: value for key, value in answer.more.items() if key not in ("evidence", "budget", "probes")})
+    text, tone = wording.headline(bare)
+    assert tone == ("good" if verdict == "none" else "warn")
+    assert ("No gap" in text) == (verdict == "none") and ("in q4" in text) == (verdict == "unknown")
+    page.write(Outcome(bare, seen[0].before, None, None), tmp_path, machine)
+    assert "12.0 mrad before; the floor is 10.0 mrad" in (tmp_path / "report.html").read_text()
+
+
+def test_lists_and_classes_read_as_sentences() -> None:
+    assert wording.listed(["a"]) == "a" and wording.listed(["a", "b", "c"]) == "a, b and c" and wording.listed([]) == ""
+    assert wording.same_as(replace(GAIN, same_as=())) == ""
+    assert "probability of 0.97 is that of one of them" in wording.same_as(GAIN)
