@@ -72,7 +72,9 @@ class Plant:
             model = effect.wrap(model, self.machine, num, device)
         follower = self.follower.build(self.machine, num, device)
         process = self.task.build(self.machine, num, device)
-        starts = {key: value.to(device) for key, value in process.starts(pool, seed).items()}
+        # with all threads, four processes on a computer of 64 cores had no starts after three minutes; with one each, after seconds
+        with one_thread("cpu"):
+            starts = {key: value.to(device) for key, value in process.starts(pool, seed).items()}
         return ControlLoop(self.machine, world, model, follower, process, starts)
 
 
