@@ -52,7 +52,7 @@ class Chambers:
         ringing = 2.0 * numbers["soft_damping"] * TAU_HZ * mode_hz / self._push
         self._friction = numbers["friction"] * (1.0 - 0.7 * hose)
         self._viscous = numbers["viscous"] + hose * (np.minimum(ringing, numbers["viscous"]) - numbers["viscous"])
-        self._leak = numbers["leak"] * FORCE_RATIO / machine.max_speed
+        self._leak = numbers["leak"] / machine.max_speed
 
     def begin(self, load: np.ndarray) -> None:
         """Lets the cylinders of resting joints bear their load, `(N, J)`."""
@@ -73,7 +73,7 @@ class Chambers:
         head_in = 1.0 + self._loose_in * ((1.0 - rod) / DROP_IN - 1.0)
         inlet = area * np.sqrt(np.maximum(np.where(out, head_out, head_in), 0.0))
         outlet = area * np.sqrt(np.maximum(np.where(out, rod, bore / ROD), 0.0) / BACK)
-        lost = self._leak * (bore - ROD * rod)
+        lost = -self._leak * load  # what the weight presses through the closed valve
         into_bore = np.where(out, inlet, -outlet) - lost
         from_rod = np.where(out, outlet, -inlet) + lost  # at the scale of the bore's speed
         speed = self.speed

@@ -28,7 +28,7 @@ class Compensated:
         inertia = np.array([body.stiffness.value for body in machine.bodies]) / TAU_HZ**2 / 36.0
         self._push = force / (inertia * machine.max_speed)
         self._stiff = (TAU_HZ * numbers["mode_hz"]) ** 2 / self._push
-        self._leak = numbers["leak"] * FORCE_RATIO / machine.max_speed
+        self._leak = numbers["leak"] / machine.max_speed
 
     def begin(self, load: np.ndarray) -> None:
         """Lets the cylinders of resting joints bear their load, `(N, J)`."""
@@ -42,7 +42,7 @@ class Compensated:
 
         def slope(force: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             pull = force + load / FORCE_RATIO - rubbing(speed, n["friction"], n["viscous"]) * speed
-            return self._stiff * (flow - self._leak * force - speed), self._push * pull
+            return self._stiff * (flow + self._leak * load - speed), self._push * pull
 
         force_1, speed_1 = slope(self._force, self.speed)
         force_2, speed_2 = slope(self._force + dt_s * force_1, self.speed + dt_s * speed_1)

@@ -11,7 +11,7 @@ Each has a severity by joint, 1 for a machine that plainly has it and 0 where it
     interlock            commands are ignored for some seconds while two certain joints are both wanted fast
     dial_error           the encoder's disc sits off its centre: an error that comes and goes with the angle
     end_cushion          the last part of the travel is slow
-    cross_talk           a neighbour's command opens the valve a little
+    cross_talk           the commands of the others open the valve a little
     fading               the pump tires after some seconds of work and recovers in pauses
     flow_boost           above a command a second pump joins
 """
@@ -54,7 +54,7 @@ class Strangers:
         if (size := self._of.get("joystick_curve")) is not None:
             u = np.sign(u) * np.abs(u) ** (1.0 + 0.7 * size)
         if (size := self._of.get("cross_talk")) is not None:
-            u = np.clip(u + 0.25 * size * np.roll(u, 1, 1), -1.0, 1.0)
+            u = np.clip(u + 0.2 * size * (u.sum(1, keepdims=True) - u), -1.0, 1.0)
         if (size := self._of.get("interlock")) is not None:
             has = size > 0
             wanted = (np.abs(u) > 0.25) & has

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import secrets
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from rich.console import Console
 from rich.progress import Progress
+from rich.table import Table
 
+from brokk_rl import record
 from brokk_rl.contracts import Excitation
-from brokk_rl.diagnosis.exam import paper, seal
+from brokk_rl.diagnosis import answer
+from brokk_rl.diagnosis.exam import ledger, marking, page, paper, seal, sitting
 from brokk_rl.diagnosis.exam.making import Half, Workshop
 from brokk_rl.diagnosis.exam.mix import Mix
+from brokk_rl.diagnosis.exam.sitting import Candidate
 from brokk_rl.diagnosis.exam.specimen import PlantFamily
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.diagnosis.exam.tally import tally
+from brokk_rl.errors import ConfigError, RecordingError, choices
 from brokk_rl.machine import Machine
 from brokk_rl.plan.schedule import Approach
 from brokk_rl.session import Session, write_json
@@ -28,7 +36,12 @@ class Examination:
     """What to do, and with which cases.
 
     Attributes:
-        do: `make` cases, `run` the diagnosis on them, `score` the answers.
+        do: `make` cases into the run folder, `run` a candidate on them, `score` the answers of one or several.
+        folder: The exam that `run` and `score` are about: the folder that `make` left.
+        candidate: Who answers.
+        workers: Cases answered at once.
+        answers: What `score` compares: a name for each candidate, and the run folder with its answers.
+        ledger: File to which `score` appends its headlines; `null`: none.
         mix: Which cases there are.
         plants: Machines that share no equations with what is examined.
         roughness: How much of a machine no tidy model has: a name of the family's, `mild` or `strong`.
@@ -41,6 +54,11 @@ class Examination:
     """
 
     do: Literal["make", "run", "score"]
+    folder: str | None
+    candidate: Candidate
+    workers: int
+    answers: dict[str, str]
+    ledger: str | None
     mix: Mix
     plants: PlantFamily
     roughness: str
@@ -52,6 +70,12 @@ class Examination:
     salt: str | None
 
     def check(self) -> None:
+        if self.do != "make" and self.folder is None:
+            raise ConfigError(f"exam.do={self.do}: expected exam.folder=<folder>, the one that exam.do=make wrote")
+        if self.do == "score" and not self.answers:
+            raise ConfigError("exam.do=score: expected exam.answers={<name>: <folder>, …}, folders that exam.do=run wrote")
+        if self.workers < 1:
+            raise ConfigError(f"exam.workers: expected 1 or more, got {self.workers}")
         for name in self.mix.troubles:
             if name not in self.plants.effects:
                 raise ConfigError(f"exam.mix.troubles: no plant has '{name}'; {choices(name, self.plants.effects)}")
@@ -59,12 +83,21 @@ class Examination:
 
 @spec
 class Exam:
-    """Examines the diagnosis on cases whose cause is withheld: makes them, sits them, scores them."""
+    """Examines the diagnosis on cases whose cause is withheld: makes them, has them answered, scores the answers.
+
+    Attributes:
+        session: Folder and seed.
+        machine: The machine of all cases.
+        excitation: What is played, by name; `exam.reference` and `exam.field` say in which file.
+        exam: What to do.
+        resume: Run folder of an interrupted `exam.do=run` to go on with; the same as `session.out`.
+    """
 
     session: Session
     machine: Machine
     excitation: dict[str, Excitation]
     exam: Examination
+    resume: str | None
 
     def run(self) -> None:
         """Does what `exam.do` says, in the run folder."""
@@ -100,3 +133,58 @@ class Exam:
         found = seal.seal(folder, {**facts, "cases": labels}, salt)
         write_json(folder / "exam.json", {**facts, "labels_sha256": found})
         log.info("%d cases in %s, labels sealed: sha256 %s", len(labels), folder / paper.CASES, found)
+
+    def _run(self) -> None:
+        """Writes `<case>/diagnosis.json` and `<case>/sitting.json` for each case."""
+        settings = self.exam
+        cases = self._cases()
+        with Progress(transient=True) as progress:
+            task = progress.add_task(f"{len(cases)} cases", total=len(cases))
+            failed = sitting.sit(
+                settings.candidate, cases, self.session.folder, self.machine, settings.workers, lambda: progress.advance(task)
+            )
+        if failed:
+            log.warning("%d of %d cases have no answer; why stands in their %s", failed, len(cases), sitting.NOTE)
+        log.info("answers in %s; exam.do=score opens the labels", self.session.folder)
+
+    def _cases(self) -> list[Path]:
+        found = sorted(path for path in (self._folder / paper.CASES).glob("*") if path.is_dir())
+        if not found:
+            raise RecordingError(f"exam.folder={self._folder}: expected cases in {paper.CASES}/, as exam.do=make writes them")
+        return found
+
+    @property
+    def _folder(self) -> Path:
+        return Path(self.exam.folder or "")
+
+    def _score(self) -> None:
+        """Opens the labels; writes `marks.json`, `exam.html` and pictures, appends to the ledger, and prints the table."""
+        labels = seal.opened(self._folder)
+        facts = json.loads((self._folder / "exam.json").read_text())
+        tables = {name: self._table(Path(folder), labels["cases"]) for name, folder in self.exam.answers.items()}
+        write_json(self.session.folder / "marks.json", {"exam": facts, "candidates": tables})
+        page.write(self.session.folder, facts, tables)
+        if self.exam.ledger is not None:
+            for name, table in tables.items():
+                ledger.append(Path(self.exam.ledger), record.now(), facts, name, table)
+        _show(tables)
+        log.info("report: %s", self.session.folder / page.PAGE)
+
+    def _table(self, folder: Path, labels: list[dict[str, Any]]) -> dict[str, Any]:
+        """Returns the figures of the answers in `folder`."""
+        mix, marks = self.exam.mix, []
+        of_machine = [name for name, trouble in mix.troubles.items() if trouble.joints == "all"]
+        for label in labels:
+            place = folder / label["case"]
+            said = answer.read(place / answer.FILE) if (place / answer.FILE).is_file() else None
+            marks.append(marking.mark(label, said, mix.classes, of_machine, sitting.seconds(place)))
+        if all(mark.verdict == "failed" for mark in marks):
+            raise RecordingError(f"exam.answers: {folder} holds no answer to any case of {self._folder}")
+        return tally(marks)
+
+
+def _show(tables: dict[str, dict[str, Any]]) -> None:
+    shown = Table("", *tables)
+    for words, *cells in page.rows(tables):
+        shown.add_row(str(words), *(f"{cell.value} ({cell.note})" if cell.note else str(cell.value) for cell in cells))  # pyright: ignore[reportAttributeAccessIssue]
+    Console().print(shown)

@@ -50,14 +50,14 @@ class Fault:
         joints: The joints that have it.
         size: Of typical.
         parameters: `(J,)` by name.
-        drawn: The parameters that were drawn, and so can be asked for.
+        drawn: The parameters that were drawn, and so can be asked for, with the value that changes nothing.
     """
 
     effect: str
     joints: tuple[str, ...]
     size: float
     parameters: dict[str, np.ndarray]
-    drawn: tuple[str, ...]
+    drawn: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,8 @@ class Mix:
             # where nothing changes a threshold is not there at all, rather than where it begins to count
             away = none if none in (0.0, 1.0) else 0.0
             parameters[key] = np.where(has & (key in drawn), none + sign * size * (typical - none), away)
-        return Fault(name, tuple(machine.joint_names[j] for j in chosen), size, parameters, drawn)
+        nothing = {key: trouble.numbers[key][0] for key in drawn}
+        return Fault(name, tuple(machine.joint_names[j] for j in chosen), size, parameters, nothing)
 
 
 def _rounds(names: list[str], generator: np.random.Generator) -> Iterator[str]:

@@ -51,12 +51,13 @@ def label(name: str, question: Question, field: Made, machine: Machine) -> dict[
                     key: {joint: float(fault.parameters[key][machine.joint_names.index(joint)]) for joint in fault.joints}
                     for key in fault.drawn
                 },
+                "nothing": fault.drawn,
             }
             for fault in question.faults
         ],
         "outside": None
         if question.ailment is None
-        else {"kind": question.ailment.kind, "joints": list(question.joints), "size": question.size},
+        else {"ailment": question.ailment.kind, "joints": list(question.joints), "size": question.size},
         "moved_rad": dict(zip(machine.joint_names, moved(field, machine).tolist(), strict=True)),
         "machine_seed": question.machine_seed,
         "chance": question.chance,
