@@ -73,7 +73,9 @@ class Examination:
         if self.do != "make" and self.folder is None:
             raise ConfigError(f"exam.do={self.do}: expected exam.folder=<folder>, the one that exam.do=make wrote")
         if self.do == "score" and not self.answers:
-            raise ConfigError("exam.do=score: expected exam.answers={<name>: <folder>, …}, folders that exam.do=run wrote")
+            raise ConfigError(
+                "exam.do=score: expected +exam.answers.<name>=<folder>, a folder that exam.do=run wrote; one or several"
+            )
         if self.workers < 1:
             raise ConfigError(f"exam.workers: expected 1 or more, got {self.workers}")
         for name in self.mix.troubles:

@@ -1,0 +1,167 @@
+"""The exam as a person runs it: cases that tell nothing, sealed labels, sittings that can be resumed, a table and a ledger."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from composed import option
+
+from brokk_rl import record
+from brokk_rl.diagnosis.answer import FILE
+from brokk_rl.diagnosis.exam import paper, seal, sitting
+from brokk_rl.diagnosis.exam.baselines import Always
+from brokk_rl.diagnosis.exam.mix import KINDS, Mix, Question
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+
+SMALL = (
+    "mode=exam", "exam.mix.num_cases=2", "exam.mix.shares={none: 0.5, faint: 0, one: 0.5, several: 0, outside: 0}",
+    "exam.reference.programs=[[levels]]", "exam.reference.file_s=12", "exam.field.programs=[[levels],[levels]]",
+    "exam.field.file_s=8",
+)  # fmt: skip
+
+
+def questions(mix: Mix, machine: Machine, seed: int) -> list[Question]:
+    return mix.questions(machine, ("fading", "interlock"), np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def mix() -> Mix:
+    return option("exam_mix", "main")
+
+
+def test_kinds_have_their_shares_and_effects_come_round_evenly(mix: Mix, machine: Machine) -> None:
+    found = questions(mix, machine, 3)
+    assert {kind: sum(one.kind == kind for one in found) for kind in KINDS} == {
+        "none": 15, "faint": 10, "one": 35, "several": 20, "outside": 20,
+    }  # fmt: skip
+    single = Counter(one.faults[0].effect for one in found if one.kind == "one")
+    assert set(single.values()) <= {1, 2, 3} and len(single) >= 20
+    assert Counter(one.ailment.kind for one in found if one.ailment) == {"fading": 10, "interlock": 10}
+
+
+def test_a_case_holds_what_its_kind_says(mix: Mix, machine: Machine) -> None:
+    for one in questions(mix, machine, 4):
+        sizes, count = [fault.size for fault in one.faults], len(one.faults)
+        assert count == {"none": 0, "faint": 1, "one": 1, "several": count, "outside": 0}[one.kind]
+        if one.kind == "several":
+            assert count in (2, 3)
+            names = {fault.effect for fault in one.faults}
+            assert len(names) == count and not any(len(names & set(group)) > 1 for group in mix.classes)
+        assert all((0.03 <= size <= 0.1) if one.kind == "faint" else (0.4 <= size <= 1.0) for size in sizes)
+        assert one.tracked or not any(mix.troubles[fault.effect].needs_tool for fault in one.faults)
+
+
+def test_the_same_seed_gives_the_same_cases_and_another_one_others(mix: Mix, machine: Machine) -> None:
+    first, again, other = (repr(questions(mix, machine, seed)) for seed in (5, 5, 6))
+    assert first == again != other
+
+
+def test_parameters_lie_at_their_size_between_nothing_and_typical(mix: Mix, machine: Machine) -> None:
+    for one in questions(mix, machine, 7):
+        for fault in one.faults:
+            for name, nothing in fault.drawn.items():
+                typical = mix.troubles[fault.effect].numbers[name][1]
+                values = fault.parameters[name][[joint in fault.joints for joint in machine.joint_names]]
+                assert np.abs(values - nothing) == pytest.approx(np.full(len(values), fault.size * abs(typical - nothing)))
+
+
+@pytest.fixture
+def exam(brokk: Callable[..., Any], tmp_path: Path) -> Path:
+    done = brokk(*SMALL, f"session.out={tmp_path / 'exam'}")
+    assert done.code == 0, done.err
+    return tmp_path / "exam"
+
+
+def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: Machine) -> None:
+    labels = exam / seal.LABELS
+    assert labels.stat().st_mode & 0o777 == 0o600
+    assert (exam / seal.HASH).read_text().split()[0] == hashlib.sha256(labels.read_bytes()).hexdigest()
+    files = sorted((exam / paper.CASES).rglob("*.parquet"))
+    assert len(files) == 2 * 3 and {file.stat().st_mtime for file in files} == {files[0].stat().st_mtime}
+    for file in files:
+        assert set(pq.read_schema(file).metadata) == {
+            b"brokk.schema", b"brokk.machine", b"brokk.rate_hz", b"brokk.created", b"brokk.fingerprint"
+        }  # fmt: skip
+        found = record.read(file, machine)
+        moving = np.abs(found.u) > 0
+        exclusive = machine.is_exclusive
+        assert not (moving[:, exclusive].any(1) & moving[:, ~exclusive].any(1)).any()
+        assert (found.q >= machine.lower - 0.05).all() and (found.q <= machine.upper + 0.05).all()
+    names = {name for case in json.loads(labels.read_text())["cases"] for one in case["effects"] for name in [one["effect"]]}
+    assert names and not any(name.encode() in file.read_bytes() for file in files for name in names)
+
+
+def test_labels_that_were_changed_are_not_scored(exam: Path) -> None:
+    path = exam / seal.LABELS
+    path.write_text(path.read_text().replace('"one"', '"none"'))
+    with pytest.raises(RecordingError, match="is not what was sealed"):
+        seal.opened(exam)
+
+
+def test_an_exam_is_made_sat_and_scored_from_the_command_line(exam: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    answers, marks, ledger = tmp_path / "answers", tmp_path / "marks", tmp_path / "ledger.jsonl"
+    about = ("mode=exam", f"exam.folder={exam}")
+    assert brokk(*about, "exam.do=run", "exam_candidate=always_none", f"session.out={answers}").code == 0
+    done = brokk(*about, "exam.do=score", f"+exam.answers.none={answers}", f"exam.ledger={ledger}", f"session.out={marks}")
+    assert done.code == 0, done.err
+    found = json.loads((marks / "marks.json").read_text())["candidates"]["none"]
+    assert found["false_alarms"]["value"] == 0.0 and found["top1"]["value"] == 0.0 and found["failed"] == 0
+    assert (marks / "exam.html").stat().st_size > 10_000 and (marks / "confusion_none.png").is_file()
+    (line,) = [json.loads(text) for text in ledger.read_text().splitlines()]
+    assert line["candidate"] == "none" and line["labels_sha256"] == (exam / seal.HASH).read_text().split()[0]
+
+
+def test_seeds_of_exams_need_to_be_sealed_and_those_of_development_not(brokk: Callable[..., Any], tmp_path: Path) -> None:
+    for seed, sealed in ((1000, "false"), (1, "true")):
+        done = brokk(*SMALL, f"session.seed={seed}", f"exam.sealed={sealed}", f"session.out={tmp_path / 'x'}")
+        assert done.code != 0 and "exam.sealed=" in done.err and not (tmp_path / "x").exists()
+
+
+class Recorder:
+    """A candidate that notes what it is given, and fails at first."""
+
+    def __init__(self, fails: bool) -> None:
+        self.given: list[tuple[Path, list[str]]] = []
+        self._fails = fails
+
+    def answer(self, case: Path, out: Path, machine: Machine) -> None:
+        self.given.append((case, sorted(str(path.relative_to(case)) for path in case.rglob("*"))))
+        if self._fails:
+            raise RecordingError("no")
+        Always(effect=None, probability=0.5).answer(case, out, machine)
+
+
+def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_again(machine: Machine, tmp_path: Path) -> None:
+    case, answers = tmp_path / "exam" / paper.CASES / "0000", tmp_path / "answers"
+    (case / "field").mkdir(parents=True)
+    (case / "field" / "00.parquet").touch()
+    seal.seal(tmp_path / "exam", {"cases": []}, "salt")
+    first, second, third = Recorder(True), Recorder(False), Recorder(False)
+    assert sitting.sit(first, [case], answers, machine, 1, lambda: None) == 1
+    assert sitting.seconds(answers / "0000") is None
+    assert sitting.sit(second, [case], answers, machine, 1, lambda: None) == 0
+    assert sitting.sit(third, [case], answers, machine, 1, lambda: None) == 0
+    given, content = second.given[0]
+    assert content == ["field", "field/00.parquet"] and tmp_path not in given.parents and "0000" not in str(given)
+    assert third.given == [] and (answers / "0000" / FILE).is_file() and sitting.seconds(answers / "0000") is not None
+
+
+def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_path: Path) -> None:
+    for words, limit_s, message in (
+        (("false", "{case}", "{out}"), 10.0, "exit status 1"),
+        (("sleep", "9", "#{case}{out}"), 0.2, "within"),
+    ):
+        command = sitting.Command(
+            command=words if words[0] == "false" else ("sh", "-c", "sleep 9 #{case}{out}"), limit_s=limit_s, threads=1
+        )
+        with pytest.raises(RecordingError, match=message):
+            command.answer(tmp_path, tmp_path / "out", machine)
