@@ -86,6 +86,22 @@ def excess_p(
     return np.where(np.isfinite(seen), larger.mean(0), np.nan)
 
 
+def standard_error(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Returns the standard error of the ratio of totals, `(C,)`, from how blocks differ; NaN for fewer than two blocks.
+
+    Source: the ratio estimator's, Cochran 1977, section 2.11.
+
+    Args:
+        sums: Of each block, `(B, C)`.
+        counts: Of each block, `(B, C)`.
+    """
+    if len(sums) < 2:
+        return np.full(sums.shape[1], np.nan)
+    total = np.maximum(counts.sum(0), 1.0)
+    off = sums - sums.sum(0) / total * counts
+    return np.sqrt(len(sums) / (len(sums) - 1) * (off**2).sum(0)) / total
+
+
 def adjusted(p: np.ndarray) -> np.ndarray:
     """Returns p so that those up to `FALSE_DISCOVERIES` hold but for that part of them; NaN stays NaN.
 

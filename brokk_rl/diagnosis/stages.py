@@ -31,6 +31,9 @@ STAGE_OF: dict[str, Stage] = {
 """Stage of each effect; all others are of the actuation."""
 CONTACT_N = 200.0
 """More than this at the tool is contact, not the noise of a force that is computed from pressures."""
+EXPLAINED, FAR = 0.05, 1.5
+"""Poses differ, and with them what a measured tool point has of noise: only what one error of geometry explains so much of, or what
+is so many times the reference's, counts as an error of kinematics."""
 NEAR_M = 0.5
 """A hole further than this from the tip is not the one that is touched."""
 TARGET = ("target_x_m", "target_y_m", "target_z_m")
@@ -70,7 +73,7 @@ class Known:
 
 def stages(known: Known, runs: FreeRuns, reference: FreeRuns | None, machine: Machine) -> list[StageFinding]:
     """Returns what each stage has to do with the gap, those about which something can be said."""
-    whole_m = known.budget.before.tip_rms_m if known.budget else None
+    whole_m = _beyond(known.budget) if known.budget else None
     found = _of_joints(known, runs, reference, machine, whole_m)
     found += list(filter(None, (_kinematics(known), perception(runs.recordings, machine), _contact(runs))))
     return found
@@ -83,6 +86,12 @@ def foremost(findings: Sequence[StageFinding], has_gap: bool) -> Stage | None:
     weighed = [(f.rms_m if f.rms_m is not None else f.part or 0.0, f.stage) for f in those]
     weighed = [pair for pair in weighed if pair[0] > 0.0]
     return max(weighed)[1] if weighed else None  # type: ignore[return-value]
+
+
+def _beyond(budget: Budget) -> float:
+    """Returns what the tip's error exceeds the floor by, as root mean square, m."""
+    floor_m = budget.floor.tip_rms_m if budget.floor else 0.0
+    return float(np.sqrt(max(budget.before.tip_rms_m**2 - floor_m**2, 0.0)))
 
 
 def _of_joints(
@@ -135,14 +144,16 @@ def _kinematics(known: Known) -> StageFinding | None:
         return None
     floor_m = reference.rms_m if reference else 0.0
     excess_m = float(np.sqrt(max(field.rms_m**2 - floor_m**2, 0.0)))
+    by_cause_m = field.rms_m * float(np.sqrt(field.explained))
     text = f"measured tool points lie {1e3 * field.rms_m:.1f} mm from forward kinematics"
     text += f" ({1e3 * floor_m:.1f} mm on the reference)" if reference else ""
-    if excess_m > 0.5 * floor_m:
+    is_explained = field.explained > max(EXPLAINED, 2.0 * reference.explained if reference else 0.0)
+    if is_explained or field.rms_m > FAR * floor_m:
         scale, unit = (1e3, f"m{field.unit}") if field.unit else (1e2, "%")
         text += f"; {100 * field.explained:.0f} % of it is explained by {field.cause} of {scale * field.size:+.1f} {unit}"
     else:
         excess_m = 0.0
-    return StageFinding("kinematics", None, excess_m, text)
+    return StageFinding("kinematics", None, by_cause_m if is_explained else excess_m, text)
 
 
 def perception(recordings: Sequence[Recording], machine: Machine) -> StageFinding | None:

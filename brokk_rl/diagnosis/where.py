@@ -1,7 +1,8 @@
 """Where the gap lies: error of free runs beyond the floor, by joint, regime, direction, load, frequency and time, with tests.
 
-The floor is the error of the same simulator on reference recordings that it was not fitted to; what exceeds it is the gap. Each
-way of sorting splits error and gap completely: parts add up to 1 over joints and categories.
+The floor is the error of the same simulator on reference recordings that it was not fitted to; what exceeds it,
+beyond one standard error, is the gap. Each way of sorting splits error and gap completely: parts add up to 1 over joints and
+categories.
 Axes: `W` windows, `J` joints, `C` categories.
 """
 
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.diagnosis.blocks import FALSE_DISCOVERIES, adjusted, blocks, excess_p, summed
+from brokk_rl.diagnosis.blocks import FALSE_DISCOVERIES, adjusted, blocks, excess_p, standard_error, summed
 from brokk_rl.diagnosis.free_runs import FreeRuns
 from brokk_rl.diagnosis.growth import Growth, growth
 from brokk_rl.diagnosis.tracing import Sums, by_joint, by_occasion, by_time
@@ -155,8 +156,9 @@ class _Judge:
         count = self._mine.count.sum(0)[:, 0]
         error = mean * count * self._weight
         error = error / max(error.sum(), TINY)
-        excess = np.maximum(mean - base, 0.0) * count * self._weight
-        gap = excess / excess.sum() if excess.sum() > 0 else error
+        chance = self._chance(self._mine, self._floor)[:, 0]
+        excess = _first_positive(mean - base - chance, mean - base, mean) * count * self._weight
+        gap = excess / max(excess.sum(), TINY)
         p = self._p(self._mine, self._floor)[:, 0]
         sure = adjusted(p) <= FALSE_DISCOVERIES
         return {
@@ -171,8 +173,9 @@ class _Judge:
         if floor is not None:
             seen = floor.count.sum(0)
             expected = np.where(seen > 0, floor.square.sum(0) / np.maximum(seen, 1.0) * count, expected)
-        excess = np.maximum(square - expected, 0.0)
-        excess = np.where(excess.sum(1, keepdims=True) > 0, excess, np.maximum(square, 0.0))
+        chance = self._chance(sums, floor) * count
+        rows = zip(square - expected - chance, square - expected, square, strict=True)
+        excess = np.stack([_first_positive(*row) for row in rows])
         within = excess / np.maximum(excess.sum(1, keepdims=True), TINY)
         gap = within * np.array([joint.gap for joint in joints.values()])[:, None]
         error = square * self._weight[:, None]
@@ -189,6 +192,17 @@ class _Judge:
     def _floor_mean(self) -> np.ndarray:
         return _mean(self._floor) if self._floor else np.zeros(self._machine.num_joints)
 
+    def _chance(self, mine: Sums, floor: Sums | None) -> np.ndarray:
+        """Returns the standard error of what exceeds the floor, per sample, `(J, C)`; 0 without a floor to exceed."""
+        shape = mine.square.shape[1:]
+        if floor is None or self._blocks is None:
+            return np.zeros(shape)
+        square = np.zeros(shape)
+        for sums, block in ((mine, self._blocks.field), (floor, self._blocks.reference)):
+            totals = (summed(values.reshape(len(block), -1), block) for values in (sums.square, sums.count))
+            square += np.nan_to_num(standard_error(*totals).reshape(shape)) ** 2
+        return np.sqrt(square)
+
     def _p(self, mine: Sums, floor: Sums | None) -> np.ndarray:
         """Returns p of each joint and category, `(J, C)`; NaN without a floor."""
         shape = mine.square.shape[1:]
@@ -199,6 +213,11 @@ class _Judge:
             for sums, block in ((mine, self._blocks.field), (floor, self._blocks.reference))
         )
         return excess_p(field, reference, self._generator).reshape(shape)
+
+
+def _first_positive(*choices: np.ndarray) -> np.ndarray:
+    """Returns the positive part of the first choice that has any."""
+    return next((np.maximum(choice, 0.0) for choice in choices if (choice > 0).any()), np.zeros_like(choices[-1]))
 
 
 def _mean(sums: Sums) -> np.ndarray:

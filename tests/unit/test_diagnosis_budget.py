@@ -179,3 +179,23 @@ def test_touches_are_held_against_the_estimated_hole(machine: Machine) -> None:
     found = perception([replace(still, extra=extra)], machine)
     assert found is not None and found.rms_m == pytest.approx(0.05, rel=1e-3) and "2 touches" in found.text
     assert perception([still], machine) is None
+
+
+def test_a_biased_encoder_is_a_matter_of_kinematics_only_where_tool_points_were_measured(machine: Machine) -> None:
+    sound = runs(machine, [recording(machine, 0), recording(machine, 1)])
+    location = locate(sound, None, machine, DEAD_TIME_S, np.random.default_rng(0))
+
+    def stage(bias_rad: float) -> tuple[str | None, float | None]:
+        shapes = []
+        for bias in (bias_rad, 0.0):
+            moved = recording(machine, 0)
+            tip = Kinematics(machine).pose(torch.as_tensor(moved.q, dtype=torch.float32)).tip_in_base_m.numpy()
+            tip = tip + 0.002 * np.random.default_rng(0).standard_normal(tip.shape)
+            biased = replace(moved, q=moved.q + bias * (np.arange(5) == 2), extra=dict(zip(COLUMNS, tip.T, strict=True)))
+            shapes.append(geometry([biased], machine))
+        found = stages(Known(location, [], None, shapes[0], shapes[1]), sound, None, machine)
+        return foremost(found, False), next(row.rms_m for row in found if row.stage == "kinematics")
+
+    assert stage(0.0) == (None, 0.0)
+    name, rms_m = stage(0.02)
+    assert name == "kinematics" and rms_m is not None and 0.02 < rms_m < 0.1

@@ -81,7 +81,7 @@ def test_two_errors_share_the_gap_as_their_squares_do(machine: Machine) -> None:
     one, other = (planted(quiet, machine, joint, "cruise", speed) for joint, speed in ((1, 0.02), (3, 0.04)))
     both = replace(quiet, simulated=one.simulated + other.simulated - quiet.simulated)
     squares = [np.nansum(runs.error**2) for runs in (one, other)]
-    found = located(both, runs(machine, 8, 1, size=0.0), machine)
+    found = located(both, None, machine)  # with a floor, one standard error of chance would be taken off
     assert found.joints["q2"].gap == pytest.approx(squares[0] / sum(squares))
     assert found.joints["q4"].gap == pytest.approx(squares[1] / sum(squares))
     parts = {(p.joint, p.category): p.gap for p in found.parts["regime"]}
