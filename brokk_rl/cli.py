@@ -45,6 +45,8 @@ def main() -> int:
     set_up_logging()
     # our options of submitit's launchers bear its own names, as everyone knows them; Hydra warns of it three times
     warnings.filterwarnings("ignore", message=r"\s*'hydra/launcher/\w+' is validated against ConfigStore schema")
+    # before torch is loaded: beside other work its threads, if they wait spinning, make an update thirty times slower
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a run that a scheduler stops ends like one stopped by hand
     try:
         with _hydra_raises():
