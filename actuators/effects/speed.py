@@ -158,6 +158,7 @@ class ThermalDrift(EffectSpec):
     time_s: Value
     elapsed_s: Value
     side = "speed"
+    running = "elapsed_s"
     numbers: ClassVar = {
         "change": Number("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
         "time_s": Number("s", none=None, typical=1200.0, bounds=(1.0, 36_000.0)),

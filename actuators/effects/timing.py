@@ -64,6 +64,7 @@ class ClockOffset(_Delayed):
 
     joints: Joints
     offset_s: Value
+    shared = True
     numbers: ClassVar = {"offset_s": Number("s", none=0.0, typical=0.05, bounds=(-0.3, 0.3))}
 
     def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
@@ -85,6 +86,7 @@ class DelayJitter(EffectSpec):
     side = "command"
     stage = "timing"
     stochastic = True
+    shared = True
     numbers: ClassVar = {"jitter_s": Number("s", none=0.0, typical=0.03, bounds=(0.0, 0.5))}
 
     def begin(self, now: Moment) -> Memory:
@@ -115,6 +117,7 @@ class FrameLoss(EffectSpec):
     stage = "timing"
     stochastic = True
     smooth = False
+    shared = True
     numbers: ClassVar = {"probability": Number("1", none=0.0, typical=0.02, bounds=(0.0, 0.95))}
 
     def begin(self, now: Moment) -> Memory:

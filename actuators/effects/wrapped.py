@@ -107,6 +107,8 @@ class EffectSpec:
         smooth: Whether its numbers can be fitted by gradient.
         delays: Whether it shifts all commands that the inner model sees, not only the newest.
         weighed: Whether it asks for the weight on the joints.
+        shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever on a few of them.
+        running: Name of the number that is the time since the machine was started, which is known and not fitted.
     """
 
     side: ClassVar[Side]
@@ -116,6 +118,8 @@ class EffectSpec:
     smooth: ClassVar[bool] = True
     delays: ClassVar[bool] = False
     weighed: ClassVar[bool] = False
+    shared: ClassVar[bool] = False
+    running: ClassVar[str | None] = None
 
     @classmethod
     def name(cls) -> str:
