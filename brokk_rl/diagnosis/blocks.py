@@ -44,7 +44,7 @@ def blocks(field: FreeRuns, reference: FreeRuns) -> Blocks:
     if not few:
         return Blocks(sides[0], sides[1], "recordings")
     cut = [parts(side) for side in (field, reference)]
-    return Blocks(cut[0], cut[1], f"parts of {PART_S:g} s, as there are too few recordings")
+    return Blocks(cut[0], cut[1], f"parts of recordings of {PART_S:g} s each (whole ones are too few)")
 
 
 def parts(runs: FreeRuns) -> np.ndarray:

@@ -28,7 +28,7 @@ def write(outcome: Outcome, folder: Path, machine: Machine) -> None:
     """
     answer, more = outcome.answer, outcome.answer.more
     text, tone = wording.headline(answer)
-    page = Page(f"Simulator and machine: {machine.title}", text, tone)
+    page = Page(f"What the simulator of {machine.name} lacks", text, tone)
     if figure := pictures.ladder(answer):
         page.picture(
             figure, "Error over free runs of 5 s on recordings that no effect was fitted to: before, after, and the floor."
@@ -50,7 +50,7 @@ def write(outcome: Outcome, folder: Path, machine: Machine) -> None:
 
 def _causes(page: Page, outcome: Outcome) -> None:
     answer = outcome.answer
-    page.heading("What the simulator lacks")
+    page.heading("Effects")
     if not answer.selected:
         page.text(
             {"none": "Nothing that could be told from chance.", "unknown": "Nothing that the library of effects knows."}.get(
@@ -86,6 +86,9 @@ def _causes(page: Page, outcome: Outcome) -> None:
         page.text(text)
     if answer.reason and answer.verdict != "unknown":
         page.text(answer.reason)
+    if isinstance(predicted := answer.more.get("predicted_closed"), float) and answer.gap and answer.gap.closed:
+        achieved = 100 * answer.gap.closed.mean
+        page.text(f"Before they were added, {100 * predicted:.0f} % were predicted to be closed; {achieved:.0f} % were.")
     for key, saying in (("undecided", "Left undecided"), ("remainder", "Remainder")):
         if isinstance(found := answer.more.get(key), str):
             page.text(f"{saying}: {found}")

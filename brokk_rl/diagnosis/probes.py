@@ -62,19 +62,20 @@ class Probe:
         return asdict(self)
 
 
+PERCENT, MILLI = 1e2, 1e3
 TEXTS = {
-    "dead_time": ("moves {:+.0f} ms later than simulated", 1e3),
-    "flow_gain": ("moves {:+.0f} % slower than simulated", 1e2),
-    "asymmetry": ("loses {:+.0f} % of its speed extending, and gains it retracting", 1e2),
-    "dead_band": ("moves {:+.0f} % slower at small commands", 1e2),
-    "saturation": ("moves {:+.0f} % slower at large commands", 1e2),
-    "flow_sharing": ("moves {:+.0f} % slower while others move", 1e2),
-    "load_dependence": ("moves {:+.0f} % slower against its full load", 1e2),
-    "thermal_drift": ("loses {:+.1f} % of its speed from the first to the last minute", 1e2),
-    "backlash": ("lacks {:+.1f} mrad (mm) after reversals", 1e3),
-    "creep": ("sinks by {:+.2f} mrad/s (mm/s) without command", 1e3),
+    "dead_time": ("moves {:.0f} ms later than simulated", "moves {:.0f} ms earlier than simulated", MILLI),
+    "flow_gain": ("moves {:.0f} % slower than simulated", "moves {:.0f} % faster than simulated", PERCENT),
+    "asymmetry": ("is {:.0f} % slower extending, faster retracting", "is {:.0f} % faster extending, slower retracting", PERCENT),
+    "dead_band": ("is {:.0f} % slower at small commands", "is {:.0f} % faster at small commands", PERCENT),
+    "saturation": ("is {:.0f} % slower at large commands", "is {:.0f} % faster at large commands", PERCENT),
+    "flow_sharing": ("is {:.0f} % slower while others move", "is {:.0f} % faster while others move", PERCENT),
+    "load_dependence": ("is {:.0f} % slower against its full load", "is {:.0f} % faster against its full load", PERCENT),
+    "thermal_drift": ("loses {:.0f} % of its speed in time", "gains {:.0f} % of speed in time", PERCENT),
+    "backlash": ("falls {:.1f} m{unit} short after reversals", "goes {:.1f} m{unit} further after reversals", MILLI),
+    "creep": ("sinks by {:.2f} m{unit}/s without command", "rises by {:.2f} m{unit}/s without command", MILLI),
 }
-"""What a coefficient says, and its factor."""
+"""What a coefficient above and below 0 says, and its factor."""
 
 
 def probes(runs: FreeRuns, reference: FreeRuns | None, machine: Machine, dead_time_s: np.ndarray) -> list[Probe]:
@@ -91,11 +92,17 @@ def probes(runs: FreeRuns, reference: FreeRuns | None, machine: Machine, dead_ti
     found = []
     for (effect, joint), (value, error) in mine.items():
         base, base_error = other.get((effect, joint), (0.0, 0.0))
-        form, factor = TEXTS[effect]
-        text = f"{joint} {form.format(factor * value)}" + (f" ({factor * base:+.1f} on the reference)" if other else "")
+        unit = machine.joints[machine.joint_names.index(joint)].unit
+        text = f"{joint} {_said(effect, value, unit)}"
+        text += f"; on the reference it {_said(effect, base, unit)}" if other else ""
         z = (value - base) / max(float(np.hypot(error, base_error)), np.finfo(float).tiny)
         found.append(Probe(effect, joint, value, base, z, text))
     return sorted(found, key=lambda probe: -abs(probe.z))
+
+
+def _said(effect: str, value: float, unit: str) -> str:
+    above, below, factor = TEXTS[effect]
+    return (below if value < 0 else above).format(abs(factor * value), unit=unit)
 
 
 def _coefficients(runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> dict[tuple[str, str], tuple[float, float]]:

@@ -111,7 +111,7 @@ def _of_joints(
             texts["timing"].append(probe.text)
         # the start of a window is measured as well, so noise counts twice
         more = 2.0 * max(noise[j] ** 2 - (floor[j] ** 2 if floor is not None else 0.0), 0.0)
-        if more > 0.1 * excess:
+        if more > 0.1 * excess and joint.gap > 0.01:
             parts["sensing"] += joint.gap * min(1.0, more / excess)
             unit = machine.joints[j].unit
             before = 0.0 if floor is None else 1e3 * floor[j]

@@ -24,7 +24,8 @@ def headline(answer: Answer) -> tuple[str, Tone]:
     if answer.verdict == "unknown":
         place = _place(answer)
         because = f" {answer.reason}" if answer.reason else ""
-        return f"There is a gap, or no telling, and no effect of the library explains it{place}.{because}{size}", "warn"
+        start = "There is no telling" if gap is None else "There is a gap that no effect of the library explains"
+        return f"{start}{place if gap is not None else ''}.{because}{size}", "warn"
     names = listed([named(one) for one in answer.selected])
     closed = gap.closed if gap else None
     share = f" closes {100 * closed.mean:.0f} % of the gap (95 %: {_percent_range(closed)})." if closed else "."

@@ -68,7 +68,7 @@ def test_the_report_says_verdict_gap_cause_place_and_what_to_do(
         "The simulator lacks flow gain on q4 (probability 0.97); adding it closes 93 % of the gap (95 %: 88 to 96 %).",
         "30.0 mrad before, 6.0 mrad after; the floor is 4.0 mrad",
         "cannot tell flow gain on q4 from encoder scale", "a measured tool point", "0.81", "0.78 to 0.84", "Next experiment",
-        "brokk mode=collect excitation=[ramps]", "q4 moves +2", "% slower than simulated", "as flow gain does", "joint at rest",
+        "brokk mode=collect excitation=[ramps]", "q4 moves 2", "% slower than simulated", "as flow gain does", "joint at rest",
         "at the tool, mm", "by running time", "grows with the way",
     ):  # fmt: skip
         assert part in text, part
