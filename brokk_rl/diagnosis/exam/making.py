@@ -26,6 +26,8 @@ from brokk_rl.spec import spec
 
 SIDE_BY_SIDE = 240
 """Runs simulated at once; their random numbers lie in memory."""
+NUM_PLANS = 4
+"""Plans drawn before a file is said to be too short: now and then the ways between distant poses leave no room."""
 FIRST_DAY = datetime(2026, 1, 5, 8, 0, tzinfo=UTC)
 """Recordings say when they were made, so that warm-up can be read across files; all cases say the same."""
 EPOCH_S = FIRST_DAY.timestamp()
@@ -160,7 +162,15 @@ class Workshop:
             if name not in self._excitations:
                 raise ConfigError(f"exam: programs: no excitation '{name}'; {choices(name, self._excitations)}")
         chosen = {name: self._excitations[name] for name in names}
-        return schedule(chosen, self._machine, self._approach, 1, job.half.file_s, job.stream("plan"))
+        stream = job.stream("plan")
+        tried = 1
+        while True:
+            try:
+                return schedule(chosen, self._machine, self._approach, 1, job.half.file_s, stream)
+            except ConfigError:
+                if tried == NUM_PLANS:
+                    raise
+                tried += 1
 
     def _batch(self, jobs: Sequence[Job], specimens: Sequence[Specimen], folders: Sequence[Path], done: list[Made]) -> None:
         """Records files of one half, of machines of one make."""
