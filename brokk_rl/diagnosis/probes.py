@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from brokk_rl.diagnosis import edges
 from brokk_rl.diagnosis.blocks import parts
 from brokk_rl.diagnosis.free_runs import FreeRuns
 from brokk_rl.diagnosis.occasions import CREEP, REGIMES, in_force, regimes
@@ -73,6 +74,8 @@ TEXTS = {
     "load_dependence": ("is {:.0f} % slower against its full load", "is {:.0f} % faster against its full load", PERCENT),
     "thermal_drift": ("loses {:.0f} % of its speed in time", "gains {:.0f} % of speed in time", PERCENT),
     "backlash": ("falls {:.1f} m{unit} short after reversals", "goes {:.1f} m{unit} further after reversals", MILLI),
+    "delay_jitter": ("starts after times that vary by {:.0f} ms", "", MILLI),
+    "compliance": ("shakes by {:.2f} m{unit} after stops", "", MILLI),
     "creep": ("sinks by {:.2f} m{unit}/s without command", "rises by {:.2f} m{unit}/s without command", MILLI),
 }
 """What a coefficient above and below 0 says, and its factor."""
@@ -87,8 +90,10 @@ def probes(runs: FreeRuns, reference: FreeRuns | None, machine: Machine, dead_ti
         machine: Gives joints and masses.
         dead_time_s: Time from command to motion of each joint, `(J,)`.
     """
-    mine = _coefficients(runs, machine, dead_time_s)
-    other = _coefficients(reference, machine, dead_time_s) if reference else {}
+    mine, other = (
+        _coefficients(side, machine, dead_time_s) | edges.figures(side, machine, dead_time_s) if side else {}
+        for side in (runs, reference)
+    )
     found = []
     for (effect, joint), (value, error) in mine.items():
         base, base_error = other.get((effect, joint), (0.0, 0.0))

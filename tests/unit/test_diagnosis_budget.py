@@ -199,3 +199,36 @@ def test_a_biased_encoder_is_a_matter_of_kinematics_only_where_tool_points_were_
     assert stage(0.0) == (None, 0.0)
     name, rms_m = stage(0.02)
     assert name == "kinematics" and rms_m is not None and 0.02 < rms_m < 0.1
+
+
+def test_starts_that_vary_and_stops_that_ring_are_seen_on_the_joint_that_does(machine: Machine) -> None:
+    rng = np.random.default_rng(0)
+
+    def shaken(r: Recording) -> Recording:
+        u, q = r.u.astype(float), r.q + 2e-4 * rng.standard_normal(r.q.shape)
+        moved = np.zeros_like(q)
+        edge, late = np.flatnonzero(np.diff(u[:, 0])) + 1, 0
+        for begin, end in zip(edge, [*edge[1:], len(u)], strict=True):
+            late = int(rng.integers(0, 5))
+            moved[min(begin + DELAY + late, len(u)) : min(end + DELAY, len(u)), 0] = (
+                0.2 * u[begin, 0] * machine.max_speed[0] * PERIOD_S
+            )
+        q[:, 0] = machine.home[0] + np.cumsum(moved[:, 0]) + 2e-4 * rng.standard_normal(len(u))
+        for stop in np.flatnonzero((np.diff(np.abs(u[:, 3]) > 0) > 0) & (u[:-1, 3] != 0)):
+            tail = np.arange(len(u) - stop - 1 - DELAY)
+            q[stop + 1 + DELAY :, 3] += 0.01 * np.exp(-tail / 8.0) * np.sin(tail * 1.2)
+        return replace(r, q=q)
+
+    field = [recording(machine, seed) for seed in range(4)]
+    rows = probes(
+        replace(runs(machine, field), recordings=[shaken(r) for r in field]),
+        runs(
+            machine,
+            [replace(r, q=r.q + 2e-4 * rng.standard_normal(r.q.shape)) for r in map(recording, [machine] * 6, range(10, 16))],
+        ),
+        machine,
+        DEAD_TIME_S,
+    )
+    for effect, joint in (("delay_jitter", "q1"), ("compliance", "q4")):
+        first = max((row for row in rows if row.effect == effect), key=lambda row: row.z)
+        assert first.joint == joint and first.is_clear, first
