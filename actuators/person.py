@@ -26,6 +26,7 @@ from actuators import draw
 from actuators.effects.ranges import CHANCE, Number, Ranges, Value
 from actuators.transport import commands_in_force, opened
 from brokk_rl.errors import ConfigError
+from brokk_rl.follower import moved_levers
 from brokk_rl.machine import Machine, exclusive_mask
 from brokk_rl.spec import spec
 
@@ -170,12 +171,8 @@ class PersonModel:
             return free
         taken, held_s = asked != 0, self.state["held_s"]
         kept = taken & (held_s > 0) & (held_s < self._ranges.value["grip_s"] - 1e-6)
-        mine = torch.where(free, priority + 2.0 * kept, -1.0)[:, :, None]
-        others = mine.transpose(1, 2)
-        order = torch.arange(asked.shape[1], device=asked.device)
-        before = (others > mine) | ((others == mine) & (order < order[:, None]))
         most = self._ranges.value["joints_at_once"].round().clamp(*self._levers)
-        held = free & (before.sum(2) < most)
+        held = free & moved_levers(torch.where(free, priority + 2.0 * kept, -1.0), most)
         held_s.copy_(torch.where(held & taken, held_s + self._period_s, 0.0))
         return held
 

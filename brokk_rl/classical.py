@@ -28,6 +28,8 @@ class Classical:
         gain_1_s: Speed of approach per distance left.
         top_speed_m_s: Bound on the speed of the tool point.
         top_rate_rad_s: Bound on the rate of its pitch.
+        straight: Whether what one joint cannot do slows all of them alike, so that the tool goes straight; otherwise each goes as
+            fast as it can.
         damping: Damping of the least squares, in the same unit as the Jacobian times joint speed (m/s at full command).
         rest: Share of full speed below which a joint is left alone.
         creep: Smallest share of full speed that is commanded at all, large enough to be beyond the dead band of every valve.
@@ -41,6 +43,7 @@ class Classical:
     gain_1_s: float
     top_speed_m_s: float
     top_rate_rad_s: float
+    straight: bool
     damping: float
     rest: float
     creep: float
@@ -95,6 +98,7 @@ class ClassicalController:
         exclusive = [i for i, e in enumerate(machine.is_exclusive) if e]
         self._reach_joint = min(exclusive[-1] + 1, machine.num_joints - 1) if exclusive else 0
         age = torch.arange(machine.num_history - 1, -1, -1, dtype=torch.float32, device=device)
+        self._period_s = machine.period_s
         self._in_flight = (config.in_flight_samples - age).clamp(0.0, 1.0)[:, None] * machine.period_s
         self._damping = config.damping**2 * torch.eye(4, device=device)
 
@@ -114,7 +118,13 @@ class ClassicalController:
         return rate.sign() * (band + (1.0 - band) * size.clamp(min=self.config.creep)).clamp(max=1.0) * (size > self.config.rest)
 
     def guide(
-        self, q: torch.Tensor, u: torch.Tensor, target_m: torch.Tensor, pitch_rad: torch.Tensor, reach_m: tuple[float, float]
+        self,
+        q: torch.Tensor,
+        u: torch.Tensor,
+        target_m: torch.Tensor,
+        pitch_rad: torch.Tensor,
+        reach_m: tuple[float, float],
+        coming: torch.Tensor | None = None,
     ) -> Guidance:
         """Returns commands and errors.
 
@@ -124,10 +134,13 @@ class ClassicalController:
             target_m: Where the tool point shall end up in the base frame, `(N, 3)`.
             pitch_rad: Wanted pitch, `(N,)`.
             reach_m: Good working range (nearest, farthest); positioning aims at its middle.
+            coming: Commands that will be given whatever is asked for now, `(N, F, J)`; `None` where nobody stands between.
         """
         config = self.config
         now = q[:, -1]
         ahead = now + (self.rate(u) * self._in_flight).sum(1)
+        if coming is not None:
+            ahead = ahead + self.rate(coming).sum(1) * self._period_s
         # one pass for both: small operations cost their launch, not their size
         both, jacobian = self.kinematics.pose_and_jacobian(torch.stack((ahead, now)))
         tip, pitch = both.tip_in_base_m[0], both.pitch_rad[0]
@@ -173,8 +186,7 @@ class ClassicalController:
         jacobian = torch.cat((tip_jacobian, pitch_jacobian[:, None]), 1) * (self.speed * (1.0 - self._exclusive))
         square = product(jacobian, jacobian.transpose(1, 2)) + self._damping
         share = product(jacobian.transpose(1, 2), _solve_4(square, torch.cat((wanted, turn[:, None]), 1)[..., None]))[..., 0]
-        # what one joint cannot do slows all of them alike, so that the tool keeps its direction
-        return share / share.abs().amax(1, keepdim=True).clamp(min=1.0)
+        return share / share.abs().amax(1, keepdim=True).clamp(min=1.0) if config.straight else share.clamp(-1.0, 1.0)
 
     def _reach(self, pose: ToolPose, target_m: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Returns reach `(M, N)`, the slope of its first row over joint positions `(N, J)`, and the distance in space `(M, N)`."""

@@ -33,3 +33,14 @@ class Direct:
     def step(self, proposed: torch.Tensor) -> torch.Tensor:
         """Returns `proposed`, `(N, J)`."""
         return proposed
+
+
+def moved_levers(priority: torch.Tensor, most: torch.Tensor | int) -> torch.Tensor:
+    """Returns which levers are moved, `(N, J)` bool: the `most`, a number or `(N, 1)`, of highest `priority`, `(N, J)`.
+
+    Of equals the first.
+    """
+    mine, others = priority[:, :, None], priority[:, None, :]
+    order = torch.arange(priority.shape[1], device=priority.device)
+    before = (others > mine) | ((others == mine) & (order < order[:, None]))
+    return before.sum(2) < most

@@ -1,10 +1,10 @@
 """The policy's observation vector (paper, Table I), the same code in training and on the machine.
 
 Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first (H x J); 133 numbers for five
-    joints
-and 13 samples. A task in which the wanted pitch of the tool differs from episode to episode appends it as one more number. Each
-part is normalised with an approximate mean and standard deviation that follow from the configuration, so that a policy carries no
-hidden statistics.
+joints and 13 samples. A task in which the wanted pitch of the tool differs from episode to episode appends it as one more number,
+and a policy that proposes to a person what it proposed before, oldest first (H x J): histories hold what the person did. Each part
+is normalised with an approximate mean and standard deviation that follow from the configuration, so that a policy carries no hidden
+statistics.
 """
 
 from collections.abc import Callable
@@ -32,9 +32,9 @@ class Scaling:
     pitch_rad: tuple[float, float] | None
 
 
-def size(machine: Machine, with_pitch: bool = False) -> int:
-    """Returns the length of the observation vector, that of the paper or with the wanted pitch behind it."""
-    return 3 + 2 * machine.num_history * machine.num_joints + with_pitch
+def size(machine: Machine, with_pitch: bool = False, with_proposals: bool = False) -> int:
+    """Returns the length of the observation vector, that of the paper or with wanted pitch and proposals behind it."""
+    return 3 + (2 + with_proposals) * machine.num_history * machine.num_joints + with_pitch
 
 
 class Encoder:
@@ -45,6 +45,7 @@ class Encoder:
         scaling: Normalisation of the target point.
         constant: Makes an array of the kind and on the device of the inputs; `numpy.asarray` on the machine.
         concat: `numpy.concatenate` or `torch.cat`, called as `concat(parts, 1)`.
+        with_proposals: Whether the policy proposes to a person.
     """
 
     def __init__(
@@ -53,11 +54,13 @@ class Encoder:
         scaling: Scaling,
         constant: Callable[[np.ndarray], Any] = np.asarray,
         concat: Callable[[tuple[Any, ...], int], Any] = np.concatenate,
+        with_proposals: bool = False,
     ) -> None:
         self.shape = (machine.num_history, machine.num_joints)
         self._machine, self._scaling = machine, scaling
         self.has_pitch = scaling.pitch_rad is not None
-        self.size = size(machine, self.has_pitch)
+        self.has_proposals = with_proposals
+        self.size = size(machine, self.has_pitch, with_proposals)
         self._concat = concat
         self._target_mean_m = constant(np.array(scaling.target_mean_m, np.float32))
         self._target_std_m = constant(np.array(scaling.target_std_m, np.float32))
@@ -65,7 +68,7 @@ class Encoder:
         self._q_mean = constant(((machine.lower + machine.upper) / 2).astype(np.float32))
         self._q_std = constant(((machine.upper - machine.lower) / 4).astype(np.float32))
 
-    def encode(self, target_in_base_m: Any, q: Any, u: Any, pitch_rad: Any = None) -> Any:
+    def encode(self, target_in_base_m: Any, q: Any, u: Any, pitch_rad: Any = None, proposed: Any = None) -> Any:
         """Returns the vector, shape `(N, size)`.
 
         Args:
@@ -73,12 +76,15 @@ class Encoder:
             q: Measured joint positions, oldest first, shape `(N, H, J)`, rad or m.
             u: Commands in force, oldest first, shape `(N, H, J)`, in [-1, 1].
             pitch_rad: Wanted pitch of the tool, shape `(N,)`; left out where the task fixes it.
+            proposed: What was proposed before, oldest first, shape `(N, H, J)`; left out where nobody stands between.
         """
         target = (target_in_base_m - self._target_mean_m) / self._target_std_m
         joints = ((q - self._q_mean) / self._q_std).reshape(len(q), -1)
         parts = (target, joints, u.reshape(len(u), -1))
         if self.has_pitch:
             parts = (*parts, ((pitch_rad - self._pitch_mean_rad) / self._pitch_std_rad)[:, None])
+        if self.has_proposals:
+            parts = (*parts, proposed.reshape(len(proposed), -1))
         return self._concat(parts, 1)
 
     def decode(self, vector: Any) -> tuple[Any, Any, Any]:
@@ -90,16 +96,21 @@ class Encoder:
 
     def decode_pitch(self, vector: Any) -> Any:
         """Returns the wanted pitch `(N,)` in rad, where `has_pitch`."""
-        return vector[:, -1] * self._pitch_std_rad + self._pitch_mean_rad
+        return vector[:, 3 + 2 * self.shape[0] * self.shape[1]] * self._pitch_std_rad + self._pitch_mean_rad
+
+    def decode_proposals(self, vector: Any) -> Any:
+        """Returns what was proposed, `(N, H, J)`, where `has_proposals`."""
+        return vector[:, -self.shape[0] * self.shape[1] :].reshape(-1, *self.shape)
 
     def describe(self) -> dict[str, Any]:
         """Returns order and scale of the vector as plain JSON data, for the contract of a policy."""
         lower, upper = self._machine.lower, self._machine.upper
         order = ["target_in_base_m (3)", "q oldest first (H x J)", "u oldest first (H x J)"]
         pitch = {"pitch": {"mean_rad": self._pitch_mean_rad, "std_rad": self._pitch_std_rad}} if self.has_pitch else {}
+        order += ["pitch_rad (1)"] * self.has_pitch + ["proposals oldest first (H x J)"] * self.has_proposals
         return {
             "size": self.size,
-            "order": [*order, "pitch_rad (1)"] if self.has_pitch else order,
+            "order": order,
             "target": {"mean_m": list(self._scaling.target_mean_m), "std_m": list(self._scaling.target_std_m)},
             "q": {"mean": ((lower + upper) / 2).tolist(), "std": ((upper - lower) / 4).tolist()},
             "u": {"mean": 0.0, "std": 1.0},

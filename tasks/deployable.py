@@ -32,12 +32,17 @@ class Deployable(torch.nn.Module):
         q, u = process.remembered(q, u)
         varies = process._encoder.has_pitch
         pitch = process._encoder.decode_pitch(observation) if varies else torch.full_like(target_m[:, 0], self._pitch_rad)
-        guidance = process._controller.guide(q, u, target_m - process._down, pitch, options.switch.reach_m)
+        adviser, proposed, coming = process.adviser, None, None
+        if adviser is not None:
+            proposed = process.recalled(process._encoder.decode_proposals(observation))
+            coming = adviser.coming(proposed, u[:, -1])
+        guidance = process._controller.guide(q, u, target_m - process._down, pitch, options.switch.reach_m, coming)
         positioning = options.switch.positioning(guidance)
         if options.memory < q.shape[1]:
-            observation = process._encoder.encode(target_m, q, u, pitch)
+            observation = process._encoder.encode(target_m, q, u, pitch, proposed)
         groups = {"policy": observation, "guide": features(guidance, positioning, u[:, -1])}
-        return options.action.command(self.network(groups), guidance.command, positioning, process._exclusive)
+        command = options.action.command(self.network(groups), guidance.command, positioning, process._exclusive)
+        return command if adviser is None or proposed is None else adviser.proposal(command, proposed)
 
 
 def features(guidance: Guidance, positioning: torch.Tensor, u_last: torch.Tensor) -> torch.Tensor:

@@ -19,6 +19,7 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.observation import Encoder, Scaling
+from tasks.advice import Advice
 from tasks.deployable import Deployable, features
 from tasks.reward import Term
 from tasks.state import ToolState
@@ -51,6 +52,7 @@ class Options:
     limit_margin: float
     depth_m: float
     memory: int
+    advice: Advice | None
     noise: Noise
     switch: Switch
     action: Action
@@ -79,7 +81,8 @@ class ToolPoseProcess:
         self._machine = machine
         self._kinematics = Kinematics(machine, device)
         self._controller: ClassicalController = options.classical.build(machine, device)
-        self._encoder = Encoder(machine, options.scaling, constant, torch.cat)
+        self.adviser = options.advice.build(machine, device) if options.advice else None
+        self._encoder = Encoder(machine, options.scaling, constant, torch.cat, with_proposals=self.adviser is not None)
         self._exclusive = constant(machine.is_exclusive).bool()
         self._lower = constant(machine.lower) + options.limit_margin
         self._upper = constant(machine.upper) - options.limit_margin
@@ -94,6 +97,8 @@ class ToolPoseProcess:
         shapes |= {"u": (num_joints,), "u_before": (num_joints,), "closeness": (), "contact_force_n": ()}
         shapes |= {"command": (num_joints,), "features": (self.num_features,), "policy": (self._encoder.size,), "privileged": (9,)}
         shapes |= {"positioning": (), "rule_reach_m": ()}
+        if self.adviser:
+            shapes["proposed"] = (machine.num_history, num_joints)
         self.state = {name: torch.zeros((num_envs, *shape), device=device) for name, shape in shapes.items()}
         figures = ("success_strict", "success_paper", "time_to_insert_s", "lateral_error_m", "peak_force_n", "valve_travel")
         self.episode = {name: torch.zeros(num_envs, device=device) for name in (*figures, "return", "length")}
@@ -133,6 +138,10 @@ class ToolPoseProcess:
     def command(self, action: torch.Tensor) -> torch.Tensor:
         """See `TaskProcess.command`."""
         u = self.options.action.command(action, self.state["command"], self.state["positioning"].bool(), self._exclusive)
+        if self.adviser:
+            proposed = self.state["proposed"]
+            u = self.adviser.proposal(u, self.recalled(proposed))
+            proposed.copy_(torch.cat((proposed[:, 1:], u[:, None]), 1))
         self.state["u_before"].copy_(self.state["u"])
         self.state["u"].copy_(u)
         return u
@@ -201,7 +210,8 @@ class ToolPoseProcess:
     def describe(self) -> dict[str, Any]:
         """See `TaskProcess.describe`."""
         options = self.options
-        return self._encoder.describe() | {"target_filter": options.noise.filter, "switch": asdict(options.switch)}
+        advice = {"advice": asdict(options.advice)} if options.advice else {}
+        return self._encoder.describe() | {"target_filter": options.noise.filter, "switch": asdict(options.switch)} | advice
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
         """See `TaskProcess.deployable`."""
@@ -213,7 +223,12 @@ class ToolPoseProcess:
         if forgotten <= 0:
             return q, u
         still = q[:, forgotten : forgotten + 1].expand(-1, forgotten, -1)
-        return torch.cat((still, q[:, forgotten:]), 1), torch.cat((torch.zeros_like(still), u[:, forgotten:]), 1)
+        return torch.cat((still, q[:, forgotten:]), 1), self.recalled(u)
+
+    def recalled(self, u: torch.Tensor) -> torch.Tensor:
+        """Returns commands, `(N, H, J)`, with none before the last `memory` samples."""
+        forgotten = u.shape[1] - self.options.memory
+        return u if forgotten <= 0 else torch.cat((torch.zeros_like(u[:, :forgotten]), u[:, forgotten:]), 1)
 
     def _start(self) -> dict[str, torch.Tensor]:
         return {name.removeprefix("start."): value for name, value in self.state.items() if name.startswith("start.")}
@@ -250,12 +265,16 @@ class ToolPoseProcess:
         state["estimate_m"].copy_(sample)
         q, u = self.remembered(history.q * state["q_scale"][:, None, None], history.u * state["u_scale"][:, None, None])
         pitch_rad = state["start.target_pitch_rad"]
-        guidance = self._controller.guide(q, u, sample - self._down, pitch_rad, self.options.switch.reach_m)
+        proposed = coming = None
+        if self.adviser:
+            proposed = self.recalled(state["proposed"])
+            coming = self.adviser.coming(proposed, u[:, -1])
+        guidance = self._controller.guide(q, u, sample - self._down, pitch_rad, self.options.switch.reach_m, coming)
         positioning = self.options.switch.positioning(guidance)
         state["positioning"].copy_(positioning)
         state["rule_reach_m"].copy_(guidance.reach_m if self.options.switch.rule == "planar" else guidance.reach_3d_m)
         state["command"].copy_(guidance.command)
-        state["policy"].copy_(self._encoder.encode(sample, q, u, pitch_rad))
+        state["policy"].copy_(self._encoder.encode(sample, q, u, pitch_rad, proposed))
         state["features"].copy_(features(guidance, positioning, u[:, -1]))
         state["privileged"].copy_(self._privileged(sample))
 

@@ -42,8 +42,8 @@ def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu")
         )
         require("policy" in groups, f"observe: no group 'policy' among {', '.join(groups)}")
         size = process.describe()["size"]
-        own = observation.size(machine), observation.size(machine, with_pitch=True)
-        require(size in own, f"describe: a vector of {size} numbers, expected one of brokk_rl.observation ({own[0]} or {own[1]})")
+        own = [observation.size(machine, pitch, proposals) for proposals in (False, True) for pitch in (False, True)]
+        require(size in own, f"describe: a vector of {size} numbers, expected one of brokk_rl.observation, {own}")
         require(tuple(groups["policy"].shape) == (NUM_ENVS, size), f"observe: expected a policy vector of {size} numbers")
         for name, value in groups.items():
             require(value.dtype == torch.float32 and bool(value.isfinite().all()), f"observe: '{name}' is not finite float32")

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import torch
 
-from brokk_rl.contracts import Actuator, Simulator, Task
-from brokk_rl.follower import Nobody
+from brokk_rl.contracts import Actuator, Follower, Simulator, Task
 from brokk_rl.machine import Machine
 from brokk_rl.modes.train import find_checkpoint, follower_of
 from brokk_rl.rl.evaluation import evaluate
@@ -32,6 +31,7 @@ class Export:
         sim: Physics in which the observations of the parity check arise.
         task: The policy's task.
         actuator: Actuator model of the same check.
+        follower: Who follows in the same check; a policy that proposes to a person is another one.
         rl: Training configuration that gives the network's shape.
         checkpoint: A checkpoint, or a run folder for its newest one.
         num_checked: Episodes that the parity check runs.
@@ -42,6 +42,7 @@ class Export:
     sim: Simulator
     task: Task
     actuator: Actuator
+    follower: Follower
     rl: Training
     checkpoint: str
     num_checked: int
@@ -56,7 +57,9 @@ class Export:
         cpu = torch.device("cpu")
         content = read_checkpoint(path, cpu)
         self.machine.check_fingerprint(content.get("fingerprint", {}), str(path))
-        plant = Plant(machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects={}, follower=Nobody())
+        plant = Plant(
+            machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects={}, follower=self.follower
+        )
         loop = plant.build(cpu, self.num_checked, self.num_checked, self.session.stream("starts"))
         config = self.rl.runner_config()
         actor = make_actor(config["actor"], config["obs_groups"], loop)

@@ -9,6 +9,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import Scaling
 from brokk_rl.sim import scene
 from brokk_rl.spec import spec
+from tasks.advice import Advice
 from tasks.process import Options, ToolPoseProcess
 from tasks.reward import Term
 from tasks.starts import Arms, Targets, Uniform, random_starts
@@ -68,6 +69,7 @@ class GoalPose:
         arms: Where the arm may begin.
         tolerance: Criteria of success.
         memory: Newest samples of history that the policy sees; the machine's `num_history` for all of them.
+        advice: How to propose to a person who moves the levers; `null` where the policy's commands are given as they are.
         noise: What the policy is told is wrong by.
         switch: When only q2 moves.
         action: How the policy's output becomes commands.
@@ -83,6 +85,7 @@ class GoalPose:
     arms: Arms
     tolerance: Tolerance
     memory: int
+    advice: Advice | None
     noise: Noise
     switch: Switch
     action: Action

@@ -1,0 +1,113 @@
+"""Proposing to a person: what their hands have yet to do of what was proposed, and proposals that hands can follow.
+
+A person follows late and sluggishly, so the machine's history lacks what the policy has lately asked for: without its own
+proposals it would ask for the same motion again and again until the first of it arrives. With them the dead times of machine and
+person are one.
+"""
+
+import torch
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.follower import moved_levers
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+Expected = float | tuple[float, float]
+"""A number, or the range [low, high] in which it lies."""
+
+
+@spec
+class Advice:
+    """How to propose to a person whose habits are known roughly; the middle of a range counts.
+
+    Attributes:
+        delay_s: Reaction delay, from the display to the hand.
+        lag_s: Time constant of the hand.
+        dead_zone: Deflection below which a lever commands nothing: what is to have an effect is proposed larger.
+        joints_at_once: Levers that the person can move at the same time, of a range the fewest: no more are proposed. `null`: all.
+        hold_s: Time for which a lever once proposed is proposed again before a larger request takes its place.
+        settle_s: Time for which the hand is followed after its last proposal; several times the lag.
+    """
+
+    delay_s: Expected
+    lag_s: Expected
+    dead_zone: Expected
+    joints_at_once: int | tuple[int, int] | None
+    hold_s: float
+    settle_s: float
+
+    def check(self) -> None:
+        for name in ("delay_s", "lag_s", "dead_zone"):
+            if _middle(getattr(self, name)) < 0:
+                raise ConfigError(f"task.advice.{name}: expected 0 or more, got {getattr(self, name)}")
+
+    def build(self, machine: Machine, device: torch.device) -> "Adviser":
+        """Returns the adviser for `machine` on `device`."""
+        return Adviser(self, machine, device)
+
+
+class Adviser:
+    """See `Advice`; stateless, so that it can stand inside a policy."""
+
+    def __init__(self, advice: Advice, machine: Machine, device: torch.device) -> None:
+        self._dead_zone = _middle(advice.dead_zone)
+        self._exclusive = torch.as_tensor(machine.is_exclusive, device=device)
+        most = advice.joints_at_once
+        self._most = machine.num_joints if most is None else most[0] if isinstance(most, tuple) else most
+        self._hold = round(advice.hold_s / machine.period_s)
+        self._future = _future(advice, machine).to(device)
+
+    def coming(self, proposed: torch.Tensor, given: torch.Tensor) -> torch.Tensor:
+        """Returns the commands that hands will yet give, `(N, F, J)`, if nothing more is proposed.
+
+        Args:
+            proposed: What was proposed, oldest first, `(N, H, J)`.
+            given: What was given in the last period, `(N, J)`.
+        """
+        hand = self._shown(given)
+        levers = torch.einsum("fh,nhj->nfj", self._future, torch.cat((proposed, hand[:, None]), 1))
+        return levers.sign() * (levers.abs() - self._dead_zone).clamp(min=0.0) / (1.0 - self._dead_zone)
+
+    def proposal(self, wanted: torch.Tensor, proposed: torch.Tensor) -> torch.Tensor:
+        """Returns what to propose, `(N, J)`, where the commands `wanted`, `(N, J)`, are to be given.
+
+        Args:
+            wanted: Commands under the masks.
+            proposed: What was proposed before, oldest first, `(N, H, J)`.
+        """
+        shown = self._shown(wanted)
+        if self._most >= wanted.shape[1]:
+            return shown
+        # a lever that was taken lately: the newest proposals have it without a gap, but not yet for `hold_s`
+        lately = ((proposed == 0).float().flip(1).cumsum(1) < 0.5).sum(1)
+        kept = (lately > 0) & (lately < self._hold) & (shown != 0)
+        return torch.where(moved_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
+
+    def _shown(self, command: torch.Tensor) -> torch.Tensor:
+        """Returns the deflection that commands `command`."""
+        return torch.where(command == 0, 0.0, command.sign() * (self._dead_zone + (1.0 - self._dead_zone) * command.abs()))
+
+
+def _future(advice: Advice, machine: Machine) -> torch.Tensor:
+    """Returns what makes levers of the coming periods, `(F, H + 1)`, of `H` proposals, oldest first, and the hand as it is."""
+    num, period_s = machine.num_history, machine.period_s
+    delay, lag = _middle(advice.delay_s) / period_s, max(_middle(advice.lag_s) / period_s, 1e-6)
+    steps = round((_middle(advice.delay_s) + advice.settle_s) / period_s) + 1
+    whole = int(delay + 5e-7)
+    part = max(0.0, delay - whole)
+    stay = float(torch.exp(torch.tensor(-1.0 / lag)))
+    rows, hand = [], torch.zeros(num + 1)
+    hand[num] = 1.0
+    for step in range(steps):
+        target = torch.zeros(num + 1)
+        for back, weight in ((whole, 1.0 - part), (whole + 1, part)):  # the proposal of so many periods ago
+            place = num + step - back
+            if 0 <= place < num:
+                target[place] += weight
+        rows.append(target + (hand - target) * lag * (1.0 - stay))  # the mean over the period
+        hand = target + (hand - target) * stay
+    return torch.stack(rows)
+
+
+def _middle(value: Expected) -> float:
+    return sum(value) / 2 if isinstance(value, tuple) else value
