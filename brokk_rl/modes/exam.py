@@ -18,7 +18,7 @@ from brokk_rl.contracts import Excitation
 from brokk_rl.diagnosis import answer
 from brokk_rl.diagnosis.exam import ledger, marking, page, paper, seal, sitting
 from brokk_rl.diagnosis.exam.making import Half, Workshop
-from brokk_rl.diagnosis.exam.mix import Mix
+from brokk_rl.diagnosis.exam.mix import Mix, Question
 from brokk_rl.diagnosis.exam.sitting import Candidate
 from brokk_rl.diagnosis.exam.specimen import PlantFamily
 from brokk_rl.diagnosis.exam.tally import tally
@@ -115,9 +115,7 @@ class Exam:
                 f"{settings.first_sealed_seed} on are for exams and need exam.sealed=true, smaller ones are for development"
             )
         salt = settings.salt or secrets.token_hex(16)
-        # cases of an exam hang on the salt too, which nobody knows before the labels are opened
-        entropy = [self.session.seed, *(salt.encode() if is_exam else b"")]
-        questions = settings.mix.questions(self.machine, settings.plants.ailments, np.random.default_rng(entropy))
+        questions = self.questions(salt)
         workshop = Workshop(self.machine, settings.plants, settings.roughness, self.excitation, settings.approach)
         total = len(questions) * (len(settings.reference.programs) + len(settings.field.programs))
         with Progress(transient=True) as progress:
@@ -135,6 +133,11 @@ class Exam:
         found = seal.seal(folder, {**facts, "cases": labels}, salt)
         write_json(folder / "exam.json", {**facts, "labels_sha256": found})
         log.info("%d cases in %s, labels sealed: sha256 %s", len(labels), folder / paper.CASES, found)
+
+    def questions(self, salt: str) -> list[Question]:
+        """Returns the cases; those of an exam hang on the salt too, which nobody knows before the labels are opened."""
+        entropy = [self.session.seed, *(salt.encode() if self.exam.sealed else b"")]
+        return self.exam.mix.questions(self.machine, self.exam.plants.ailments, np.random.default_rng(entropy))
 
     def _run(self) -> None:
         """Writes `<case>/diagnosis.json` and `<case>/sitting.json` for each case."""

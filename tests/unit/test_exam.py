@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,17 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from composed import option
+from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
 
 from brokk_rl import record
+from brokk_rl.diagnosis import answer
 from brokk_rl.diagnosis.answer import FILE
 from brokk_rl.diagnosis.exam import paper, seal, sitting
 from brokk_rl.diagnosis.exam.baselines import Always
 from brokk_rl.diagnosis.exam.mix import KINDS, Mix, Question
-from brokk_rl.errors import RecordingError
+from brokk_rl.diagnosis.exam.trees import Trees
+from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.machine import Machine
 
 SMALL = (
@@ -100,11 +105,15 @@ def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: M
     assert names and not any(name.encode() in file.read_bytes() for file in files for name in names)
 
 
-def test_labels_that_were_changed_are_not_scored(exam: Path) -> None:
-    path = exam / seal.LABELS
+def test_labels_that_were_changed_are_not_scored(tmp_path: Path) -> None:
+    seal.seal(tmp_path, {"cases": [{"kind": "one"}]}, "salt")
+    assert seal.opened(tmp_path)["cases"] == [{"kind": "one"}]
+    path = tmp_path / seal.LABELS
     path.write_text(path.read_text().replace('"one"', '"none"'))
     with pytest.raises(RecordingError, match="is not what was sealed"):
-        seal.opened(exam)
+        seal.opened(tmp_path)
+    with pytest.raises(StorageError, match="is sealed"):
+        seal.seal(tmp_path, {"cases": []}, "salt")
 
 
 def test_an_exam_is_made_sat_and_scored_from_the_command_line(exam: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
@@ -124,6 +133,30 @@ def test_seeds_of_exams_need_to_be_sealed_and_those_of_development_not(brokk: Ca
     for seed, sealed in ((1000, "false"), (1, "true")):
         done = brokk(*SMALL, f"session.seed={seed}", f"exam.sealed={sealed}", f"session.out={tmp_path / 'x'}")
         assert done.code != 0 and "exam.sealed=" in done.err and not (tmp_path / "x").exists()
+
+
+def test_cases_of_an_exam_hang_on_the_salt_and_those_of_development_on_the_seed_alone(tmp_path: Path) -> None:
+    def drawn(seed: int, salt: str) -> str:
+        with initialize_config_module("conf", version_base="1.3"):
+            sealed = "true" if seed >= 1000 else "false"
+            cfg = compose("config", [*SMALL, f"session.out={tmp_path}", f"session.seed={seed}", f"exam.sealed={sealed}"])
+        return repr(instantiate(cfg, _convert_="all").questions(salt))
+
+    assert drawn(1000, "a") == drawn(1000, "a") != drawn(1000, "b")
+    assert drawn(1, "a") == drawn(1, "b")
+
+
+def test_a_forest_learns_from_development_cases_only_and_answers(exam: Path, machine: Machine, tmp_path: Path) -> None:
+    pytest.importorskip("sklearn")
+    trees = Trees(exam=str(exam), trees=20, least=0.3, seed=0)
+    trees.answer(exam / paper.CASES / "0000", tmp_path / "out", machine)
+    found = answer.read(tmp_path / "out" / FILE)
+    assert all(0 <= one.probability <= 1 for one in found.ranking) and found.verdict in ("effects", "none", "unknown")
+    sealed = tmp_path / "sealed"
+    sealed.mkdir()
+    (sealed / "exam.json").write_text('{"sealed": true}')
+    with pytest.raises(ConfigError, match="development seeds only"):
+        replace(trees, exam=str(sealed)).answer(exam / paper.CASES / "0000", tmp_path / "out", machine)
 
 
 class Recorder:

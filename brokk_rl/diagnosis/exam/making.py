@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -65,6 +67,18 @@ class Made:
     u: list[np.ndarray]
     q: list[np.ndarray]
     without_q: list[np.ndarray]
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Leaves out what the runner says of ways to start poses that took too long: an ailing machine may well be slow."""
+    logger = logging.getLogger(Runner.__module__)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 class Job:
@@ -179,7 +193,7 @@ class Workshop:
         plan = Plan(runs=tuple(job.plan.runs[0] for job in jobs), run_s=half.file_s, names=tuple(self._excitations))
         link = self._plants.build(machine, specimens, half.file_s)
         runner = Runner(plan, machine, self._approach, self._guards)
-        with link as opened:
+        with link as opened, _without_warnings():
             samples = list(drive(opened, runner, machine, len(jobs), half.file_s))
         track = Track(samples)
         extra = {name: np.stack([sample.extra[name] for sample in samples], 1) for name in samples[0].extra}
