@@ -1,7 +1,7 @@
 """Fits `actuators.valve` in seconds: positions hardly feed back into the speed, so the speed is fitted as a function of commands.
 
 The model is driven by recorded commands and, for the pose, recorded positions; increments of `WIDTH` samples are compared. For
-given dead time, play and lags the curves are a linear least-squares problem; pose and pump follow in turns, a few of which are enough.
+given dead time, play and lags the curves are a linear least-squares problem; pose and pump follow in a few turns.
 Axes: `R` recordings, `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import yaml
 from rich.progress import Progress
-from scipy.optimize import minimize
+from scipy.optimize import least_squares
 
 from actuators.valve import Valve
 from actuators.valve_speeds import PLAYS, Speeds
@@ -36,7 +36,7 @@ class ValveFit:
         actuator: The model; its knots are kept.
         longest_lag_s: Upper bound of each lag.
         sweeps: Turns of curve, pose and pump.
-        iterations: Steps of the search for dead time, play and lags, joint by joint.
+        iterations: Steps of each of the two searches for dead time, play and lags, joint by joint; the second knows pose and pump.
     """
 
     name: str
@@ -68,8 +68,12 @@ class ValveFit:
         data = Speeds([*train, *validation], machine, np.array(self.actuator.knots))
         dynamics = np.zeros((machine.num_joints, 4))
         with Progress(transient=True) as progress:
-            for j in progress.track(range(machine.num_joints), description=f"{self.name}: dead times and lags"):
-                dynamics[j] = self._dynamics(data, j)
+            rounds = [(turn, j) for turn in range(2) for j in range(machine.num_joints)]
+            known: list[list[np.ndarray]] | None = None
+            for turn, j in progress.track(rounds, description=f"{self.name}: dead times and lags"):
+                if turn and known is None:
+                    known = data.factors(data.statics(dynamics, self.sweeps), dynamics)
+                dynamics[j] = self._dynamics(data, j, known and known[j], dynamics[j] if turn else None)
         fitted = self._spec(data, dynamics)
         facts = {key: _plain(value) for key, value in dataclasses.asdict(fitted).items()}  # pyright: ignore[reportArgumentType]
         try:
@@ -84,28 +88,45 @@ class ValveFit:
         """Returns `fitted` with curves, pose and pump fitted to other recordings; dead times, play and lags stay."""
         columns = [getattr(fitted, name) for name in ("dead_time_s", "play", "spool_s", "speed_s")]
         dynamics = np.array([[column[name] for column in columns] for name in machine.joint_names])
-        return self._spec(Speeds(recordings, machine, np.array(self.actuator.knots)), dynamics)
+        assert isinstance(fitted.demand, dict), "a fitted actuator has numbers by joint"
+        demand = np.array([fitted.demand[name] for name in machine.joint_names])
+        return self._spec(Speeds(recordings, machine, np.array(self.actuator.knots)), dynamics, demand)
 
-    def _dynamics(self, data: Speeds, j: int) -> np.ndarray:
-        """Returns dead time, play, spool lag and speed lag of joint `j` that explain its increments best, by a simplex search."""
+    def _dynamics(self, data: Speeds, j: int, known: Sequence[np.ndarray] | None, start: np.ndarray | None) -> np.ndarray:
+        """Returns dead time, play, spool lag and speed lag of joint `j` that explain its increments best.
+
+        Args:
+            data: The recordings.
+            j: The joint.
+            known: Factor on the speed, from pose and pump, of each recording; `None` while they are not known.
+            start: Where the search begins; `None`: at the best dead time.
+        """
         machine = data.machine
         most = np.array([(machine.num_history - 2) * machine.period_s, PLAYS[-1], self.longest_lag_s, self.longest_lag_s])
 
-        def loss(x: np.ndarray) -> float:
-            x = np.clip(x, 0.0, most)
-            features = data.features(j, x)
-            return float(np.mean(np.square(data.way[j] - features @ data.curve(features, data.way[j]))) / data.scale[j])
+        def left(x: np.ndarray) -> np.ndarray:
+            features = data.features(j, x, known)
+            return (data.way[j] - features @ data.curve(features, data.way[j])) / np.sqrt(data.scale[j])
 
-        start = np.array([0.0, 0.02, 0.04, 0.02])
-        delays = np.arange(0.0, most[0] + 1e-9, machine.period_s)
-        start[0] = delays[int(np.argmin([loss(np.array([delay, 0.01, 0.04, 0.0])) for delay in delays]))]
-        reach = np.array([0.02, 0.03, 0.06, 0.06])
-        simplex = np.vstack([start, start + np.diag(reach)])
-        options = {"maxiter": self.iterations, "initial_simplex": simplex, "xatol": 5e-4, "fatol": 1e-6}
-        return np.clip(minimize(loss, start, method="Nelder-Mead", options=options).x, 0.0, most)
+        if start is None:
+            delays = np.arange(0.0, most[0] + 1e-9, machine.period_s)
+            losses = [float(np.square(left(np.array([delay, 0.01, 0.04, 0.0]))).sum()) for delay in delays]
+            start = np.array([delays[int(np.argmin(losses))], 0.02, 0.03, 0.02])
+        inside = np.clip(start, 1e-6, most - 1e-6)
+        step = np.array([0.1, 0.3, 0.3, 0.3])  # of `x_scale`: above the grain of the samples
+        return least_squares(
+            left,
+            inside,
+            bounds=(np.zeros(4), most),
+            x_scale=np.array([0.02, 0.02, 0.02, 0.02]),
+            diff_step=0.02 * step / np.maximum(inside, 1e-3) * 0.5,
+            loss="soft_l1",
+            f_scale=0.05,
+            max_nfev=self.iterations,
+        ).x
 
-    def _spec(self, data: Speeds, dynamics: np.ndarray) -> Valve:
-        found = data.statics(dynamics, self.sweeps)
+    def _spec(self, data: Speeds, dynamics: np.ndarray, demand: np.ndarray | None = None) -> Valve:
+        found = data.statics(dynamics, self.sweeps if demand is None else max(1, self.sweeps // 2), demand)
         names, half = data.machine.joint_names, len(self.actuator.knots) - 1
 
         def table(values: np.ndarray) -> dict[str, float]:

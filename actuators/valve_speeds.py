@@ -60,14 +60,26 @@ class Speeds:
         self._noise = 1e-3 * self.scale  # a first guess of the squared error, for the priors
         self._bend = _bend(knots)
 
-    def features(self, j: int, dynamics: np.ndarray) -> np.ndarray:
-        """Returns increments per unit of the curve at each knot, `(I, 2 (K - 1))`, without pose and pump."""
-        return np.concatenate(
-            [
-                self._increments(lagged(self._basis(self._spool(n, j, dynamics), j), dynamics[3], self._period_s))
-                for n in range(len(self._u))
-            ]
-        )
+    def features(self, j: int, dynamics: np.ndarray, known: Sequence[np.ndarray] | None = None) -> np.ndarray:
+        """Returns increments per unit of the curve at each knot, `(I, 2 (K - 1))`, with factors `known` on the speed or none."""
+        parts = []
+        for n in range(len(self._u)):
+            basis = self._basis(self._spool(n, j, dynamics), j)
+            basis = basis if known is None else basis * known[n][:, None]
+            parts.append(self._increments(lagged(basis, dynamics[3], self._period_s)))
+        return np.concatenate(parts)
+
+    def factors(self, found: Statics, dynamics: np.ndarray) -> list[list[np.ndarray]]:
+        """Returns the factor on the speed from pose and pump, by joint and recording, each `(T,)`."""
+        joints, half = range(self.machine.num_joints), len(self._knots) - 1
+        full = np.maximum(np.abs(found.curve[:, [half - 1, 2 * half - 1]]), 1e-3)
+        unit = self.machine.max_speed * self._period_s
+        spool = [np.stack([self._spool(n, j, dynamics[j]) for j in joints], 1) for n in range(len(self._u))]
+        plain = [np.stack([self._basis(s[:, j], j) @ found.curve[j] for j in joints], 1) / unit for s in spool]
+        share = [
+            _share(found.demand, np.abs(p) / np.where(s > 0, full[:, 0], full[:, 1])) for p, s in zip(plain, spool, strict=True)
+        ]
+        return [[self._factor(n, j, spool[n][:, j] > 0, found.pose) * share[n] for n in range(len(self._u))] for j in joints]
 
     def curve(
         self, features: np.ndarray, way: np.ndarray, noise: float | None = None, free: np.ndarray | None = None
@@ -79,12 +91,12 @@ class Speeds:
         normal += 1e-9 * np.trace(normal) * np.eye(len(normal))
         return np.linalg.solve(normal, weighted.T @ way)
 
-    def statics(self, dynamics: np.ndarray, sweeps: int) -> Statics:
-        """Returns curves, pose and demands for given dynamics `(J, 4)`."""
+    def statics(self, dynamics: np.ndarray, sweeps: int, demand: np.ndarray | None = None) -> Statics:
+        """Returns curves, pose and demands for given dynamics `(J, 4)`, beginning at `demand` where it is known."""
         joints, count, half = self.machine.num_joints, len(self._u), len(self._knots) - 1
         spool = [np.stack([self._spool(n, j, dynamics[j]) for j in range(joints)], 1) for n in range(count)]
         basis = [[self._basis(spool[n][:, j], j) for j in range(joints)] for n in range(count)]
-        found = Statics(np.zeros((joints, 2 * half)), np.zeros((joints, 2, self.num_pose)), np.full(joints, 0.55))
+        found = Statics(np.zeros((joints, 2 * half)), np.zeros((joints, 2, self.num_pose)), np.full(joints, 0.55) if demand is None else demand)
         opening = [np.abs(s) for s in spool]
         noise, free = self._noise.copy(), self._free.copy()
 

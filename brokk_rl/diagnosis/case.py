@@ -1,0 +1,108 @@
+"""A gap case: recordings of the machine as it was believed to be, and of the machine as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from brokk_rl import open_loop, record
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.split import COMMANDED
+
+HORIZON_S = 5.0
+LEAST_S = 60.0
+"""Field recordings that are shorter in all say nothing that holds beyond them."""
+MOVED = 0.01
+"""A joint that moved less, of its travel, in all field recordings shows nothing."""
+PART_S = 150.0
+"""Longest part of a recording that stays together when some are left out."""
+PAUSE_S = 4.0 * 3600.0
+"""After so long without a recording the machine has been off."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a diagnosis is given.
+
+    Attributes:
+        machine: The machine.
+        reference: Recordings that the simulator was built from; empty where it is given.
+        field: Recordings of the machine as it is.
+    """
+
+    machine: Machine
+    reference: Sequence[Recording]
+    field: Sequence[Recording]
+
+    def doubts(self) -> list[str]:
+        """Returns reasons why these recordings cannot tell anything, in words for people; none where they can."""
+        found = []
+        total_s = sum(recording.duration_s for recording in self.field)
+        if total_s < LEAST_S:
+            found.append(f"the field recordings last {total_s:.0f} s in all; {LEAST_S:.0f} s or more are needed")
+        if open_loop.longest_s(self.field, self.machine) < HORIZON_S:
+            found.append(f"no field recording is long enough for a free run of {HORIZON_S:g} s")
+        u = np.concatenate([recording.u for recording in self.field])
+        if not (np.abs(u) > COMMANDED).any():
+            found.append("no joint is ever commanded in the field recordings")
+        elif all(np.ptp(recording.u, axis=0).max() < COMMANDED for recording in self.field):
+            found.append("the commands never change in the field recordings")
+        return found
+
+    def resting(self) -> np.ndarray:
+        """Returns which joints are never commanded in the field recordings, `(J,)` bool."""
+        commanded = np.abs(np.concatenate([recording.u for recording in self.field])) > COMMANDED
+        return np.logical_not(np.any(commanded, axis=0))
+
+
+def load(folder: Path, machine: Machine) -> Case:
+    """Reads a gap case: `reference/*.parquet` and `field/*.parquet`.
+
+    Raises:
+        RecordingError: a part is missing, or a recording cannot be used (another machine, NaN, gaps, …).
+    """
+    if not folder.is_dir():
+        raise RecordingError(f"diagnosis.case={folder}: there is no such folder (seen from {Path.cwd()})")
+    parts = {name: folder / name for name in ("reference", "field")}
+    for name, part in parts.items():
+        if not any(part.glob("*.parquet")):
+            why = "the simulator is fitted to it; without one give diagnosis.field=<glob> and actuator=<simulator>"
+            raise RecordingError(f"{folder}: no {name}/*.parquet; a case has both" + (f" ({why})" if name == "reference" else ""))
+    return Case(machine, *(record.read_all(str(part / "*.parquet"), machine) for part in parts.values()))
+
+
+def running_s(recordings: Sequence[Recording]) -> list[float]:
+    """Returns how long the machine had been running at the beginning of each recording, as far as their dates tell."""
+    dates = [recording.metadata.get("created") for recording in recordings]
+    if not all(dates):
+        return [0.0] * len(recordings)
+    stamps = np.array([datetime.fromisoformat(date).timestamp() for date in dates if date])
+    order = np.argsort(stamps, kind="stable")
+    begun, found = stamps[order[0]], np.zeros(len(stamps))
+    for before, at in zip([order[0], *order[:-1]], order, strict=True):
+        if stamps[at] - stamps[before] > PAUSE_S:
+            begun = stamps[at]
+        found[at] = stamps[at] - begun
+    return found.tolist()
+
+
+def parts(recordings: Sequence[Recording]) -> list[Recording]:
+    """Returns the recordings, those longer than `PART_S` cut into equal parts, each part a run by itself."""
+    found = []
+    for number, recording in enumerate(recordings):
+        count = max(1, round(recording.duration_s / PART_S))
+        for part, rows in enumerate(np.array_split(np.arange(recording.num_samples), count)):
+            rows = slice(rows[0], rows[-1] + 1)
+            extra = {name: values[rows] for name, values in recording.extra.items()}
+            named = {**recording.metadata, "run": f"{number}.{part}"}
+            if created := recording.metadata.get("created"):
+                named["created"] = record.later(created, float(recording.t_s[rows][0]))
+            t_s = recording.t_s[rows] - recording.t_s[rows][0]
+            found.append(replace(recording, t_s=t_s, u=recording.u[rows], q=recording.q[rows], extra=extra, metadata=named))
+    return found

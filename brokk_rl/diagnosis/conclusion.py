@@ -1,0 +1,197 @@
+"""The whole way from a case to an outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.diagnosis import engine, gap, verdict
+from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
+from brokk_rl.diagnosis.base import Base
+from brokk_rl.diagnosis.case import Case
+from brokk_rl.diagnosis.engine import Findings, Prices, Tell
+from brokk_rl.diagnosis.free_runs import FreeRuns
+from brokk_rl.diagnosis.library import Kind
+from brokk_rl.diagnosis.outcome import Outcome
+from brokk_rl.diagnosis.repair import repair
+from brokk_rl.diagnosis.survey import survey
+from brokk_rl.inspection import Thresholds
+
+DECIDED_BY = {
+    frozenset({"flow_gain", "encoder_scale"}): "an outside measurement of the angle (inclinometer, laser) at two positions",
+    frozenset({"dead_time", "clock_offset"}): "one clock for commands and positions, or a pulse that both record",
+}
+"""Measurements that would tell apart what commands and joint positions cannot."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a diagnosis works with.
+
+    Attributes:
+        case: The recordings.
+        base: The simulator.
+        kinds: The library.
+        prices: What effects must earn.
+        thresholds: When a stretch of a recording is worth telling.
+        generator: Draws bootstraps and permutations.
+    """
+
+    case: Case
+    base: Base
+    kinds: Sequence[Kind]
+    prices: Prices
+    thresholds: Thresholds
+    generator: np.random.Generator
+
+    def run(self, tell: Tell) -> Outcome:
+        """Returns the outcome; `tell` is told what is being done and how much of the whole is done."""
+        if doubts := self.case.doubts():
+            return self._cannot_tell("; ".join(doubts))
+        findings = engine.search(self.base, self.kinds, self.prices, tell)
+        return self._outcome(findings)
+
+    def _outcome(self, findings: Findings) -> Outcome:
+        field = self.base.field
+        measured = field.evidence.candidates.cut.measured
+        before, floor = field.runs(field.evidence.base), self._floor()
+        unknown = verdict.is_unknown(findings, self.prices)
+        repaired = findings.repair if findings.repair and not unknown else None
+        after = field.runs(repaired.after) if repaired else None
+        square = gap.squares(field.evidence.base, measured)
+        floors = self._floor_squares() if self.base.nulls else np.zeros(1)
+        left = gap.squares(repaired.after, measured) if repaired else square
+        share = gap.closed(square, left, floors, self.generator) if self.base.nulls else None
+        selected = self._selected(findings, square, floors) if repaired else []
+        seen = survey(before, floor, after, self.case.machine, self.thresholds, self._dead_time_s(), self.generator, before)
+        told = "unknown" if unknown else "effects" if selected else "none"
+        chance = self._unknown_chance(findings)
+        answer = Answer(
+            verdict=told,
+            selected=tuple(selected),
+            ranking=tuple(verdict.ranking(findings, selected, self.prices, self.case.machine, chance)),
+            where=seen.where(),
+            gap=Gap(gap.rmse(square), gap.rmse(left), gap.rmse(floors), share),
+            next_experiment=None,
+            reason=self._reason(told, findings, selected),
+            more=seen.more() | self._more(findings, share),
+        )
+        return Outcome(answer, before, after, floor)
+
+    def _selected(self, findings: Findings, square: np.ndarray, floors: np.ndarray) -> list[Selected]:
+        kinds = {kind.name: kind for kind in self.kinds}
+        chosen = verdict.chosen_kinds(findings, kinds)
+        shares = gap.shapley([kind.name for kind in chosen], lambda names: self._closed_by(findings, names, square, floors))
+        assert findings.repair is not None, "what is selected has been simulated"
+        found = []
+        for kind in chosen:
+            swaps = verdict.rivals(findings, kind.name)
+            own = sum(
+                table.score(s).total - table.score(s - {kind.name}).total
+                for table, s in zip(findings.tables, findings.chosen.subsets, strict=True)
+                if kind.name in s
+            )
+            like = verdict.same_as(swaps, own)
+            chance = verdict.probability(verdict.margin(findings, self.prices, frozenset({kind.name, *like})), self.prices)
+            joints = findings.repair.joints_of(kind)
+            decided = next((how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)), None)
+            found.append(
+                Selected(
+                    effect=kind.name,
+                    joints=tuple(name for name, has in zip(self.case.machine.joint_names, joints, strict=True) if has),
+                    probability=chance,
+                    parameters=verdict.numbers(findings, kind, self.case.machine),
+                    gap_closed=Estimate(shares[kind.name], (shares[kind.name], shares[kind.name])),
+                    same_as=like,
+                    decided_by=decided,
+                )
+            )
+        return sorted(found, key=lambda one: -one.probability)
+
+    def _closed_by(self, findings: Findings, names: frozenset[str], square: np.ndarray, floors: np.ndarray) -> float:
+        """Returns the share of the gap that some of the chosen effects close, their sizes fitted anew."""
+        if not names:
+            return 0.0
+        whole = findings.repair
+        assert whole is not None, "only chosen effects close anything"
+        evidence = self.base.field.evidence
+        if names == findings.chosen.names:
+            after = whole.after
+        else:
+            subsets = [subset & names for subset in findings.chosen.subsets]
+            start = [table.score(s).sizes for table, s in zip(findings.tables, subsets, strict=True)]
+            after = repair(evidence, subsets, findings.rays, start, steps=2).after
+        before, left = gap.rmse(square), gap.rmse(gap.squares(after, evidence.candidates.cut.measured))
+        return (before - left) / max(before - gap.rmse(floors), 0.02 * before)
+
+    def _floor(self) -> FreeRuns | None:
+        if not self.base.nulls:
+            return None
+        recordings, source, row, paths = [], [], [], []
+        for one in self.base.nulls:
+            source.append(one.source + len(recordings))
+            recordings += one.recordings
+            row.append(one.row)
+            paths.append(one.evidence.base)
+        return FreeRuns(recordings, np.concatenate(source), np.concatenate(row), np.concatenate(paths).astype(float))
+
+    def _floor_squares(self) -> np.ndarray:
+        return np.concatenate([gap.squares(one.evidence.base, one.evidence.candidates.cut.measured) for one in self.base.nulls])
+
+    def _dead_time_s(self) -> np.ndarray:
+        return np.full(self.case.machine.num_joints, self.case.machine.dead_time_s)
+
+    def _unknown_chance(self, findings: Findings) -> float:
+        left = findings.left - 1.5 * findings.left_null - self.prices.remainder
+        return verdict.probability(float(left.max()), self.prices)
+
+    def _more(self, findings: Findings, share: Estimate | None) -> dict[str, Any]:
+        names = self.case.machine.joint_names
+        rivals = [
+            {
+                "name": f"{name} on {joint}",
+                "effect": name,
+                "joints": [joint],
+                "score": table.scored[subset].total,
+                "selected": name in findings.chosen.subsets[j],
+            }
+            for j, (joint, table) in enumerate(zip(names, findings.tables, strict=True))
+            for subset in table.scored
+            if len(subset) == 1 and (name := next(iter(subset)))
+        ]
+        rivals = sorted(rivals, key=lambda row: -row["score"])[:40]
+        left = {
+            name: {"earned": float(a), "null": float(b)}
+            for name, a, b in zip(names, findings.left, findings.left_null, strict=True)
+        }
+        return {
+            "evidence": {"rivals": rivals, "threshold": self.prices.name + self.prices.joint, "unit": "log likelihood"},
+            "remainder": left,
+            "predicted_closed": share.mean if share else None,
+        }
+
+    def _reason(self, told: str, findings: Findings, selected: Sequence[Selected]) -> str:
+        if told == "effects":
+            return "; ".join(f"{one.effect} on {', '.join(one.joints) or 'the machine'}" for one in selected)
+        if told == "unknown":
+            joints = np.flatnonzero(verdict.unexplained(findings, self.prices) > 0)
+            where = ", ".join(self.case.machine.joint_names[j] for j in joints)
+            return f"the gap of {where} can be predicted from commands and positions, but by no effect of the library"
+        return "no effect earns more on the field recordings than it would by chance"
+
+    def _cannot_tell(self, why: str) -> Outcome:
+        """Returns the answer of recordings that cannot tell anything."""
+        field = self.base.field
+        runs, floor = field.runs(field.evidence.base), self._floor()
+        measured = field.evidence.candidates.cut.measured
+        square = gap.squares(field.evidence.base, measured)
+        floors = self._floor_squares() if self.base.nulls else np.zeros(1)
+        known = Gap(gap.rmse(square), gap.rmse(square), gap.rmse(floors), None)
+        answer = Answer(
+            verdict="unknown", selected=(), ranking=(Ranked("unknown", (), 1.0),), where=Where({}, (), None), gap=known,
+            next_experiment=None, reason=f"cannot tell, because {why}",
+        )  # fmt: skip
+        return Outcome(answer, runs, None, floor)

@@ -1,0 +1,153 @@
+"""The search over sets of effects: joint by joint over subsets, then over the names that all joints share.
+
+A set is judged by what it earns on recordings that it was not fitted to, less its price: what the same effect earns on reference
+recordings, where there is nothing to find. Saturation may pay only together with a dead band, so sets are never grown from one
+effect alone: each joint keeps the best few of each size.
+Axes: `J` joints, `E` entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from brokk_rl.diagnosis.sizes import Shape, earned
+
+MOST = 4
+"""Effects in a set."""
+KEPT = 5
+"""Subsets of each size that a joint goes on from."""
+NAMES = 12
+"""Names among which whole sets are chosen."""
+TRIED = 14
+"""Subsets of each joint that are tried on the reference too."""
+
+Subset = frozenset[str]
+Price = Callable[[int, Subset], float]
+"""What a subset costs on a joint, by its number."""
+
+
+@dataclass
+class Scored:
+    """What a subset of effects earns on a joint.
+
+    Attributes:
+        gain: Entry by entry, `(E,)`.
+        sizes: By effect, along each of its rays.
+    """
+
+    gain: np.ndarray
+    sizes: dict[str, np.ndarray]
+
+    @property
+    def total(self) -> float:
+        """What it earns in all, nats."""
+        return float(self.gain.sum())
+
+
+@dataclass
+class Table:
+    """Subsets of effects that were tried on one joint, and what they earn.
+
+    Attributes:
+        z: The joint's errors over the noise, `(E,)`.
+        shapes: By effect: one shape a ray; effects that do nothing to the joint are absent.
+        fold: Half of the recordings of each entry.
+    """
+
+    z: np.ndarray
+    shapes: dict[str, list[Shape]]
+    fold: np.ndarray
+    scored: dict[Subset, Scored] = field(default_factory=dict)
+
+    def score(self, subset: Subset) -> Scored:
+        """Returns what a subset earns."""
+        if subset not in self.scored:
+            names = sorted(subset)
+            shapes = [shape for name in names for shape in self.shapes[name]]
+            if not shapes:
+                return Scored(np.zeros(len(self.z)), {})
+            gain, sizes = earned(self.z, shapes, self.fold)
+            ends = np.cumsum([len(self.shapes[name]) for name in names])[:-1]
+            self.scored[subset] = Scored(gain, dict(zip(names, np.split(sizes, ends), strict=True)))
+        return self.scored[subset]
+
+    def explore(self, price: Mapping[str, float], most: int) -> None:
+        """Tries all single effects, and larger subsets that contain one of the best of the size below."""
+
+        def net(subset: Subset) -> float:
+            return self.score(subset).total - sum(price[name] for name in subset)
+
+        level = [frozenset({name}) for name in self.shapes]
+        single = sorted(level, key=net, reverse=True)
+        for size in range(2, most + 1):
+            best = sorted(level, key=net, reverse=True)[:KEPT]
+            if size == 2:
+                level = [a | b for a, b in combinations(single[: KEPT + 1], 2)]
+            else:
+                level = []
+            level = list({*level, *(one | {name} for one in best for name in self.shapes if name not in one)})
+            gained = max((net(one) for one in level), default=0.0)
+            if size > 2 and gained <= max((net(one) for one in best), default=0.0):
+                break
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A set of effects, joint by joint.
+
+    Attributes:
+        subsets: Effects of each joint.
+        worth: What they earn in all, less their prices.
+    """
+
+    subsets: tuple[Subset, ...]
+    worth: float
+
+    @property
+    def names(self) -> Subset:
+        """All effects of the set."""
+        return frozenset().union(*self.subsets)
+
+
+def choose(tables: Sequence[Table], price: Price, name_price: float, share: float) -> Chosen:
+    """Returns the set that is worth most.
+
+    Args:
+        tables: What was tried on each joint.
+        price: What a subset costs on a joint.
+        name_price: What each effect costs once, however many joints have it.
+        share: Part of what a joint's subset earns that each of its effects must add.
+    """
+    worth: list[dict[Subset, float]] = []
+    for j, table in enumerate(tables):
+        promising = sorted((s for s in table.scored if s), key=lambda s: table.scored[s].total, reverse=True)[:TRIED]
+        promising += [s for s in table.scored if len(s) == 1 and table.scored[s].total > 0 and s not in promising]
+        priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising}
+        whole = [s for s in priced if priced[s] > 0 and _each_adds(s, table, share)]
+        worth.append({subset: priced[subset] for subset in whole})
+    names = sorted({name for by_subset in worth for subset in by_subset for name in subset}, key=lambda n: -_sum(worth, n))[:NAMES]
+    best = Chosen((frozenset(),) * len(tables), 0.0)
+    for size in range(1, MOST + 1):
+        for chosen in combinations(names, size):
+            among = frozenset(chosen)
+            subsets = [max([s for s in w if s <= among], key=w.__getitem__, default=frozenset()) for w in worth]
+            total = sum(w[s] for s, w in zip(subsets, worth, strict=True) if s)
+            total -= name_price * len(frozenset().union(*subsets))
+            if total > best.worth:
+                best = Chosen(tuple(subsets), total)
+    return best
+
+
+def _each_adds(subset: Subset, table: Table, share: float) -> bool:
+    """Says whether each effect of a subset adds its share: else it mends the form of another."""
+    total = table.scored[subset].total
+    return len(subset) == 1 or all(total - table.score(subset - {name}).total >= share * total for name in subset)
+
+
+def _sum(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
+    """Returns the most that a subset with `name` is worth, summed over joints."""
+    return sum(max([value for subset, value in by_subset.items() if name in subset], default=0.0) for by_subset in worth)

@@ -1,0 +1,128 @@
+"""From what the search found to what is said: classes that cannot be told apart, probabilities, numbers, a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from brokk_rl.diagnosis.answer import Estimate, Ranked, Selected
+from brokk_rl.diagnosis.engine import Findings, Prices
+from brokk_rl.diagnosis.library import Kind
+from brokk_rl.diagnosis.search import Table, choose
+from brokk_rl.machine import Machine
+
+SAME = 0.9
+"""An effect that earns so much of what another earns in its place cannot be told from it."""
+AS_GOOD = 3.0
+"""Difference in log likelihood that says nothing."""
+LISTED = 8
+
+
+@dataclass(frozen=True)
+class Swap:
+    """An effect in the place of a chosen one, and what it earns of what that one earns."""
+
+    name: str
+    earned: float
+    share: float
+
+
+def rivals(findings: Findings, name: str) -> list[Swap]:
+    """Returns what each other effect would earn in the place of `name`, the best first."""
+    found, subsets, own = [], findings.chosen.subsets, 0.0
+    places = [j for j, subset in enumerate(subsets) if name in subset]
+    without = {j: findings.tables[j].score(subsets[j] - {name}).total for j in places}
+    own = sum(findings.tables[j].score(subsets[j]).total - without[j] for j in places)
+    for other in findings.rays:
+        if other in findings.chosen.names or not all(other in findings.tables[j].shapes for j in places):
+            continue
+        earned = sum(findings.tables[j].score(subsets[j] - {name} | {other}).total - without[j] for j in places)
+        found.append(Swap(other, earned, earned / max(own, 1e-9)))
+    return sorted(found, key=lambda swap: -swap.earned)
+
+
+def same_as(swaps: Sequence[Swap], own: float) -> tuple[str, ...]:
+    """Returns the effects that cannot be told from one that earns `own`, at most three."""
+    return tuple(swap.name for swap in swaps if swap.share > SAME or own - swap.earned < AS_GOOD)[:3]
+
+
+def margin(findings: Findings, prices: Prices, left_out: frozenset[str]) -> float:
+    """Returns by how much the chosen set is worth more than the best set without some effects."""
+    tables = [_without(table, left_out) for table in findings.tables]
+    other = choose(tables, findings.price, prices.name, prices.share)
+    return findings.chosen.worth - other.worth
+
+
+def _without(table: Table, left_out: frozenset[str]) -> Table:
+    return replace(table, scored={subset: one for subset, one in table.scored.items() if not subset & left_out})
+
+
+def probability(margin: float, prices: Prices) -> float:
+    """Returns the probability that goes with a margin of worth."""
+    return float(1.0 / (1.0 + np.exp(-np.clip(margin / prices.temperature, -30.0, 30.0))))
+
+
+def numbers(findings: Findings, kind: Kind, machine: Machine) -> dict[str, dict[str, Estimate]]:
+    """Returns the numbers of a selected effect by joint."""
+    repair = findings.repair
+    assert repair is not None, "a selected effect has been simulated"
+    found: dict[str, dict[str, Estimate]] = {}
+    for ray, mask, size, deviation in zip(repair.rays, repair.mask, repair.sizes, repair.deviation, strict=True):
+        if ray.kind.name != kind.name:
+            continue
+        for name in (ray.name,) if ray.name else kind.fitted:
+            number, unit = kind.numbers[name], kind.size(name)
+            for j in np.flatnonzero(mask):
+                ends = number.none + unit * (size[j] + np.array([-1.96, 0.0, 1.96]) * deviation[j])
+                low, mean, high = (float(v) for v in np.sort(np.clip(ends, *number.bounds)))
+                joint = machine.joint_names[j] if number.per_joint else "machine"
+                found.setdefault(name, {})[joint] = Estimate(mean, (low, high))
+    for name in kind.shaping:
+        value = float(kind.numbers[name].typical)
+        found[name] = {machine.joint_names[j]: Estimate(value, (value, value)) for j in np.flatnonzero(repair.joints_of(kind))}
+    return found
+
+
+def chosen_kinds(findings: Findings, kinds: Mapping[str, Kind]) -> list[Kind]:
+    """Returns the chosen effects, the ones that earn most first."""
+
+    def earned(name: str) -> float:
+        subsets = [(t, s) for t, s in zip(findings.tables, findings.chosen.subsets, strict=True) if name in s]
+        return sum(table.score(subset).total - table.score(subset - {name}).total for table, subset in subsets)
+
+    return [kinds[name] for name in sorted(findings.chosen.names, key=earned, reverse=True)]
+
+
+def unexplained(findings: Findings, prices: Prices) -> np.ndarray:
+    """Returns what a flexible model earns, by joint, beyond what it earns where nothing is to be found, `(J,)`."""
+    return np.maximum(findings.left - 1.5 * findings.left_null - prices.remainder, 0.0)
+
+
+def is_unknown(findings: Findings, prices: Prices) -> bool:
+    """Says whether something is there that the library does not explain."""
+    left = unexplained(findings, prices)
+    gained = [table.score(s).total if s else 0.0 for table, s in zip(findings.tables, findings.chosen.subsets, strict=True)]
+    return bool(left.sum() > 0 and sum(gained) < prices.explained * (sum(gained) + findings.left[left > 0].sum()))
+
+
+def ranking(findings: Findings, selected: Sequence[Selected], prices: Prices, machine: Machine, unknown: float) -> list[Ranked]:
+    """Returns all rivals worth naming, most probable first; `none` and `unknown` among them."""
+    named = {one.effect: Ranked(one.effect, one.joints, one.probability) for one in selected}
+    for name in findings.rays:
+        if name in named:
+            continue
+        worth = [
+            (table.scored[frozenset({name})].total - findings.price(j, frozenset({name})), j)
+            for j, table in enumerate(findings.tables)
+            if frozenset({name}) in table.scored and table.scored[frozenset({name})].total > prices.joint
+        ]
+        alone = sum(max(value, 0.0) for value, _ in worth) - prices.name
+        chance = probability(alone - max(findings.chosen.worth, 0.0), prices)
+        joints = tuple(machine.joint_names[j] for value, j in worth if value > 0)
+        if joints:
+            named[name] = Ranked(name, joints, chance)
+    none = probability(-findings.chosen.worth - prices.name * (not findings.chosen.names), prices) if selected else 1.0
+    rows = [*named.values(), Ranked("none", (), none * (1.0 - unknown)), Ranked("unknown", (), unknown)]
+    return sorted(rows, key=lambda one: -one.probability)[:LISTED]

@@ -1,0 +1,127 @@
+"""`brokk mode=diagnose`: where the gap between a simulator and the machine lies, which effects cause it, how far they close it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from brokk_rl import record
+from brokk_rl.contracts import Actuator, ActuatorFit
+from brokk_rl.diagnosis import answer, base, case, library, page, prescription
+from brokk_rl.diagnosis.answer import Answer
+from brokk_rl.diagnosis.base import Base
+from brokk_rl.diagnosis.case import Case
+from brokk_rl.diagnosis.conclusion import Diagnosis
+from brokk_rl.diagnosis.engine import Prices
+from brokk_rl.errors import ConfigError
+from brokk_rl.inspection import Thresholds
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class Subject:
+    """What is diagnosed.
+
+    Attributes:
+        case: Folder with `reference/` and `field/`; or `null`.
+        field: Glob or globs of recordings of the machine as it is, held against `actuator`; instead of a case.
+        effects: Names of the effects to choose among; `null`: all that are registered.
+        prices: What an effect must earn.
+    """
+
+    case: str | None
+    field: str | tuple[str, ...] | None
+    effects: tuple[str, ...] | None
+    prices: Prices
+
+    def check(self) -> None:
+        if (self.case is None) == (self.field is None):
+            raise ConfigError(
+                "diagnosis: give either case=<folder with reference/ and field/>, or field=<glob> and actuator=<simulator>"
+            )
+
+
+@spec
+class Diagnose:
+    """Holds a simulator against recordings and says what it lacks.
+
+    Attributes:
+        session: Folder, seed, device.
+        machine: The machine that was recorded.
+        fit: How the simulator is made from `reference/`.
+        actuator: The simulator that `diagnosis.field` is held against.
+        thresholds: When a stretch of a recording is worth telling.
+        diagnosis: What is diagnosed.
+    """
+
+    session: Session
+    machine: Machine
+    fit: ActuatorFit
+    actuator: Actuator | None
+    thresholds: Thresholds
+    diagnosis: Subject
+
+    def run(self) -> None:
+        """Writes `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
+
+        Raises:
+            RecordingError: a recording cannot be used, or there is too little data to fit a simulator to.
+            ConfigError: neither a case nor an actuator is given, or an effect is unknown.
+            StorageError: something could not be written.
+        """
+        self.session.seed_all()
+        given = self._case()
+        kinds = library.load(self.machine, self.diagnosis.effects)
+        torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
+        with Progress(transient=True) as progress:
+            task = progress.add_task("simulator", total=1.0)
+            simulator = self._base(given)
+            work = Diagnosis(given, simulator, kinds, self.diagnosis.prices, self.thresholds, self.session.generator("diagnosis"))
+            outcome = work.run(lambda doing, done: progress.update(task, description=doing, completed=done))
+        folder = self.session.folder
+        outcome.save(folder)
+        prescription.write(outcome.answer, kinds, folder / prescription.FILE)
+        page.write(outcome, folder, self.machine)
+        _show(outcome.answer, folder)
+
+    def _case(self) -> Case:
+        subject = self.diagnosis
+        if subject.case is not None:
+            return case.load(Path(subject.case), self.machine)
+        assert subject.field is not None, "checked by Subject"
+        if self.actuator is None:
+            raise ConfigError("diagnosis.field needs a simulator to hold it against: add actuator=<name>")
+        return Case(self.machine, [], record.read_all(subject.field, self.machine))
+
+    def _base(self, given: Case) -> Base:
+        seed, device = self.session.stream("base"), self.session.torch_device()
+        if given.reference:
+            return base.fitted(given, self.fit, self.session.folder / "base", seed, device)
+        assert self.actuator is not None, "there is one where there is no reference"
+        return base.given(given, self.actuator, seed)
+
+
+def _show(found: Answer, folder: Path) -> None:
+    console = Console()
+    table = Table("effect", "joints", "probability", "numbers", "closes", "same as", box=None)
+    for one in found.selected:
+        told = [
+            f"{name} {joint} {value.mean:.4g} ({value.ci95[0]:.4g} to {value.ci95[1]:.4g})"
+            for name, values in one.parameters.items()
+            for joint, value in values.items()
+        ]
+        closes = f"{100 * one.gap_closed.mean:.0f} %" if one.gap_closed else ""
+        table.add_row(one.effect, " ".join(one.joints), f"{one.probability:.2f}", "\n".join(told), closes, " ".join(one.same_as))
+    console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False)
+    if found.selected:
+        console.print(table)
+    console.print(f"report: {folder / page.PAGE}, answer: {folder / answer.FILE}", highlight=False)
