@@ -84,14 +84,22 @@ def _causes(page: Page, outcome: Outcome) -> None:
             page.text(text, "warn")
     if text := wording.left(answer):
         page.text(text)
-    if answer.reason and answer.verdict != "unknown":
-        page.text(answer.reason)
+    if answer.reason and answer.verdict == "none":
+        page.text(f"{answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}.")
     if isinstance(predicted := answer.more.get("predicted_closed"), float) and answer.gap and answer.gap.closed:
         achieved = 100 * answer.gap.closed.mean
         page.text(f"Before they were added, {100 * predicted:.0f} % were predicted to be closed; {achieved:.0f} % were.")
     for key, saying in (("undecided", "Left undecided"), ("remainder", "Remainder")):
         if isinstance(found := answer.more.get(key), str):
             page.text(f"{saying}: {found}")
+
+    if isinstance(left := answer.more.get("remainder"), Mapping) and left:
+        rows = [
+            [joint, *(None if one.get(key) is None else f"{one[key]:.1f}" for key in ("earned", "null"))]
+            for joint, one in left.items()
+        ]
+        caption = "What a flexible model still predicts of the error that is left, and what it would by chance"
+        page.table(["joint", "earned", "by chance"], rows, caption)
 
 
 def _where(page: Page, outcome: Outcome, machine: Machine) -> None:

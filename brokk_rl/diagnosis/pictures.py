@@ -88,7 +88,9 @@ def paths(outcome: Outcome, machine: Machine) -> Figure:
     """Draws measured against simulated positions of the joints with the largest gaps: a whole recording, and the worst windows."""
     before = outcome.before
     error = np.sqrt(np.nanmean(before.error**2, 1))  # (W, J)
-    shown = np.argsort([-outcome.answer.where.joints[name].share for name in machine.joint_names])[: min(SHOWN, machine.num_joints)]
+    located = outcome.answer.where.joints
+    foremost = [-located[name].share if name in located else 0.0 for name in machine.joint_names]
+    shown = np.argsort(foremost, kind="stable")[: min(SHOWN, machine.num_joints)]
     height = 2.6 * len(shown) + 0.6
     figure = Figure(figsize=(12.0, height))
     rows = figure.add_gridspec(

@@ -23,9 +23,9 @@ def headline(answer: Answer) -> tuple[str, Tone]:
         return f"No gap: the simulator is as right about these recordings as about its own.{size}", "good"
     if answer.verdict == "unknown":
         place = _place(answer)
-        because = f" {answer.reason}" if answer.reason else ""
-        start = "There is no telling" if gap is None else "There is a gap that no effect of the library explains"
-        return f"{start}{place if gap is not None else ''}.{because}{size}", "warn"
+        because = f" {answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}." if answer.reason else ""
+        start = f"There is a gap that no effect of the library explains{place}" if place else "There is no telling"
+        return f"{start}.{because}{size}", "warn"
     names = listed([named(one) for one in answer.selected])
     closed = gap.closed if gap else None
     share = f" closes {100 * closed.mean:.0f} % of the gap (95 %: {_percent_range(closed)})." if closed else "."

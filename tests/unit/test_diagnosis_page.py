@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.diagnosis import outcome, page, wording
-from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Selected
+from brokk_rl.diagnosis import outcome, page, pictures, wording
+from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Selected, Where
 from brokk_rl.diagnosis.free_runs import FreeRuns
 from brokk_rl.diagnosis.outcome import Outcome
 from brokk_rl.diagnosis.survey import Survey, survey
@@ -107,6 +107,15 @@ def test_an_answer_without_effects_is_said_in_plain_words(
     assert ("No gap" in text) == (verdict == "none") and ("in q4" in text) == (verdict == "unknown")
     page.write(Outcome(bare, seen[0].before, None, None), tmp_path, machine)
     assert "12.0 mrad before; the floor is 10.0 mrad" in (tmp_path / "report.html").read_text()
+
+
+def test_an_answer_that_cannot_tell_says_why(machine: Machine, seen: tuple[Outcome, Survey]) -> None:
+    bare = Answer(
+        verdict="unknown", selected=(), ranking=(), where=Where({}, (), None), gap=Gap(0.01, 0.01, 0.01, None),
+        next_experiment=None, reason="cannot tell, because nothing moves",
+    )  # fmt: skip
+    assert wording.headline(bare)[0].startswith("There is no telling. Cannot tell, because nothing moves. Error over 5 s")
+    assert pictures.paths(Outcome(bare, seen[0].before, None, None), machine).axes
 
 
 def test_lists_and_classes_read_as_sentences() -> None:
