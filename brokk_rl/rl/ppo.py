@@ -39,6 +39,8 @@ class DevicePPO(PPO):
     _rows: torch.Tensor
     _advantages: torch.Tensor
     _rate: torch.Tensor
+    _wanted: torch.Tensor
+    """`desired_kl`, which may change from update to update."""
     _sums: torch.Tensor
 
     def act(self, obs: TensorDict) -> torch.Tensor:
@@ -76,6 +78,7 @@ class DevicePPO(PPO):
             self._rows.copy_(order[: len(self._rows)])
             self._mini_batch = self._parts()
         self._sums.zero_()
+        self._wanted.fill_(self.desired_kl or 0.0)
         for _ in range(self.num_learning_epochs):
             for rows in order.split(len(self._rows)):
                 self._rows.copy_(rows)
@@ -113,6 +116,7 @@ class DevicePPO(PPO):
         self._rows = torch.zeros(self._batch_size(), dtype=torch.int64, device=self.device)
         self._advantages = torch.zeros_like(self.storage.values)
         self._rate = torch.tensor(self.learning_rate, device=self.device)
+        self._wanted = torch.zeros((), device=self.device)
         self._sums = torch.zeros(len(FIGURES), device=self.device)
         parameters = list(chain(self.actor.parameters(), self.critic.parameters()))
         self._gathered = torch.zeros(sum(p.numel() for p in parameters) + 1, device=self.device)
@@ -216,6 +220,6 @@ class DevicePPO(PPO):
     def _adapt_rate(self, divergence: torch.Tensor) -> None:
         """Raises the learning rate where the policy moves less than `desired_kl`, lowers it where it moves more."""
         lower, higher = (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE), (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE)
-        too_near = (divergence < self.desired_kl / 2.0) & (divergence > 0.0)
-        rate = torch.where(divergence > self.desired_kl * 2.0, lower, torch.where(too_near, higher, self._rate))
+        too_near = (divergence < self._wanted / 2.0) & (divergence > 0.0)
+        rate = torch.where(divergence > self._wanted * 2.0, lower, torch.where(too_near, higher, self._rate))
         self._rate.copy_(rate)

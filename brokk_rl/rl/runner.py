@@ -22,6 +22,9 @@ from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
+ROUND = 10
+"""Iterations between two changes of the desired divergence; processes that train together must agree on it."""
+
 
 @spec
 class Budget:
@@ -54,6 +57,8 @@ class Training:
         budget: When training ends.
         save_interval: Iterations between checkpoints; a killed run loses no more. As often several processes prove that they agree.
         keep_checkpoints: Newest checkpoints kept.
+        settling: Last part of the budget, over which the divergence that an update aims at (`desired_kl`) falls to a tenth: large
+            steps learn fast, and small ones keep what was learned.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world before the run stops with an error.
         fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of compiling and a C++ compiler:
             a fifth faster on a GPU; on a CPU, whose physics takes less than half of a control step of few worlds, far more.
@@ -67,10 +72,22 @@ class Training:
     budget: Budget
     save_interval: int
     keep_checkpoints: int
+    settling: float
     max_fault_rate: float
     fuse: bool
     random_episode_lengths: bool
     runner: dict[str, Any]
+
+    def check(self) -> None:
+        if not 0.0 <= self.settling <= 1.0:
+            raise ConfigError(f"rl.settling: expected a part of the budget, 0 to 1, got {self.settling}")
+
+    def divergence(self, share_spent: float) -> float | None:
+        """Returns the `desired_kl` of updates when this share of the budget is spent."""
+        desired = self.runner["algorithm"].get("desired_kl")
+        if desired is None or share_spent <= 1.0 - self.settling:
+            return desired
+        return desired * (1.0 - 0.9 * min(1.0, (share_spent - 1.0 + self.settling) / self.settling))
 
     def runner_config(self) -> dict[str, Any]:
         """Returns a copy for rsl-rl, which writes into it; keys without a value are dropped: its constructors know no `null`."""
@@ -112,17 +129,23 @@ class Runner(OnPolicyRunner):
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
         while rounds := self.group.from_first(self._rounds(book, steps)):
+            if self.current_learning_iteration % ROUND == 0:
+                share = self.group.from_first(self.training.budget.share_spent(book.env_steps, book.seconds))
+                self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
             with contextlib.redirect_stdout(io.StringIO()):
                 self.learn(rounds, init_at_random_ep_len=first and self.training.random_episode_lengths)
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
-            self.group.check_same(self._policy_state())
-            self.checkpoint()
+            over = self.group.from_first(self._rounds(book, steps)) == 0
+            if over or self.current_learning_iteration % self.training.save_interval == 0:
+                self.group.check_same(self._policy_state())
+                self.checkpoint()
 
     def _rounds(self, book: Logbook, steps: int) -> int:
-        """Returns how many iterations to do until the next checkpoint, 0 when the budget is spent."""
-        budget, rounds = self.training.budget, self.training.save_interval
+        """Returns how many iterations to do until the next checkpoint or change of step, 0 when the budget is spent."""
+        budget, interval = self.training.budget, self.training.save_interval
+        rounds = min(part - self.current_learning_iteration % part for part in (ROUND, interval))
         if budget.share_spent(book.env_steps, book.seconds) >= 1.0:
             return 0
         if budget.max_env_steps:
@@ -166,6 +189,7 @@ class Runner(OnPolicyRunner):
         content = self.alg.save() | {
             "iter": self.current_learning_iteration,
             "learning_rate": self.alg.learning_rate,
+            "desired_kl": self.alg.desired_kl,
             **own,
             "others": parts[1:],
             "book": book.state_dict(),
@@ -204,6 +228,7 @@ class Runner(OnPolicyRunner):
                 self.env.load_state_dict(part["env"])
                 set_random_state(part["random"], self.device)
             self.alg.learning_rate = content["learning_rate"]
+            self.alg.desired_kl = content["desired_kl"]
             self.current_learning_iteration = content["iter"]
             book: Logbook = self.logger  # type: ignore[assignment]
             book.load_state_dict(content["book"])  # last: it rewrites progress.csv

@@ -42,6 +42,17 @@ def test_a_resumed_run_is_the_run_that_was_never_interrupted(save_interval: int,
     assert all(same(state[0][key], state[1][key]) for key in state[0])
 
 
+def test_a_resumed_run_settles_as_the_run_that_was_never_interrupted(
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("brokk_rl.rl.runner.ROUND", 2)
+    training = runs.small(max_env_steps=8 * ITERATION, settling=0.8)
+    whole = runs.train(machine, tmp_path / "run", replace(training, keep_checkpoints=9))
+    again = runs.train(machine, tmp_path / "run", training, tmp_path / "run" / "model_5.pt")
+    assert same(runs.weights(whole), runs.weights(again))
+    assert whole.alg.desired_kl == again.alg.desired_kl == pytest.approx(0.01 * (1 - 0.9 * (6 / 8 - 0.2) / 0.8))
+
+
 def test_how_often_a_checkpoint_is_written_does_not_change_training(machine: Machine, tmp_path: Path) -> None:
     often, once = (
         runs.train(machine, tmp_path / str(interval), runs.small(max_env_steps=4 * ITERATION, save_interval=interval))

@@ -222,3 +222,11 @@ def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(machine
     assert [float(row["fault_rate"]) for row in rows] == [1 / ITERATION, 0.0, 0.0]
     assert float(rows[0]["episode/end/fault"]) == 1.0 and all(value != "nan" for row in rows for value in row.values())
     assert all(value.isfinite().all() for value in runs.weights(runner).values())
+
+
+def test_the_divergence_of_updates_falls_to_a_tenth_while_the_policy_settles() -> None:
+    training = runs.small(max_env_steps=100, settling=0.5)
+    assert [training.divergence(share) for share in (0.0, 0.5, 0.75, 1.0, 1.2)] == pytest.approx([0.01, 0.01, 0.0055, 0.001, 0.001])
+    assert runs.small(max_env_steps=100, settling=0.0).divergence(1.0) == 0.01
+    with pytest.raises(ConfigError, match=r"rl\.settling: expected a part of the budget"):
+        runs.small(max_env_steps=100, settling=1.5)
