@@ -95,7 +95,7 @@ class ToolPoseProcess:
         shapes = {f"start.{key}": tuple(value.shape[1:]) for key, value in start.items()}
         shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "estimate_m": (3,), "q_scale": (), "u_scale": (), "steps": (), "age": ()}
         shapes |= {"u": (num_joints,), "u_before": (num_joints,), "closeness": (), "contact_force_n": ()}
-        shapes |= {"command": (num_joints,), "features": (self.num_features,), "policy": (self._encoder.size,), "privileged": (9,)}
+        shapes |= {"command": (num_joints,), "features": (self.num_features,), "policy": (self._encoder.size,), "privileged": (10,)}
         shapes |= {"positioning": (), "rule_reach_m": ()}
         if self.adviser:
             shapes["proposed"] = (machine.num_history, num_joints)
@@ -172,6 +172,7 @@ class ToolPoseProcess:
             reach_range_m=options.switch.reach_m,
             positioning=state["positioning"].bool(),
             contact_force_n=force_n,
+            peak_force_n=self.episode["peak_force_n"],
             u=state["u"],
             u_before=state["u_before"],
             lateral_m=(start["target_m"] - pose.tip_in_base_m)[:, :2].norm(dim=1),
@@ -285,6 +286,7 @@ class ToolPoseProcess:
             (state["q_scale"] - 1) * 100,
             (state["u_scale"] - 1) * 10,
             (state["contact_force_n"] / 2000).clamp(max=5.0),
+            (self.episode["peak_force_n"] / 2000).clamp(max=5.0),
             state["steps"] / self.max_episode_steps,
             state["closeness"],
             state["positioning"],

@@ -104,6 +104,16 @@ def contact(state: ToolState) -> torch.Tensor:
     return (state.contact_force_n / 1000.0).clamp(max=10.0)
 
 
+def peak_contact(state: ToolState) -> torch.Tensor:
+    """Growth of the episode's peak contact force in kN, up to 10 kN.
+
+    What an episode pays for is its hardest blow, not how long it leans on the rim: a penalty of every step in contact teaches a
+    beginner to stay away from the hole.
+    """
+    peak_n = torch.maximum(state.peak_force_n, state.contact_force_n)
+    return (peak_n.clamp(max=10_000.0) - state.peak_force_n.clamp(max=10_000.0)) / 1000.0
+
+
 def duration(state: ToolState) -> torch.Tensor:
     """One each step: time is money."""
     return torch.ones_like(state.reach_m)

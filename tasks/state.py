@@ -18,6 +18,7 @@ class ToolState:
         reach_range_m: Good working range (nearest, farthest).
         positioning: Whether only the exclusive joints could move in this step, `(N,)` bool.
         contact_force_n: Peak contact force of the step, `(N,)`.
+        peak_force_n: The largest of the episode's steps before, `(N,)`.
         u: Commands of this step, `(N, J)`.
         u_before: Commands of the step before, `(N, J)`.
         lateral_m: Distance of the tool point from the vertical through the target, `(N,)`.
@@ -36,6 +37,7 @@ class ToolState:
     reach_range_m: tuple[float, float]
     positioning: torch.Tensor
     contact_force_n: torch.Tensor
+    peak_force_n: torch.Tensor
     u: torch.Tensor
     u_before: torch.Tensor
     lateral_m: torch.Tensor

@@ -25,6 +25,7 @@ def state() -> ToolState:
         reach_range_m=(1.7, 2.4),
         positioning=NO,
         contact_force_n=torch.tensor([0.0]),
+        peak_force_n=torch.tensor([0.0]),
         u=torch.tensor([[0.5, 0.0, -0.25, 0.0, 1.0]]),
         u_before=torch.tensor([[0.25, 0.0, 0.25, 0.0, 1.0]]),
         lateral_m=torch.tensor([0.2]),
@@ -114,3 +115,11 @@ def test_contact_counts_kilonewtons_up_to_ten(state: ToolState) -> None:
 def test_a_term_that_is_no_function_is_refused(function: str) -> None:
     with pytest.raises(ConfigError, match=r"expected package\.module:function"):
         reward.Term(function=function, weight=1.0)
+
+
+@pytest.mark.parametrize(
+    ("before_n", "now_n", "expected"), [(0, 2500, 2.5), (2500, 1000, 0), (9000, 14000, 1.0), (12000, 15000, 0)]
+)
+def test_an_episode_pays_for_its_hardest_blow_once(state: ToolState, before_n: float, now_n: float, expected: float) -> None:
+    blow = replace(state, peak_force_n=torch.tensor([float(before_n)]), contact_force_n=torch.tensor([float(now_n)]))
+    assert reward.peak_contact(blow).item() == pytest.approx(expected)
