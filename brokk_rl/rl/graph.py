@@ -1,10 +1,14 @@
-"""Capturing a step in a CUDA graph."""
+"""Capturing a step in a CUDA graph, and compiling it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 
 import torch
+from torch._dynamo.exc import BackendCompilerFailed
+
+from brokk_rl.errors import ConfigError
 
 WARM_UP = 3
 """Calls before the capture: kernels are compiled and buffers allocated before anything is recorded."""
@@ -30,3 +34,19 @@ def capture(step: Callable[[], None], device: torch.device, gradients: bool = Fa
         with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
             step()
     return graph
+
+
+@contextlib.contextmanager
+def compiling() -> Iterator[None]:
+    """Says what to do where `torch.compile` finds nothing to compile with.
+
+    Raises:
+        ConfigError: Something that is first called in here cannot be compiled.
+    """
+    try:
+        yield
+    except BackendCompilerFailed as error:
+        raise ConfigError(
+            f"rl.fuse: cannot compile the control step ({str(error).splitlines()[0]}); install a C++ compiler (g++), or give "
+            "rl.fuse=false"
+        ) from error

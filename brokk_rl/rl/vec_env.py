@@ -7,13 +7,14 @@ CUDA graph and replayed.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
-from torch._dynamo.exc import BackendCompilerFailed
 
 from brokk_rl.contracts import (
     Actuator,
@@ -27,10 +28,9 @@ from brokk_rl.contracts import (
     TaskProcess,
     World,
 )
-from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.rl.graph import capture
+from brokk_rl.rl.graph import capture, compiling
 from brokk_rl.rl.threads import one_thread
 
 Starts = dict[str, torch.Tensor]
@@ -145,14 +145,14 @@ class ControlLoop(VecEnv):
     def episode_length_buf(self, value: torch.Tensor) -> None:
         self.task.state["steps"].copy_(value)
 
-    @torch.no_grad()
     def begin(self, starts: Starts | None = None) -> None:
         """Starts a new episode everywhere: from `starts`, each entry `(N, …)`, else from random rows of the pool."""
-        start = starts or self._draw()
-        self.done.fill_(True)
-        self.world.reset(self.done, start["q"], start["scene"])
-        self._perceive(start)
-        self.done.fill_(False)
+        with self._always_alike():
+            start = starts or self._draw()
+            self.done.fill_(True)
+            self.world.reset(self.done, start["q"], start["scene"])
+            self._perceive(start)
+            self.done.fill_(False)
 
     def capture(self, fuse: bool = False) -> None:
         """Captures the control step in a CUDA graph where device and world allow it; a few steps are simulated on the way.
@@ -164,23 +164,18 @@ class ControlLoop(VecEnv):
             ConfigError: There is nothing here with which to compile.
         """
         graphs = self.device.type == "cuda" and self.world.supports_graphs
-        fuse = fuse and (graphs or self.device.type == "cpu")
-        if fuse:
+        if fuse := fuse and (graphs or self.device.type == "cpu"):
             # not `_renew`: a library of effects draws so much there that compiling it takes minutes
             for name in ("_command", "_judge", "_observe"):
                 setattr(self, name, torch.compile(getattr(self, name), fullgraph=True, dynamic=False))
-        try:
+        with compiling():
             if graphs:
                 self._graph = capture(self._advance, self.device)
             elif fuse:
-                self._launch()
+                with self._always_alike():
+                    self._advance()
             else:
                 return
-        except BackendCompilerFailed as error:
-            raise ConfigError(
-                f"rl.fuse: cannot compile the control step ({str(error).splitlines()[0]}); install a C++ compiler (g++), or give "
-                "rl.fuse=false"
-            ) from error
         self.begin()
 
     def get_observations(self) -> TensorDict:
@@ -189,13 +184,13 @@ class ControlLoop(VecEnv):
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """Advances one control period; see `rsl_rl.env.VecEnv.step`."""
-        with one_thread(self.device):
+        with self._always_alike():
             self._action.copy_(actions)
             self._steps += 1
             if self._graph is not None:
                 self._graph.replay()
             else:
-                self._launch()
+                self._advance()
             return self.get_observations(), self.reward, self.done, {"time_outs": self.timed_out}
 
     def statistics(self) -> dict[str, float]:
@@ -238,10 +233,11 @@ class ControlLoop(VecEnv):
                 value.copy_(tensors[f"{prefix}.{name}"])
         self.world.load_state_dict(state["world"])
 
-    def _launch(self) -> None:
-        # the same in and outside of rsl-rl's inference mode and at any number of threads: for each, torch would compile anew
+    @contextlib.contextmanager
+    def _always_alike(self) -> Iterator[None]:
+        """In and outside of rsl-rl's inference mode, at any number of threads: for each, torch would compile anew what is fused."""
         with one_thread(self.device), torch.inference_mode(False), torch.no_grad():
-            self._advance()
+            yield
 
     def _advance(self) -> None:
         """One control step on the device."""
