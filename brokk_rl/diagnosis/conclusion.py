@@ -10,13 +10,13 @@ import numpy as np
 
 from brokk_rl.diagnosis import engine, gap, verdict
 from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
-from brokk_rl.diagnosis.base import Base
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.engine import Findings, Prices, Tell
 from brokk_rl.diagnosis.free_runs import FreeRuns
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.outcome import Outcome
 from brokk_rl.diagnosis.repair import repair
+from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.survey import survey
 from brokk_rl.inspection import Thresholds
 

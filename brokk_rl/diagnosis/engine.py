@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from brokk_rl.diagnosis import remainder
-from brokk_rl.diagnosis.base import Base
 from brokk_rl.diagnosis.evidence import Evidence, Ray, rays
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.repair import Repair, repair
 from brokk_rl.diagnosis.search import Chosen, Table, choose
+from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.sizes import Shape
 from brokk_rl.spec import spec
 

@@ -12,12 +12,12 @@ from rich.table import Table
 
 from brokk_rl import record
 from brokk_rl.contracts import Actuator, ActuatorFit
-from brokk_rl.diagnosis import answer, base, case, library, page, prescription
+from brokk_rl.diagnosis import answer, case, library, page, prescription, simulator
 from brokk_rl.diagnosis.answer import Answer
-from brokk_rl.diagnosis.base import Base
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.conclusion import Diagnosis
 from brokk_rl.diagnosis.engine import Prices
+from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.errors import ConfigError
 from brokk_rl.inspection import Thresholds
 from brokk_rl.machine import Machine
@@ -84,8 +84,8 @@ class Diagnose:
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
         with Progress(transient=True) as progress:
             task = progress.add_task("simulator", total=1.0)
-            simulator = self._base(given)
-            work = Diagnosis(given, simulator, kinds, self.diagnosis.prices, self.thresholds, self.session.generator("diagnosis"))
+            base = self._base(given)
+            work = Diagnosis(given, base, kinds, self.diagnosis.prices, self.thresholds, self.session.generator("diagnosis"))
             outcome = work.run(lambda doing, done: progress.update(task, description=doing, completed=done))
         folder = self.session.folder
         outcome.save(folder)
@@ -105,9 +105,9 @@ class Diagnose:
     def _base(self, given: Case) -> Base:
         seed, device = self.session.stream("base"), self.session.torch_device()
         if given.reference:
-            return base.fitted(given, self.fit, self.session.folder / "base", seed, device)
+            return simulator.fitted(given, self.fit, self.session.folder / "base", seed, device)
         assert self.actuator is not None, "there is one where there is no reference"
-        return base.given(given, self.actuator, seed)
+        return simulator.given(given, self.actuator, seed)
 
 
 def _show(found: Answer, folder: Path) -> None:
