@@ -162,14 +162,19 @@ def rivals(evidence: Mapping[str, Any]) -> Figure | None:
     for place, row in enumerate(rows):
         axis.barh(place, row["score"], color=BLUE if row.get("selected") else IDLE, height=0.7)
         axis.annotate(
-            f"{row['score']:.3g}", (max(row["score"], 0.0), place), (5, 0), textcoords="offset points", va="center", fontsize=8
+            f"{row['score']:.{0 if abs(row['score']) >= 100 else 1}f}",
+            (max(row["score"], 0.0), place),
+            (5, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
         )
     if len(null):
         low, high = np.percentile(null, (2.5, 97.5))
         axis.axvspan(low, high, color="#999999", alpha=0.25, lw=0, label="chance: cases without a gap (95 %)")
     if threshold is not None:
         axis.axvline(threshold, color="black", ls="--", lw=1.0, label="to be believed")
-    axis.set_yticks(range(len(rows)), [row["name"] for row in rows], fontsize=9)
+    axis.set_yticks(range(len(rows)), [row["name"].replace("_", " ") for row in rows], fontsize=9)
     axis.invert_yaxis()
     axis.set_xlabel(evidence.get("unit", "what it earns on recordings that it was not fitted to"))
     if axis.get_legend_handles_labels()[0]:
@@ -190,7 +195,7 @@ def waterfall(budget: Mapping[str, Any]) -> Figure:
         top = level + part
         ends = [np.sqrt(max(value, 0.0)) * whole for value in (level, top)]
         axis.bar(place, ends[1] - ends[0], bottom=ends[0], color=BEFORE, alpha=0.35 + 0.65 * min(1.0, abs(part)), width=0.62)
-        axis.annotate(f"{100 * part:.0f} %", (place, max(ends)), (0, 3), textcoords="offset points", ha="center", fontsize=9)
+        axis.annotate(f"{round(100 * part)} %", (place, max(ends)), (0, 3), textcoords="offset points", ha="center", fontsize=9)
         axis.plot([place + 0.31, place + 0.69], [ends[1]] * 2, color="#777777", lw=0.8)
         level = top
         names.append(joint)
@@ -204,7 +209,7 @@ def waterfall(budget: Mapping[str, Any]) -> Figure:
             names.append(name)
     axis.set_xticks(range(len(names)), names)
     axis.set_ylabel("at the tool, RMS [mm]")
-    axis.margins(y=0.14)
+    axis.set_ylim(0.0, 1.15 * max(whole, *(one["tip_rms_mm"] for _, one, _ in totals if one is not None)))
     clean(axis)
     return figure
 

@@ -29,8 +29,9 @@ def headline(answer: Answer) -> tuple[str, Tone]:
     names = listed([named(one) for one in answer.selected])
     closed = gap.closed if gap else None
     share = f" closes {100 * closed.mean:.0f} % of the gap (95 %: {_percent_range(closed)})." if closed else "."
+    it = "it" if len(answer.selected) == 1 else "them"
     tone: Tone = "good" if closed is not None and closed.ci95[0] > MOST else "warn"
-    return f"The simulator lacks {names}; adding it{share}{size}" if closed else f"The simulator lacks {names}.{size}", tone
+    return f"The simulator lacks {names}; adding {it}{share}{size}" if closed else f"The simulator lacks {names}.{size}", tone
 
 
 def named(one: Selected) -> str:
