@@ -11,6 +11,7 @@ import pytest
 import torch
 from composed import names, option
 
+from actuators.effects.library import LibraryModel
 from actuators.effects.wrapped import EffectSpec, Wrapped
 from brokk_rl.checks import NUM_ENVS, check_actuator_model
 from brokk_rl.errors import ConfigError
@@ -298,16 +299,17 @@ def test_the_first_effect_is_nearest_to_the_machine(machine: Machine) -> None:
 
 
 @pytest.mark.gpu
-def test_all_effects_can_be_captured_in_a_cuda_graph(machine: Machine) -> None:
+@pytest.mark.parametrize("those", [FIXED, ["library"]], ids=["one around the other", "the library"])
+def test_all_effects_can_be_captured_in_a_cuda_graph(those: list[str], machine: Machine) -> None:
     device, num = torch.device("cuda"), 8
     torch.manual_seed(0)
     u = commands(machine, 40, num).to(device)
     paths = []
     for captured in (False, True):
         model = shipped("actuator", "lag").build(machine, num, device)
-        for name in FIXED:
+        for name in those:
             model = shipped("effect", name).wrap(model, machine, num, device)
-        assert isinstance(model, Wrapped)
+        assert isinstance(model, (Wrapped, LibraryModel))
         shape = (num, machine.num_history, machine.num_joints)
         history = History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
         command, seen = torch.zeros(num, 5, device=device), torch.zeros(num, 8, device=device)
@@ -315,7 +317,7 @@ def test_all_effects_can_be_captured_in_a_cuda_graph(machine: Machine) -> None:
         home = torch.as_tensor(machine.home, dtype=torch.float32, device=device).expand(num, 5)
 
         def period(
-            model: Wrapped = model,
+            model: Any = model,
             history: History = history,
             command: Any = command,
             mask: Any = mask,
