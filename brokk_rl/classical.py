@@ -36,6 +36,7 @@ class Classical:
         hover_m: Height above the target at which the tool waits until it is aligned.
         funnel_m: Lateral error at which the descent begins and at which it is free, (outer, inner).
         margin_rad: Distance to a joint limit within which the joint is no longer driven towards it.
+        brake_s: Time in which a joint at full speed would cover the distance before that margin over which it is slowed down.
     """
 
     in_flight_samples: float
@@ -50,6 +51,7 @@ class Classical:
     hover_m: float
     funnel_m: tuple[float, float]
     margin_rad: float
+    brake_s: float
 
     def build(self, machine: Machine, device: torch.device) -> "ClassicalController":
         """Returns the controller for `machine` on `device`."""
@@ -70,6 +72,8 @@ class Guidance:
             `(N,)`.
         reach_3d_m: The same measured in space.
         tip_z_m: Measured height of the tool point, `(N,)`.
+        lowest: Commands below these would drive joints into their ends, `(N, J)` in [-1, 0].
+        highest: Commands above these would, `(N, J)` in [0, 1].
     """
 
     command: torch.Tensor
@@ -79,6 +83,8 @@ class Guidance:
     reach_m: torch.Tensor
     reach_3d_m: torch.Tensor
     tip_z_m: torch.Tensor
+    lowest: torch.Tensor
+    highest: torch.Tensor
 
 
 class ClassicalController:
@@ -116,6 +122,11 @@ class ClassicalController:
         band = self.config.dead_band
         size = rate.abs()
         return rate.sign() * (band + (1.0 - band) * size.clamp(min=self.config.creep)).clamp(max=1.0) * (size > self.config.rest)
+
+    def _opening(self, share: torch.Tensor) -> torch.Tensor:
+        """Returns the largest command that is no faster than this share of full speed, `(N, J)` in [0, 1]; 0 for none."""
+        band = self.config.dead_band
+        return (band + (1.0 - band) * share) * (share > 0)
 
     def guide(
         self,
@@ -155,7 +166,9 @@ class ClassicalController:
         reach, reach_slope, reach_3d = self._reach(both, target_m)
         left = (sum(reach_m) / 2 - reach[0])[:, None] * reach_slope / (reach_slope.square() + 0.05)
         share = share + (config.gain_1_s * left * self._exclusive / self.speed).clamp(-1.0, 1.0)
-        share = share * ((ahead > self._lower) | (share > 0)) * ((ahead < self._upper) | (share < 0))
+        # each joint slows down before the place from which it must go no further
+        down, up = ((room / (self.speed * config.brake_s)).clamp(0.0, 1.0) for room in (ahead - self._lower, self._upper - ahead))
+        share = torch.maximum(torch.minimum(share, up), -down)
 
         bearing = tip[:, :2] / tip[:, :2].norm(dim=1, keepdim=True).clamp(min=1e-3)
         radial = (error[:, :2] * bearing).sum(1)
@@ -168,6 +181,8 @@ class ClassicalController:
             reach_m=reach[1],
             reach_3d_m=reach_3d[1],
             tip_z_m=both.tip_in_base_m[1, :, 2],
+            lowest=-self._opening(down),
+            highest=self._opening(up),
         )
 
     def reach(self, q: torch.Tensor, target_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

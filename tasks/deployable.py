@@ -41,7 +41,9 @@ class Deployable(torch.nn.Module):
         if options.memory < q.shape[1]:
             observation = process._encoder.encode(target_m, q, u, pitch, proposed)
         groups = {"policy": observation, "guide": features(guidance, positioning, u[:, -1])}
-        command = options.action.command(self.network(groups), guidance.command, positioning, process._exclusive)
+        command = options.action.command(
+            self.network(groups), guidance.command, guidance.lowest, guidance.highest, positioning, process._exclusive
+        )
         return command if adviser is None or proposed is None else adviser.proposal(command, proposed)
 
 

@@ -96,7 +96,7 @@ class ToolPoseProcess:
         shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "estimate_m": (3,), "q_scale": (), "u_scale": (), "steps": (), "age": ()}
         shapes |= {"u": (num_joints,), "u_before": (num_joints,), "closeness": (), "contact_force_n": ()}
         shapes |= {"command": (num_joints,), "features": (self.num_features,), "policy": (self._encoder.size,), "privileged": (10,)}
-        shapes |= {"positioning": (), "rule_reach_m": ()}
+        shapes |= {"positioning": (), "rule_reach_m": (), "lowest": (num_joints,), "highest": (num_joints,)}
         if self.adviser:
             shapes["proposed"] = (machine.num_history, num_joints)
         self.state = {name: torch.zeros((num_envs, *shape), device=device) for name, shape in shapes.items()}
@@ -137,7 +137,8 @@ class ToolPoseProcess:
 
     def command(self, action: torch.Tensor) -> torch.Tensor:
         """See `TaskProcess.command`."""
-        u = self.options.action.command(action, self.state["command"], self.state["positioning"].bool(), self._exclusive)
+        told = (self.state[name] for name in ("command", "lowest", "highest"))
+        u = self.options.action.command(action, *told, self.state["positioning"].bool(), self._exclusive)
         if self.adviser:
             proposed = self.state["proposed"]
             u = self.adviser.proposal(u, self.recalled(proposed))
@@ -275,6 +276,8 @@ class ToolPoseProcess:
         state["positioning"].copy_(positioning)
         state["rule_reach_m"].copy_(guidance.reach_m if self.options.switch.rule == "planar" else guidance.reach_3d_m)
         state["command"].copy_(guidance.command)
+        state["lowest"].copy_(guidance.lowest)
+        state["highest"].copy_(guidance.highest)
         state["policy"].copy_(self._encoder.encode(sample, q, u, pitch_rad, proposed))
         state["features"].copy_(features(guidance, positioning, u[:, -1]))
         state["privileged"].copy_(self._privileged(sample))

@@ -71,22 +71,36 @@ class Action:
         kind: `direct`: the output is the command. `residual`: it is added to the classical controller's command.
         scale: Factor on the output.
         mask: Keep exclusive and other joints apart, as the machine does; only an ablation switches it off.
+        limits: Slow joints down before their ends, as far as the commands in flight let them be foreseen.
     """
 
     kind: Literal["direct", "residual"]
     scale: float
     mask: bool
+    limits: bool
 
-    def command(self, output: torch.Tensor, base: torch.Tensor, positioning: torch.Tensor, exclusive: torch.Tensor) -> torch.Tensor:
+    def command(
+        self,
+        output: torch.Tensor,
+        base: torch.Tensor,
+        lowest: torch.Tensor,
+        highest: torch.Tensor,
+        positioning: torch.Tensor,
+        exclusive: torch.Tensor,
+    ) -> torch.Tensor:
         """Returns valve commands in [-1, 1], `(N, J)`.
 
         Args:
             output: What the network says, `(N, J)`.
             base: Command of the classical controller, `(N, J)`.
+            lowest: Least commands that do not drive joints into their ends, `(N, J)` (`Guidance.lowest`).
+            highest: Largest such commands, `(N, J)`.
             positioning: Whether only the exclusive joints move, `(N,)` bool.
             exclusive: Which joints are exclusive, `(J,)` bool.
         """
         u = self.scale * output + (base if self.kind == "residual" else 0.0)
+        if self.limits:
+            u = torch.maximum(torch.minimum(u, highest), lowest)
         if self.mask:
             u = torch.where(exclusive_mask(exclusive, positioning), u, 0.0)
         return u.clamp(-1.0, 1.0)

@@ -57,8 +57,7 @@ class Training:
         budget: When training ends.
         save_interval: Iterations between checkpoints; a killed run loses no more. As often several processes prove that they agree.
         keep_checkpoints: Newest checkpoints kept.
-        settling: Last part of the budget, over which the divergence that an update aims at (`desired_kl`) falls to a tenth: large
-            steps learn fast, and small ones keep what was learned.
+        settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps learn fast, small ones keep it.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world before the run stops with an error.
         fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of compiling and a C++ compiler:
             a fifth faster on a GPU; on a CPU, whose physics takes less than half of a control step of few worlds, far more.

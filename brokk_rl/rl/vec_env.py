@@ -165,8 +165,7 @@ class ControlLoop(VecEnv):
         """
         graphs = self.device.type == "cuda" and self.world.supports_graphs
         if fuse := fuse and (graphs or self.device.type == "cpu"):
-            # not `_renew`: a library of effects draws so much there that compiling it takes minutes
-            for name in ("_command", "_judge", "_observe"):
+            for name in ("_command", "_judge", "_perceive"):
                 setattr(self, name, torch.compile(getattr(self, name), fullgraph=True, dynamic=False))
         with compiling():
             if graphs:
@@ -275,17 +274,9 @@ class ControlLoop(VecEnv):
 
     def _perceive(self, start: Starts) -> None:
         """Resets finished environments and observes all of them."""
-        self._renew()
-        self._observe(start)
-
-    def _renew(self) -> None:
-        """Another machine and another person where an episode has ended."""
+        self.truth.reset(self.done, start["q"])
         self.actuator.reset(self.done)
         self.follower.reset(self.done)
-
-    def _observe(self, start: Starts) -> None:
-        """Begins the new episodes and observes all environments."""
-        self.truth.reset(self.done, start["q"])
         if self._sensing:
             q = self._sensing.measure(self.truth.q[:, -1])
             self.history.push_q(q)

@@ -122,6 +122,16 @@ def test_nothing_is_driven_into_a_limit(machine: Machine) -> None:
     assert back.command[0, 4] < 0 < back.command[1, 4]
 
 
+def test_whoever_commands_within_the_bounds_slows_down_before_the_ends(machine: Machine) -> None:
+    """Half the braking distance before the margin a joint may go at half its speed, at the margin not at all, far away freely."""
+    classical = controller(machine, margin_rad=0.05, brake_s=0.2, dead_band=0.08)
+    speed, upper = torch.tensor(machine.max_speed), torch.tensor(machine.upper)
+    q = torch.stack([upper - 0.05 - share * speed * 0.2 for share in (0.0, 0.5, 2.0)]).float()
+    found = classical.guide(*at_rest(q, machine), torch.tensor([[2.8, 0.0, 0.75]]).repeat(3, 1), torch.full((3,), 1.57), RANGE_M)
+    torch.testing.assert_close(found.highest[1:], torch.tensor([[0.08 + 0.92 * 0.5], [1.0]]).expand(-1, 5), atol=1e-5, rtol=0)
+    assert (found.highest[0] <= 0.081).all() and (found.lowest == -1.0).all()
+
+
 def test_the_tool_waits_above_the_hole_until_it_is_aligned(machine: Machine) -> None:
     classical = controller(machine, hover_m=0.24, funnel_m=(0.06, 0.012))
     q = torch.tensor(machine.home, dtype=torch.float32).repeat(3, 1)

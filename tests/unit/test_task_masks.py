@@ -47,32 +47,46 @@ def test_at_the_height_itself_the_tool_is_not_low() -> None:
     assert switch("equation").positioning(seen(2.0, 2.0, 0.2)).item() is True
 
 
+FREE = torch.ones(5)
+"""No joint is near its end."""
+
+
+def test_no_action_drives_a_joint_into_its_end() -> None:
+    action = Action(kind="residual", scale=1.0, mask=False, limits=True)
+    lowest, highest = torch.tensor([[-1.0, 0.0, -0.3, -1.0, -1.0]]), torch.tensor([[0.0, 1.0, 1.0, 0.4, 1.0]])
+    for output in (torch.full((1, 5), 3.0), torch.full((1, 5), -3.0)):
+        u = action.command(
+            output, torch.full((1, 5), 0.1), lowest, highest, torch.tensor([False]), torch.zeros(5, dtype=torch.bool)
+        )
+        assert torch.equal(u, highest if output[0, 0] > 0 else lowest)
+
+
 @pytest.mark.parametrize("kind", ["direct", "residual"])
 def test_q2_never_moves_with_another_joint(kind: str, machine: Machine) -> None:
     torch.manual_seed(0)
-    action = Action(kind=kind, scale=0.5, mask=True)  # type: ignore[arg-type]
+    action = Action(kind=kind, scale=0.5, mask=True, limits=False)  # type: ignore[arg-type]
     positioning = torch.arange(64) % 2 == 0
     exclusive = torch.as_tensor(machine.is_exclusive)
-    u = action.command(5 * torch.randn(64, 5), torch.rand(64, 5) * 2 - 1, positioning, exclusive)
+    u = action.command(5 * torch.randn(64, 5), torch.rand(64, 5) * 2 - 1, -FREE, FREE, positioning, exclusive)
     assert (u[positioning][:, [0, 2, 3, 4]] == 0).all() and (u[positioning][:, 1] != 0).any()
     assert (u[~positioning][:, 1] == 0).all() and (u[~positioning][:, [0, 2, 3, 4]] != 0).any()
     assert (u.abs() <= 1).all()
 
 
 def test_the_masks_are_the_papers_and_those_of_the_machine(machine: Machine) -> None:
-    action = Action(kind="direct", scale=1.0, mask=True)
+    action = Action(kind="direct", scale=1.0, mask=True, limits=False)
     for positioning, paper in ((True, [0, 1, 0, 0, 0]), (False, [1, 0, 1, 1, 1])):
         flag = torch.tensor([positioning])
-        u = action.command(torch.ones(1, 5), torch.zeros(1, 5), flag, torch.as_tensor(machine.is_exclusive))
+        u = action.command(torch.ones(1, 5), torch.zeros(1, 5), -FREE, FREE, flag, torch.as_tensor(machine.is_exclusive))
         assert u[0].tolist() == paper == exclusive_mask(machine.is_exclusive, positioning).astype(int).tolist()
 
 
 def test_direct_and_residual_actions_on_numbers(machine: Machine) -> None:
     output, base = torch.tensor([[0.4, 0.4, -0.4, 4.0, 0.0]]), torch.tensor([[0.5, 0.5, 0.5, 0.5, -0.25]])
-    rest = (torch.tensor([False]), torch.as_tensor(machine.is_exclusive))
-    direct = Action(kind="direct", scale=0.5, mask=True).command(output, base, *rest)
-    residual = Action(kind="residual", scale=0.5, mask=True).command(output, base, *rest)
-    unmasked = Action(kind="residual", scale=0.5, mask=False).command(output, base, *rest)
+    rest = (-FREE, FREE, torch.tensor([False]), torch.as_tensor(machine.is_exclusive))
+    direct = Action(kind="direct", scale=0.5, mask=True, limits=False).command(output, base, *rest)
+    residual = Action(kind="residual", scale=0.5, mask=True, limits=False).command(output, base, *rest)
+    unmasked = Action(kind="residual", scale=0.5, mask=False, limits=False).command(output, base, *rest)
     np.testing.assert_allclose(direct[0], [0.2, 0.0, -0.2, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(residual[0], [0.7, 0.0, 0.3, 1.0, -0.25], atol=1e-6)
     np.testing.assert_allclose(unmasked[0], [0.7, 0.7, 0.3, 1.0, -0.25], atol=1e-6)
