@@ -137,8 +137,8 @@ class ToolPoseProcess:
 
     def command(self, action: torch.Tensor) -> torch.Tensor:
         """See `TaskProcess.command`."""
-        told = (self.state[name] for name in ("command", "lowest", "highest"))
-        u = self.options.action.command(action, *told, self.state["positioning"].bool(), self._exclusive)
+        base, lowest, highest = (self.state[name] for name in ("command", "lowest", "highest"))
+        u = self.options.action.command(action, base, lowest, highest, self.state["positioning"].bool(), self._exclusive)
         if self.adviser:
             proposed = self.state["proposed"]
             u = self.adviser.proposal(u, self.recalled(proposed))
