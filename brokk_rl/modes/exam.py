@@ -14,9 +14,9 @@ from rich.progress import Progress
 from rich.table import Table
 
 from brokk_rl import record
-from brokk_rl.contracts import Excitation
+from brokk_rl.contracts import ActuatorFit, Excitation
 from brokk_rl.diagnosis import answer
-from brokk_rl.diagnosis.exam import ledger, marking, page, paper, seal, sitting
+from brokk_rl.diagnosis.exam import ledger, marking, oracle, page, paper, seal, sitting
 from brokk_rl.diagnosis.exam.making import Half, Workshop
 from brokk_rl.diagnosis.exam.mix import Mix, Question
 from brokk_rl.diagnosis.exam.sitting import Candidate
@@ -30,17 +30,21 @@ from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
+ORACLE = "oracle.json"
+
 
 @spec
 class Examination:
     """What to do, and with which cases.
 
     Attributes:
-        do: `make` cases into the run folder, `run` a candidate on them, `score` the answers of one or several.
-        folder: The exam that `run` and `score` are about: the folder that `make` left.
+        do: `make` cases into the run folder, `run` a candidate on them, ask the `oracle`, `score` the answers of one or several.
+        folder: The exam that all but `make` are about: the folder that `make` left.
         candidate: Who answers.
         workers: Cases answered at once.
         answers: What `score` compares: a name for each candidate, and the run folder with its answers.
+        oracle: Fit of the simulator whose gap the oracle closes; that of the candidate.
+        oracles: Of `score`: run folder of `exam.do=oracle`; `null`: nobody asked it.
         ledger: File to which `score` appends its headlines; `null`: none.
         mix: Which cases there are.
         plants: Machines that share no equations with what is examined.
@@ -53,11 +57,13 @@ class Examination:
         salt: That salt, to make the cases of an opened exam again; `null` draws one.
     """
 
-    do: Literal["make", "run", "score"]
+    do: Literal["make", "run", "oracle", "score"]
     folder: str | None
     candidate: Candidate
     workers: int
     answers: dict[str, str]
+    oracle: ActuatorFit
+    oracles: str | None
     ledger: str | None
     mix: Mix
     plants: PlantFamily
@@ -162,6 +168,24 @@ class Exam:
     def _folder(self) -> Path:
         return Path(self.exam.folder or "")
 
+    def _oracle(self) -> None:
+        """Opens the labels; writes `oracle.json`, the share of the gap that the true effects of each case close."""
+        labels = [label for label in seal.opened(self._folder)["cases"] if label["kind"] in ("one", "several")]
+        place, found = self.session.folder / ORACLE, {}
+        if place.is_file():
+            found = json.loads(place.read_text())  # of a run that was interrupted
+        with Progress(transient=True) as progress:
+            task = progress.add_task(f"{len(labels)} cases", total=len(labels))
+            for label in labels:
+                if label["case"] not in found:
+                    effects = {one["effect"]: one["joints"] for one in label["effects"]}
+                    case = self._folder / paper.CASES / label["case"]
+                    found[label["case"]] = oracle.closed_by(case, effects, self.exam.oracle, self.machine)
+                    write_json(place, found)
+                progress.advance(task)
+        shares = [share for share in found.values() if share is not None]
+        log.info("the true effects close %.2f of the gap (median of %d cases with one)", np.median(shares or [0.0]), len(shares))
+
     def _score(self) -> None:
         """Opens the labels; writes `marks.json`, `exam.html` and pictures, appends to the ledger, and prints the table."""
         labels = seal.opened(self._folder)
@@ -178,11 +202,12 @@ class Exam:
     def _table(self, folder: Path, labels: list[dict[str, Any]]) -> dict[str, Any]:
         """Returns the figures of the answers in `folder`."""
         mix, marks = self.exam.mix, []
+        best = {} if self.exam.oracles is None else json.loads((Path(self.exam.oracles) / ORACLE).read_text())
         of_machine = [name for name, trouble in mix.troubles.items() if trouble.joints == "all"]
         for label in labels:
             place = folder / label["case"]
             said = answer.read(place / answer.FILE) if (place / answer.FILE).is_file() else None
-            marks.append(marking.mark(label, said, mix.classes, of_machine, sitting.seconds(place)))
+            marks.append(marking.mark(label, said, mix.classes, of_machine, sitting.seconds(place), best.get(label["case"])))
         if all(mark.verdict == "failed" for mark in marks):
             raise RecordingError(f"exam.answers: {folder} holds no answer to any case of {self._folder}")
         return tally(marks)

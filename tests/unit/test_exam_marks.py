@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
 from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
-from brokk_rl.diagnosis.exam import tally
+from brokk_rl.diagnosis.exam import rules, tally
+from brokk_rl.diagnosis.exam.ground import Errors
 from brokk_rl.diagnosis.exam.marking import Claim, Mark, mark
+from brokk_rl.diagnosis.sizes import Shape
 
 CLASSES = (("dead_time", "clock_offset"), ("flow_gain", "encoder_scale"))
 
@@ -139,10 +142,11 @@ def test_auroc_counts_ties_half() -> None:
     assert tally.auroc(marks[:2]) is None
 
 
-def test_the_gap_closed_is_weighed_by_what_the_oracle_closes() -> None:
+def test_the_gap_closed_is_held_against_what_the_oracle_closes() -> None:
     truth = label("one", ("lag", "q3", 1.0))
     marks = [mark(truth, answered(chosen("lag")), CLASSES, (), 1.0, oracle) for oracle in (1.0, 0.8, 0.01)]
-    assert tally.closed_of_oracle(marks) == pytest.approx(1.8 / 1.8)  # each closes 0.9; where nothing can be closed nobody is asked
+    # each closes 0.9, so 0.9 and 1.125 of it; where nothing can be closed nobody is asked
+    assert tally.closed_of_oracle(marks) == pytest.approx((0.9 + 1.125) / 2)
     assert tally.closed_of_oracle([mark(truth, None, CLASSES, (), None, 0.9)]) == 0.0
 
 
@@ -153,3 +157,14 @@ def test_intervals_hold_their_figure_and_shrink_with_the_number_of_cases() -> No
         assert low <= few[key]["value"] <= high
         assert many[key]["ci95"][1] - many[key]["ci95"][0] <= high - low + 1e-9
     assert math.isclose(few["top1"]["ci95"][0], 0.2077, abs_tol=1e-3)  # Wilson, 2 of 3
+
+
+def test_forward_selection_takes_what_is_there_and_bic_leaves_what_does_not_pay() -> None:
+    generator, fold = np.random.default_rng(0), np.arange(600) // 100 % 2
+    form, other = generator.standard_normal((2, 600))
+    sizes = np.array([0.0, 1.0, 2.0])
+    shapes = {name: [Shape(sizes, np.outer(sizes, ray))] for name, ray in (("lag", form), ("creep", other))}
+    errors = Errors(1.2 * form + 0.5 * generator.standard_normal(600), shapes, fold)
+    assert set(rules.grown(errors, rules.bic)) == {"lag"}
+    assert next(iter(rules.grown(errors, rules.held_out))) == "lag"
+    assert rules.grown(Errors(generator.standard_normal(600), shapes, fold), rules.bic) == {}

@@ -19,6 +19,9 @@ SIZES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.01)
 MOVED_RAD = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 1.0)
 """Bins of the same against what a cause does to the motion."""
 
+CLOSES = 0.1
+"""Share of the gap that the true effects must close before anybody is compared with them."""
+
 Figure = dict[str, Any]
 
 
@@ -201,9 +204,11 @@ def ece(made: Sequence[Claim]) -> float | None:
 
 
 def closed_of_oracle(marks: Sequence[Mark]) -> float | None:
-    """Returns the share of the gap closed over what the true effects close, over the cases where they close something."""
-    both = [(mark.closed or 0.0, mark.oracle) for mark in marks if mark.oracle is not None and mark.oracle > 0.1]
-    return sum(closed for closed, _ in both) / sum(best for _, best in both) if both else None
+    """Returns the share of the gap closed over what the true effects close, the median of the cases where they close something.
+
+    The median, as the gap itself is a difference of two errors: where it is small, shares of it are wild.
+    """
+    return _median([(mark.closed or 0.0) / mark.oracle for mark in marks if mark.oracle is not None and mark.oracle > CLOSES])
 
 
 def predicted_off(marks: Sequence[Mark]) -> float | None:
