@@ -24,6 +24,10 @@ class RecordingError(BrokkError):
     """A recording cannot be used; names file, row and column."""
 
 
+class FrameError(BrokkError):
+    """A camera frame cannot be used; names the file or the camera, and what is wrong with it."""
+
+
 class CheckpointError(BrokkError):
     """A checkpoint or policy bundle is missing, corrupt, or made for another machine."""
 

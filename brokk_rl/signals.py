@@ -44,10 +44,26 @@ class Borehole:
 
 @dataclass(frozen=True)
 class Frame:
-    """One RGB-D frame: colour `(h, w, 3)` uint8, depth `(h, w)` float32 in m with NaN where unknown, and the camera."""
+    """One RGB-D frame of a camera in the optical convention: x right, y down, z forward.
+
+    Attributes:
+        color: RGB, `(h, w, 3)` uint8.
+        depth_m: Depth along z, `(h, w)` float32 in m, NaN where unknown; never 0, never infinite.
+        camera_matrix: `(3, 3)`, px; pixel centres at whole numbers.
+        base_from_camera: Pose of the camera in the base frame when the picture was taken, `(4, 4)`; `None` where nobody knows it.
+        t_s: When the picture was taken.
+        distortion: Coefficients of the lens in OpenCV's order; `None` for a rectified picture.
+        right: Right picture of a rectified stereo pair, as `color`; `None` where there is none.
+        baseline_m: Distance between the two cameras of the pair.
+        name: Path of a frame on disk without its endings, else ''.
+    """
 
     color: np.ndarray
     depth_m: np.ndarray
     camera_matrix: np.ndarray
-    base_from_camera: np.ndarray
+    base_from_camera: np.ndarray | None
     t_s: float
+    distortion: np.ndarray | None = None
+    right: np.ndarray | None = None
+    baseline_m: float | None = None
+    name: str = ""
