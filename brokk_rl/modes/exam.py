@@ -98,7 +98,7 @@ class Exam:
         machine: The machine of all cases.
         excitation: What is played, by name; `exam.reference` and `exam.field` say in which file.
         exam: What to do.
-        resume: Run folder of an interrupted `exam.do=run` to go on with; the same as `session.out`.
+        resume: Run folder of an interrupted `exam.do=run` or `oracle` to go on with; the same as `session.out`.
     """
 
     session: Session
@@ -106,6 +106,15 @@ class Exam:
     excitation: dict[str, Excitation]
     exam: Examination
     resume: str | None
+
+    def check(self) -> None:
+        if self.resume is None:
+            return
+        if Path(self.resume).resolve() != self.session.folder.resolve() or self.exam.do not in ("run", "oracle"):
+            raise ConfigError(
+                f"resume={self.resume}: an interrupted exam.do=run or oracle goes on in its folder; add session.out={self.resume} "
+                "and give exam.do as before"
+            )
 
     def run(self) -> None:
         """Does what `exam.do` says, in the run folder."""

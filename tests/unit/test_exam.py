@@ -120,6 +120,8 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(exam: Path, brokk:
     answers, marks, ledger = tmp_path / "answers", tmp_path / "marks", tmp_path / "ledger.jsonl"
     about = ("mode=exam", f"exam.folder={exam}")
     assert brokk(*about, "exam.do=run", "exam_candidate=always_none", f"session.out={answers}").code == 0
+    again = brokk(*about, "exam.do=run", "exam_candidate=always_none", f"session.out={answers}", f"resume={answers}")
+    assert again.code == 0 and brokk(*about, "exam.do=run", f"session.out={answers}").code != 0
     done = brokk(*about, "exam.do=score", f"+exam.answers.none={answers}", f"exam.ledger={ledger}", f"session.out={marks}")
     assert done.code == 0, done.err
     found = json.loads((marks / "marks.json").read_text())["candidates"]["none"]
