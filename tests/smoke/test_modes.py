@@ -59,7 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_training_leaves_all_that_is_needed_to_judge_and_use_the_policy(run: Path) -> None:
     names = {path.name for path in run.iterdir()}
     assert names == {
-        "evaluation.json", "learning_curves.png", "model_1.pt", "model_3.pt", "policy.json", "policy.onnx", "policy.safetensors",
+        "evaluation.json", "learning_curves.png", "model_2.pt", "model_3.pt", "policy.json", "policy.onnx", "policy.safetensors",
         "progress.csv", "resolved.yaml", "session.json", "tensorboard",
     }  # fmt: skip
     assert (run / "learning_curves.png").read_bytes().startswith(b"\x89PNG")
