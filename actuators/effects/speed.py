@@ -159,6 +159,7 @@ class ThermalDrift(EffectSpec):
     elapsed_s: Value
     side = "speed"
     running = "elapsed_s"
+    shared = True
     numbers: ClassVar = {
         "change": Number("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
         "time_s": Number("s", none=None, typical=1200.0, bounds=(1.0, 36_000.0)),

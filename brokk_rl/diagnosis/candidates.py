@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,6 +37,7 @@ class Candidates:
         cut: Windows.
         running_s: Time since the machine was started at the beginning of each window, `(W,)`.
         seed: Of the random numbers that stochastic effects draw.
+        fixed: Effects that all candidates have, with numbers `(1, J)`.
     """
 
     base: Actuator
@@ -42,31 +45,40 @@ class Candidates:
     cut: Windows
     running_s: np.ndarray
     seed: int
+    fixed: Sequence[tuple[Kind, Values]] = ()
 
-    def paths(self, effects: Sequence[tuple[Kind, Values]], count: int = 1) -> np.ndarray:
-        """Returns measured positions of free runs, `(C, W, K, J)`, with the effects, of which all have `count` = `C` candidates.
+    def paths(self, effects: Sequence[tuple[Kind, Values]], count: int = 1, own: Values = MappingProxyType({})) -> np.ndarray:
+        """Returns measured positions of free runs, `(C, W, K, J)`.
+
+        Args:
+            effects: Effects with the numbers of each candidate.
+            count: Number of candidates, `C`.
+            own: Numbers of the base itself that candidates change, of those in its `parameters`.
 
         Raises:
             BrokkError: the model ran into NaN.
         """
-        effects = sorted(effects, key=lambda one: one[0].order)
+        fixed = [(kind, {name: np.repeat(value, count, 0) for name, value in values.items()}) for kind, values in self.fixed]
+        effects = sorted([*effects, *fixed], key=lambda one: one[0].order)
         windows = len(self.cut.q)
         found = np.empty((count * windows, *self.cut.measured.shape[1:]), dtype=np.float32)
         for start in range(0, len(found), ROWS):
             rows = np.arange(start, min(start + ROWS, len(found)))
-            found[rows] = self._run(effects, rows // windows, rows % windows)
+            found[rows] = self._run(effects, own, rows // windows, rows % windows)
         if not np.isfinite(found).all():
             names = ", ".join(kind.name for kind, _ in effects) or "no effect"
             raise BrokkError(f"the simulator ran into NaN in a free run with {names}; look at its fit")
         return found.reshape(count, windows, *found.shape[1:])
 
-    def _run(self, effects: Sequence[tuple[Kind, Values]], candidate: np.ndarray, window: np.ndarray) -> np.ndarray:
+    def _run(self, effects: Sequence[tuple[Kind, Values]], own: Values, candidate: np.ndarray, window: np.ndarray) -> np.ndarray:
         """Returns one free run a row, `(N, K, J)`."""
         cut, count, device = self.cut, len(window), torch.device("cpu")
         size, before = cut.num_history, cut.num_before
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.seed)
-            model = self.base.build(self.machine, count, device)
+            torch.manual_seed(self.seed + int(candidate[0]))  # rows of other batches draw other numbers
+            model: Any = self.base.build(self.machine, count, device)
+            for name, value in own.items():
+                model.parameters[name].copy_(torch.as_tensor(value[candidate], dtype=torch.float32))
             for kind, values in effects:
                 model = kind.wrap(model, self.machine, count, device)
                 for name, value in values.items():

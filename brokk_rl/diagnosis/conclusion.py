@@ -51,28 +51,32 @@ class Diagnosis:
         """Returns the outcome; `tell` is told what is being done and how much of the whole is done."""
         if doubts := self.case.doubts():
             return self._cannot_tell("; ".join(doubts))
-        findings = engine.search(self.base, self.kinds, self.prices, tell)
-        return self._outcome(findings)
+        search = engine.Search(self.case, self.base, self.kinds, self.prices, tell)
+        return self._outcome(search.run())
 
     def _outcome(self, findings: Findings) -> Outcome:
-        field = self.base.field
-        measured = field.evidence.candidates.cut.measured
+        field, evidence = self.base.field, findings.evidence
+        measured = evidence.candidates.cut.measured
         before, floor = field.runs(field.evidence.base), self._floor()
         unknown = verdict.is_unknown(findings, self.prices)
-        repaired = findings.repair if findings.repair and not unknown else None
-        after = field.runs(repaired.after) if repaired else None
-        square = gap.squares(field.evidence.base, measured)
+        repaired = None if unknown else findings.repair
+        found = [] if unknown else findings.others
+        mean = 0.0 if evidence.mean is None else evidence.mean
+        paths = repaired.after if repaired else evidence.base + mean if found else field.evidence.base
+        square, left = (gap.squares(one, measured) for one in (field.evidence.base, paths))
         floors = self._floor_squares() if self.base.nulls else np.zeros(1)
-        left = gap.squares(repaired.after, measured) if repaired else square
         share = gap.closed(square, left, floors, self.generator) if self.base.nulls else None
-        selected = self._selected(findings, square, floors) if repaired else []
-        seen = survey(before, floor, after, self.case.machine, self.thresholds, self._dead_time_s(), self.generator, before)
+        selected = [verdict.other(one, self.prices, self.case.machine) for one in found]
+        selected += self._selected(findings, square, floors) if repaired else []
+        selected.sort(key=lambda one: -one.probability)
         told = "unknown" if unknown else "effects" if selected else "none"
-        chance = self._unknown_chance(findings)
+        after = field.runs(paths) if selected else None
+        machine = self.case.machine
+        seen = survey(before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator, before)
         answer = Answer(
             verdict=told,
             selected=tuple(selected),
-            ranking=tuple(verdict.ranking(findings, selected, self.prices, self.case.machine, chance)),
+            ranking=tuple(verdict.ranking(findings, selected, self.prices, machine, self._unknown_chance(findings))),
             where=seen.where(),
             gap=Gap(gap.rmse(square), gap.rmse(left), gap.rmse(floors), share),
             next_experiment=None,
@@ -89,13 +93,8 @@ class Diagnosis:
         found = []
         for kind in chosen:
             swaps = verdict.rivals(findings, kind.name)
-            own = sum(
-                table.score(s).total - table.score(s - {kind.name}).total
-                for table, s in zip(findings.tables, findings.chosen.subsets, strict=True)
-                if kind.name in s
-            )
-            like = verdict.same_as(swaps, own)
-            chance = verdict.probability(verdict.margin(findings, self.prices, frozenset({kind.name, *like})), self.prices)
+            like = verdict.same_as(swaps, verdict.own_gain(findings, kind.name))
+            chance = verdict.probability(verdict.margin(findings, self.prices, kind.name, swaps, like), self.prices)
             joints = findings.repair.joints_of(kind)
             decided = next((how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)), None)
             found.append(
@@ -117,7 +116,7 @@ class Diagnosis:
             return 0.0
         whole = findings.repair
         assert whole is not None, "only chosen effects close anything"
-        evidence = self.base.field.evidence
+        evidence = findings.evidence
         if names == findings.chosen.names:
             after = whole.after
         else:
@@ -145,8 +144,10 @@ class Diagnosis:
         return np.full(self.case.machine.num_joints, self.case.machine.dead_time_s)
 
     def _unknown_chance(self, findings: Findings) -> float:
-        left = findings.left - 1.5 * findings.left_null - self.prices.remainder
-        return verdict.probability(float(left.max()), self.prices)
+        left = verdict.unexplained(findings, self.prices).sum()
+        if verdict.is_unknown(findings, self.prices):
+            return max(0.5, verdict.probability(left, self.prices))
+        return min(0.5, verdict.probability(left - 4.0 * self.prices.temperature, self.prices))
 
     def _more(self, findings: Findings, share: Estimate | None) -> dict[str, Any]:
         names = self.case.machine.joint_names
@@ -164,8 +165,8 @@ class Diagnosis:
         ]
         rivals = sorted(rivals, key=lambda row: -row["score"])[:40]
         left = {
-            name: {"earned": float(a), "null": float(b)}
-            for name, a, b in zip(names, findings.left, findings.left_null, strict=True)
+            name: {"earned": float(a), "null": float(b), "scatter": float(c)}
+            for name, a, b, c in zip(names, findings.left, findings.left_null, findings.scatter, strict=True)
         }
         return {
             "evidence": {"rivals": rivals, "threshold": self.prices.name + self.prices.joint, "unit": "log likelihood"},

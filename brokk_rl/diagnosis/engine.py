@@ -7,23 +7,29 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from brokk_rl.diagnosis import remainder
+from brokk_rl.diagnosis import frames, remainder, sensors, tool
+from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.evidence import Evidence, Ray, rays
+from brokk_rl.diagnosis.found import Found
 from brokk_rl.diagnosis.library import Kind
+from brokk_rl.diagnosis.noise import increments
 from brokk_rl.diagnosis.repair import Repair, repair
-from brokk_rl.diagnosis.search import Chosen, Table, choose
+from brokk_rl.diagnosis.search import Chosen, Price, Table, choose
+from brokk_rl.diagnosis.shapes import SMALL, Nulls, add
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.sizes import Shape
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
-SMALL = (0.12, 0.5)
-"""Sizes at which effects are simulated on the reference: what they find there is small."""
+SCATTERED = 1.3
+"""Mean square error over that of the reference from which what effects earn is taken down."""
+CUT = 25.0
+"""Squares of errors over the noise count no more than this in what scatters."""
 Tell = Callable[[str, float], None]
 """Is told what is being done and how much of the whole is done."""
 
@@ -33,20 +39,28 @@ class Prices:
     """What an effect must earn, in units of log likelihood on recordings that it was not fitted to.
 
     Attributes:
-        joint: For each joint that has it, beside what it earns on reference recordings.
+        joint: For each joint that has it.
+        reference: Times what it earns on reference recordings.
         name: For the effect as such.
+        partial: For each joint that lacks an effect with one cause for all joints.
         share: Of what its joint's set earns: an effect that adds less only mends the form of another.
         temperature: Of the probabilities: a worth of so much makes odds of e to 1.
         remainder: Worth from which a flexible model shows that something is there.
         explained: Share of what can be predicted that a set must explain for the verdict `effects`.
+        scatter: Mean square error over that of the reference from which something unknown is there.
+        tool: Error of measured tool points over that of the reference from which something unknown is there.
     """
 
     joint: float
+    reference: float
     name: float
+    partial: float
     share: float
     temperature: float
     remainder: float
     explained: float
+    scatter: float
+    tool: float
 
 
 @dataclass
@@ -54,88 +68,152 @@ class Findings:
     """What the search found.
 
     Attributes:
+        evidence: The simulator against the field, with what was found by other means.
         tables: Of each joint.
         rays: Of each effect.
+        price: What a subset of effects costs on a joint.
         chosen: The set.
         repair: Its simulation; `None` for the empty set.
+        others: Effects that sensors, frames and tool points show.
         left: What a flexible model earns on what is left, by joint, `(J,)`.
         left_null: The same on reference recordings, the most of any part, at the length of the field, `(J,)`.
+        scatter: Mean square of what is left over that of the reference, by joint, `(J,)`.
+        tool_left: Error of measured tool points that is left over that of the reference.
     """
 
+    evidence: Evidence
     tables: list[Table]
     rays: dict[str, list[Ray]]
+    price: Price
     chosen: Chosen
-    repair: Repair | None = None
-    left: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    left_null: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    price: Callable[[int, frozenset[str]], float] = lambda j, s: 0.0
+    repair: Repair | None
+    others: list[Found]
+    left: np.ndarray
+    left_null: np.ndarray
+    scatter: np.ndarray
+    tool_left: float
 
-
-def search(base: Base, kinds: Sequence[Kind], prices: Prices, tell: Tell) -> Findings:
-    """Returns the set of effects that is worth most, and its rivals."""
-    evidence = base.field.evidence
-    grown = {kind.name: rays(kind) for kind in kinds if not kind.target.stochastic and kind.target.side != "kinematics"}
-    shapes: list[dict[str, list[Shape]]] = [{} for _ in range(evidence.way.shape[2])]
-    for number, (name, ways) in enumerate(grown.items()):
-        tell(f"simulating {name}", 0.3 + 0.25 * number / len(grown))
-        _put(shapes, name, ways, evidence)
-    tables = [Table(z, mine, evidence.fold) for z, mine in zip(evidence.z, shapes, strict=True)]
-    nulls = _Nulls(base, {kind.name: rays(kind, SMALL) for kind in kinds if kind.name in grown})
-    price = dict.fromkeys(grown, prices.joint)
-    for j, table in enumerate(tables):
-        tell(f"trying sets on joint {j + 1}", 0.55 + 0.15 * j / len(tables))
-        table.explore(price, 3)
-
-    def subset_price(j: int, subset: frozenset[str]) -> float:
-        return prices.joint * len(subset) + nulls.earned(j, subset)
-
-    tell("the same on the reference", 0.7)
-    chosen = choose(tables, subset_price, prices.name, prices.share)
-    findings = Findings(tables, grown, chosen, price=subset_price)
-    if chosen.names:
-        tell("simulating what was found", 0.85)
-        start = [table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)]
-        findings.repair = repair(evidence, chosen.subsets, grown, start)
-    tell("what is left", 0.92)
-    z = findings.repair.z if findings.repair else evidence.z
-    findings.left = remainder.predictable(evidence, z).sum(1)
-    entries = evidence.z.shape[1]
-    of_nulls = [
-        remainder.predictable(one.evidence, one.evidence.z).sum(1) * entries / one.evidence.z.shape[1] for one in base.nulls
-    ]
-    findings.left_null = np.max([np.zeros(len(z)), *of_nulls], 0)
-    return findings
-
-
-def _put(shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray], evidence: Evidence) -> None:
-    """Adds the shapes of an effect to the joints that it does something to."""
-    responses = [evidence.response(ray) for ray in ways]
-    for j, mine in enumerate(shapes):
-        if max(np.abs(response[j]).max() for response in responses) > 1e-3:
-            mine[name] = [Shape(ray.sizes, response[j]) for ray, response in zip(ways, responses, strict=True)]
+    @property
+    def names(self) -> set[str]:
+        """All effects that were found."""
+        return {*self.chosen.names, *(one.kind.name for one in self.others)}
 
 
 @dataclass
-class _Nulls:
-    """What sets of effects earn on reference recordings; an effect is simulated there when it is first asked for."""
+class Search:
+    """The search for effects.
 
+    Attributes:
+        case: The recordings.
+        base: The simulator.
+        kinds: The library.
+        prices: What effects must earn.
+        tell: Is told what is being done.
+    """
+
+    case: Case
     base: Base
-    rays: Mapping[str, Sequence[Ray]]
-    tables: list[list[Table]] = field(default_factory=list)
-    known: set[str] = field(default_factory=set)
+    kinds: Sequence[Kind]
+    prices: Prices
+    tell: Tell
 
-    def earned(self, j: int, subset: frozenset[str]) -> float:
-        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field."""
-        if not self.tables:
-            parts = [one.evidence for one in self.base.nulls]
-            self.tables = [[Table(z, {}, part.fold) for z in part.z] for part in parts]
-        for name in subset - self.known:
-            for tables, one in zip(self.tables, self.base.nulls, strict=True):
-                _put([table.shapes for table in tables], name, self.rays[name], one.evidence)
-            self.known.add(name)
-        found, entries = 0.0, self.base.field.evidence.z.shape[1]
-        for tables in self.tables:
-            mine = tables[j]
-            usable = frozenset(name for name in subset if name in mine.shapes)
-            found = max(found, mine.score(usable).total * entries / len(mine.z))
-        return found
+    def run(self) -> Findings:
+        """Returns what is found."""
+        prices, nulls = self.prices, [one.evidence for one in self.base.nulls]
+        self.tell("sensors", 0.32)
+        on_sensors = sensors.search(self.case, self.kinds, prices.joint, prices.name)
+        on_tool = tool.search(self.case, self.kinds, prices.joint, prices.name)
+        evidence = _adjusted(self.base.field.evidence, [*on_sensors, *on_tool.found])
+        grown, shapes = self._simulated(evidence, tool.is_tracked(self.case.field, self.case.machine))
+        known = Nulls(self.base, {name: rays(ways[0].kind, SMALL) for name, ways in grown.items()}, grown)
+
+        def price(j: int, subset: frozenset[str]) -> float:
+            return prices.joint * len(subset) + prices.reference * known.earned(j, subset)
+
+        scatter = np.ones(self.case.machine.num_joints)
+        tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)
+        self.tell("frames", 0.8)
+        after = repaired.after if repaired else evidence.base
+        late = frames.search(evidence, evidence.error_of(after), nulls, self.kinds, prices.joint, prices.name)
+        scatter = np.maximum(1.0, self._scatter(evidence, repaired))
+        for _ in range(2 if late else int(scatter.max() > SCATTERED)):
+            if late:  # what delays change depends on when commands act, and so on what else delays them
+                steady = [*evidence.candidates.fixed, *(repaired.effects() if repaired else [])]
+                mean = frames.mean_change(replace(evidence.candidates, fixed=steady), late)
+                evidence = replace(evidence, mean=mean)
+            tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)
+        self.tell("what is left", 0.92)
+        others = [*on_sensors, *on_tool.found, *([late] if late else [])]
+        left, left_null = self._left(evidence, repaired, scatter)
+        return Findings(
+            evidence, tables, grown, price, chosen, repaired, others, left, left_null, self._scatter(evidence, repaired),
+            on_tool.left,
+        )  # fmt: skip
+
+    def _simulated(self, evidence: Evidence, tracked: bool) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
+        """Returns the rays of each effect that free runs can show, and what it does to each joint."""
+        grown: dict[str, list[Ray]] = {}
+        shapes: list[dict[str, list[Shape]]] = [{} for _ in range(evidence.way.shape[2])]
+        for number, kind in enumerate(self.kinds):
+            measured = kind.target.side == "measurement" and (tracked or not kind.target.smooth)
+            if kind.target.stochastic or kind.target.side == "kinematics" or measured:
+                continue
+            self.tell(f"simulating {kind.name}", 0.35 + 0.2 * number / len(self.kinds))
+            grown[kind.name] = add(shapes, kind.name, rays(kind), evidence)
+        return grown, shapes
+
+    def _round(
+        self,
+        evidence: Evidence,
+        grown: Mapping[str, list[Ray]],
+        shapes: Sequence[Mapping[str, list[Shape]]],
+        price: Price,
+        scatter: np.ndarray,
+    ) -> tuple[list[Table], Chosen, Repair | None]:
+        """Searches sets where errors scatter more than the noise says: they are worth less by as much."""
+        tables, flat = [], dict.fromkeys(grown, self.prices.joint)
+        for j, mine in enumerate(shapes):
+            self.tell(f"trying sets on joint {j + 1}", 0.55 + 0.1 * j / len(shapes))
+            by = 1.0 / np.sqrt(scatter[j])
+            scaled = {name: [Shape(shape.sizes, shape.change * by) for shape in own] for name, own in mine.items()}
+            tables.append(Table(evidence.z[j] * by, scaled, evidence.fold, evidence.block))
+            tables[-1].explore(flat, 3)
+        self.tell("the same on the reference", 0.7)
+        prices = self.prices
+        shared = frozenset(kind.name for kind in self.kinds if getattr(kind.target, "shared", False))
+        chosen = choose(tables, price, prices.name, prices.share, shared, prices.partial)
+        start = [table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)]
+        return tables, chosen, repair(evidence, chosen.subsets, grown, start) if chosen.names else None
+
+    def _scatter(self, evidence: Evidence, repaired: Repair | None) -> np.ndarray:
+        """Returns the mean square of errors over the noise over that of the reference, outliers cut, `(J,)`."""
+        z = repaired.z if repaired else evidence.z
+        nulls = [one.evidence.z for one in self.base.nulls]
+        usual = np.mean(np.minimum(np.concatenate(nulls, 1) ** 2, CUT), 1) if nulls else np.ones(len(z))
+        return np.mean(np.minimum(z**2, CUT), 1) / usual
+
+    def _left(self, evidence: Evidence, repaired: Repair | None, scatter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        z = (repaired.z if repaired else evidence.z) / np.sqrt(scatter)[:, None]
+        entries, of_nulls = z.shape[1], [np.zeros(len(z))]
+        for one in self.base.nulls:
+            earned = remainder.predictable(one.evidence, one.evidence.z).sum(1)
+            of_nulls.append(earned * entries / one.evidence.z.shape[1])
+        return remainder.predictable(evidence, z).sum(1), np.max(of_nulls, 0)
+
+
+def _adjusted(evidence: Evidence, found: Sequence[Found]) -> Evidence:
+    """Returns the evidence where encoders err as was found, and where sensors that scatter more say less."""
+    steady = [(one.kind, one.values()) for one in found if one.kind.target.side == "measurement" and _is_steady(one.kind)]
+    evidence = replace(evidence, candidates=replace(evidence.candidates, fixed=steady))
+    for one in found:
+        if one.kind.target.side == "measurement" and not _is_steady(one.kind):
+            assert evidence.noise is not None, "noise is known by now"
+            paths = evidence.candidates.paths([(one.kind, one.values())])[0]
+            more = (increments(paths, evidence.start) - evidence.way).std((0, 1))
+            noise = [replace(n, sensor=float(np.hypot(n.sensor, m))) for n, m in zip(evidence.noise, more, strict=True)]
+            evidence = replace(evidence, noise=noise)
+    return evidence
+
+
+def _is_steady(kind: Kind) -> bool:
+    return kind.target.smooth and not kind.target.stochastic

@@ -5,8 +5,8 @@ Axes: `C` candidates, `W` windows, `I` increments in a window, `J` joints, `E` e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 
@@ -16,7 +16,7 @@ from brokk_rl.diagnosis.candidates import Candidates
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.noise import LONGEST, Noise, increments
 
-GRID = (0.12, 0.35, 0.7, 1.2, 2.0)
+GRID = (0.1, 0.25, 0.45, 0.7, 1.0, 1.4, 1.9, 2.5)
 """Sizes, over the typical one, at which an effect is simulated; in between its doing is interpolated."""
 
 
@@ -28,11 +28,13 @@ class Ray:
         kind: The effect.
         name: Of the number; empty for all at once.
         sizes: Sizes at which it is simulated, over the typical one, rising, 0 among them.
+        shape: Values of the numbers that only shape the effect, over the typical ones, by name, each `(J,)`; 1 where not given.
     """
 
     kind: Kind
     name: str
     sizes: np.ndarray
+    shape: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def values(self, size: np.ndarray) -> dict[str, np.ndarray]:
         """Returns the numbers at sizes `(C, J)`, each `(C, J)` or `(C, 1)`."""
@@ -41,6 +43,10 @@ class Ray:
             number = self.kind.numbers[name]
             step = size if number.per_joint else size.max(1, keepdims=True)
             found[name] = self.kind.clipped(name, number.none + step * self.kind.size(name))
+        for name, part in self.shape.items():
+            number = self.kind.numbers[name]
+            value = self.kind.clipped(name, part * number.typical)
+            found[name] = np.repeat(value[None] if number.per_joint else value[None, :1], len(size), 0)
         return found
 
 
@@ -72,11 +78,13 @@ class Evidence:
         candidates: Its free runs.
         noise: Of each joint; `None` while it is still to be found.
         claims: Whether each window says something about each joint, `(W, J)`.
+        mean: What effects of chance change on average, which are known already, `(W, K, J)`.
     """
 
     candidates: Candidates
     noise: Sequence[Noise] | None
     claims: np.ndarray
+    mean: np.ndarray | None = None
 
     @cached_property
     def base(self) -> np.ndarray:
@@ -96,7 +104,13 @@ class Evidence:
     @cached_property
     def error(self) -> np.ndarray:
         """Measured less simulated increments, `(W, I, J)`."""
-        return increments(self.candidates.cut.measured, self.start) - self.way
+        return self.error_of(self.base)
+
+    def error_of(self, paths: np.ndarray) -> np.ndarray:
+        """Returns measured less simulated increments, `(…, W, I, J)`, of free runs `(…, W, K, J)`."""
+        still = np.zeros_like(self.start)
+        known = 0.0 if self.mean is None else increments(self.mean, still)
+        return increments(self.candidates.cut.measured, self.start) - increments(paths, self.start) - known
 
     @cached_property
     def groups(self) -> list[np.ndarray]:

@@ -63,6 +63,7 @@ def shapley(names: Sequence[str], closed_by: Callable[[frozenset[str]], float]) 
 
 
 def _share(before: float, after: float, floor: float) -> float:
+    floor = min(floor, after)  # no repair is better than the floor: where it is, the floor was measured on harder recordings
     return float((before - after) / max(before - floor, 0.02 * before + 1e-12))
 
 

@@ -45,6 +45,11 @@ class Kind:
         return self.target.numbers
 
     @property
+    def stage(self) -> str:
+        """On which part of the way from command to estimate it lies."""
+        return self.target.stage
+
+    @property
     def order(self) -> tuple[int, int]:
         """Place from the machine outwards."""
         return ORDER.get(self.target.side, 3), int(self.target.stage == "timing")
@@ -126,13 +131,13 @@ def _try(kind: Kind, machine: Machine) -> None:
     """Raises a `ConfigError` when the effect needs what is not known of the machine."""
     device = torch.device("cpu")
     rest = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32).expand(1, machine.num_history, -1)
-    model = kind.wrap(_Still(), machine, 1, device)
+    model = kind.wrap(Still(), machine, 1, device)
     with torch.inference_mode():
         model.step(History(q=rest.clone(), u=torch.zeros_like(rest)))
         model.misplacement(rest[:, -1]) if kind.target.side == "kinematics" else None
 
 
-class _Still:
+class Still:
     """A machine that does not move."""
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 from brokk_rl.diagnosis.candidates import Candidates
 from brokk_rl.diagnosis.evidence import Evidence, Ray
 from brokk_rl.diagnosis.library import Kind
-from brokk_rl.diagnosis.noise import increments, loss, weight
+from brokk_rl.diagnosis.noise import loss, weight
 from brokk_rl.diagnosis.sizes import PRIOR
 
 STEPS = 4
@@ -48,6 +48,10 @@ class Repair:
         """Effects of the set, each once."""
         return list({ray.kind.name: ray.kind for ray in self.rays}.values())
 
+    def effects(self) -> list[tuple[Kind, dict[str, np.ndarray]]]:
+        """Returns the effects with their numbers, each `(1, J)` or `(1, 1)`."""
+        return _effects(self.rays, self.sizes[None])
+
     def joints_of(self, kind: Kind) -> np.ndarray:
         """Returns which joints have an effect, `(J,)` bool."""
         return np.any([mask for ray, mask in zip(self.rays, self.mask, strict=True) if ray.kind is kind], 0)
@@ -55,10 +59,14 @@ class Repair:
 
 def simulate(candidates: Candidates, rays: Sequence[Ray], sizes: np.ndarray) -> np.ndarray:
     """Returns free runs `(C, W, K, J)` with the effects at sizes `(C, R, J)`."""
+    return candidates.paths(_effects(rays, sizes), len(sizes))
+
+
+def _effects(rays: Sequence[Ray], sizes: np.ndarray) -> list[tuple[Kind, dict[str, np.ndarray]]]:
     values: dict[str, tuple[Kind, dict[str, np.ndarray]]] = {}
     for r, ray in enumerate(rays):
         values.setdefault(ray.kind.name, (ray.kind, {}))[1].update(ray.values(sizes[:, r]))
-    return candidates.paths(list(values.values()), len(sizes))
+    return list(values.values())
 
 
 def repair(
@@ -108,7 +116,7 @@ def repair(
         now = np.clip(np.where(better[:, None], now + step, 0.5 * (origin + now)), low, high)
     z, slopes, paths = _linear(evidence, found, best)
     half = evidence.fold.reshape(len(evidence.way), -1)[:, 0]
-    after = np.where((half == 0)[:, None, None], paths[1], paths[2])
+    after = np.where((half == 0)[:, None, None], paths[1], paths[2]) + (0.0 if evidence.mean is None else evidence.mean)
     held = np.where(evidence.fold == 0, z[1], z[2])
     deviation = _deviation(z[0], slopes[0], mask, evidence.block)
     return Repair(found, mask, best[0], best[1:], after, held, deviation)
@@ -124,8 +132,7 @@ def _linear(evidence: Evidence, rays: Sequence[Ray], sizes: np.ndarray) -> tuple
     for r in range(count):
         varied[:, r + 1, r] += STEP * sign[:, r, None]
     paths = simulate(evidence.candidates, rays, varied.reshape(-1, count, joints))
-    measured = increments(evidence.candidates.cut.measured, evidence.start)
-    z = evidence.whitened(measured - increments(paths, evidence.start)).reshape(joints, fits, count + 1, -1)
+    z = evidence.whitened(evidence.error_of(paths)).reshape(joints, fits, count + 1, -1)
     slopes = (z[:, :, :1] - z[:, :, 1:]) / (STEP * sign)[None, :, :, None]
     return z[:, :, 0].swapaxes(0, 1), slopes.swapaxes(0, 1), paths.reshape(fits, count + 1, *paths.shape[1:])[:, 0]
 

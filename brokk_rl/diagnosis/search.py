@@ -22,6 +22,10 @@ KEPT = 5
 """Subsets of each size that a joint goes on from."""
 NAMES = 12
 """Names among which whole sets are chosen."""
+LEAST = 0.15
+"""Smallest size, over the typical one, that is worth naming: what is smaller any simulator gets wrong."""
+SURELY = 2.0
+"""Standard errors by which a set must earn more than a simpler one."""
 TRIED = 14
 """Subsets of each joint that are tried on the reference too."""
 
@@ -56,11 +60,13 @@ class Table:
         z: The joint's errors over the noise, `(E,)`.
         shapes: By effect: one shape a ray; effects that do nothing to the joint are absent.
         fold: Half of the recordings of each entry.
+        block: Part of the recordings, the same for neighbours, of each entry.
     """
 
     z: np.ndarray
     shapes: dict[str, list[Shape]]
     fold: np.ndarray
+    block: np.ndarray
     scored: dict[Subset, Scored] = field(default_factory=dict)
 
     def score(self, subset: Subset) -> Scored:
@@ -113,14 +119,18 @@ class Chosen:
         return frozenset().union(*self.subsets)
 
 
-def choose(tables: Sequence[Table], price: Price, name_price: float, share: float) -> Chosen:
-    """Returns the set that is worth most.
+def choose(
+    tables: Sequence[Table], price: Price, name_price: float, share: float, shared: Subset = frozenset(), partial: float = 0.0
+) -> Chosen:
+    """Returns the set that is worth most, or one of fewer effects that is not surely worth less.
 
     Args:
         tables: What was tried on each joint.
         price: What a subset costs on a joint.
         name_price: What each effect costs once, however many joints have it.
         share: Part of what a joint's subset earns that each of its effects must add.
+        shared: Effects with one cause for all joints.
+        partial: What such an effect costs for each joint that could show it and does not.
     """
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
@@ -129,22 +139,61 @@ def choose(tables: Sequence[Table], price: Price, name_price: float, share: floa
         priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising}
         whole = [s for s in priced if priced[s] > 0 and _each_adds(s, table, share)]
         worth.append({subset: priced[subset] for subset in whole})
+    felt = [shared & table.shapes.keys() for table in tables]
+    best = _best(worth, felt, name_price, partial)
+    while simpler := _simpler(best, worth, tables, felt, name_price, partial, share):
+        best = simpler
+    return best
+
+
+def _best(worth: Sequence[Mapping[Subset, float]], felt: Sequence[Subset], name_price: float, partial: float) -> Chosen:
+    """Returns the set of at most `MOST` names that is worth most; each joint takes the best subset of them."""
     names = sorted({name for by_subset in worth for subset in by_subset for name in subset}, key=lambda n: -_sum(worth, n))[:NAMES]
-    best = Chosen((frozenset(),) * len(tables), 0.0)
+    best = Chosen((frozenset(),) * len(worth), 0.0)
     for size in range(1, MOST + 1):
         for chosen in combinations(names, size):
             among = frozenset(chosen)
-            subsets = [max([s for s in w if s <= among], key=w.__getitem__, default=frozenset()) for w in worth]
-            total = sum(w[s] for s, w in zip(subsets, worth, strict=True) if s)
-            total -= name_price * len(frozenset().union(*subsets))
-            if total > best.worth:
+            total, subsets = -name_price * size, []
+            for w, every in zip(worth, felt, strict=True):
+                net = {s: w[s] - partial * len(among & every - s) for s in w if s <= among}
+                net[frozenset()] = -partial * len(among & every)
+                subsets.append(max(net, key=net.__getitem__))
+                total += net[subsets[-1]]
+            if total > best.worth and frozenset().union(*subsets) == among:
                 best = Chosen(tuple(subsets), total)
     return best
 
 
+def _simpler(
+    best: Chosen,
+    worth: Sequence[Mapping[Subset, float]],
+    tables: Sequence[Table],
+    felt: Sequence[Subset],
+    name_price: float,
+    partial: float,
+    share: float,
+) -> Chosen | None:
+    """Returns a set with fewer names whose loss is within what chance does between blocks, or a small part of the whole."""
+    for name in sorted(best.names):
+        other = _best([{s: value for s, value in w.items() if name not in s} for w in worth], felt, name_price, partial)
+        if len(other.names) >= len(best.names) or not other.names:
+            continue
+        lost, whole, blocks = 0.0, 0.0, np.zeros(int(tables[0].block.max()) + 1)
+        for table, mine, others in zip(tables, best.subsets, other.subsets, strict=True):
+            if mine != others:
+                difference = table.score(mine).gain - table.score(others).gain
+                lost, whole = lost + difference.sum(), whole + table.score(mine).total
+                blocks += np.bincount(table.block, difference, len(blocks))
+        if lost < max(SURELY * blocks.std() * np.sqrt(len(blocks)), share * whole):
+            return other
+    return None
+
+
 def _each_adds(subset: Subset, table: Table, share: float) -> bool:
-    """Says whether each effect of a subset adds its share: else it mends the form of another."""
-    total = table.scored[subset].total
+    """Says whether each effect of a subset has a size worth naming and adds its share: else it mends the form of another."""
+    total, sizes = table.scored[subset].total, table.scored[subset].sizes
+    if any(np.abs(sizes[name]).max() < LEAST for name in subset):
+        return False
     return len(subset) == 1 or all(total - table.score(subset - {name}).total >= share * total for name in subset)
 
 

@@ -13,7 +13,7 @@ import torch
 
 from brokk_rl import open_loop
 from brokk_rl.contracts import Actuator, ActuatorFit
-from brokk_rl.diagnosis import noise
+from brokk_rl.diagnosis import noise, tuning
 from brokk_rl.diagnosis.candidates import Candidates
 from brokk_rl.diagnosis.case import HORIZON_S, Case, parts, running_s
 from brokk_rl.diagnosis.evidence import Evidence
@@ -46,6 +46,12 @@ class Held:
     evidence: Evidence
     source: np.ndarray
     row: np.ndarray
+
+    def with_base(self, actuator: Actuator) -> Held:
+        """Returns another simulator held against the same recordings; its noise is still to be found."""
+        evidence = self.evidence
+        candidates = replace(evidence.candidates, base=actuator)
+        return replace(self, evidence=Evidence(candidates, None, evidence.claims))
 
     def runs(self, paths: np.ndarray) -> FreeRuns:
         """Returns free runs `(W, K, J)` beside their recordings."""
@@ -124,8 +130,12 @@ def fitted(case: Case, fit: ActuatorFit, folder: Path, seed: int, device: torch.
         left = [one for one, out in zip(begun, last, strict=True) if out]
         nulls.append(held(actuator, left, machine, seed))
     field = held(actuator, _begun(case.field), machine, seed)
-    noises = _noises(nulls, machine)
-    nulls = [replace(one, evidence=replace(one.evidence, noise=noises)) for one in nulls]
+    nulls = _noised(nulls, machine)
+    if changes := tuning.changes([one.evidence for one in nulls]):
+        actuator = tuning.changed(actuator, changes, machine)
+        nulls = _noised([one.with_base(tuning.changed(one.evidence.candidates.base, changes, machine)) for one in nulls], machine)
+        field = field.with_base(actuator)
+    noises = nulls[0].evidence.noise
     claims = _known(case, field)
     return Base(actuator, replace(field, evidence=replace(field.evidence, noise=noises, claims=claims)), nulls)
 
@@ -134,6 +144,11 @@ def given(case: Case, actuator: Actuator, seed: int) -> Base:
     """Returns a configured simulator held against the field; without reference its noise is that of the field's own errors."""
     field = held(actuator, _begun(case.field), case.machine, seed)
     return Base(actuator, replace(field, evidence=replace(field.evidence, noise=_noises([field], case.machine))), [])
+
+
+def _noised(nulls: Sequence[Held], machine: Machine) -> list[Held]:
+    noises = _noises(nulls, machine)
+    return [replace(one, evidence=replace(one.evidence, noise=noises)) for one in nulls]
 
 
 def _begun(recordings: Sequence[Recording]) -> Begun:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from brokk_rl.diagnosis.answer import Estimate, Ranked, Selected
 from brokk_rl.diagnosis.engine import Findings, Prices
+from brokk_rl.diagnosis.found import Found
 from brokk_rl.diagnosis.library import Kind
-from brokk_rl.diagnosis.search import Table, choose
 from brokk_rl.machine import Machine
 
 SAME = 0.9
@@ -48,15 +48,18 @@ def same_as(swaps: Sequence[Swap], own: float) -> tuple[str, ...]:
     return tuple(swap.name for swap in swaps if swap.share > SAME or own - swap.earned < AS_GOOD)[:3]
 
 
-def margin(findings: Findings, prices: Prices, left_out: frozenset[str]) -> float:
-    """Returns by how much the chosen set is worth more than the best set without some effects."""
-    tables = [_without(table, left_out) for table in findings.tables]
-    other = choose(tables, findings.price, prices.name, prices.share)
-    return findings.chosen.worth - other.worth
+def own_gain(findings: Findings, name: str) -> float:
+    """Returns what a chosen effect adds to the rest of the set, on all joints that have it."""
+    subsets = [(t, s) for t, s in zip(findings.tables, findings.chosen.subsets, strict=True) if name in s]
+    return sum(table.score(subset).total - table.score(subset - {name}).total for table, subset in subsets)
 
 
-def _without(table: Table, left_out: frozenset[str]) -> Table:
-    return replace(table, scored={subset: one for subset, one in table.scored.items() if not subset & left_out})
+def margin(findings: Findings, prices: Prices, name: str, swaps: Sequence[Swap], like: Sequence[str]) -> float:
+    """Returns by how much a chosen effect is worth more than nothing in its place, and than what is not like it."""
+    own, subsets = own_gain(findings, name), findings.chosen.subsets
+    saved = sum(findings.price(j, s) - findings.price(j, s - {name}) for j, s in enumerate(subsets) if name in s)
+    others = [own - swap.earned for swap in swaps if swap.name not in like]
+    return min([own - saved - prices.name, *others])
 
 
 def probability(margin: float, prices: Prices) -> float:
@@ -79,32 +82,51 @@ def numbers(findings: Findings, kind: Kind, machine: Machine) -> dict[str, dict[
                 low, mean, high = (float(v) for v in np.sort(np.clip(ends, *number.bounds)))
                 joint = machine.joint_names[j] if number.per_joint else "machine"
                 found.setdefault(name, {})[joint] = Estimate(mean, (low, high))
-    for name in kind.shaping:
-        value = float(kind.numbers[name].typical)
-        found[name] = {machine.joint_names[j]: Estimate(value, (value, value)) for j in np.flatnonzero(repair.joints_of(kind))}
+    for ray in repair.rays:
+        for name, part in ray.shape.items() if ray.kind.name == kind.name else ():
+            values = kind.clipped(name, part * kind.numbers[name].typical)
+            places = np.flatnonzero(repair.joints_of(kind))
+            given = {machine.joint_names[j]: float(values[j]) for j in places}
+            found[name] = {joint: Estimate(value, (value, value)) for joint, value in given.items()}
     return found
 
 
 def chosen_kinds(findings: Findings, kinds: Mapping[str, Kind]) -> list[Kind]:
     """Returns the chosen effects, the ones that earn most first."""
-
-    def earned(name: str) -> float:
-        subsets = [(t, s) for t, s in zip(findings.tables, findings.chosen.subsets, strict=True) if name in s]
-        return sum(table.score(subset).total - table.score(subset - {name}).total for table, subset in subsets)
-
-    return [kinds[name] for name in sorted(findings.chosen.names, key=earned, reverse=True)]
+    return [kinds[name] for name in sorted(findings.chosen.names, key=lambda name: -own_gain(findings, name))]
 
 
 def unexplained(findings: Findings, prices: Prices) -> np.ndarray:
-    """Returns what a flexible model earns, by joint, beyond what it earns where nothing is to be found, `(J,)`."""
-    return np.maximum(findings.left - 1.5 * findings.left_null - prices.remainder, 0.0)
+    """Returns what shows that something is left, by joint, `(J,)`: predicted by a flexible model, or scattered too much."""
+    predicted = np.maximum(findings.left - 1.5 * findings.left_null - prices.remainder, 0.0)
+    entries = findings.evidence.z.shape[1]
+    noisy = {one.kind.stage for one in findings.others} & {"timing"}
+    scattered = np.zeros(len(predicted)) if noisy else 0.5 * entries * np.log(np.maximum(findings.scatter / prices.scatter, 1.0))
+    return predicted + scattered
 
 
 def is_unknown(findings: Findings, prices: Prices) -> bool:
     """Says whether something is there that the library does not explain."""
     left = unexplained(findings, prices)
-    gained = [table.score(s).total if s else 0.0 for table, s in zip(findings.tables, findings.chosen.subsets, strict=True)]
-    return bool(left.sum() > 0 and sum(gained) < prices.explained * (sum(gained) + findings.left[left > 0].sum()))
+    subsets = zip(findings.tables, findings.chosen.subsets, strict=True)
+    gained = sum(table.score(s).total if s else 0.0 for table, s in subsets) + sum(one.gain for one in findings.others)
+    if findings.tool_left > prices.tool and not any(one.kind.stage in ("kinematics", "sensing") for one in findings.others):
+        return True
+    return bool(left.sum() > 0 and gained < prices.explained * (gained + left.sum()))
+
+
+def other(found: Found, prices: Prices, machine: Machine) -> Selected:
+    """Returns what is said of an effect that sensors, frames or tool points show."""
+    near = sorted(found.rivals, key=lambda name: -found.rivals[name])
+    like = tuple(name for name in near if found.rivals[name] > max(SAME * found.gain, found.gain - AS_GOOD))[:3]
+    return Selected(
+        effect=found.kind.name,
+        joints=tuple(name for name, has in zip(machine.joint_names, found.joints, strict=True) if has),
+        probability=probability(found.worth, prices),
+        parameters=found.parameters,
+        gap_closed=Estimate(found.closed, (found.closed, found.closed)),
+        same_as=like,
+    )
 
 
 def ranking(findings: Findings, selected: Sequence[Selected], prices: Prices, machine: Machine, unknown: float) -> list[Ranked]:
@@ -123,6 +145,7 @@ def ranking(findings: Findings, selected: Sequence[Selected], prices: Prices, ma
         joints = tuple(machine.joint_names[j] for value, j in worth if value > 0)
         if joints:
             named[name] = Ranked(name, joints, chance)
-    none = probability(-findings.chosen.worth - prices.name * (not findings.chosen.names), prices) if selected else 1.0
-    rows = [*named.values(), Ranked("none", (), none * (1.0 - unknown)), Ranked("unknown", (), unknown)]
+    chances = [one.probability for one in selected]
+    none = 1.0 - max(chances) if chances else max(0.0, 1.0 - unknown)
+    rows = [*named.values(), Ranked("none", (), none), Ranked("unknown", (), unknown)]
     return sorted(rows, key=lambda one: -one.probability)[:LISTED]

@@ -1,0 +1,196 @@
+"""Frames that are late or lost: hidden delays of single commands, each measured by where its joint ends up.
+
+A command that changes acts a little earlier or later; what one period later would do is simulated. The delays that explain the
+errors best, one for each change of a command, scatter no more than their own errors where all frames arrive in time; how they
+scatter tells lost frames (whole periods, seldom) from jitter (parts of periods, always).
+Axes: `W` windows, `K` steps, `I` increments, `J` joints, `D` changes of a command, `C` candidates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import stats
+
+from brokk_rl.diagnosis.answer import Estimate
+from brokk_rl.diagnosis.candidates import Candidates
+from brokk_rl.diagnosis.evidence import Evidence
+from brokk_rl.diagnosis.found import Found, interval
+from brokk_rl.diagnosis.library import Kind
+from brokk_rl.diagnosis.noise import FREEDOM, increments
+
+CHANGE = 0.06
+"""Smaller changes of a command tell nothing about when it arrived."""
+WIDE = 1.5
+"""Prior standard deviation of a delay, periods."""
+SURE = 0.4
+"""Largest standard error, in periods, of a delay that counts."""
+FEWEST = 20
+"""Fewer delays tell nothing about how they scatter."""
+SIZES = np.geomspace(0.2, 8.0, 12)
+DRAWN = 3
+"""Times that the chances of each window are drawn."""
+MOST = 300
+"""Delays drawn by which those seen are judged."""
+WIDER = 1.2
+"""Scatter of the delays, over that of reference recordings, below which nothing is looked for."""
+
+
+@dataclass(frozen=True)
+class Delays:
+    """Hidden delays that could be measured, each less the mean of its joint.
+
+    Attributes:
+        value: In periods, `(D,)`.
+        error: Their standard errors, `(D,)`.
+    """
+
+    value: np.ndarray
+    error: np.ndarray
+
+
+@dataclass(frozen=True)
+class Changes:
+    """The changes of commands in some windows, and what it would do if they came one period later."""
+
+    evidence: Evidence
+
+    @cached_property
+    def responses(self) -> np.ndarray:
+        """Increments that change where the n-th change of each joint's command in a window comes late, `(C, W, I, J)`."""
+        cut = self.evidence.candidates.cut
+        jump = np.abs(np.diff(cut.u, axis=1)) > CHANGE
+        jump[:, : cut.num_before - cut.num_history] = False  # over when the free run begins
+        rank = np.cumsum(jump, 1) * jump
+        count, windows = int(rank.max(initial=0)), len(cut.u)
+        if not count:
+            return np.zeros((0, *self.evidence.way.shape))
+        late = [np.where(rank == number, cut.u[:, :-1], cut.u[:, 1:]) for number in range(1, count + 1)]
+        u = np.concatenate([np.repeat(cut.u[None, :, :1], count, 0), np.stack(late)], 2)
+        rows = np.tile(np.arange(windows), count)
+        many = replace(cut, u=u.reshape(-1, *u.shape[2:]), q=cut.q[rows], run=cut.run[rows])
+        candidates = replace(self.evidence.candidates, cut=many, running_s=self.evidence.candidates.running_s[rows])
+        paths = candidates.paths([])[0].reshape(count, windows, *self.evidence.base.shape[1:])
+        return increments(paths, self.evidence.start) - self.evidence.way
+
+    @cached_property
+    def _solutions(self) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
+        """Window, joint, matrix from increments to delays, and standard errors, for each window and joint with changes."""
+        assert self.evidence.noise is not None, "noise is known by now"
+        found = []
+        for j, noise in enumerate(self.evidence.noise):
+            whiteners = noise.whitener(self.evidence.way[..., j])
+            for w, whitener in enumerate(whiteners):
+                x = whitener @ self.responses[:, w, :, j].T
+                x = x[:, np.abs(x).max(0) > 0.3] if x.size else x
+                if x.size and self.evidence.claims[w, j]:
+                    inverse = np.linalg.inv(x.T @ x + np.eye(x.shape[1]) / WIDE**2)
+                    found.append((w, j, inverse @ x.T @ whitener, np.sqrt(np.diag(inverse))))
+        return found
+
+    def delays(self, error: np.ndarray) -> Delays:
+        """Returns the delays that explain errors `(W, I, J)` (measured less simulated increments) best."""
+        value, deviation, joint = [], [], []
+        for w, j, matrix, errors in self._solutions:
+            sure = errors < SURE
+            value.append((matrix @ error[w, :, j])[sure])
+            deviation.append(errors[sure])
+            joint.append(np.full(sure.sum(), j))
+        if not value:
+            return Delays(np.zeros(0), np.zeros(0))
+        value, deviation, joint = np.concatenate(value), np.concatenate(deviation), np.concatenate(joint)
+        for j in np.unique(joint):
+            mine = joint == j
+            value[mine] -= np.average(value[mine], weights=deviation[mine] ** -2)
+        return Delays(value, deviation)
+
+
+def search(
+    field: Evidence, error: np.ndarray, nulls: Sequence[Evidence], kinds: Sequence[Kind], price: float, name_price: float
+) -> Found | None:
+    """Returns the effect on the arrival of commands that the scatter of hidden delays shows, if any.
+
+    Args:
+        field: The simulator against the field.
+        error: Measured less simulated increments after what else was found, `(W, I, J)`.
+        nulls: The simulator against parts of the reference that it was not fitted to.
+        kinds: The library.
+        price: Beside what is earned on the reference.
+        name_price: For the effect as such.
+    """
+    kinds = [kind for kind in kinds if kind.target.stochastic and kind.target.side == "command"]
+    changes, others = Changes(field), [Changes(one) for one in nulls]
+    seen, known = changes.delays(error), [one.delays(one.evidence.error) for one in others]
+    if not kinds or len(seen.value) < FEWEST or sum(len(one.value) for one in known) < FEWEST:
+        return None
+    # how much larger errors are than the noise says: found where frames arrive in time
+    normal = np.concatenate([one.value / one.error for one in known])
+    scale = max(1.0, 1.4826 * float(np.median(np.abs(normal))))
+    if _scatter(seen.value / seen.error) < WIDER * _scatter(normal):
+        return None
+    gains, earned = {}, {}
+    for kind in kinds:
+        drawn = [_thinned(one) for one in _drawn(changes, kind)]
+        gains[kind.name] = np.array([_gain(seen, one, scale) for one in drawn])
+        best = drawn[int(np.argmax(gains[kind.name]))]
+        share = [len(seen.value) / max(1, len(one.value)) for one in known]
+        earned[kind.name] = max(0.0, *(_gain(one, best, scale) * part for one, part in zip(known, share, strict=True)))
+    worth = {name: float(gain.max()) - price - 1.5 * earned[name] - name_price for name, gain in gains.items()}
+    best = max(kinds, key=lambda kind: worth[kind.name])
+    if worth[best.name] <= 0:
+        return None
+    ends = np.array(interval(SIZES, gains[best.name]))
+    machine = field.candidates.machine
+    parameters = {}
+    for name in best.fitted:
+        mean, low, high = (float(v) for v in best.clipped(name, best.numbers[name].none + best.size(name) * ends))
+        parameters[name] = {joint: Estimate(mean, (low, high)) for joint in machine.joint_names}
+    rest = {name: float(gain.max()) for name, gain in gains.items() if name != best.name}
+    every = np.ones(machine.num_joints, dtype=bool)
+    return Found(best, every, parameters, worth[best.name], float(gains[best.name].max()), _explained(seen, scale), rest)
+
+
+def mean_change(candidates: Candidates, found: Found) -> np.ndarray:
+    """Returns what the found effect changes about free runs on average, `(W, K, J)`."""
+    count = 4 * DRAWN
+    return candidates.paths([(found.kind, found.values(count))], count).mean(0) - candidates.paths([])[0]
+
+
+def _drawn(changes: Changes, kind: Kind) -> list[np.ndarray]:
+    """Returns hidden delays that an effect of each size makes, without errors of measurement, each `(D,)`."""
+    evidence, joints = changes.evidence, changes.evidence.way.shape[2]
+    sizes = np.repeat(SIZES, DRAWN)[:, None]
+    values = {}
+    for name in kind.fitted:
+        values[name] = np.repeat(kind.clipped(name, kind.numbers[name].none + sizes * kind.size(name)), joints, 1)
+    paths = evidence.candidates.paths([(kind, values)], len(sizes))
+    moved = increments(paths, evidence.start) - evidence.way
+    found = [changes.delays(one).value for one in moved]
+    return [np.concatenate(found[start : start + DRAWN]) for start in range(0, len(found), DRAWN)]
+
+
+def _scatter(values: np.ndarray) -> float:
+    """Returns the root mean square, outliers cut."""
+    return float(np.sqrt(np.mean(np.minimum(np.square(values), 25.0))))
+
+
+def _thinned(drawn: np.ndarray) -> np.ndarray:
+    return drawn[np.linspace(0, len(drawn) - 1, min(MOST, len(drawn))).astype(int)]
+
+
+def _gain(seen: Delays, drawn: np.ndarray, scale: float) -> float:
+    """Returns the log likelihood of the delays seen, where true ones are like those drawn, over that without any."""
+    if not len(seen.value):
+        return 0.0
+    width = scale * seen.error[:, None]
+    off = (seen.value[:, None] - drawn[None]) / width
+    likely = stats.t.pdf(off, FREEDOM).mean(1)
+    return float(np.log(likely + 1e-12).sum() - stats.t.logpdf(seen.value / width[:, 0], FREEDOM).sum())
+
+
+def _explained(seen: Delays, scale: float) -> float:
+    """Returns the share of the scatter of the delays that is more than their errors."""
+    return float(np.clip(1.0 - np.mean((scale * seen.error) ** 2) / max(np.mean(seen.value**2), 1e-12), 0.0, 1.0))

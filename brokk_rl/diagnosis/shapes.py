@@ -1,0 +1,84 @@
+"""What effects do to each joint, in the field and on the reference.
+
+Axes: `J` joints, `E` entries (increments of all windows, over the simulator's noise).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from brokk_rl.diagnosis.evidence import Evidence, Ray
+from brokk_rl.diagnosis.noise import loss
+from brokk_rl.diagnosis.search import Table
+from brokk_rl.diagnosis.simulator import Base
+from brokk_rl.diagnosis.sizes import Shape, fitted, predicted
+
+SHAPES = (0.4, 2.0)
+"""Values of a number that only shapes an effect that are tried beside the typical one, over it."""
+SMALL = (0.12, 0.5)
+"""Sizes at which effects are simulated on the reference: what they find there is small."""
+FELT = 1e-3
+"""An effect that changes errors over the noise by less does nothing to a joint."""
+
+
+def add(shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray], evidence: Evidence) -> list[Ray]:
+    """Adds the shapes of an effect to the joints that it does something to.
+
+    Numbers that only shape the effect are tried at several values; each joint keeps the best, and the rays remember them.
+    """
+    kind = ways[0].kind
+    trials: list[dict[str, float]] = [{}]
+    if not ways[0].shape:
+        trials += [{number: part} for number in kind.shaping for part in SHAPES]
+    shaped = [[replace(ray, shape=_all(trial, len(shapes))) if trial else ray for ray in ways] for trial in trials]
+    responses = [[evidence.response(ray) for ray in one] for one in shaped]
+    best = np.zeros(len(shapes), dtype=int)
+    for j, mine in enumerate(shapes):
+        if max(np.abs(response[j]).max() for response in responses[0]) < FELT:
+            continue
+        made = [[Shape(ray.sizes, r[j]) for ray, r in zip(ways, response, strict=True)] for response in responses]
+        if len(made) > 1:
+            best[j] = int(np.argmin([loss(evidence.z[j] - predicted(one, fitted(evidence.z[j], one))) for one in made]))
+        mine[name] = made[best[j]]
+    if len(trials) == 1:
+        return list(ways)
+    shape = {number: np.array([trials[b].get(number, 1.0) for b in best]) for number in kind.shaping}
+    return [replace(ray, shape=shape) for ray in ways]
+
+
+def _all(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:
+    return {name: np.full(joints, part) for name, part in trial.items()}
+
+
+@dataclass
+class Nulls:
+    """What sets of effects earn on reference recordings; an effect is simulated there when it is first asked for."""
+
+    base: Base
+    rays: Mapping[str, Sequence[Ray]]
+    grown: Mapping[str, Sequence[Ray]]
+    tables: list[list[Table]] = field(default_factory=list)
+    known: set[str] = field(default_factory=set)
+
+    def _ways(self, name: str) -> list[Ray]:
+        """Returns the rays of an effect, shaped as they are in the field."""
+        return [replace(ray, shape=self.grown[name][0].shape) for ray in self.rays[name]]
+
+    def earned(self, j: int, subset: frozenset[str]) -> float:
+        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field."""
+        if not self.tables:
+            parts = [one.evidence for one in self.base.nulls]
+            self.tables = [[Table(z, {}, part.fold, part.block) for z in part.z] for part in parts]
+        for name in subset - self.known:
+            for tables, one in zip(self.tables, self.base.nulls, strict=True):
+                add([table.shapes for table in tables], name, self._ways(name), one.evidence)
+            self.known.add(name)
+        found, entries = 0.0, self.base.field.evidence.z.shape[1]
+        for tables in self.tables:
+            mine = tables[j]
+            usable = frozenset(name for name in subset if name in mine.shapes)
+            found = max(found, mine.score(usable).total * entries / len(mine.z))
+        return found
