@@ -1,0 +1,204 @@
+"""Frames on disk, and beside each rendered one its truth.
+
+A folder holds `camera.yaml` and for each frame `<stem>.color.png`, `<stem>.depth.npy` (float32, m, NaN unknown) or `<stem>.depth.png`
+(16 bits, mm, 0 unknown), and where there is a pair `<stem>.right.png`. Truth of a rendered frame:
+
+* `<stem>.truth.json`: `scene`, `conditions`, `holes` (`center_m`, `axis` and `center_in_base_m`, `axis_in_base`, `radius_m`,
+  `depth_m`, `hidden`: the part of the rim that cannot be seen, `in_view`), `decoys` (likewise), `block` (`center_m`, `rotation`,
+  `half_m`). Axes point out of the hole; coordinates without a frame in their name are the left camera's.
+* `<stem>.mask.png`: bits of `BLOCK` (its mouths too), `MOUTH` (what is seen through the rim of a hole), `ARM`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from brokk_rl.errors import FrameError, StorageError
+
+BLOCK, MOUTH, ARM = 1, 2, 4
+CAMERA, COLOR, RIGHT, DEPTH, DEPTH_MM, TRUTH, MASK = (
+    "camera.yaml", ".color.png", ".right.png", ".depth.npy", ".depth.png", ".truth.json", ".mask.png",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A rim, or a disc that is none, as it truly is.
+
+    Attributes:
+        center_m: Centre, `(3,)`, left camera's coordinates.
+        axis: Unit normal out of the block, `(3,)`.
+        center_in_base_m: Centre in the base frame.
+        axis_in_base: Axis in the base frame.
+        radius_m: Radius.
+        depth_m: Of the hole; 0 for a disc.
+        hidden: Part of the rim that cannot be seen from the left camera, in [0, 1].
+        in_view: The whole rim lies within the picture.
+    """
+
+    center_m: tuple[float, ...]
+    axis: tuple[float, ...]
+    center_in_base_m: tuple[float, ...]
+    axis_in_base: tuple[float, ...]
+    radius_m: float
+    depth_m: float
+    hidden: float
+    in_view: bool
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a rendered frame shows.
+
+    Attributes:
+        scene: Kind of scene.
+        conditions: What was drawn for it by name, numbers.
+        holes: All of them; the first one is what the camera was pointed at.
+        decoys: Flat discs.
+        block: `center_m`, `rotation`, `half_m`; empty where there is no block.
+    """
+
+    scene: str
+    conditions: dict[str, float]
+    holes: tuple[Circle, ...]
+    decoys: tuple[Circle, ...]
+    block: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Label:
+    """Masks of a frame, `(h, w)` bool: the block with its mouths, what is seen through rims, and the arm."""
+
+    block: np.ndarray
+    mouth: np.ndarray
+    arm: np.ndarray
+
+
+def stems(folder: Path) -> list[Path]:
+    """Returns the frames of a folder, sorted: each path without its endings.
+
+    Raises:
+        FrameError: there is no such folder, or no frame in it.
+    """
+    found = sorted(path.with_name(path.name.removesuffix(COLOR)) for path in folder.glob(f"*{COLOR}") if path.name[0] != ".")
+    if not found:
+        raise FrameError(f"{folder}: no frames; expected files <stem>{COLOR}" if folder.is_dir() else f"{folder}: no such folder")
+    return found
+
+
+def read_truth(stem: Path) -> Truth:
+    """Returns the truth of the rendered frame at `stem`.
+
+    Raises:
+        FrameError: it has none, or one that cannot be read.
+    """
+    path = _beside(stem, TRUTH)
+    try:
+        told = json.loads(path.read_text())
+        circles = {name: tuple(Circle(**entry) for entry in told[name]) for name in ("holes", "decoys")}
+        return Truth(told["scene"], told["conditions"], circles["holes"], circles["decoys"], told["block"])
+    except FileNotFoundError as error:
+        raise FrameError(f"{path}: no truth; only rendered frames have it") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise FrameError(f"{path}: not a truth file of this version ({error})") from error
+
+
+def read_label(stem: Path) -> Label:
+    """Returns the masks of the rendered frame at `stem`.
+
+    Raises:
+        FrameError: it has none, or one that cannot be read.
+    """
+    path = _beside(stem, MASK)
+    bits = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if bits is None or bits.ndim != 2:
+        raise FrameError(f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames have one")
+    return Label((bits & BLOCK) > 0, (bits & MOUTH) > 0, (bits & ARM) > 0)
+
+
+def mask_bits(label: Label) -> np.ndarray:
+    """Returns masks as they stand in the file, `(h, w)` uint8."""
+    return (BLOCK * label.block + MOUTH * label.mouth + ARM * label.arm).astype(np.uint8)
+
+
+def write_camera(
+    folder: Path, matrix: np.ndarray, base_from_camera: np.ndarray | None, baseline_m: float | None, dist: Sequence[float] = ()
+) -> None:
+    """Writes `camera.yaml`.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    told: dict[str, Any] = {"K": np.asarray(matrix).tolist(), "dist": [float(value) for value in dist]}
+    if baseline_m is not None:
+        told["baseline_m"] = float(baseline_m)
+    if base_from_camera is not None:
+        told["T_base_cam"] = np.asarray(base_from_camera).tolist()
+    _write(folder / CAMERA, yaml.safe_dump(told, sort_keys=False, default_flow_style=None).encode())
+
+
+def write_frame(
+    stem: Path,
+    color: np.ndarray,
+    depth_m: np.ndarray | None,
+    right: np.ndarray | None = None,
+    label: Label | None = None,
+    truth: Truth | None = None,
+) -> None:
+    """Writes a frame, the truth last: where that stands, all of it does.
+
+    Raises:
+        StorageError: a file could not be written.
+    """
+    for ending, picture in ((COLOR, color[..., ::-1]), (RIGHT, None if right is None else right[..., ::-1])):
+        if picture is not None:
+            write_picture(_beside(stem, ending), picture)
+    if depth_m is not None:
+        _write(_beside(stem, DEPTH), depth_m.astype(np.float32))
+    if label is not None:
+        write_picture(_beside(stem, MASK), mask_bits(label))
+    if truth is not None:
+        _write(_beside(stem, TRUTH), (json.dumps(asdict(truth), indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_picture(path: Path, picture: np.ndarray) -> None:
+    """Writes a picture, grey or BGR, as PNG.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    done, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not done:
+        raise StorageError(f"{path}: a picture of shape {picture.shape} cannot be encoded")
+    _write(path, data.tobytes())
+
+
+def is_whole(stem: Path) -> bool:
+    """Says whether a rendered frame has been written to its end."""
+    return _beside(stem, TRUTH).is_file()
+
+
+def _beside(stem: Path, ending: str) -> Path:
+    return stem.with_name(stem.name + ending)
+
+
+def _write(path: Path, value: bytes | np.ndarray) -> None:
+    """Writes a file in one step: readers see all of it or none."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            file.write(value) if isinstance(value, bytes) else np.save(file, value)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise StorageError(f"{path} could not be written: {error.strerror or error}; nothing was left behind") from error

@@ -1,0 +1,205 @@
+"""Solids that a ray can hit: planes, boxes, cylinders, and a block that holes are drilled into.
+
+`M` rays start at `origin`, `(3,)` or `(M, 3)`, along `direction`, `(M, 3)`, all float32 in camera coordinates (m; x right, y down,
+z forward). Directions need not be unit vectors: a hit is given as the factor `t` on the direction, `inf` for a miss. Each solid has
+parts (faces, walls of holes, …) with a material of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from perception.render.texture import Material
+
+NEAR_M = 1e-4
+"""Hits nearer than this are those of the surface that a shadow ray starts on."""
+
+
+class Hits(NamedTuple):
+    """Where rays meet one solid.
+
+    Attributes:
+        t: Factor on the direction, `inf` where they miss, `(M,)`.
+        part: Index of the part, `(M,)` int16.
+        mouth: They pass through the rim of a hole, `(M,)` bool; `None` for solids without.
+    """
+
+    t: np.ndarray
+    part: np.ndarray
+    mouth: np.ndarray | None = None
+
+
+class Surface(NamedTuple):
+    """What a solid is like at `M` points of its surface.
+
+    Attributes:
+        normal: Unit normals, `(M, 3)`.
+        uv_m: Coordinates of the texture in m, `(M, 2)`.
+        openness: Part of the ambient light that arrives, `(M,)`; `None` for all of it.
+        sunlit: The solid itself does not shade the point, `(M,)` bool; `None` where only the normal decides.
+    """
+
+    normal: np.ndarray
+    uv_m: np.ndarray
+    openness: np.ndarray | None = None
+    sunlit: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A place in camera coordinates: `rotation` (columns: the solid's axes, `(3, 3)`) and `center_m`, `(3,)`."""
+
+    rotation: np.ndarray
+    center_m: np.ndarray
+
+    def local(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns rays in the solid's coordinates."""
+        turn = self.rotation.astype(np.float32)
+        return ((origin - self.center_m) @ self.rotation).astype(np.float32), direction @ turn
+
+    def point(self, local_m: np.ndarray) -> np.ndarray:
+        """Returns a point, `(…, 3)`, of the solid's coordinates in those of the camera."""
+        return local_m @ self.rotation.T + self.center_m
+
+
+class Solid(Protocol):
+    """Something that a ray can hit."""
+
+    @property
+    def role(self) -> str:
+        """`block`, `arm`, `ground` or `clutter`."""
+        ...
+
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """One for each part."""
+        ...
+
+    @property
+    def corners_m(self) -> np.ndarray | None:
+        """Points, `(K, 3)`, whose convex hull holds the solid; `None` for one without end."""
+        ...
+
+    def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
+        """Returns where rays meet the solid first."""
+        ...
+
+    def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
+        """Describes the surface at the points, `(M, 3)`; `to_sun` is the unit vector to the light."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane without end: the third axis of `pose` is its normal."""
+
+    role: str
+    pose: Pose
+    materials: tuple[Material, ...]
+    corners_m: None = None
+
+    def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
+        """Returns where rays meet the plane, from either side."""
+        start, along = self.pose.local(origin, direction)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -start[..., 2] / along[:, 2]
+        t = np.where(t > NEAR_M, t, np.inf).astype(np.float32)
+        return Hits(t, np.zeros(len(t), np.int16))
+
+    def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
+        """Describes the plane; its texture lies along its first two axes."""
+        normal = np.broadcast_to(self.pose.rotation[:, 2].astype(np.float32), point.shape)
+        return Surface(normal, (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation[:, :2].astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box about the origin of `pose`. Parts: faces -x, +x, -y, +y, -z, +z; one material may serve all of them."""
+
+    role: str
+    pose: Pose
+    half_m: np.ndarray
+    materials: tuple[Material, ...]
+
+    @property
+    def corners_m(self) -> np.ndarray:
+        """The eight corners."""
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        return self.pose.point(signs * self.half_m)
+
+    def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
+        """Returns where rays enter the box; rays that start inside miss."""
+        start, along = self.pose.local(origin, direction)
+        half = self.half_m.astype(np.float32)
+        enter = np.full(len(along), -np.inf, np.float32)
+        leave = np.full(len(along), np.inf, np.float32)
+        part = np.zeros(len(along), np.int16)
+        for axis in range(3):
+            slope = along[:, axis]
+            slope = np.where(np.abs(slope) < 1e-12, np.float32(1e-12), slope)
+            side = np.where(slope > 0, -half[axis], half[axis])
+            near = (side - start[..., axis]) / slope
+            far = (-side - start[..., axis]) / slope
+            later = near > enter
+            enter = np.where(later, near, enter)
+            part = np.where(later, np.where(slope > 0, 2 * axis, 2 * axis + 1).astype(np.int16), part)
+            leave = np.minimum(leave, far)
+        t = np.where((enter <= leave) & (enter > NEAR_M), enter, np.inf).astype(np.float32)
+        return Hits(t, part)
+
+    def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
+        """Describes faces; opposite ones show different places of the texture."""
+        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(np.float32)
+        axis, sign = part // 2, (2.0 * (part % 2) - 1.0).astype(np.float32)
+        normal = self.pose.rotation.T.astype(np.float32)[axis] * sign[:, None]
+        rows = np.arange(len(part))
+        uv = np.stack([local[rows, (axis + 1) % 3], local[rows, (axis + 2) % 3]], 1)
+        return Surface(normal, uv + 0.37 * part[:, None].astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A cylinder with caps along the third axis of `pose`. Parts: side, cap."""
+
+    role: str
+    pose: Pose
+    radius_m: float
+    half_length_m: float
+    materials: tuple[Material, ...]
+
+    @property
+    def corners_m(self) -> np.ndarray:
+        """The eight corners of the box around it."""
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        return self.pose.point(signs * [self.radius_m, self.radius_m, self.half_length_m])
+
+    def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
+        """Returns where rays enter the cylinder."""
+        start, along = self.pose.local(origin, direction)
+        across = along[:, 0] ** 2 + along[:, 1] ** 2
+        across = np.maximum(across, np.float32(1e-12))
+        # about the point that is nearest to the axis: the difference of large squares would cost the digits that matter
+        middle = -(start[..., 0] * along[:, 0] + start[..., 1] * along[:, 1]) / across
+        x, y = start[..., 0] + middle * along[:, 0], start[..., 1] + middle * along[:, 1]
+        root = np.sqrt(np.maximum(self.radius_m**2 - x * x - y * y, 0.0) / across)
+        outside = x * x + y * y > self.radius_m**2
+        slope = np.where(np.abs(along[:, 2]) < 1e-12, np.float32(1e-12), along[:, 2])
+        side = np.where(slope > 0, -self.half_length_m, self.half_length_m)
+        cap, end = (side - start[..., 2]) / slope, (-side - start[..., 2]) / slope
+        enter, leave = np.maximum(middle - root, cap), np.minimum(middle + root, end)
+        t = np.where((enter <= leave) & (enter > NEAR_M) & ~outside, enter, np.inf).astype(np.float32)
+        return Hits(t, (cap > middle - root).astype(np.int16))
+
+    def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
+        """Describes side and caps; the texture goes round the side."""
+        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(np.float32)
+        side, up = local.copy(), np.zeros_like(local)
+        side[:, 2] = 0.0
+        side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+        up[:, 2] = np.sign(local[:, 2])
+        normal = np.where((part == 0)[:, None], side, up) @ self.pose.rotation.T.astype(np.float32)
+        around = np.stack([np.arctan2(local[:, 1], local[:, 0]) * self.radius_m, local[:, 2]], 1)
+        return Surface(normal, np.where((part == 0)[:, None], around, local[:, :2]).astype(np.float32))

@@ -1,0 +1,119 @@
+"""The studio: draws a scene, takes both pictures of it, matches them, and writes frame and truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from brokk_rl.spec import spec
+from perception import dataset
+from perception.dataset import Circle, Label, Truth
+from perception.drawing import compose
+from perception.render.sensor import dust, photograph
+from perception.render.tracer import Tracer
+from perception.rig import Rig
+from perception.scenes import Scene, Scenes
+from perception.stereo import Stereo
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A rendered frame.
+
+    Attributes:
+        color: Left picture, RGB, `(h, w, 3)` uint8.
+        right: Right picture.
+        depth_m: As a camera would tell it, `(h, w)` float32, NaN where unknown.
+        exact_depth_m: As it is.
+        label: Masks.
+        truth: Holes, decoys, block.
+    """
+
+    color: np.ndarray
+    right: np.ndarray
+    depth_m: np.ndarray
+    exact_depth_m: np.ndarray
+    label: Label
+    truth: Truth
+
+
+@spec
+class Studio:
+    """Renders frames of a kind of scene for a stereo camera, with their truth.
+
+    Attributes:
+        rig: The camera pair.
+        scene: What there is to see.
+        stereo: Makes the depth.
+        depth: `matched` makes depth of the two pictures; `exact` writes the mathematical one; `none` leaves it to the reader.
+    """
+
+    rig: Rig
+    scene: Scenes
+    stereo: Stereo
+    depth: Literal["matched", "exact", "none"]
+
+    def prepare(self, folder: Path) -> None:
+        """Writes what all frames of a folder share."""
+        dataset.write_camera(folder, self.rig.left.matrix, self.rig.base_from_camera, self.rig.baseline_m)
+
+    def has(self, stem: Path) -> bool:
+        """Says whether the frame at `stem` is there, whole."""
+        return dataset.is_whole(stem)
+
+    def shoot(self, stem: Path, generator: np.random.Generator) -> None:
+        """Draws, renders and writes one frame; the same generator makes the same files.
+
+        Raises:
+            StorageError: a file could not be written.
+        """
+        shot = self.shot(compose(self.scene, self.rig, generator), generator)
+        depth = {"matched": shot.depth_m, "exact": shot.exact_depth_m, "none": None}[self.depth]
+        dataset.write_frame(stem, shot.color, depth, shot.right, shot.label, shot.truth)
+
+    def shot(self, scene: Scene, generator: np.random.Generator) -> Shot:
+        """Returns the frame of a scene."""
+        tracer = Tracer(scene.solids, scene.light, scene.sky)
+        left, right = tracer.view(self.rig.left), tracer.view(self.rig.right)
+        density = dust(scene.exposure.patchiness, generator)
+        color, partner = (photograph(view.radiance, view.depth_m, scene.exposure, density, generator) for view in (left, right))
+        depth = left.depth_m
+        if self.depth == "matched":
+            depth = self.stereo.depth_m(color, partner, self.rig.focal_px, self.rig.baseline_m)
+        roles = np.array([solid.role for solid in scene.solids] + ["nothing"])[left.solid]
+        label = Label(roles == "block", left.mouth, roles == "arm")
+        return Shot(color, partner, depth, left.depth_m, label, self._truth(scene))
+
+    def _truth(self, scene: Scene) -> Truth:
+        block = scene.block
+        if block is None:
+            return Truth(self.scene.name, scene.conditions, (), (), {})
+        holes = tuple(
+            self._circle(block.pose.point(hole.center_m), block.pose.rotation @ hole.outward, hole.radius_m, hole.depth_m, hidden)
+            for hole, hidden in zip(block.holes, scene.hidden, strict=True)
+        )
+        decoys = tuple(
+            self._circle(block.pose.point(disc.center_m), block.pose.rotation[:, 2], disc.radius_m, 0.0, 0.0)
+            for disc in block.discs
+        )
+        place = {name: np.asarray(value).tolist() for name, value in
+                 (("center_m", block.pose.center_m), ("rotation", block.pose.rotation), ("half_m", block.half_m))}  # fmt: skip
+        return Truth(self.scene.name, scene.conditions, holes, decoys, place)
+
+    def _circle(self, center: np.ndarray, axis: np.ndarray, radius_m: float, depth_m: float, hidden: float) -> Circle:
+        base = self.rig.base_from_camera
+        first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        first /= np.linalg.norm(first)
+        angle = np.linspace(0, 2 * np.pi, 64)[:, None]
+        rim = center + radius_m * (np.cos(angle) * first + np.sin(angle) * np.cross(axis, first))
+        in_view = False
+        if rim[:, 2].min() > 0.05:
+            pixel = self.rig.left.project(rim)
+            in_view = bool((pixel.min(0) >= 0).all() and (pixel.max(0) <= [self.rig.width - 1, self.rig.height - 1]).all())
+        return Circle(
+            tuple(center.tolist()), tuple(axis.tolist()), tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
+            tuple((base[:3, :3] @ axis).tolist()), float(radius_m), float(depth_m), float(hidden), in_view,
+        )  # fmt: skip
