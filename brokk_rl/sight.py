@@ -10,11 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
 from brokk_rl.signals import Borehole, Frame
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from brokk_rl.session import Session
 
 
 @dataclass(frozen=True)
@@ -261,4 +266,20 @@ class FilterSpec(Protocol):
 
     def build(self) -> TargetFilter:
         """Returns a filter without memory yet."""
+        ...
+
+
+class SegmenterFit(Protocol):
+    """A spec that trains a segmenter: the node `training` of `mode=train_perception`."""
+
+    def fit(self, session: Session, resume: bool) -> dict[str, Any]:
+        """Trains into the session's folder, going on where it was stopped if `resume`; returns what `training.json` says."""
+        ...
+
+
+class Labelling(Protocol):
+    """A spec that makes masks for real footage: the node `label` of `mode=label`."""
+
+    def label(self, folder: Path) -> dict[str, Any]:
+        """Labels into `folder`; returns what `labels.json` says."""
         ...

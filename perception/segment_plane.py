@@ -1,0 +1,238 @@
+"""The block from depth alone: bounded planes that stand in front of what surrounds them.
+
+Inverse depth is the natural coordinate: on a plane `n · P = d` it is linear in the picture, `1/z = (n / d) · (x, y, 1)` with
+`(x, y)` the pixel over the focal length, and a stereo matcher's noise in it is the same at every distance.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.sight import Masks
+from brokk_rl.signals import Frame
+from brokk_rl.spec import spec
+
+
+@spec
+class DepthPlane:
+    """Takes planes that stand in front of their surroundings for the block; needs depth and no training.
+
+    Attributes:
+        width_px: Width of the picture in which planes are looked for.
+        min_known: Part of the pixels whose depth must be known; a frame with less is refused.
+        noise_per_m: Standard deviation of inverse depth, 1/m: disparity noise in px over focal length in px and baseline in m.
+        num_sigma: A pixel belongs to a plane within so many standard deviations.
+        num_trials: Planes through three pixels that are tried for each plane that is kept.
+        num_samples: Pixels that judge a trial.
+        num_planes: Planes that are kept at most.
+        neighbourhood: Width of the window from which the three pixels are drawn, as a part of the picture's width.
+        min_area: Smallest face, as a part of the picture.
+        min_extent_m: Smallest extent of a face.
+        max_extent_m: Largest extent of a face; what is larger is ground or wall.
+        max_tilt_rad: Largest angle between the face's normal and the line of sight.
+        min_front: Of the surroundings that are not in the plane, at least this part must lie behind it.
+        edge_px: Radius of the filter that moves the mask's edge onto the picture's edge, in px of the small picture.
+        edge_contrast: Grey step, of 1, below which the picture does not move the mask's edge.
+        seed: Of the trials; the same frame always gives the same mask.
+    """
+
+    width_px: int
+    min_known: float
+    noise_per_m: float
+    num_sigma: float
+    num_trials: int
+    num_samples: int
+    num_planes: int
+    neighbourhood: float
+    min_area: float
+    min_extent_m: float
+    max_extent_m: float
+    max_tilt_rad: float
+    min_front: float
+    edge_px: int
+    edge_contrast: float
+    seed: int
+
+    def check(self) -> None:
+        counts = (self.width_px, self.num_trials, self.num_samples, self.num_planes, self.edge_px)
+        if min(counts) < 1 or min(self.noise_per_m, self.num_sigma, self.neighbourhood, self.edge_contrast) <= 0:
+            raise ConfigError("perception/segmenter=depth_plane: sizes, counts and noise must be above 0")
+        if not 0 < self.min_extent_m < self.max_extent_m:
+            raise ConfigError(
+                f"segmenter: expected 0 < min_extent_m < max_extent_m, got {self.min_extent_m} and {self.max_extent_m}"
+            )
+
+    def build(self) -> PlaneSegmenter:
+        """Returns the segmenter."""
+        return PlaneSegmenter(self)
+
+
+class PlaneSegmenter:
+    """Finds the block's faces in the depth picture."""
+
+    def __init__(self, settings: DepthPlane) -> None:
+        self._settings = settings
+        self._tolerance = settings.num_sigma * settings.noise_per_m
+
+    def segment(self, frame: Frame) -> Masks:
+        """Returns the block's mask; nobody has looked for mouths.
+
+        Raises:
+            FrameError: too little depth is known.
+        """
+        height, width = frame.depth_m.shape
+        step = max(1, round(width / self._settings.width_px))
+        inverse, known = _shrunk(frame.depth_m, step)
+        if known.mean() < self._settings.min_known:
+            raise FrameError(
+                f"{frame.name or 'frame'}: depth is known in {known.mean():.1%} of the pixels, depth_plane needs "
+                f"{self._settings.min_known:.0%}; check the depth camera, or segment by colour (perception/segmenter=onnx)"
+            )
+        grid = _directions(frame.camera_matrix, inverse.shape, step)
+        face = np.zeros(inverse.shape, np.uint8)
+        for plane in self._planes(grid, inverse, known):
+            face |= self._faces(plane, grid, inverse, known)
+        gray = cv2.cvtColor(cv2.resize(frame.color, (width // 2, height // 2), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+        mask = onto_edges(face.astype(np.float32), gray, self._settings.edge_px, self._settings.edge_contrast)
+        return Masks(cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR), None)
+
+    def _planes(self, grid: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
+        """Returns planes `n / d`, `(3,)`, the best supported first: each explains pixels that those before it do not."""
+        settings, generator = self._settings, np.random.default_rng(self._settings.seed)
+        found, rest = [], known.copy()
+        for _ in range(settings.num_planes):
+            rows, columns = np.nonzero(rest)
+            if len(rows) < settings.min_area * known.size:
+                break
+            trials = self._trials(grid, inverse, rest, rows, columns, generator)
+            judge = generator.integers(len(rows), size=settings.num_samples)
+            there, value = grid[rows[judge], columns[judge]], inverse[rows[judge], columns[judge]]
+            votes = (np.abs(trials @ there.T - value) < self._tolerance).sum(1)
+            best = int(votes.argmax()) if len(votes) else 0
+            if not len(votes) or votes[best] / settings.num_samples * len(rows) < settings.min_area * known.size:
+                break
+            found.append(self._refined(trials[best], grid, inverse, rest))
+            rest &= np.abs(grid @ found[-1] - inverse) >= self._tolerance
+        return found
+
+    def _trials(
+        self,
+        grid: np.ndarray,
+        inverse: np.ndarray,
+        rest: np.ndarray,
+        rows: np.ndarray,
+        columns: np.ndarray,
+        generator: np.random.Generator,
+    ) -> np.ndarray:
+        """Returns planes through three pixels of `rest` that lie near each other, at many scales, `(trials, 3)`."""
+        count, (height, width) = self._settings.num_trials, inverse.shape
+        first = generator.integers(len(rows), size=count)
+        reach = width * self._settings.neighbourhood * generator.uniform(0.2, 1.0, count)
+        shift = np.rint(generator.uniform(-1.0, 1.0, (2, 2, count)) * reach).astype(int)
+        corner_rows = np.stack([rows[first], *np.clip(rows[first] + shift[0], 0, height - 1)])
+        corner_columns = np.stack([columns[first], *np.clip(columns[first] + shift[1], 0, width - 1)])
+        corners = grid[corner_rows, corner_columns].transpose(1, 0, 2)  # (trials, 3 pixels, 3)
+        usable = rest[corner_rows, corner_columns].all(0) & (np.abs(np.linalg.det(corners)) > 1e-5)
+        values = inverse[corner_rows, corner_columns].T[usable]
+        return np.linalg.solve(corners[usable], values[..., None].astype(float))[..., 0].astype(np.float32)
+
+    def _refined(self, plane: np.ndarray, grid: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Returns the least-squares plane of the pixels that agree with `plane`."""
+        for _ in range(2):
+            inside = known & (np.abs(grid @ plane - inverse) < self._tolerance)
+            if inside.sum() < 3:
+                break
+            plane = np.linalg.lstsq(grid[inside], inverse[inside], rcond=None)[0]
+        return plane
+
+    def _faces(self, plane: np.ndarray, grid: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Returns where connected pieces of a plane look like a face of a block, `(h, w)` uint8 of 0 and 1."""
+        settings = self._settings
+        excess = inverse - grid @ plane  # > 0: nearer than the plane
+        support = (known & (np.abs(excess) < self._tolerance)).astype(np.uint8)
+        support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+        count, labels, stats, centres = cv2.connectedComponentsWithStats(support, connectivity=4)
+        faces = np.zeros_like(support)
+        for label in range(1, count):
+            if stats[label, cv2.CC_STAT_AREA] < settings.min_area * support.size:
+                continue
+            piece = _filled((labels == label).astype(np.uint8), known & (excess > self._tolerance))
+            column, row = (round(float(value)) for value in centres[label])
+            sight = grid[row, column]
+            tilt_rad = np.arccos(np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0))
+            extents_m = _extents(piece, plane, grid)
+            if (
+                tilt_rad > settings.max_tilt_rad
+                or extents_m.min() < settings.min_extent_m
+                or extents_m.max() > settings.max_extent_m
+            ):
+                continue
+            if self._front(piece, excess, known) >= settings.min_front:
+                faces |= piece
+        return faces
+
+    def _front(self, piece: np.ndarray, excess: np.ndarray, known: np.ndarray) -> float:
+        """Returns which part of what surrounds a piece lies behind its plane, a half where nothing speaks for either side."""
+        near, far = (cv2.dilate(piece, np.ones((size, size), np.uint8)) for size in (5, 9))
+        ring = (far > near) & known
+        behind = np.count_nonzero(excess[ring] < -self._tolerance)
+        before = np.count_nonzero(excess[ring] > self._tolerance)
+        doubt = 0.05 * np.count_nonzero(ring) + 1.0
+        return (behind + 0.5 * doubt) / (behind + before + doubt)
+
+
+def onto_edges(mask: np.ndarray, gray: np.ndarray, radius_px: int, contrast: float) -> np.ndarray:
+    """Moves the edges of a small mask onto those of a larger picture by a guided filter (He and Sun, Fast Guided Filter, 2015).
+
+    Args:
+        mask: `(h, w)` float32 in [0, 1].
+        gray: The same view, larger, uint8.
+        radius_px: Radius of the filter in px of the mask.
+        contrast: Grey step, of 1, below which the picture does not count.
+
+    Returns:
+        The mask in the size of `gray`, float32 in [0, 1].
+    """
+    height, width = mask.shape
+    guide = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+    size = (2 * radius_px + 1, 2 * radius_px + 1)
+    mean_guide, mean_mask = cv2.blur(guide, size), cv2.blur(mask, size)
+    slope = (cv2.blur(guide * mask, size) - mean_guide * mean_mask) / (cv2.blur(guide * guide, size) - mean_guide**2 + contrast**2)
+    offset = cv2.blur(mean_mask - slope * mean_guide, size)
+    full = (gray.shape[1], gray.shape[0])
+    slope = cv2.resize(cv2.blur(slope, size), full, interpolation=cv2.INTER_LINEAR)
+    return np.clip(slope * (gray * np.float32(1 / 255)) + cv2.resize(offset, full, interpolation=cv2.INTER_LINEAR), 0.0, 1.0)
+
+
+def _shrunk(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns inverse depth in 1/m at the middle of each `step` x `step` cell, `(h, w)` float32, and where it is known."""
+    depth = depth_m[step // 2 :: step, step // 2 :: step]
+    known = np.isfinite(depth) & (depth > 0)
+    return np.divide(1.0, depth, out=np.zeros(depth.shape, np.float32), where=known), known
+
+
+def _directions(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> np.ndarray:
+    """Returns `(x, y, 1)` of the pixels that `_shrunk` keeps, `(h, w, 3)`: the line of sight at depth 1."""
+    rows, columns = (np.arange(count) * step + step // 2 for count in shape)
+    x = (columns - camera_matrix[0, 2]) / camera_matrix[0, 0]
+    y = (rows - camera_matrix[1, 2]) / camera_matrix[1, 1]
+    return np.stack([*np.meshgrid(x, y), np.ones(shape)], axis=-1).astype(np.float32)
+
+
+def _filled(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
+    """Fills a piece's holes (a mouth, lost depth), except where something stands in front of it."""
+    outlines, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    whole = cv2.drawContours(np.zeros_like(piece), outlines, -1, 1, cv2.FILLED)
+    hidden = cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return np.where(np.asarray(hidden) > 0, 0, whole).astype(np.uint8)
+
+
+def _extents(piece: np.ndarray, plane: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Returns the two extents in m that a rectangle with the piece's second moments would have."""
+    sight = grid[piece > 0]
+    points = sight / np.maximum(sight @ plane, 1e-6)[:, None]
+    spread = np.linalg.eigvalsh(np.cov(points.T))[1:]  # the smallest is the plane's own thickness
+    return np.sqrt(12.0 * np.maximum(spread, 0.0))

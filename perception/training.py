@@ -1,0 +1,285 @@
+"""Training the segmenter: samples made on the CPU's cores, the network on whatever there is, best by unseen frames."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import logging
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch.utils.data import DataLoader
+
+from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from perception import export, training_data, training_report
+from perception.augment import Augmentation
+from perception.training_data import Batches, Crop, Samples, Views
+from perception.unet import UNet, loss
+
+STATE = "training.pt"
+"""What an interrupted training goes on from."""
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class SegmenterTraining:
+    """Fits a U-Net to frames with masks.
+
+    Attributes:
+        frames: Folder, or list of folders, of frames with masks, those below them too.
+        validation: Folders to judge by; `null` sets a part of `frames` aside.
+        hold_out: Without `validation`, one part in so many is kept from the training: a run of frames at the end.
+        size_px: Width and height of the network's picture.
+        widths: Channels of the network at each size, the full picture first.
+        updates: Steps of the optimiser.
+        batch: Samples a step.
+        rate: Learning rate at its highest; it rises for a twentieth of the updates, then falls as a cosine to nothing.
+        decay: Weight decay.
+        closer: How often a sample is cut from the closer view of the block.
+        margin: Room around the block in that view, as a part of its box; that of the segmenter.
+        validate_every: Updates between two judgements, after each of which the training can go on if it is stopped.
+        workers: Processes that make samples; 0 makes them in this one, `null` takes one for each CPU core but one.
+        crop: Which part of a view a sample shows.
+        augment: What happens to its picture, by name, in this order.
+    """
+
+    frames: str | tuple[str, ...]
+    validation: str | tuple[str, ...] | None
+    hold_out: int
+    size_px: tuple[int, int]
+    widths: tuple[int, ...]
+    updates: int
+    batch: int
+    rate: float
+    decay: float
+    closer: float
+    margin: float
+    validate_every: int
+    workers: int | None
+    crop: Crop
+    augment: dict[str, Augmentation]
+
+    def check(self) -> None:
+        multiple = 2 ** (len(self.widths) - 1)
+        if any(side % multiple for side in self.size_px) or min(self.size_px, default=0) <= 0:
+            raise ConfigError(
+                f"training.size_px: {len(self.widths)} widths halve it {len(self.widths) - 1} times, so expected multiples of "
+                f"{multiple}, got {list(self.size_px)}"
+            )
+        if min(self.updates, self.batch, self.validate_every) < 1 or self.hold_out < 2 or self.rate <= 0:
+            raise ConfigError("training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or more, rate above 0")
+
+    def fit(self, session: Session, resume: bool) -> dict[str, Any]:
+        """Trains; leaves the network as safetensors and ONNX, curve and samples as PNG in the session's folder.
+
+        Returns:
+            What `training.json` says: `conditions` (see `training_report.judged`), `best_update`, `parameters`, `parity`, …
+
+        Raises:
+            FrameError: frames or masks cannot be used.
+            CheckpointError: there is nothing to go on from, it is another training, or the export says something else.
+        """
+        return _Training(self, session, resume).run()
+
+
+class _Training:
+    """A training under way."""
+
+    def __init__(self, settings: SegmenterTraining, session: Session, resume: bool) -> None:
+        self._settings, self._session, self._folder = settings, session, session.folder
+        self._device = session.torch_device()
+        session.seed_all()
+        self._train, self._unseen = self._views()
+        self._network = UNet(settings.widths).to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._optimizer = torch.optim.AdamW(self._network.parameters(), lr=settings.rate, weight_decay=settings.decay)
+        self._update, self._best, self._curve = 0, {"score": -1.0, "update": 0}, []
+        self._best_tensors: dict[str, torch.Tensor] = {}
+        self._stamp = self._identity()
+        if resume:
+            self._load()
+
+    def run(self) -> dict[str, Any]:
+        settings = self._settings
+        pictures, known = training_report.looked_at(self._unseen, settings.size_px)
+        total = torch.zeros((), device=self._device)
+        count = settings.updates - self._update
+        log.info("%d frames to train on, %d to judge by, %s", len(self._train), len(self._unseen), self._device)
+        with _progress(self._update, settings.updates) as advance:
+            for picture, target in self._loader(count):
+                total += self._step(picture, target)
+                self._update += 1
+                advance()
+                if self._update % settings.validate_every == 0 or self._update == settings.updates:
+                    since = self._update - (self._curve[-1]["update"] if self._curve else 0)
+                    self._validate(pictures, known, float(total) / since)
+                    total.zero_()
+                    self._save()
+        return self._finish(pictures, known)
+
+    def _views(self) -> tuple[Views, Views]:
+        settings, seed = self._settings, self._session.stream("views")
+        stems = training_data.frames(_several(settings.frames))
+        if settings.validation is None:
+            last = max(1, len(stems) // settings.hold_out)
+            stems, unseen = stems[:-last], stems[-last:]
+        else:
+            unseen = training_data.frames(_several(settings.validation))
+            if shared := {path.resolve() for path in stems} & {path.resolve() for path in unseen}:
+                raise ConfigError(f"training.validation: {min(shared)} is also among training.frames; judge by other frames")
+        if not stems:
+            raise ConfigError("training.frames: one frame is too few to train on and to judge by")
+        both = training_data.read([*stems, *unseen], settings.size_px, settings.margin, seed)
+        number = np.arange(len(both))
+        return both.part(number[: len(stems)]), both.part(number[len(stems) :])
+
+    def _loader(self, count: int) -> DataLoader:
+        settings = self._settings
+        samples = Samples(
+            self._train, settings.crop, settings.augment, settings.size_px, settings.closer, self._session.stream("samples")
+        )
+        workers = _cores() - 1 if settings.workers is None else settings.workers
+        return DataLoader(
+            samples,
+            batch_sampler=Batches(settings.updates - count, settings.updates, settings.batch),
+            num_workers=workers,
+            pin_memory=self._device.type == "cuda",
+            prefetch_factor=4 if workers else None,
+            worker_init_fn=_alone,
+        )
+
+    def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        self._network.train()
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._rate()
+        inputs = picture.to(self._device, non_blocking=True).to(memory_format=torch.channels_last).float() / 255.0
+        value = loss(self._network(inputs), target.to(self._device, non_blocking=True).float() / 255.0)
+        self._optimizer.zero_grad(set_to_none=True)
+        value.backward()
+        torch.nn.utils.clip_grad_norm_(self._network.parameters(), 1.0)
+        self._optimizer.step()
+        return value.detach()
+
+    def _rate(self) -> float:
+        rise = max(1.0, self._settings.updates / 20.0)
+        fall = 0.5 * (1.0 + math.cos(math.pi * self._update / self._settings.updates))
+        return self._settings.rate * min(1.0, (self._update + 1) / rise) * fall
+
+    def _validate(self, pictures: torch.Tensor, known: torch.Tensor, mean_loss: float) -> None:
+        probabilities = training_report.predicted(self._network, pictures, self._device)
+        figures = training_report.judged(probabilities, known, self._unseen.conditions)["all"]
+        block, mouth = figures["block"] or 0.0, figures["mouth"] or 0.0
+        self._curve.append({"update": self._update, "loss": mean_loss, "block": block, "mouth": mouth})
+        if not math.isfinite(mean_loss):
+            raise CheckpointError(f"the training diverged before update {self._update}; try a smaller training.rate")
+        if block + mouth > self._best["score"]:
+            self._best = {"score": block + mouth, "update": self._update}
+            self._best_tensors = {name: value.cpu().clone() for name, value in self._network.state_dict().items()}
+        log.info("update %d: loss %.4f, overlap of blocks %.3f, of mouths %.3f", self._update, mean_loss, block, mouth)
+
+    def _finish(self, pictures: torch.Tensor, known: torch.Tensor) -> dict[str, Any]:
+        network = UNet(self._settings.widths)
+        network.load_state_dict(self._best_tensors)
+        network.eval().requires_grad_(False)
+        probabilities = training_report.predicted(network.to(self._device), pictures, self._device)
+        conditions = training_report.judged(probabilities, known, self._unseen.conditions)
+        network.cpu()
+        facts = {
+            "overlap": {name: conditions["all"][name] for name in ("block", "mouth")},
+            "frames": len(self._train),
+            "update": self._best["update"],
+            "margin": self._settings.margin,
+            "data": self._stamp["data"],
+        }
+        header = export.header_of(network, self._settings.size_px, facts)
+        export.write(self._folder / export.TENSORS, network, header)
+        compared = pictures[: min(len(pictures), 8)].flatten(0, 1).float() / 255.0
+        parity = export.write_onnx(self._folder / export.ONNX, network, header, compared)
+        training_report.draw_curve(self._folder / "curve.png", self._curve)
+        training_report.draw_samples(self._folder / "samples.png", pictures, probabilities, known)
+        return {
+            "schema": 1,
+            "conditions": conditions,
+            "best_update": self._best["update"],
+            "updates": self._update,
+            "parameters": sum(value.numel() for value in network.parameters()),
+            "onnx_bytes": (self._folder / export.ONNX).stat().st_size,
+            "parity": parity,
+            "frames": {"train": len(self._train), "validation": len(self._unseen)},
+            "device": str(self._device),
+            "curve": self._curve,
+        }
+
+    def _identity(self) -> dict[str, str]:
+        """Returns what must be the same for a training to go on."""
+        settings = self._settings
+        same = (settings.size_px, settings.widths, settings.updates, settings.batch, settings.rate, settings.decay, settings.closer,
+                settings.margin, settings.crop, settings.augment, self._session.seed)  # fmt: skip
+        data = hashlib.sha256()
+        for views in (self._train, self._unseen):
+            data.update(views.pictures[:: max(1, len(views) // 50)].tobytes())
+            data.update(views.shares[:: max(1, len(views) // 50)].tobytes())
+        return {"settings": hashlib.sha256(repr(same).encode()).hexdigest()[:16], "data": data.hexdigest()[:16]}
+
+    def _save(self) -> None:
+        content = io.BytesIO()
+        torch.save(
+            {
+                "stamp": self._stamp, "update": self._update, "best": self._best, "curve": self._curve,
+                "network": self._network.state_dict(), "optimizer": self._optimizer.state_dict(),
+                "best_tensors": self._best_tensors,
+            },
+            content,
+        )  # fmt: skip
+        export.write_bytes(self._folder / STATE, content.getvalue())
+
+    def _load(self) -> None:
+        path = self._folder / STATE
+        if not path.is_file():
+            log.info("%s: nothing was kept yet, the training begins anew", path)
+            return
+        try:
+            state = torch.load(path, map_location=self._device, weights_only=True)
+        except Exception as error:  # torch raises whatever its unpickler meets
+            raise CheckpointError(f"{path}: corrupt ({error}); delete it to begin the training again") from error
+        if state["stamp"] != self._stamp:
+            differing = [name for name, value in self._stamp.items() if state["stamp"].get(name) != value]
+            raise CheckpointError(
+                f"{path}: an interrupted training that cannot go on: its {' and '.join(differing)} differ. Train with what it "
+                "began with, or choose another folder (session.out=…)."
+            )
+        self._network.load_state_dict(state["network"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._update, self._best, self._curve = state["update"], state["best"], state["curve"]
+        self._best_tensors = {name: value.cpu() for name, value in state["best_tensors"].items()}
+
+
+def _several(folders: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (folders,) if isinstance(folders, str) else folders
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _alone(_: int) -> None:
+    """Keeps each process that makes samples to one core: there is one for each."""
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+
+
+@contextmanager
+def _progress(done: int, total: int) -> Iterator[Any]:
+    columns = (TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True) as progress:
+        task = progress.add_task("training", total=total, completed=done)
+        yield lambda: progress.advance(task)

@@ -1,0 +1,85 @@
+"""The network: a small U-Net (Ronneberger et al., 2015) from a colour picture to the block and the mouths of its holes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+CHANNELS = ("block", "mouth")
+"""What the network tells apart; channels overlap: a mouth lies in its block."""
+
+
+class UNet(nn.Module):
+    """Halves the picture `len(widths) - 1` times and comes back, with a bridge at each size.
+
+    Args:
+        widths: Channels at each size, the full picture first.
+    """
+
+    def __init__(self, widths: Sequence[int]) -> None:
+        super().__init__()
+        self.widths = tuple(widths)
+        self.down = nn.ModuleList(_Pair(before, after) for before, after in zip((3, *widths[:-1]), widths, strict=True))
+        back = list(widths[::-1])
+        # each step up takes what came from below beside the bridge and leaves half as many, as the size above has
+        below, steps = back[0], []
+        for here, above in zip(back[1:], [*back[2:], back[-1]], strict=True):
+            steps.append(_Pair(below + here, above))
+            below = above
+        self.up = nn.ModuleList(steps)
+        self.head = nn.Conv2d(below, len(CHANNELS), 1)
+        nn.init.constant_(self.head.bias, -2.0)  # type: ignore[arg-type] (both are rare in a picture)
+
+    @property
+    def multiple(self) -> int:
+        """Height and width of a picture are multiples of this."""
+        return 2 ** (len(self.widths) - 1)
+
+    def forward(self, picture: torch.Tensor) -> torch.Tensor:
+        """Returns logits, `(B, 2, h, w)`, of RGB pictures `(B, 3, h, w)` in [0, 1]."""
+        x, bridges = picture * 4.0 - 2.0, []
+        for number, pair in enumerate(self.down):
+            x = pair(x if number == 0 else functional.max_pool2d(x, 2))
+            bridges.append(x)
+        for pair, bridge in zip(self.up, bridges[-2::-1], strict=True):
+            x = pair(torch.cat([functional.interpolate(x, scale_factor=2.0, mode="nearest"), bridge], 1))
+        return self.head(x)
+
+
+class Probabilities(nn.Module):
+    """A network as it is used: probabilities instead of logits."""
+
+    def __init__(self, network: UNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, picture: torch.Tensor) -> torch.Tensor:
+        """Returns probabilities, `(B, 2, h, w)`."""
+        return torch.sigmoid(self.network(picture))
+
+
+def loss(logits: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Returns binary cross-entropy plus Dice (Milletari et al., 2016), both averaged over the channels.
+
+    Args:
+        logits: `(B, 2, h, w)`.
+        target: Share of each pixel that shows the channel, same shape, in [0, 1].
+    """
+    entropy = functional.binary_cross_entropy_with_logits(logits, target)
+    probability = torch.sigmoid(logits)
+    # over the whole batch: a picture without a hole has no overlap of its own to speak of
+    shared, both = (probability * target).sum((0, 2, 3)), (probability + target).sum((0, 2, 3))
+    return entropy + (1.0 - (2.0 * shared + 1.0) / (both + 1.0)).mean()
+
+
+class _Pair(nn.Sequential):
+    """Two 3 x 3 convolutions, each normalised over the batch and rectified."""
+
+    def __init__(self, before: int, after: int) -> None:
+        layers: list[nn.Module] = []
+        for channels in (before, after):
+            layers += [nn.Conv2d(channels, after, 3, padding=1, bias=False), nn.BatchNorm2d(after), nn.ReLU(inplace=True)]
+        super().__init__(*layers)
