@@ -19,7 +19,7 @@ from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.noise import increments
 from brokk_rl.diagnosis.repair import Repair, repair
 from brokk_rl.diagnosis.search import Chosen, Price, Table, choose
-from brokk_rl.diagnosis.shapes import SMALL, Nulls, add
+from brokk_rl.diagnosis.shapes import SMALL, Nulls, add, plain_joints
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.sizes import Shape
 from brokk_rl.spec import spec
@@ -172,11 +172,11 @@ class Search:
     ) -> tuple[list[Table], Chosen, Repair | None]:
         """Searches sets where errors scatter more than the noise says: they are worth less by as much."""
         tables, flat = [], dict.fromkeys(grown, self.prices.joint)
-        for j, mine in enumerate(shapes):
+        for j, (mine, joint) in enumerate(zip(shapes, plain_joints(evidence, scatter), strict=True)):
             self.tell(f"trying sets on joint {j + 1}", 0.55 + 0.1 * j / len(shapes))
             by = 1.0 / np.sqrt(scatter[j])
             scaled = {name: [Shape(shape.sizes, shape.change * by) for shape in own] for name, own in mine.items()}
-            tables.append(Table(evidence.z[j] * by, scaled, evidence.fold, evidence.block))
+            tables.append(Table(joint, scaled, evidence.block))
             tables[-1].explore(flat, 3)
         self.tell("the same on the reference", 0.7)
         prices = self.prices

@@ -9,8 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import torch
 
 from brokk_rl.diagnosis.candidates import Candidates
 from brokk_rl.diagnosis.library import Kind
@@ -18,6 +20,9 @@ from brokk_rl.diagnosis.noise import LONGEST, Noise, increments
 
 GRID = (0.1, 0.25, 0.45, 0.7, 1.0, 1.4, 1.9, 2.5)
 """Sizes, over the typical one, at which an effect is simulated; in between its doing is interpolated."""
+
+GAIN, FAULT_S, FAULT = 0.01, 0.004, 0.01
+"""What a simulator gets wrong from day to day, and what is no effect: speeds by a percent, times in s, other numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +172,18 @@ class Evidence:
     def z(self) -> np.ndarray:
         """The error over its noise, `(J, E)`."""
         return self.whitened(self.error[None])[:, 0]
+
+    @cached_property
+    def faults(self) -> np.ndarray:
+        """What small faults of the simulator itself change, over the noise, `(J, P, E)`, each by its prior standard deviation."""
+        found = [self.whitened((self.way * GAIN * side)[None]) for side in (self.way > 0, self.way < 0)]
+        candidates = self.candidates
+        model: Any = candidates.base.build(candidates.machine, 1, torch.device("cpu"))
+        for name, value in (getattr(model, "parameters", None) or {}).items():
+            by = FAULT_S if name.endswith("_s") else FAULT
+            moved = increments(candidates.paths([], 1, {name: value.numpy() + by})[0], self.start) - self.way
+            found.append(self.whitened(moved[None]))
+        return np.concatenate(found, 1)
 
     def response(self, ray: Ray) -> np.ndarray:
         """Returns what an effect on all joints changes at each size of the ray, over the noise, `(J, C, E)`."""

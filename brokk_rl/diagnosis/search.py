@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
-from brokk_rl.diagnosis.sizes import Shape, earned
+from brokk_rl.diagnosis.sizes import Plain, Shape, earned
 
 MOST = 4
 """Effects in a set."""
@@ -57,15 +57,13 @@ class Table:
     """Subsets of effects that were tried on one joint, and what they earn.
 
     Attributes:
-        z: The joint's errors over the noise, `(E,)`.
+        joint: The joint's errors over the noise.
         shapes: By effect: one shape a ray; effects that do nothing to the joint are absent.
-        fold: Half of the recordings of each entry.
         block: Part of the recordings, the same for neighbours, of each entry.
     """
 
-    z: np.ndarray
+    joint: Plain
     shapes: dict[str, list[Shape]]
-    fold: np.ndarray
     block: np.ndarray
     scored: dict[Subset, Scored] = field(default_factory=dict)
 
@@ -75,8 +73,8 @@ class Table:
             names = sorted(subset)
             shapes = [shape for name in names for shape in self.shapes[name]]
             if not shapes:
-                return Scored(np.zeros(len(self.z)), {})
-            gain, sizes = earned(self.z, shapes, self.fold)
+                return Scored(np.zeros(len(self.joint.z)), {})
+            gain, sizes = earned(self.joint, shapes)
             ends = np.cumsum([len(self.shapes[name]) for name in names])[:-1]
             self.scored[subset] = Scored(gain, dict(zip(names, np.split(sizes, ends), strict=True)))
         return self.scored[subset]

@@ -14,12 +14,14 @@ from brokk_rl.diagnosis.evidence import Evidence, Ray
 from brokk_rl.diagnosis.noise import loss
 from brokk_rl.diagnosis.search import Table
 from brokk_rl.diagnosis.simulator import Base
-from brokk_rl.diagnosis.sizes import Shape, fitted, predicted
+from brokk_rl.diagnosis.sizes import Plain, Shape, fitted, plain, predicted
 
 SHAPES = (0.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
 SMALL = (0.12, 0.5)
 """Sizes at which effects are simulated on the reference: what they find there is small."""
+WIDE = 6.0
+"""Faults of the simulator reach so many times their prior standard deviation."""
 FELT = 1e-3
 """An effect that changes errors over the noise by less does nothing to a joint."""
 
@@ -49,6 +51,16 @@ def add(shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray]
     return [replace(ray, shape=shape) for ray in ways]
 
 
+def plain_joints(evidence: Evidence, scatter: np.ndarray | None = None) -> list[Plain]:
+    """Returns the errors of each joint with small faults of the simulator, in units of `scatter` times the noise."""
+    by = np.ones(len(evidence.z)) if scatter is None else 1.0 / np.sqrt(scatter)
+    joints = []
+    for j, z in enumerate(evidence.z):
+        faults = [Shape(np.array([-WIDE, 0.0, WIDE]), np.stack([-WIDE * c, 0.0 * c, WIDE * c]) * by[j]) for c in evidence.faults[j]]
+        joints.append(plain(z * by[j], faults, evidence.fold))
+    return joints
+
+
 def _all(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:
     return {name: np.full(joints, part) for name, part in trial.items()}
 
@@ -71,7 +83,7 @@ class Nulls:
         """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field."""
         if not self.tables:
             parts = [one.evidence for one in self.base.nulls]
-            self.tables = [[Table(z, {}, part.fold, part.block) for z in part.z] for part in parts]
+            self.tables = [[Table(joint, {}, part.block) for joint in plain_joints(part)] for part in parts]
         for name in subset - self.known:
             for tables, one in zip(self.tables, self.base.nulls, strict=True):
                 add([table.shapes for table in tables], name, self._ways(name), one.evidence)
@@ -80,5 +92,5 @@ class Nulls:
         for tables in self.tables:
             mine = tables[j]
             usable = frozenset(name for name in subset if name in mine.shapes)
-            found = max(found, mine.score(usable).total * entries / len(mine.z))
+            found = max(found, mine.score(usable).total * entries / len(mine.joint.z))
         return found

@@ -22,10 +22,11 @@ PRIOR = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What growing along a ray does to one joint: `change` `(S, E)` at `sizes` `(S,)`."""
+    """What growing along a ray does to one joint: `change` `(S, E)` at `sizes` `(S,)`, which are `prior` wide beforehand."""
 
     sizes: np.ndarray
     change: np.ndarray
+    prior: float = PRIOR
 
     def at(self, size: float) -> tuple[np.ndarray, np.ndarray]:
         """Returns the change at a size and its slope over the size, each `(E,)`."""
@@ -35,7 +36,7 @@ class Shape:
 
     def part(self, rows: np.ndarray) -> Shape:
         """Returns the shape on some entries only."""
-        return Shape(self.sizes, self.change[:, rows])
+        return Shape(self.sizes, self.change[:, rows], self.prior)
 
 
 def predicted(shapes: Sequence[Shape], sizes: np.ndarray) -> np.ndarray:
@@ -45,13 +46,16 @@ def predicted(shapes: Sequence[Shape], sizes: np.ndarray) -> np.ndarray:
 
 def fitted(z: np.ndarray, shapes: Sequence[Shape], start: np.ndarray | None = None) -> np.ndarray:
     """Returns the sizes that explain the errors `z` `(E,)` best: most likely under a t distribution and a wide prior."""
+    if not shapes:
+        return np.zeros(0)
     low, high = (np.array([shape.sizes[end] for shape in shapes]) for end in (0, -1))
+    prior = np.array([shape.prior for shape in shapes])
     size = np.array([_best(z, shape) for shape in shapes]) if start is None else start.copy()
     if len(shapes) > 1 and start is None:
         size *= 0.7
 
     def total(at: np.ndarray) -> float:
-        return float(loss(z - predicted(shapes, at))) + 0.5 * float(np.square(at / PRIOR).sum())
+        return float(loss(z - predicted(shapes, at))) + 0.5 * float(np.square(at / prior).sum())
 
     now = total(size)
     damping = 1e-3
@@ -59,8 +63,8 @@ def fitted(z: np.ndarray, shapes: Sequence[Shape], start: np.ndarray | None = No
         pairs = [shape.at(one) for shape, one in zip(shapes, size, strict=True)]
         left, slope = z - np.sum([pair[0] for pair in pairs], 0), np.stack([pair[1] for pair in pairs])
         weighted = slope * weight(left)
-        normal = weighted @ slope.T + np.eye(len(size)) / PRIOR**2
-        gradient = weighted @ left - size / PRIOR**2
+        normal = weighted @ slope.T + np.diag(prior**-2.0)
+        gradient = weighted @ left - size / prior**2
         improved = False
         for _ in range(3):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
@@ -79,27 +83,54 @@ def fitted(z: np.ndarray, shapes: Sequence[Shape], start: np.ndarray | None = No
 def _best(z: np.ndarray, shape: Shape) -> float:
     """Returns the best of the simulated sizes and those in the middle between them."""
     trials = np.unique(np.concatenate([shape.sizes, (shape.sizes[1:] + shape.sizes[:-1]) / 2]))
-    totals = [float(loss(z - shape.at(size)[0])) + 0.5 * size**2 / PRIOR**2 for size in trials]
+    totals = [float(loss(z - shape.at(size)[0])) + 0.5 * size**2 / shape.prior**2 for size in trials]
     return float(trials[int(np.argmin(totals))])
 
 
-def earned(z: np.ndarray, shapes: Sequence[Shape], fold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@dataclass(frozen=True)
+class Plain:
+    """A joint's errors without any effect, small faults of the simulator itself fitted.
+
+    Attributes:
+        z: Errors over the noise, `(E,)`.
+        fold: Half of the recordings of each entry.
+        faults: What the simulator's own numbers change.
+        loss: Loss of each entry where faults were fitted to the other half.
+    """
+
+    z: np.ndarray
+    fold: np.ndarray
+    faults: Sequence[Shape]
+    loss: np.ndarray
+
+
+def plain(z: np.ndarray, faults: Sequence[Shape], fold: np.ndarray) -> Plain:
+    """Returns a joint's errors with the simulator's faults fitted crosswise."""
+    return Plain(z, fold, faults, _each(z - crossed(z, faults, fold, fitted(z, faults))))
+
+
+def crossed(z: np.ndarray, shapes: Sequence[Shape], fold: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Returns what shapes change, `(E,)`, on each half with sizes fitted to the other."""
+    change = np.zeros(len(z))
+    for half in (0, 1):
+        own, other = fold != half, fold == half
+        if shapes and own.any() and other.any():
+            size = fitted(z[own], [shape.part(own) for shape in shapes], start)
+            change[other] = predicted([shape.part(other) for shape in shapes], size)
+    return change
+
+
+def earned(joint: Plain, shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
     """Returns by how much shapes fitted to one half of the entries lower the loss of the other, entry by entry `(E,)`.
 
     Returns:
         What each entry earns, and the sizes fitted to all.
     """
-    gain = np.zeros(len(z))
-    whole = fitted(z, shapes)
-    for half in (0, 1):
-        own, other = fold != half, fold == half
-        if not own.any() or not other.any():
-            continue
-        size = fitted(z[own], [shape.part(own) for shape in shapes], whole)
-        held = z[other]
-        change = predicted([shape.part(other) for shape in shapes], size)
-        gain[other] = _each(held) - _each(held - change)
-    return gain, whole
+    every = [*shapes, *joint.faults]
+    alone = fitted(joint.z, shapes)
+    start = np.concatenate([alone, np.zeros(len(joint.faults))])
+    whole = fitted(joint.z, every, start)
+    return joint.loss - _each(joint.z - crossed(joint.z, every, joint.fold, whole)), whole[: len(shapes)]
 
 
 def _each(z: np.ndarray) -> np.ndarray:
