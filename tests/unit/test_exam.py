@@ -204,17 +204,15 @@ def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("roughness", "least_rad", "most_rad"), [("mild", 0.005, 0.013), ("strong", 0.012, 0.028)])
-def test_floors_are_as_stated(
-    brokk: Callable[..., Any], machine: Machine, tmp_path: Path, roughness: str, least_rad: float, most_rad: float
-) -> None:
+def test_a_mild_floor_is_as_stated(brokk: Callable[..., Any], machine: Machine, tmp_path: Path) -> None:
+    # the machine of seed 2 is the make that simulates fastest; benchmarks/exam/floors.py does the same for any number of others
     shares = "exam.mix.shares={none: 1.0, faint: 0, one: 0, several: 0, outside: 0}"
-    made = brokk("mode=exam", "exam.mix.num_cases=3", shares, f"exam.roughness={roughness}", f"session.out={tmp_path / 'exam'}")
+    few = ("mode=exam", "session.seed=2", "exam.mix.num_cases=1", shares, "exam.roughness=mild")
+    made = brokk(*few, f"session.out={tmp_path / 'exam'}")
     assert made.code == 0, made.err
-    floors = []
-    for case in sorted((tmp_path / "exam" / paper.CASES).iterdir()):
-        reference, field = (record.read_all(str(case / half / "*.parquet"), machine) for half in ("reference", "field"))
-        base = option("fit", "valve").fit(machine, reference, [], tmp_path, 0, torch.device("cpu"))
-        cut = open_loop.windows(field, machine, 5.0, 2.5)
-        floors.append(float(np.sqrt(np.square(open_loop.free_run(base, machine, cut, torch.device("cpu")) - cut.measured).mean())))
-    assert least_rad < min(floors) and max(floors) < most_rad, floors
+    case = tmp_path / "exam" / paper.CASES / "0000"
+    reference, field = (record.read_all(str(case / half / "*.parquet"), machine) for half in ("reference", "field"))
+    base = option("fit", "valve").fit(machine, reference, [], tmp_path, 0, torch.device("cpu"))
+    cut = open_loop.windows(field, machine, 5.0, 2.5)
+    error = open_loop.free_run(base, machine, cut, torch.device("cpu")) - cut.measured
+    assert 0.005 < np.sqrt(np.square(error).mean()) < 0.013
