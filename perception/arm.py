@@ -47,7 +47,8 @@ def _parts(start: np.ndarray, ray: np.ndarray, sideways: np.ndarray, generator: 
     thick = float(generator.uniform(0.05, 0.12))
     yellow = np.clip(np.array([0.75, 0.45, 0.08]) * generator.uniform(0.3, 1.2) + 0.05 * generator.standard_normal(3), 0.02, 0.9)
     paint = Material((float(yellow[0]), float(yellow[1]), float(yellow[2])), 0.08, 0.002, int(generator.integers(4)))
-    steel = Material((float(generator.uniform(0.03, 0.3)),) * 3, 0.15, 0.001, int(generator.integers(4)))
+    grey = float(generator.uniform(0.03, 0.3))
+    steel = Material((grey, grey, grey), 0.15, 0.001, int(generator.integers(4)))
     length = float(generator.uniform(0.6, 1.5))
     pose = np.stack([sideways, along, np.cross(sideways, along)], 1)
     if generator.random() < 0.5:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import cv2
@@ -50,7 +51,7 @@ def block_at(kind: Concrete, target: np.ndarray, normal: np.ndarray, turn_rad: f
     rotation = frame_of(normal, turn_rad)
     first = np.array([*places[0], half[2]]) if places else np.array([0.0, 0.0, half[2]])
     pose = Pose(rotation, target - rotation @ first)
-    return Block(pose, half, _materials(kind, half, holes, discs, generator), tuple(holes), chips, discs)
+    return Block(pose, half, materials_of(kind, half, holes, discs, generator), tuple(holes), chips, discs)
 
 
 def _scattered(half_m: np.ndarray, radii: list[float], edge_m: float, generator: np.random.Generator) -> list[np.ndarray]:
@@ -96,8 +97,8 @@ def _chips(kind: Concrete, hole: Hole, generator: np.random.Generator) -> list[C
     return found
 
 
-def _materials(
-    kind: Concrete, half: np.ndarray, holes: list[Hole], discs: tuple[Disc, ...], generator: np.random.Generator
+def materials_of(
+    kind: Concrete, half: np.ndarray, holes: Sequence[Hole], discs: tuple[Disc, ...], generator: np.random.Generator
 ) -> tuple[Material, ...]:
     """Returns the materials of all parts of the block; see `Block`."""
     bright, grain = float(generator.uniform(*kind.brightness)), float(generator.uniform(*kind.grain))

@@ -1,7 +1,7 @@
 """Frames on disk, and beside each rendered one its truth.
 
-A folder holds `camera.yaml` and for each frame `<stem>.color.png`, `<stem>.depth.npy` (float32, m, NaN unknown) or `<stem>.depth.png`
-(16 bits, mm, 0 unknown), and where there is a pair `<stem>.right.png`. Truth of a rendered frame:
+A folder holds `camera.yaml` and for each frame `<stem>.color.png`, `<stem>.depth.npy` (float32, m, NaN unknown) or
+`<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is a pair `<stem>.right.png`. Truth of a rendered frame:
 
 * `<stem>.truth.json`: `scene`, `conditions`, `holes` (`center_m`, `axis` and `center_in_base_m`, `axis_in_base`, `radius_m`,
   `depth_m`, `hidden`: the part of the rim that cannot be seen, `in_view`), `decoys` (likewise), `block` (`center_m`, `rotation`,
@@ -122,6 +122,7 @@ def read_label(stem: Path) -> Label:
     bits = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if bits is None or bits.ndim != 2:
         raise FrameError(f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames have one")
+    bits = np.asarray(bits, np.uint8)
     return Label((bits & BLOCK) > 0, (bits & MOUTH) > 0, (bits & ARM) > 0)
 
 

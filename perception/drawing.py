@@ -23,25 +23,51 @@ _GREY = 1 / 3
 
 
 def compose(kind: Scenes, rig: Rig, generator: np.random.Generator) -> Scene:
-    """Returns a scene: first the block before the camera, then the arm and the rest about it, then the light."""
+    """Returns a scene: first the block before the camera, then the arm, then all the rest; the generator is the only chance."""
     target, normal, turn = _target(kind, rig, generator)
-    block = None
+    block, arm = None, []
     if generator.random() < kind.block.present:
         block = block_at(kind.block, target, normal, turn, generator)
+    hidden = uniform(kind.around.hidden, generator)
+    if generator.random() < kind.around.arm:
+        rim = rim_points(block, 0) if block and block.holes else target + 0.05 * frame_of(normal, turn)[:, :2].T
+        arm = arm_over(rim, rig, hidden, generator)
+    return surround(kind, rig, block, arm, target, normal, generator)
+
+
+def surround(
+    kind: Scenes,
+    rig: Rig,
+    block: Block | None,
+    arm: Sequence[Solid],
+    target: np.ndarray,
+    normal: np.ndarray,
+    generator: np.random.Generator,
+    ground_m: float | None = None,
+) -> Scene:
+    """Returns a scene of this kind around a block and an arm that stand already.
+
+    Args:
+        kind: Says what else there is, and how it is lit.
+        rig: The camera pair.
+        block: The block, `None` for none.
+        arm: Parts of the arm.
+        target: What the camera is pointed at, `(3,)`, camera coordinates.
+        normal: Normal of the face there, `(3,)`.
+        generator: The only source of chance.
+        ground_m: How far below the camera the ground lies; `None` for where the block stands on it.
+    """
     down = rig.down_in_camera
-    lowest = max(0.5, float((block.corners_m @ down).max())) if block else float(target @ down) + 0.2
-    solids: list[Solid] = [*_setting(kind, down, lowest, generator)]
+    if ground_m is None:
+        ground_m = max(0.5, float((block.corners_m @ down).max())) if block else float(target @ down) + 0.2
+    solids: list[Solid] = [*_setting(kind, down, ground_m, generator)]
     if block:
         solids.append(block)
-    hidden = uniform(kind.around.hidden, generator)
-    with_arm = generator.random() < kind.around.arm
-    if with_arm:
-        rim = rim_points(block, 0) if block and block.holes else target + 0.05 * frame_of(normal, turn)[:, :2].T
-        solids += arm_over(rim, rig, hidden, generator)
-    solids += _clutter(kind, rig, solids, block, down, lowest, generator)
-    light = _light(kind, normal, down, target, generator)
+    solids += arm
+    solids += _clutter(kind, rig, block, down, ground_m, generator)
+    light = _light(kind, down, target, generator)
     exposure, level = _exposure(kind, light, normal, target, generator)
-    sky = (0.8 * light.ambient,) * 3
+    sky = (0.8 * light.ambient, 0.8 * light.ambient, 0.8 * light.ambient)
     hidden_parts = tuple(hidden_part(solids, block, number) for number in range(len(block.holes))) if block else ()
     sight = target / np.linalg.norm(target)
     conditions = {
@@ -50,7 +76,7 @@ def compose(kind: Scenes, rig: Rig, generator: np.random.Generator) -> Scene:
         "hidden": hidden_parts[0] if hidden_parts else 0.0,
         "light": level,
         "transmission": math.exp(-exposure.extinction_per_m * float(target[2])),
-        "arm": float(with_arm),
+        "arm": float(bool(arm)),
         "decoys": float(len(block.discs)) if block else 0.0,
     }
     return Scene(tuple(solids), block, light, exposure, sky, hidden_parts, conditions)
@@ -126,13 +152,7 @@ def _setting(kind: Scenes, down: np.ndarray, lowest_m: float, generator: np.rand
 
 
 def _clutter(
-    kind: Scenes,
-    rig: Rig,
-    solids: list[Solid],
-    block: Block | None,
-    down: np.ndarray,
-    lowest_m: float,
-    generator: np.random.Generator,
+    kind: Scenes, rig: Rig, block: Block | None, down: np.ndarray, lowest_m: float, generator: np.random.Generator
 ) -> list[Solid]:
     """Returns things on the ground, in the picture, not in front of a rim and not inside the block."""
     wanted, found = integer(kind.around.clutter, generator), []
@@ -158,7 +178,7 @@ def _clutter(
     return found
 
 
-def _light(kind: Scenes, normal: np.ndarray, down: np.ndarray, target: np.ndarray, generator: np.random.Generator) -> Light:
+def _light(kind: Scenes, down: np.ndarray, target: np.ndarray, generator: np.random.Generator) -> Light:
     """Returns sun and sky, and things out of sight that throw shadows on the face."""
     elevation, azimuth = uniform(kind.light.elevation_rad, generator), generator.uniform(-np.pi, np.pi)
     frame = frame_of(-down, 0.0)

@@ -136,8 +136,8 @@ class Block:
         entry = start + t[struck, None] * along
         near = np.zeros(len(struck), bool)
         for disc_number, disc in enumerate(self.discs):
-            away = entry[:, :2] - disc.center_m[:2].astype(np.float32)
-            on = (part[struck] == FRONT) & ((away * away).sum(1) < disc.radius_m**2)
+            x, y = entry[:, 0] - np.float32(disc.center_m[0]), entry[:, 1] - np.float32(disc.center_m[1])
+            on = (part[struck] == FRONT) & (x * x + y * y < disc.radius_m**2)
             part[struck[on]] = self.break_part + 1 + disc_number
         for hole in self.holes:
             x, y, depth = hole.across_m(entry)
@@ -145,7 +145,8 @@ class Block:
             mouth[struck[through]] = True
             near |= through
         for chip in self.chips:
-            near |= ((entry - chip.center_m.astype(np.float32)) ** 2).sum(1) < chip.radius_m**2
+            away = entry - chip.center_m.astype(np.float32)
+            near |= np.einsum("ij,ij->i", away, away) < chip.radius_m**2
         if near.any():
             way, through_part = self._march(entry[near], along[near])
             moved = through_part >= 0
@@ -186,7 +187,7 @@ class Block:
                 uv[rows], openness[rows], sunlit[rows] = inside.uv_m, inside.openness, inside.sunlit
         for chip in self.chips:
             away = chip.center_m.astype(np.float32) - local
-            on = (part == self.break_part) & (np.abs((away * away).sum(1) - chip.radius_m**2) < 1e-4 * chip.radius_m)
+            on = (part == self.break_part) & (np.abs(np.einsum("ij,ij->i", away, away) - chip.radius_m**2) < 1e-4 * chip.radius_m)
             normal[on] = (away[on] / chip.radius_m) @ self.pose.rotation.T.astype(np.float32)
         return Surface(normal, uv, openness, sunlit)
 

@@ -176,8 +176,9 @@ class Tracer:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns the radiance of points of one solid, `(M, 3)`, and whether the sun reaches them, `(M,)`."""
         surface = thing.surface(point, part, self.light.to_sun)
-        away = np.sign((surface.normal * direction).sum(1))
-        facing = np.abs((surface.normal * direction).sum(1)) / np.linalg.norm(direction, axis=1)
+        along = np.einsum("ij,ij->i", surface.normal, direction)
+        away = np.sign(along)
+        facing = np.abs(along) / np.sqrt(np.einsum("ij,ij->i", direction, direction))
         slope = surface.normal @ self.light.to_sun.astype(np.float32) * -away
         lit = slope > 0
         if surface.sunlit is not None:
@@ -189,7 +190,7 @@ class Tracer:
         bright = ambient + self.light.sun * np.where(lit, slope, 0.0)
         albedo = np.empty((len(part), 3), np.float32)
         size_m = pixel_m / np.sqrt(np.maximum(facing, 0.1))
-        for number in np.unique(part):
+        for number in np.flatnonzero(np.bincount(part)):
             rows = np.flatnonzero(part == number)
             material = thing.materials[min(int(number), len(thing.materials) - 1)]
             albedo[rows] = material.albedo(surface.uv_m[rows], size_m[rows])
@@ -209,8 +210,8 @@ class Caster:
 
     def darken(self, point: np.ndarray, lit: np.ndarray) -> None:
         """Clears `lit`, `(M,)` bool, at the points, `(M, 3)`, that the solid shades."""
-        flat = point @ self._across
-        rows = np.flatnonzero(lit & ((flat > self._low) & (flat < self._high)).all(1))
+        x, y = point @ self._across[:, 0], point @ self._across[:, 1]
+        rows = np.flatnonzero(lit & (x > self._low[0]) & (x < self._high[0]) & (y > self._low[1]) & (y < self._high[1]))
         if len(rows):
             sun = np.broadcast_to(self._to_sun, (len(rows), 3))
             lit[rows[np.isfinite(self.solid.hit(point[rows], sun).t)]] = False

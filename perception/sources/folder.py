@@ -1,0 +1,207 @@
+"""Frames of a folder, one after the other."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.signals import Frame
+from brokk_rl.spec import spec
+from perception import dataset
+from perception.sources import soundness
+from perception.stereo import Stereo
+
+_PNG_HEAD = b"\x89PNG\r\n\x1a\n"
+
+
+@spec
+class Folder:
+    """Replays the frames of a folder; `camera.yaml` holds for all of them.
+
+    Attributes:
+        folder: Where they lie.
+        rate_hz: How fast they followed each other; gives frame `k` the time k / rate_hz.
+        least_known: Part of the picture whose depth must be known.
+        pictures_only: Photographs without depth are welcome, grey ones and those without `camera.yaml` too: enough to look for
+            ellipses in the picture.
+        stereo: Makes the depth of a frame that has a right picture and no depth.
+    """
+
+    folder: str
+    rate_hz: float
+    least_known: float
+    pictures_only: bool
+    stereo: Stereo
+
+    def check(self) -> None:
+        if self.rate_hz <= 0 or not 0 <= self.least_known <= 1:
+            raise ConfigError(
+                f"source: expected rate_hz above 0 and least_known from 0 to 1, got {self.rate_hz} and {self.least_known}"
+            )
+
+    def build(self) -> FolderSource:
+        """Returns the source, not yet opened."""
+        return FolderSource(self)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """What `camera.yaml` says; see `brokk_rl.signals.Frame`."""
+
+    matrix: np.ndarray
+    distortion: np.ndarray | None
+    baseline_m: float | None
+    base_from_camera: np.ndarray | None
+
+
+def read_camera(path: Path) -> Camera:
+    """Reads `camera.yaml`.
+
+    Raises:
+        FrameError: it is missing, is no YAML, or says what cannot be.
+    """
+    try:
+        told = yaml.safe_load(path.read_text())
+    except FileNotFoundError as error:
+        raise FrameError(f"{path}: no such file; a folder of frames needs it (K, dist, baseline_m, T_base_cam)") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise FrameError(f"{path}: cannot be read as YAML ({error})") from error
+    if not isinstance(told, dict) or "K" not in told:
+        raise FrameError(f"{path}: expected a mapping with K, dist, baseline_m and T_base_cam, K is missing")
+    where = str(path)
+    optional: dict[str, Any] = {name: told[name] for name in ("baseline_m", "T_base_cam") if told.get(name) is not None}
+    return Camera(
+        soundness.matrix(told["K"], where),
+        soundness.distortion(told.get("dist"), where),
+        soundness.baseline(optional["baseline_m"], where) if "baseline_m" in optional else None,
+        soundness.pose(optional["T_base_cam"], where) if "T_base_cam" in optional else None,
+    )
+
+
+def read_picture(path: Path) -> np.ndarray:
+    """Returns a picture as it stands in the file, blue first.
+
+    Raises:
+        FrameError: it is missing, truncated, or no picture.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FrameError(f"{path}: no such file") from error
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read ({error.strerror})") from error
+    if data.startswith(_PNG_HEAD) and not _is_whole_png(data):
+        raise FrameError(f"{path}: truncated or damaged")
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if picture is None:
+        raise FrameError(f"{path}: {'truncated or no picture' if data else 'empty'}")
+    return np.asarray(picture)
+
+
+class FolderSource:
+    """An open folder; see `brokk_rl.sight.FrameSource`."""
+
+    def __init__(self, settings: Folder) -> None:
+        self._settings, self._place = settings, Path(settings.folder)
+        self._stems: list[Path] = []
+        self._camera: Camera | None = None
+        self._next = 0
+
+    @property
+    def num_frames(self) -> int:
+        """How many frames there are."""
+        return len(self._stems) or len(dataset.stems(self._place))
+
+    def __enter__(self) -> FolderSource:
+        self._stems, self._next = dataset.stems(self._place), 0
+        path = self._place / dataset.CAMERA
+        self._camera = None if self._settings.pictures_only and not path.exists() else read_camera(path)
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        self._stems = []
+
+    def read_latest(self) -> Frame | None:
+        """Returns the next frame, `None` after the last.
+
+        Raises:
+            FrameError: it cannot be used; the next call goes on with the one after it.
+        """
+        if self._next >= len(self._stems):
+            return None
+        stem, number = self._stems[self._next], self._next
+        self._next += 1
+        return self._read(stem, number / self._settings.rate_hz)
+
+    def _read(self, stem: Path, t_s: float) -> Frame:
+        paths = {ending: stem.with_name(stem.name + ending) for ending in (dataset.COLOR, dataset.RIGHT)}
+        picture = read_picture(paths[dataset.COLOR])
+        if self._settings.pictures_only and picture.ndim == 2:
+            picture = np.repeat(picture[..., None], 3, 2)
+        color = soundness.color(picture, str(paths[dataset.COLOR]))
+        height, width = color.shape[:2]
+        camera = self._camera or Camera(_guessed(height, width), None, None, None)
+        soundness.fits(camera.matrix, height, width, str(self._place / dataset.CAMERA))
+        right = None
+        if paths[dataset.RIGHT].exists():
+            right = soundness.color(read_picture(paths[dataset.RIGHT]), str(paths[dataset.RIGHT]))
+            soundness.same_size(color, right, str(paths[dataset.RIGHT]), "the right picture")
+        depth = self._depth(stem, color, right, camera)
+        return Frame(
+            color=color, depth_m=depth, camera_matrix=camera.matrix, base_from_camera=camera.base_from_camera, t_s=t_s,
+            distortion=camera.distortion, right=right, baseline_m=camera.baseline_m, name=str(stem),
+        )  # fmt: skip
+
+    def _depth(self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: Camera) -> np.ndarray:
+        """Returns the depth of a frame: what is stored, else what its two pictures tell."""
+        stored, millimetres = (stem.with_name(stem.name + ending) for ending in (dataset.DEPTH, dataset.DEPTH_MM))
+        least = self._settings.least_known
+        if stored.exists() or millimetres.exists():
+            where = stored if stored.exists() else millimetres
+            values = _array(stored) if stored.exists() else soundness.depth_of_png(read_picture(millimetres), str(millimetres))
+            found = soundness.depth(values, str(where), least)
+            soundness.same_size(color, found, str(where), "depth")
+            return found
+        if self._settings.pictures_only:
+            return np.full(color.shape[:2], np.nan, np.float32)
+        if right is None:
+            raise FrameError(
+                f"{stem}: no depth; expected {stored.name}, {millimetres.name}, or {stem.name}{dataset.RIGHT} to match with"
+            )
+        if camera.baseline_m is None or camera.distortion is not None:
+            raise FrameError(f"{stem}: depth of a pair needs baseline_m and a rectified camera (dist 0) in {dataset.CAMERA}")
+        matched = self._settings.stereo.depth_m(color, right, float(camera.matrix[0, 0]), camera.baseline_m)
+        return soundness.depth(matched, f"{stem}: matching left and right", least)
+
+
+def _array(path: Path) -> np.ndarray:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise FrameError(f"{path}: truncated or no array ({error})") from error
+
+
+def _guessed(height: int, width: int) -> np.ndarray:
+    """Returns the camera matrix of an ordinary lens, for pictures of which nothing is known."""
+    return np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]])
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Says whether all chunks of a PNG are there with the right check sums; OpenCV fills what is missing with black."""
+    place = len(_PNG_HEAD)
+    while place + 12 <= len(data):
+        length = int.from_bytes(data[place : place + 4], "big")
+        end = place + 12 + length
+        if end > len(data) or zlib.crc32(data[place + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return False
+        if data[place + 4 : place + 8] == b"IEND":
+            return True
+        place = end
+    return False

@@ -1,0 +1,143 @@
+"""What live cameras share: fresh frames only, a time limit, and depth without invented values."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.signals import Frame
+from brokk_rl.spec import spec
+from perception.sources import soundness
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What a camera says of itself: camera matrix `(3, 3)`, distortion or `None`, baseline in m or `None`."""
+
+    matrix: np.ndarray
+    distortion: np.ndarray | None
+    baseline_m: float | None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One capture: RGB, depth in m as the camera tells it (0, NaN and infinite where unknown), time it was taken, right picture."""
+
+    color: np.ndarray
+    depth_m: np.ndarray
+    t_s: float
+    right: np.ndarray | None = None
+
+
+class Device(Protocol):
+    """A camera's own library, behind three methods."""
+
+    def open(self) -> Lens:
+        """Opens the camera; raises a `FrameError` when that fails."""
+        ...
+
+    def capture(self, timeout_s: float) -> Capture | None:
+        """Waits for a new capture; `None` when there is none within the time."""
+        ...
+
+    def now_s(self) -> float:
+        """Returns the time on the clock by which captures are stamped."""
+        ...
+
+    def close(self) -> None:
+        """Closes the camera; may be called twice."""
+        ...
+
+
+@spec
+class Freshness:
+    """What counts as a frame that one may act on.
+
+    Attributes:
+        timeout_s: How long `read_latest` waits for a frame.
+        max_age_s: Older frames are dropped; a camera that only delivers such is as good as silent.
+        least_known: Part of the picture whose depth must be known.
+    """
+
+    timeout_s: float
+    max_age_s: float
+    least_known: float
+
+    def check(self) -> None:
+        if min(self.timeout_s, self.max_age_s) <= 0 or not 0 <= self.least_known <= 1:
+            raise ConfigError(
+                f"source.fresh: expected timeout_s and max_age_s above 0, least_known from 0 to 1, got {self.timeout_s}, "
+                f"{self.max_age_s} and {self.least_known}"
+            )
+
+
+class LiveSource:
+    """An open camera; see `brokk_rl.sight.FrameSource`. Each frame is returned once.
+
+    Args:
+        device: The camera's library.
+        name: What it is called in messages.
+        fresh: Which frames are too old, and how long to wait.
+        base_from_camera: Where the camera is in the base frame, `(4, 4)`; `None` where nobody knows.
+    """
+
+    num_frames = None
+
+    def __init__(self, device: Device, name: str, fresh: Freshness, base_from_camera: np.ndarray | None) -> None:
+        self._device, self._name, self._fresh, self._pose = device, name, fresh, base_from_camera
+        self._lens: Lens | None = None
+        self._last_s = -np.inf
+
+    def __enter__(self) -> LiveSource:
+        try:
+            lens = self._device.open()
+            self._lens = Lens(soundness.matrix(lens.matrix, self._name), lens.distortion, lens.baseline_m)
+        except BaseException:
+            self._device.close()
+            raise
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        self._lens = None
+        self._device.close()
+
+    def read_latest(self) -> Frame | None:
+        """Returns the newest frame, waiting for one that has not been returned yet and is not too old.
+
+        Raises:
+            FrameError: no such frame came in time, or it cannot be used.
+        """
+        if self._lens is None:
+            raise FrameError(f"{self._name}: not open; use it in a `with` block")
+        until, oldest_s = time.monotonic() + self._fresh.timeout_s, None
+        while (left := until - time.monotonic()) > 0:
+            capture = self._device.capture(left)
+            if capture is None or capture.t_s <= self._last_s:
+                continue
+            age_s = self._device.now_s() - capture.t_s
+            if age_s <= self._fresh.max_age_s:
+                self._last_s = capture.t_s
+                return self._frame(capture, self._lens)
+            oldest_s = age_s if oldest_s is None else max(oldest_s, age_s)
+        stale = (
+            "" if oldest_s is None else f"; the frames that came were up to {oldest_s:.2f} s old, {self._fresh.max_age_s:g} allowed"
+        )
+        raise FrameError(f"{self._name}: no new frame for {self._fresh.timeout_s:g} s{stale}. Is it plugged in?")
+
+    def _frame(self, capture: Capture, lens: Lens) -> Frame:
+        soundness.same_size(capture.color, capture.depth_m, self._name, "depth")
+        soundness.fits(lens.matrix, capture.color.shape[0], capture.color.shape[1], self._name)
+        return Frame(
+            color=capture.color,
+            depth_m=soundness.depth(capture.depth_m, self._name, self._fresh.least_known),
+            camera_matrix=lens.matrix,
+            base_from_camera=self._pose,
+            t_s=capture.t_s,
+            distortion=lens.distortion,
+            right=capture.right,
+            baseline_m=lens.baseline_m,
+        )

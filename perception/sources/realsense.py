@@ -1,0 +1,101 @@
+"""A RealSense camera through its own library (`pyrealsense2`), which is imported only when the camera is opened."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.errors import FrameError
+from brokk_rl.spec import spec
+from perception.sources import soundness
+from perception.sources.live import Capture, Freshness, Lens, LiveSource
+
+
+@spec
+class RealSense:
+    """A RealSense camera: colour, and depth aligned to it; its own hole filling is left off.
+
+    Attributes:
+        serial: Which camera, by serial number; `null` for the only one.
+        width: Pixels.
+        height: Pixels.
+        rate_hz: Pictures a second.
+        base_from_camera: Pose of the colour camera in the base frame, `(4, 4)`, from `mode=calibrate`; `null` where unknown.
+        fresh: Which frames are too old, and how long to wait.
+    """
+
+    serial: str | None
+    width: int
+    height: int
+    rate_hz: int
+    base_from_camera: tuple[tuple[float, ...], ...] | None
+    fresh: Freshness
+
+    def build(self) -> LiveSource:
+        """Returns the source, not yet opened."""
+        pose = None if self.base_from_camera is None else soundness.pose(self.base_from_camera, "source.base_from_camera")
+        return LiveSource(RealSenseDevice(self), "RealSense camera", self.fresh, pose)
+
+
+class RealSenseDevice:
+    """The library behind `Device`; see `perception.sources.live`."""
+
+    def __init__(self, settings: RealSense) -> None:
+        self._settings = settings
+        self._pipeline: Any = None
+        self._started = False
+
+    def open(self) -> Lens:
+        """Opens the camera.
+
+        Raises:
+            FrameError: there is no library, no camera, or it cannot do what is asked of it.
+        """
+        try:
+            rs = importlib.import_module("pyrealsense2")
+        except ImportError as error:
+            raise FrameError("RealSense camera: the Python package `pyrealsense2` is not installed") from error
+        settings, config = self._settings, rs.config()
+        if settings.serial is not None:
+            config.enable_device(settings.serial)
+        size = (settings.width, settings.height)
+        config.enable_stream(rs.stream.depth, *size, rs.format.z16, settings.rate_hz)
+        config.enable_stream(rs.stream.color, *size, rs.format.rgb8, settings.rate_hz)
+        self._pipeline, self._align = rs.pipeline(), rs.align(rs.stream.color)
+        try:
+            profile = self._pipeline.start(config)
+        except RuntimeError as error:
+            raise FrameError(
+                f"RealSense camera: cannot be opened at {size[0]} x {size[1]}, {settings.rate_hz} Hz ({error})"
+            ) from error
+        self._started = True
+        self._scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
+        matrix = np.array([[lens.fx, 0.0, lens.ppx], [0.0, lens.fy, lens.ppy], [0.0, 0.0, 1.0]])
+        return Lens(matrix, soundness.distortion(list(lens.coeffs), "RealSense camera"), None)
+
+    def capture(self, timeout_s: float) -> Capture | None:
+        """Returns the next capture, `None` when there is none in time."""
+        try:
+            frames = self._align.process(self._pipeline.wait_for_frames(max(1, int(1000 * timeout_s))))
+        except RuntimeError:  # the library's way to say that time is up
+            return None
+        depth, color = frames.get_depth_frame(), frames.get_color_frame()
+        if not depth or not color:
+            return None
+        # copies: the library reuses its memory
+        values = np.asanyarray(depth.get_data()).astype(np.float32) * np.float32(self._scale_m)
+        return Capture(np.array(color.get_data(), np.uint8), values, float(color.get_timestamp()) * 1e-3)
+
+    def now_s(self) -> float:
+        """Returns the host's time: the library stamps captures by it."""
+        return time.time()
+
+    def close(self) -> None:
+        """Closes the camera."""
+        if self._started:
+            self._started = False
+            self._pipeline.stop()

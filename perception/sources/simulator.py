@@ -1,0 +1,147 @@
+"""The simulator as a source of frames: the present scene of the task, seen by a rendered camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.signals import Frame
+from brokk_rl.spec import spec
+from perception.concrete import frame_of, materials_of
+from perception.drawing import surround
+from perception.render.drilled import FRONT, Block, Hole
+from perception.render.solids import Cylinder, Pose, Solid
+from perception.render.texture import Material
+from perception.rig import Rig
+from perception.scenes import Scenes
+from perception.stereo import Stereo
+from perception.studio import Shot, Studio
+
+
+@spec
+class Simulated:
+    """A rendered camera that looks at the scene of the borehole task.
+
+    Attributes:
+        rig: The camera pair.
+        surroundings: Gives concrete, light, dust and ground; the block itself is the task's.
+        stereo: Makes the depth.
+        task_scene: What is seen until somebody shows something else: `hole_x_m hole_y_m rim_z_m yaw_rad block_scale hole_radius_m`,
+            as the task's scenes are told.
+        block_m: Length, width and height of a block of scale 1.
+        hole_depth_m: Of the hole.
+        arm_m: Radius of the arm's links and of the tool.
+        num_frames: Frames until the source is at its end.
+        rate_hz: Gives frame `k` the time k / rate_hz.
+        seed: Of stains, light and noise; these stay the same as long as the scene does, but for the noise.
+    """
+
+    rig: Rig
+    surroundings: Scenes
+    stereo: Stereo
+    task_scene: tuple[float, float, float, float, float, float]
+    block_m: tuple[float, float, float]
+    hole_depth_m: float
+    arm_m: tuple[float, float]
+    num_frames: int
+    rate_hz: float
+    seed: int
+
+    def check(self) -> None:
+        if min(self.block_m) <= 0 or min(self.arm_m) <= 0 or self.rate_hz <= 0 or self.num_frames < 1:
+            raise ConfigError("source: expected block_m, arm_m and rate_hz above 0 and num_frames of 1 or more")
+        if not 0 < self.hole_depth_m < self.block_m[2]:
+            raise ConfigError(f"source: a hole of {self.hole_depth_m} m does not fit into a block {self.block_m[2]} m high")
+
+    def build(self) -> SimulatedSource:
+        """Returns the source, not yet opened."""
+        return SimulatedSource(self)
+
+
+class SimulatedSource:
+    """An open simulated camera; see `brokk_rl.sight.FrameSource`.
+
+    Whoever runs the simulation calls `show` before each `read_latest`.
+    """
+
+    def __init__(self, settings: Simulated) -> None:
+        self._settings = settings
+        self._studio = Studio(rig=settings.rig, scene=settings.surroundings, stereo=settings.stereo, depth="matched")
+        self._scene: tuple[float, ...] = settings.task_scene
+        self._chain = np.zeros((0, 3))
+        self._count = -1
+
+    @property
+    def num_frames(self) -> int:
+        """How many frames there are."""
+        return self._settings.num_frames
+
+    def __enter__(self) -> SimulatedSource:
+        self._count = 0
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        self._count = -1
+
+    def show(self, task_scene: Sequence[float], chain_in_base_m: np.ndarray) -> None:
+        """Sets what is seen.
+
+        Args:
+            task_scene: See `Simulated.task_scene`.
+            chain_in_base_m: The arm as points in the base frame, `(P, 3)`: its joints in order, then the tip of the tool
+                (`brokk_rl.kinematics`); empty for none.
+        """
+        self._scene, self._chain = tuple(float(value) for value in task_scene), np.asarray(chain_in_base_m, float).reshape(-1, 3)
+
+    def read_latest(self) -> Frame | None:
+        """Returns a frame of what is shown now, `None` after `num_frames`.
+
+        Raises:
+            FrameError: the source is not open, or the hole is behind the camera.
+        """
+        if self._count < 0:
+            raise FrameError("simulated camera: not open; use it in a `with` block")
+        if self._count >= self.num_frames:
+            return None
+        number, rig = self._count, self._settings.rig
+        self._count += 1
+        shot = self.shot(np.random.default_rng((self._settings.seed, number)))
+        return Frame(
+            color=shot.color, depth_m=shot.depth_m, camera_matrix=rig.left.matrix, base_from_camera=rig.base_from_camera,
+            t_s=number / self._settings.rate_hz, right=shot.right, baseline_m=rig.baseline_m,
+        )  # fmt: skip
+
+    def shot(self, noise: np.random.Generator) -> Shot:
+        """Returns what is shown now, with its truth."""
+        settings, kind = self._settings, self._settings.surroundings
+        chance = np.random.default_rng(settings.seed)  # the same stains and light for every frame
+        x, y, z, yaw, scale, radius_m = self._scene
+        from_base = np.linalg.inv(settings.rig.base_from_camera)
+        target = from_base[:3, :3] @ [x, y, z] + from_base[:3, 3]
+        if target[2] < 0.2:
+            raise FrameError(f"simulated camera: the hole at {self._scene[:3]} m in the base frame is behind the camera")
+        half = np.array(settings.block_m) / 2 * [scale, scale, 1.0]
+        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        rotation = from_base[:3, :3] @ turn
+        hole = Hole(np.array([0.0, 0.0, half[2]]), radius_m, settings.hole_depth_m, FRONT, 0.0)
+        pose = Pose(rotation, target - rotation @ hole.center_m)
+        block = Block(pose, half, materials_of(kind.block, half, (hole,), (), chance), (hole,))
+        down_m = float((from_base[:3, 3]) @ settings.rig.down_in_camera)
+        scene = surround(kind, settings.rig, block, self._arm(from_base), target, rotation[:, 2], chance, max(down_m, 0.3))
+        return self._studio.shot(scene, noise)
+
+    def _arm(self, from_base: np.ndarray) -> list[Solid]:
+        """Returns the links as cylinders from point to point, in camera coordinates."""
+        points = self._chain @ from_base[:3, :3].T + from_base[:3, 3]
+        parts: list[Solid] = []
+        for number, (start, end) in enumerate(pairwise(points)):
+            length = float(np.linalg.norm(end - start))
+            if length > 1e-3:
+                radius_m = self._settings.arm_m[1 if number == len(points) - 2 else 0]
+                pose = Pose(frame_of(end - start, 0.0), (start + end) / 2)
+                parts.append(Cylinder("arm", pose, radius_m, length / 2, (Material((0.6, 0.35, 0.06), 0.1, 0.002),)))
+        return parts

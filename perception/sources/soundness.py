@@ -1,0 +1,131 @@
+"""What a frame must be like before anything is made of it; every refusal says what was expected and what came."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.errors import FrameError
+
+_NUM_DISTORTION = (0, 4, 5, 8, 12, 14)
+_FIELD_RATIO = (0.25, 12.0)
+"""Focal length over the picture's width: from a fisheye of 127 degrees to a telescope of 5."""
+_ASPECT = (0.8, 1.25)
+_CENTER = 0.25
+"""The principal point is no farther from the middle than this part of the picture's size."""
+_FARTHEST_M = 200.0
+"""A median depth beyond this is one in millimetres."""
+_RIGID = 1e-3
+
+
+def matrix(value: Any, where: str) -> np.ndarray:
+    """Returns a camera matrix, `(3, 3)`, or raises a `FrameError` where it is none."""
+    found = _numbers(value, (3, 3), f"{where}: K")
+    if found[0, 0] <= 0 or found[1, 1] <= 0:
+        raise FrameError(f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected more than 0")
+    if not _ASPECT[0] <= found[0, 0] / found[1, 1] <= _ASPECT[1]:
+        raise FrameError(f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected them about equal")
+    if np.abs(found[[1, 2, 2], [0, 0, 1]]).max() > 1e-9 or abs(found[2, 2] - 1.0) > 1e-9 or abs(found[0, 1]) > 0.1 * found[0, 0]:
+        raise FrameError(f"{where}: K is no camera matrix, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {found.tolist()}")
+    return found
+
+
+def fits(camera_matrix: np.ndarray, height: int, width: int, where: str) -> None:
+    """Refuses a camera matrix that cannot be that of a picture of this size."""
+    ratio = camera_matrix[0, 0] / width
+    if not _FIELD_RATIO[0] <= ratio <= _FIELD_RATIO[1]:
+        raise FrameError(
+            f"{where}: a focal length of {camera_matrix[0, 0]:g} px is absurd for a picture {width} px wide, expected "
+            f"{_FIELD_RATIO[0] * width:g} to {_FIELD_RATIO[1] * width:g}; was K made for another resolution?"
+        )
+    for name, center, size in (("cx", camera_matrix[0, 2], width), ("cy", camera_matrix[1, 2], height)):
+        if abs(center - (size - 1) / 2) > _CENTER * size:
+            raise FrameError(
+                f"{where}: {name} is {center:g} px in a picture of {width} x {height}, expected about {(size - 1) / 2:g}; was K "
+                "made for another resolution?"
+            )
+
+
+def distortion(value: Any, where: str) -> np.ndarray | None:
+    """Returns distortion coefficients, `None` where all of them are 0."""
+    found = np.asarray(_numbers([] if value is None else value, None, f"{where}: dist")).reshape(-1)
+    if len(found) not in _NUM_DISTORTION:
+        raise FrameError(f"{where}: dist has {len(found)} coefficients, expected {', '.join(map(str, _NUM_DISTORTION))} of them")
+    if np.abs(found).max(initial=0.0) > 100:
+        raise FrameError(f"{where}: dist is absurd, {found.tolist()}")
+    return found if np.any(found) else None
+
+
+def pose(value: Any, where: str) -> np.ndarray:
+    """Returns a pose, `(4, 4)`, or raises a `FrameError` where it is none."""
+    found = _numbers(value, (4, 4), f"{where}: T_base_cam")
+    turn = found[:3, :3]
+    if np.abs(found[3] - [0, 0, 0, 1]).max() > 1e-9 or np.abs(turn @ turn.T - np.eye(3)).max() > _RIGID or np.linalg.det(turn) < 0:
+        raise FrameError(f"{where}: T_base_cam is no rigid transform: expected a rotation, a shift in m and the row 0 0 0 1")
+    return found
+
+
+def baseline(value: Any, where: str) -> float:
+    """Returns a baseline in m, or raises a `FrameError` where it is none."""
+    found = float(_numbers(value, (), f"{where}: baseline_m"))
+    if not 1e-3 <= found <= 3.0:
+        raise FrameError(f"{where}: baseline_m is {found:g}, expected 0.001 to 3 m; is it in mm?")
+    return found
+
+
+def color(picture: np.ndarray, where: str) -> np.ndarray:
+    """Returns a picture as RGB, `(h, w, 3)` uint8; it comes as OpenCV reads it, blue first."""
+    if picture.ndim != 3 or picture.shape[2] not in (3, 4):
+        raise FrameError(f"{where}: a grey picture, expected colour (3 channels of 8 bits)")
+    if picture.dtype != np.uint8:
+        raise FrameError(f"{where}: {picture.dtype} in each channel, expected 8 bits")
+    return np.ascontiguousarray(picture[..., 2::-1])
+
+
+def depth_of_png(picture: np.ndarray, where: str) -> np.ndarray:
+    """Returns depth in m, `(h, w)` float32 with NaN, of a picture in mm."""
+    if picture.ndim != 2:
+        raise FrameError(f"{where}: {picture.shape[2]} channels, expected one of 16 bits (depth in mm)")
+    if picture.dtype != np.uint16:
+        raise FrameError(f"{where}: {picture.dtype}, expected 16 bits (depth in mm); 8 bits cannot hold depth")
+    return np.where(picture > 0, picture.astype(np.float32) / 1000.0, np.float32(np.nan))
+
+
+def depth(values: np.ndarray, where: str, least_known: float) -> np.ndarray:
+    """Returns depth in m, `(h, w)` float32, NaN where it was 0, negative or infinite: none of these is a depth."""
+    if values.ndim != 2:
+        raise FrameError(f"{where}: depth of shape {values.shape}, expected (height, width)")
+    if not np.issubdtype(values.dtype, np.floating):
+        raise FrameError(f"{where}: depth of type {values.dtype}, expected float32 in m")
+    with np.errstate(invalid="ignore"):
+        found = np.where(np.isfinite(values) & (values > 0), values, np.nan).astype(np.float32)
+    known = np.isfinite(found)
+    if not known.any() or known.mean() < least_known:
+        raise FrameError(
+            f"{where}: depth is known for {100 * known.mean():.2g} % of the picture, expected {100 * least_known:g} % or more"
+        )
+    if (middle := float(np.median(found[known]))) > _FARTHEST_M:
+        raise FrameError(f"{where}: the median depth is {middle:g} m; is it in mm?")
+    return found
+
+
+def same_size(one: np.ndarray, other: np.ndarray, where: str, what: str) -> None:
+    """Refuses two pictures of one frame that differ in size."""
+    if one.shape[:2] != other.shape[:2]:
+        raise FrameError(
+            f"{where}: {what} has {other.shape[1]} x {other.shape[0]} pixels, the colour picture {one.shape[1]} x {one.shape[0]}; "
+            "they must be registered pixel by pixel"
+        )
+
+
+def _numbers(value: Any, shape: tuple[int, ...] | None, where: str) -> np.ndarray:
+    try:
+        found = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise FrameError(f"{where} holds no numbers: {value!r}") from error
+    if shape is not None and found.shape != shape:
+        raise FrameError(f"{where} has shape {found.shape}, expected {shape}")
+    if not np.isfinite(found).all():
+        raise FrameError(f"{where} holds values that are no numbers: {found.tolist()}")
+    return found

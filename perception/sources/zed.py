@@ -1,0 +1,141 @@
+"""A ZED stereo camera through its own SDK (`pyzed`), which is imported only when the camera is opened."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from typing import Any, Literal
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.spec import spec
+from perception.sources import soundness
+from perception.sources.live import Capture, Freshness, Lens, LiveSource
+
+_TRIES_S = 0.005
+
+
+@spec
+class Zed:
+    """A ZED camera: rectified left picture and its depth, both from the SDK.
+
+    Attributes:
+        serial: Which camera, by serial number; `null` for the only one.
+        recording: SVO file to replay instead of a camera, `null` for none.
+        resolution: The SDK's name of it; at `HD1080` depth is half as uncertain as at `HD720`.
+        rate_hz: Pictures a second.
+        depth_mode: The SDK's name of the way depth is made.
+        sensing: `standard` leaves unknown what is not seen. `fill` invents it and is refused.
+        confidence: Depth that the SDK trusts less than this, in percent of its own scale, is unknown.
+        nearest_m: Range of depth.
+        farthest_m: Range of depth.
+        base_from_camera: Pose of the left camera in the base frame, `(4, 4)`, from `mode=calibrate`; `null` where unknown.
+        fresh: Which frames are too old, and how long to wait.
+    """
+
+    serial: int | None
+    recording: str | None
+    resolution: Literal["HD2K", "HD1080", "HD720", "VGA"]
+    rate_hz: int
+    depth_mode: Literal["NEURAL_PLUS", "NEURAL", "NEURAL_LIGHT", "ULTRA", "QUALITY", "PERFORMANCE"]
+    sensing: Literal["standard", "fill"]
+    confidence: int
+    nearest_m: float
+    farthest_m: float
+    base_from_camera: tuple[tuple[float, ...], ...] | None
+    fresh: Freshness
+
+    def check(self) -> None:
+        if self.sensing == "fill":
+            raise ConfigError("source.sensing=fill: it invents depth where nothing was seen, also across boreholes; use standard")
+        if not 0 < self.nearest_m < self.farthest_m:
+            raise ConfigError(f"source: expected 0 < nearest_m < farthest_m, got {self.nearest_m} and {self.farthest_m}")
+        if not 1 <= self.confidence <= 100:
+            raise ConfigError(f"source.confidence: expected 1 to 100, got {self.confidence}")
+
+    def build(self) -> LiveSource:
+        """Returns the source, not yet opened."""
+        pose = None if self.base_from_camera is None else soundness.pose(self.base_from_camera, "source.base_from_camera")
+        return LiveSource(ZedDevice(self), "ZED camera", self.fresh, pose)
+
+
+class ZedDevice:
+    """The SDK behind `Device`; see `perception.sources.live`."""
+
+    def __init__(self, settings: Zed) -> None:
+        self._settings = settings
+        self._sl: Any = None
+        self._camera: Any = None
+
+    def open(self) -> Lens:
+        """Opens the camera.
+
+        Raises:
+            FrameError: there is no SDK, no camera, or it cannot do what is asked of it.
+        """
+        try:
+            sl = importlib.import_module("pyzed.sl")
+        except ImportError as error:
+            raise FrameError(
+                "ZED camera: the Python package `pyzed` is not installed; it comes with the ZED SDK (get_python_api.py). "
+                "Frames that were recorded replay without it: perception/source=folder"
+            ) from error
+        settings, init = self._settings, sl.InitParameters()
+        init.camera_resolution = getattr(sl.RESOLUTION, settings.resolution)
+        init.camera_fps = settings.rate_hz
+        init.depth_mode = _named(sl.DEPTH_MODE, settings.depth_mode, "source.depth_mode")
+        init.coordinate_units = sl.UNIT.METER
+        init.coordinate_system = sl.COORDINATE_SYSTEM.IMAGE  # x right, y down, z forward
+        init.depth_minimum_distance, init.depth_maximum_distance = settings.nearest_m, settings.farthest_m
+        if settings.serial is not None:
+            init.set_from_serial_number(settings.serial)
+        if settings.recording is not None:
+            init.set_from_svo_file(settings.recording)
+        self._sl, self._camera = sl, sl.Camera()
+        if (status := self._camera.open(init)) != sl.ERROR_CODE.SUCCESS:
+            raise FrameError(f"ZED camera: cannot be opened ({status}). Is it plugged in, and free of other programs?")
+        self._picture, self._right, self._depth = sl.Mat(), sl.Mat(), sl.Mat()
+        self._runtime = sl.RuntimeParameters()
+        self._runtime.confidence_threshold = settings.confidence
+        if hasattr(self._runtime, "enable_fill_mode"):
+            self._runtime.enable_fill_mode = False
+        else:  # SDK 3
+            self._runtime.sensing_mode = sl.SENSING_MODE.STANDARD
+        information = self._camera.get_camera_information()
+        # SDK 4 moved the calibration into the configuration
+        calibration = getattr(information, "camera_configuration", information).calibration_parameters
+        left = calibration.left_cam  # rectified: its distortion is that of the raw picture, which is not used
+        matrix = np.array([[left.fx, 0.0, left.cx], [0.0, left.fy, left.cy], [0.0, 0.0, 1.0]])
+        return Lens(matrix, None, abs(float(calibration.get_camera_baseline())))
+
+    def capture(self, timeout_s: float) -> Capture | None:
+        """Returns the next capture, `None` when there is none in time or the recording has ended."""
+        sl, until = self._sl, time.monotonic() + timeout_s
+        while self._camera.grab(self._runtime) != sl.ERROR_CODE.SUCCESS:
+            if time.monotonic() > until:
+                return None
+            time.sleep(_TRIES_S)
+        self._camera.retrieve_image(self._picture, sl.VIEW.LEFT)
+        self._camera.retrieve_image(self._right, sl.VIEW.RIGHT)
+        self._camera.retrieve_measure(self._depth, sl.MEASURE.DEPTH)
+        t_s = self._camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds() * 1e-9
+        color, right = (soundness.color(np.asarray(mat.get_data()), "ZED camera") for mat in (self._picture, self._right))
+        return Capture(color, np.array(self._depth.get_data(), np.float32), t_s, right)  # the SDK reuses its memory
+
+    def now_s(self) -> float:
+        """Returns the time on the SDK's clock; that of a recording stands at its pictures."""
+        reference = self._sl.TIME_REFERENCE.IMAGE if self._settings.recording else self._sl.TIME_REFERENCE.CURRENT
+        return self._camera.get_timestamp(reference).get_nanoseconds() * 1e-9
+
+    def close(self) -> None:
+        """Closes the camera."""
+        camera, self._camera = self._camera, None
+        if camera is not None:
+            camera.close()
+
+
+def _named(names: Any, name: str, where: str) -> Any:
+    if not hasattr(names, name):
+        raise FrameError(f"{where}={name}: this SDK does not know it")
+    return getattr(names, name)
