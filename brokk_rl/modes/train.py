@@ -17,6 +17,7 @@ from brokk_rl.modes.evaluate import Evaluation, evaluate_policies
 from brokk_rl.rl.curves import draw_curves
 from brokk_rl.rl.distributed import Group
 from brokk_rl.rl.export import export_onnx
+from brokk_rl.rl.head_start import begin_with
 from brokk_rl.rl.logbook import PROGRESS, Logbook
 from brokk_rl.rl.policy import Classical, Trained, Untrained, write_bundle
 from brokk_rl.rl.runner import Runner, Training, checkpoints
@@ -43,6 +44,7 @@ class Train:
         rl: How to train.
         tracking: Where figures go beside the run folder.
         evaluation: How to evaluate at the end.
+        start_from: Policy (`policy.folder`) with whose network training begins; `null` for a fresh one.
         resume: Run folder, or checkpoint, from which to go on.
     """
 
@@ -56,6 +58,7 @@ class Train:
     rl: Training
     tracking: Tracking
     evaluation: Evaluation
+    start_from: str | None
     resume: str | None
 
     together: ClassVar[bool] = True
@@ -89,6 +92,8 @@ class Train:
             if checkpoint:
                 runner.load(str(checkpoint))
                 log.info("going on from %s: %d control steps, %.0f s", checkpoint, book.env_steps, book.seconds)
+            elif self.start_from:
+                begin_with(runner.alg.actor, self.start_from, self.machine)
             runner.run()
         if not group.rank.first:
             return None

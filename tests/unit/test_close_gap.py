@@ -1,0 +1,116 @@
+"""What a diagnosis is worth to a policy: intervals, orders and sentences; and the mode's refusals."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+from conftest import Done
+from training import CPU, plant, small, train
+
+from brokk_rl.diagnosis import downstream, downstream_page
+from brokk_rl.errors import CheckpointError
+from brokk_rl.machine import Machine
+from brokk_rl.rl.head_start import begin_with
+from brokk_rl.rl.policy import make_actor, write_bundle
+
+EPISODES = 200
+
+
+def spread(actor: Any) -> torch.Tensor:
+    return actor.distribution.log_std_param
+
+
+def row(rate: float) -> dict[str, Any]:
+    return {"episodes": EPISODES, "success_strict": {"mean": rate}, "time_to_insert_s": {"median": 9.0 if rate else None}}
+
+
+def evaluations(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]:
+    """Returns what `mode=evaluate` says on simulator, repaired simulator and machine, from rates by policy."""
+    return {
+        place: {"episodes": EPISODES, "policies": {policy: row(three[number]) for policy, three in rates.items()}}
+        for number, place in enumerate(downstream.PLANTS)
+    }
+
+
+def test_success_that_fell_and_came_back_is_told_as_such(tmp_path: Path) -> None:
+    found = downstream.compare(evaluations(before=(0.95, 0.2, 0.15), after=(0.9, 0.95, 0.93), classical=(0.9, 0.1, 0.1)))
+    text, tone = downstream.headline(found)
+    assert tone == "good" and "It is back" in text and "95 % (91 to 97)" in text and "15 % (11 to 21)" in text
+    assert found["fall"]["mean"] == pytest.approx(0.8) and found["return"]["mean"] == pytest.approx(0.78)
+    assert found["predicted"]["mean"] == 0.95 and found["achieved"]["mean"] == 0.93
+    downstream_page.write(found | {"plants": {}, "retraining": {}}, tmp_path)
+    assert "It is back" in (tmp_path / downstream_page.PAGE).read_text()
+    assert (tmp_path / downstream_page.PICTURE).read_bytes().startswith(b"\x89PNG")
+    json.dumps(found, allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("after", "said", "tone"),
+    [(0.5, "A part is back", "good"), (0.16, "did not bring it back", "bad"), (0.05, "did not bring it back", "bad")],
+)
+def test_what_did_not_come_back_is_not_sold_as_success(after: float, said: str, tone: str) -> None:
+    found = downstream.compare(evaluations(before=(0.95, 0.2, 0.15), after=(0.9, 0.95, after)))
+    assert said in downstream.headline(found)[0] and downstream.headline(found)[1] == tone
+
+
+def test_without_a_fall_there_is_nothing_to_regain() -> None:
+    found = downstream.compare(evaluations(before=(0.95, 0.94, 0.93), after=(0.95, 0.95, 0.95)))
+    assert downstream.headline(found)[0].startswith("Nothing to regain")
+
+
+def test_the_interval_of_a_difference_is_newcombe_s() -> None:
+    # his table II, case (a), 56/70 and 48/80: 0.0524 to 0.3339
+    first, second = ({"mean": k / n, "ci95": list(downstream.wilson(k, n))} for k, n in ((56, 70), (48, 80)))
+    assert downstream.difference(first, second)["ci95"] == pytest.approx([0.0524, 0.3339], abs=5e-5)
+
+
+def test_a_wrong_order_costs_what_it_would_lose_on_the_machine() -> None:
+    # the simulator swaps the first two; choosing by it loses 0.3 for each of them, nothing for the third
+    assert downstream.rank_violation([0.8, 0.9, 0.1], [0.9, 0.6, 0.2]) == pytest.approx((0.3 + 0.3 + 0.0) / 3)
+    assert downstream.rank_violation([0.5, 0.6, 0.7], [0.1, 0.2, 0.9]) == 0.0
+
+
+def test_a_simulator_without_an_order_claims_none() -> None:
+    found = downstream.compare(evaluations(before=(0.9, 0.2, 0.2), after=(0.9, 0.8, 0.7), classical=(0.9, 0.1, 0.1)))
+    assert found["agreement"]["simulator"]["kendall"] is None and found["agreement"]["repaired"]["kendall"] == pytest.approx(1.0)
+
+
+def test_training_that_begins_with_a_policy_has_its_network_and_its_own_exploration(machine: Machine, tmp_path: Path) -> None:
+    training = small(max_env_steps=64)
+    runner = train(machine, tmp_path / "old", training)
+    old = runner.alg.actor
+    with torch.no_grad():
+        spread(old).fill_(-3.0)  # as one that has settled
+    write_bundle(tmp_path / "old", old, training, runner.env, {})
+    config = training.runner_config()
+    loop = plant(machine).build(CPU, 16, 64, 0)
+    actor = make_actor(config["actor"], config["obs_groups"], loop)
+    begin_with(actor, str(tmp_path / "old"), machine)
+    groups = loop.get_observations()
+    np.testing.assert_array_equal(actor(groups).detach(), old(groups).detach())
+    shipped = option("rl", "ppo").runner["actor"]["distribution_cfg"]["init_std"]
+    torch.testing.assert_close(spread(actor).exp(), torch.full((5,), shipped))
+
+    other = make_actor(config["actor"] | {"hidden_dims": [8]}, config["obs_groups"], loop)
+    with pytest.raises(CheckpointError, match="start_from"):
+        begin_with(other, str(tmp_path / "old"), machine)
+
+
+def test_without_an_effect_there_is_nothing_to_retrain_with(brokk: Callable[..., Done]) -> None:
+    done = brokk("mode=close_gap")
+    assert done.code == 2 and "no effect to retrain with" in done.err
+
+
+def test_an_interrupted_run_goes_on_in_its_own_folder_only(brokk: Callable[..., Done], tmp_path: Path) -> None:
+    (tmp_path / "found.yaml").write_text(
+        "# @package effect\nlag: {_target_: actuators.effects.speed.Lag, joints: all, time_constant_s: 0.1}\n"
+    )
+    done = brokk("mode=close_gap", "effect@found=[@found.yaml]", "resume=elsewhere")
+    assert done.code == 2 and "session.out=elsewhere" in done.err
