@@ -1,0 +1,66 @@
+"""What tells a hole from a flat dark disc: darkness, and how brightness and depth go on inside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from perception import conic
+from perception.plane import Plane
+
+INSIDE, RING = 0.8, (1.15, 1.6)
+"""Radii: the inside without the rim's blur, and the ring around that shows how bright the face is."""
+
+
+@dataclass(frozen=True)
+class Interior:
+    """What an ellipse looks like inside.
+
+    Attributes:
+        darkness: Brightness of its darkest quarter over that of the face around it.
+        slope: How much brighter the wall that the camera sees is than the opposite side, over the face's brightness.
+        unevenness: Standard deviation of smoothed brightness inside over that of the face.
+        deeper: Part of the known depth inside that lies clearly behind the face.
+        unknown: Part of the inside without depth.
+    """
+
+    darkness: float
+    slope: float
+    unevenness: float
+    deeper: float
+    unknown: float
+
+
+def interior(
+    gray: np.ndarray, depth_m: np.ndarray, ellipse: np.ndarray, camera_matrix: np.ndarray, plane: Plane | None
+) -> Interior:
+    """Returns what is seen inside an ellipse `(5,)`; slope and depth need the plane of the face."""
+    x, y, a = ellipse[:3]
+    reach = a * RING[1] + 2
+    top, left = max(0, int(y - reach)), max(0, int(x - reach))
+    bottom, right = min(gray.shape[0], int(y + reach) + 2), min(gray.shape[1], int(x + reach) + 2)
+    part = gray[top:bottom, left:right].astype(np.float32)
+    rows, columns = np.mgrid[top:bottom, left:right]
+    place = np.stack([columns, rows, np.ones_like(rows)], -1).astype(float)
+    radii = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", place, conic.form(ellipse), place) + 1.0, 0.0))
+    inside, ring = radii < INSIDE, (radii > RING[0]) & (radii < RING[1])
+    if inside.sum() < 8 or ring.sum() < 8:
+        return Interior(np.nan, np.nan, np.nan, np.nan, np.nan)
+    face = max(float(np.median(part[ring])), 1.0)
+    smooth = cv2.GaussianBlur(part, (0, 0), max(0.15 * float(np.sqrt(ellipse[2] * ellipse[3])), 0.6))
+    values = smooth[inside]
+    darkness = float(np.percentile(values, 25.0)) / face
+    depth = depth_m[top:bottom, left:right][inside]
+    unknown = float(np.mean(~np.isfinite(depth)))
+    slope = deeper = np.nan
+    if plane is not None:
+        rays = place[inside] @ np.linalg.inv(camera_matrix).T
+        behind = rays @ plane.m - 1.0 / np.where(np.isfinite(depth), depth, np.inf)
+        known = np.isfinite(depth)
+        deeper = float(np.mean(behind[known] > 4 * plane.sigma)) if known.any() else 0.0
+        into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * rays.mean(0)[:2])
+        along = (place[inside][:, :2] - (x, y)) @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
+        slope = float(np.polyfit(along, values, 1)[0]) / face
+    return Interior(darkness, slope, float(values.std()) / face, deeper, unknown)

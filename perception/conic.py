@@ -1,0 +1,183 @@
+"""Conics, many at a time: ellipses by centre, semi-axes and direction, and as quadratic forms.
+
+Axes: `C` conics, `P` points. An ellipse is a row `(x, y, a, b, theta_rad)` with `a >= b`; rows of NaN are no ellipses. A quadratic
+form `Q`, `(3, 3)`, holds the points with `(x, y, 1) Q (x, y, 1)^T = 0`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Returns the ellipses that fit weighted points best, `(C, 5)`, rows of NaN where they determine none.
+
+    Halir and Flusser (1998), the numerically stable form of Fitzgibbon's direct fit, on points moved and scaled to unit size.
+
+    Args:
+        points: `(C, P, 2)`.
+        weights: `(C, P)`, 0 for points that do not count.
+    """
+    total = np.maximum(weights.sum(1), 1e-12)
+    center = np.einsum("cpk,cp->ck", points, weights) / total[:, None]
+    moved = np.where(weights[..., None] > 0, points - center[:, None], 0.0)
+    scale = np.sqrt(np.einsum("cpk,cpk,cp->c", moved, moved, weights) / total) + 1e-12
+    x, y = np.moveaxis(moved / scale[:, None, None], -1, 0)
+    square = np.stack([x * x, x * y, y * y], -1)
+    line = np.stack([x, y, np.ones_like(x)], -1)
+    heavy = square * weights[..., None]
+    s1 = np.einsum("cpi,cpj->cij", heavy, square)
+    s2 = np.einsum("cpi,cpj->cij", heavy, line)
+    s3 = np.einsum("cpi,cpj->cij", line * weights[..., None], line)
+    known = ((weights > 0).sum(1) >= 6) & np.isfinite(s1).all((1, 2)) & (np.linalg.det(s3) > 1e-9)
+    result = np.full((len(points), 5), np.nan)
+    if not known.any():
+        return result
+    t = -np.linalg.solve(s3[known], s2[known].transpose(0, 2, 1))
+    m = s1[known] + s2[known] @ t
+    m = np.stack([m[:, 2] / 2, -m[:, 1], m[:, 0] / 2], 1)
+    vectors = np.real(np.linalg.eig(m)[1])
+    condition = 4 * vectors[:, 0] * vectors[:, 2] - vectors[:, 1] ** 2
+    best = np.argmax(condition, 1)
+    rows = np.arange(len(best))
+    a1 = vectors[rows, :, best]
+    a2 = np.einsum("cij,cj->ci", t, a1)
+    fitted = ellipse_of(form_of_coefficients(np.concatenate([a1, a2], 1)))
+    fitted[condition[rows, best] <= 0] = np.nan
+    fitted[:, :4] *= scale[known][:, None]
+    fitted[:, :2] += center[known]
+    result[known] = fitted
+    return result
+
+
+def form_of_coefficients(coefficients: np.ndarray) -> np.ndarray:
+    """Returns the forms `(C, 3, 3)` of `A x² + B xy + C y² + D x + E y + F`, coefficients `(C, 6)`."""
+    a, b, c, d, e, f = np.moveaxis(coefficients, -1, 0)
+    rows = [np.stack([a, b / 2, d / 2], -1), np.stack([b / 2, c, e / 2], -1), np.stack([d / 2, e / 2, f], -1)]
+    return np.stack(rows, -2)
+
+
+def form(ellipses: np.ndarray) -> np.ndarray:
+    """Returns the forms `(C, 3, 3)` of ellipses `(C, 5)`, negative inside, with `F = (distance / axis)² - 1` along the axes."""
+    x, y, a, b, theta = np.moveaxis(np.asarray(ellipses, dtype=float), -1, 0)
+    u = np.stack([np.cos(theta), np.sin(theta)], -1) / a[..., None]
+    v = np.stack([-np.sin(theta), np.cos(theta)], -1) / b[..., None]
+    inner = u[..., :, None] * u[..., None, :] + v[..., :, None] * v[..., None, :]
+    center = np.stack([x, y], -1)
+    side = -np.einsum("...ij,...j->...i", inner, center)
+    last = -np.einsum("...i,...i->...", side, center) - 1.0
+    top = np.concatenate([inner, side[..., None]], -1)
+    return np.concatenate([top, np.concatenate([side, last[..., None]], -1)[..., None, :]], -2)
+
+
+def ellipse_of(forms: np.ndarray) -> np.ndarray:
+    """Returns the ellipses `(C, 5)` of forms `(C, 3, 3)`, rows of NaN where a form is no ellipse."""
+    inner, side, last = forms[:, :2, :2], forms[:, :2, 2], forms[:, 2, 2]
+    result = np.full((len(forms), 5), np.nan)
+    det = np.linalg.det(inner)
+    known: np.ndarray = np.isfinite(forms).all((1, 2)) & (det > 1e-15 * np.maximum(np.abs(inner).max((1, 2)), 1e-300) ** 2)
+    if not known.any():
+        return result
+    center = -np.linalg.solve(inner[known], side[known][..., None])[..., 0]
+    level = -(np.einsum("ci,ci->c", side[known], center) + last[known])
+    size = np.abs(level) > 1e-300
+    values, vectors = np.linalg.eigh(inner[known] / np.where(size, level, 1.0)[:, None, None])
+    axes = 1.0 / np.sqrt(np.where((values > 0) & size[:, None], values, np.nan))
+    major = vectors[:, :, 0]
+    theta = np.arctan2(major[:, 1], major[:, 0]) % np.pi
+    result[known] = np.where(np.isfinite(axes).all(axis=1, keepdims=True), np.column_stack([center, axes, theta]), np.nan)
+    return result
+
+
+def distance(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Returns Sampson's distance of points `(C, P, 2)` from their ellipses `(C, 5)`, negative inside, `(C, P)`."""
+    value, slope = _value(ellipses, points)
+    return value / np.maximum(np.linalg.norm(slope, axis=-1), 1e-12)
+
+
+def normals(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Returns the outward unit normals of ellipses `(C, 5)` at points near them `(C, P, 2)`, `(C, P, 2)`."""
+    slope = _value(ellipses, points)[1]
+    return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
+
+
+def slopes(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Returns the length of the gradient of each ellipse's form at its points, `(C, P)`: turns algebraic into geometric error."""
+    return np.linalg.norm(_value(ellipses, points)[1], axis=-1)
+
+
+def sample(ellipses: np.ndarray, angles_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns points, outward unit normals, `(C, P, 2)` each, and the arc length per radian `(C, P)` at eccentric angles `(P,)`."""
+    x, y, a, b, theta = (column[:, None] for column in ellipses.T)
+    cos, sin, c, s = np.cos(angles_rad), np.sin(angles_rad), np.cos(theta), np.sin(theta)
+    u, v = a * cos, b * sin
+    points = np.stack([x + c * u - s * v, y + s * u + c * v], -1)
+    nu, nv = b * cos, a * sin
+    length = np.hypot(nu, nv)
+    outward = np.stack([c * nu - s * nv, s * nu + c * nv], -1) / np.maximum(length, 1e-12)[..., None]
+    return points, outward, length
+
+
+def perimeter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns the circumference by Ramanujan's first formula."""
+    return np.pi * (3 * (a + b) - np.sqrt((3 * a + b) * (a + 3 * b)))
+
+
+def _value(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    x, y, a, b, theta = (column[:, None] for column in ellipses.T)
+    c, s = np.cos(theta), np.sin(theta)
+    dx, dy = points[..., 0] - x, points[..., 1] - y
+    u, v = (c * dx + s * dy) / a, (c * dy - s * dx) / b
+    slope = 2 * np.stack([c * u / a - s * v / b, s * u / a + c * v / b], -1)
+    return u * u + v * v - 1.0, slope
+
+
+def on_plane(ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the curve on the plane `m · P = 1` that a camera sees as an ellipse, exactly.
+
+    Args:
+        ellipse: In the picture, `(5,)`.
+        camera_matrix: `(3, 3)`.
+        m: The plane, `(3,)`.
+
+    Returns:
+        The centre of the curve in camera coordinates, `(3,)` m, and its semi-axes `(2,)`, NaN where it is no ellipse.
+    """
+    ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
+    origin = ray / (m @ ray)
+    normal = m / np.linalg.norm(m)
+    first = np.cross(normal, [0.0, 1.0, 0.0] if abs(normal[1]) < 0.9 else [1.0, 0.0, 0.0])
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    homography = camera_matrix @ np.column_stack([first, second, origin])
+    curve = ellipse_of((homography.T @ form(ellipse) @ homography)[None])[0]
+    return origin + curve[0] * first + curve[1] * second, curve[2:4]
+
+
+def circles(ellipse: np.ndarray, camera_matrix: np.ndarray, radius_m: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Returns the circles of a known radius that a camera sees as an ellipse: two of them, told apart by something else.
+
+    From the eigenvectors of the cone through the circle (Forsyth et al. 1991).
+
+    Args:
+        ellipse: In the picture, `(5,)`.
+        camera_matrix: `(3, 3)`.
+        radius_m: Radius of the circle.
+
+    Returns:
+        Centre `(3,)` m and unit normal towards the camera `(3,)` of each.
+    """
+    cone = camera_matrix.T @ form(ellipse) @ camera_matrix
+    values, vectors = np.linalg.eigh(cone if np.linalg.det(cone) < 0 else -cone)  # one negative value: the cone's axis
+    order = [2, 1, 0]
+    (l1, l2, l3), v = values[order], vectors[:, order]
+    along = np.sqrt(max((l1 - l2) / (l1 - l3), 0.0))
+    across = np.sqrt(max((l2 - l3) / (l1 - l3), 0.0))
+    distance = radius_m / np.sqrt(-l1 * l3) * l2
+    found = []
+    for sign in (1.0, -1.0):
+        normal = v @ np.array([sign * along, 0.0, across])
+        center = distance * v @ np.array([sign * along * l3 / l2, 0.0, across * l1 / l2])
+        center = center if center[2] > 0 else -center
+        found.append((center, normal if normal @ center < 0 else -normal))
+    return found

@@ -1,0 +1,280 @@
+"""Ellipses from edges: convex arcs, grouped where they lie on one conic, judged by what supports them all around."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.sight import Ellipse, SizePrior
+from brokk_rl.spec import spec
+from perception import conic, ellipse_edges, ellipse_groups, ellipse_support
+from perception.ellipse_edges import Edges
+from perception.ellipse_support import ANGLES, NUM_SAMPLES, Candidates
+
+NUM_SEEDS = 64
+"""Points that stand for an arc in its first fit."""
+ROUNDS_PX = (1.0, 0.5, 0.3)
+"""Rounds of refinement: the distance at which a point counts a quarter."""
+TIGHT = 0.7
+"""Of the reach, once the ellipse is refined."""
+
+
+@spec
+class ContourArcs:
+    """Ellipses by arc grouping on plain OpenCV: percentile Canny, convex arcs, co-conic groups, support by gradient direction.
+
+    Attributes:
+        sigma_px: Blur before the gradient.
+        percentile: Of the gradient's magnitude, the upper threshold of the edges.
+        noise: Least upper threshold in standard deviations of noise.
+        low: Lower threshold as a part of the upper one.
+        arc_tolerance_px: Polygon that finds where arcs bend back.
+        corner_rad: Turn of that polygon at which an arc ends.
+        arc_points: Least number of points of an arc.
+        reach_px: How far from an ellipse its edge points may lie, per px of the geometric mean of the semi-axes `reach_relative`,
+            at least this.
+        reach_relative: See `reach_px`.
+        angle_rad: Largest angle between the gradient at a supporting point and the ellipse's normal.
+        coverage: Least part of the circumference with support.
+        gap: Largest part of the circumference without any.
+        rms_px: Largest standard deviation of the support's distances, plus `rms_relative` per px of the geometric mean semi-axis;
+            for an ellipse seen in part, as large a part of that.
+        rms_relative: See `rms_px`.
+        angle_rms_rad: Largest standard deviation of the support's angles, plus `angle_rms_small` over the geometric mean semi-axis
+            in px; for an ellipse seen in part, as large a part of that.
+        angle_rms_small: See `angle_rms_rad`.
+        purity: Least part of the supporting arcs that lies on the ellipse.
+        departure: Largest part of the circumference where the supporting chains run on beside the ellipse (spirals, hearts).
+        evidence: Least decimal exponent by which the support is no accident.
+        smallest_px: Least minor semi-axis.
+        flattest: Least ratio of the semi-axes.
+    """
+
+    sigma_px: float
+    percentile: float
+    noise: float
+    low: float
+    arc_tolerance_px: float
+    corner_rad: float
+    arc_points: int
+    reach_px: float
+    reach_relative: float
+    angle_rad: float
+    coverage: float
+    gap: float
+    rms_px: float
+    rms_relative: float
+    angle_rms_rad: float
+    angle_rms_small: float
+    purity: float
+    departure: float
+    evidence: float
+    smallest_px: float
+    flattest: float
+
+    def check(self) -> None:
+        if not 0 < self.percentile < 100 or not 0 < self.low <= 1 or self.sigma_px <= 0:
+            raise ConfigError(
+                "perception.ellipse: expected 0 < percentile < 100, 0 < low <= 1 and sigma_px > 0, got "
+                f"{self.percentile}, {self.low} and {self.sigma_px}"
+            )
+        if not 0 < self.coverage <= 1 or self.arc_points < 6:
+            raise ConfigError(
+                f"perception.ellipse: expected 0 < coverage <= 1 and arc_points >= 6, got {self.coverage} and {self.arc_points}"
+            )
+
+    def build(self) -> ArcDetector:
+        """Returns a detector."""
+        return ArcDetector(self)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Candidates that passed, with the figures of `Ellipse` and the edge points behind each, `(C, NUM_SAMPLES)`, -1 for none."""
+
+    candidates: Candidates
+    support: np.ndarray
+    rms_px: np.ndarray
+    coverage: np.ndarray
+    score: np.ndarray
+
+
+class ArcDetector:
+    """See `ContourArcs`.
+
+    Args:
+        settings: The spec.
+    """
+
+    def __init__(self, settings: ContourArcs) -> None:
+        self.settings = settings
+
+    def detect(self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None) -> list[Ellipse]:
+        """Returns ellipses, the best first; see `EllipseDetector`."""
+        s = self.settings
+        if roi is not None:
+            rows, columns = (np.flatnonzero(roi.any(k)) for k in (1, 0))
+            if not len(rows):
+                return []
+            top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
+        else:
+            top, bottom, left, right = 0, gray.shape[0], 0, gray.shape[1]
+        part = gray[top:bottom, left:right]
+        if min(part.shape) < 8:
+            return []
+        edges = ellipse_edges.find(
+            part, None if roi is None else roi[top:bottom, left:right], s.sigma_px, s.percentile, s.noise, s.low
+        ).cut(s.arc_tolerance_px, s.corner_rad, s.arc_points)
+        if not len(edges.points):
+            return []
+        limits = prior or SizePrior(0.0, float(max(part.shape)))
+        found = self.on(edges, limits)
+        shift = np.array([left, top, 0.0, 0.0, 0.0])
+        return [
+            Ellipse(*map(float, row + shift), rms_px=float(rms), coverage=float(cover), score=float(score))
+            for row, rms, cover, score in found
+        ]
+
+    def on(self, edges: Edges, limits: SizePrior) -> list[tuple[np.ndarray, float, float, float]]:
+        """Returns ellipses with residual, coverage and score: first whole contours, then single arcs, then groups of arcs."""
+        s = self.settings
+        claimed = np.zeros(len(edges.points), bool)
+        found: list[tuple[np.ndarray, float, float, float]] = []
+        spans = edges.spans[edges.spans[:, 1] - edges.spans[:, 0] >= s.arc_points]
+        self._try(spans[:, None], edges, limits, claimed, found)
+        whole = set(map(tuple, spans.tolist()))
+        parts = np.array([arc for arc in edges.arcs.tolist() if tuple(arc) not in whole], int).reshape(-1, 2)
+        self._try(_free(parts, claimed)[:, None], edges, limits, claimed, found)
+        arcs = _free(edges.arcs, claimed)
+        for number in (4, 3, 2):
+            self._try(arcs[ellipse_groups.find(arcs, edges, number)], edges, limits, claimed, found)
+        return sorted(found, key=lambda one: -one[3])
+
+    def _try(self, groups: np.ndarray, edges: Edges, limits: SizePrior, claimed: np.ndarray, found: list) -> None:
+        """Fits, refines and judges candidates of groups of spans `(C, G, 2)`, adds to `found` and marks the points behind them."""
+        if not len(groups):
+            return
+        judged = self.judge(self.refine(self.first(_seeds(groups), edges, limits), edges), edges, limits)
+        for k in np.argsort(-judged.score, kind="stable"):
+            mine = judged.support[k][judged.support[k] >= 0]
+            if claimed[mine].mean() > 0.4:
+                continue
+            one = judged.candidates[k : k + 1]
+            claimed[mine] = True
+            number = max(NUM_SAMPLES, int(conic.perimeter(*one.ellipses[0, 2:4])) * 2)
+            dense = self._gather(one, edges, np.arange(number) * (2 * np.pi / number))[0][0]
+            claimed[dense[dense >= 0]] = True
+            found.append((one.ellipses[0], judged.rms_px[k], judged.coverage[k], judged.score[k]))
+
+    def first(self, seeds: np.ndarray, edges: Edges, limits: SizePrior) -> Candidates:
+        """Returns the candidates of seed points `(C, P)` that lie on an ellipse of a possible size, their gradients all one way."""
+        if not len(seeds):
+            return Candidates(np.empty((0, 5)), np.empty(0))
+        points = edges.points[seeds]
+        ellipses = conic.fit(points, np.ones(seeds.shape))
+        ellipses = ellipses.copy()
+        possible = self._sized(ellipses, limits, 1.5)
+        ellipses, points, seeds = ellipses[possible], points[possible], seeds[possible]
+        off = conic.distance(ellipses, points)
+        outward = (conic.normals(ellipses, points) * edges.directions[seeds]).sum(-1)
+        reach = self._reach(ellipses)
+        near = (np.abs(off) < reach[:, None]).mean(1) > 0.5
+        keep = near & (np.abs(outward.mean(1)) > 0.5)
+        return Candidates(ellipses[keep], np.sign(outward.mean(1))[keep])
+
+    def refine(self, candidates: Candidates, edges: Edges) -> Candidates:
+        """Returns the candidates fitted again to the edge points that support them.
+
+        Points are weighted so that distances count, not form values, and so that those beside the ellipse, where the edge of
+        something else meets it, count less from round to round.
+        """
+        for scale_px in ROUNDS_PX:
+            if not len(candidates.ellipses):
+                break
+            e = candidates.ellipses
+            support, off, along = self._gather(candidates, edges, ANGLES)
+            size = np.sqrt(e[:, 2] * e[:, 3])
+            slope = conic.slopes(e, edges.points[support]) * size[:, None]
+            robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / 0.05) ** 2) ** 2
+            weights = np.where(support >= 0, robust / np.maximum(slope, 1e-3) ** 2, 0.0)
+            ellipses = conic.fit(edges.points[support], weights)
+            keep = np.isfinite(ellipses).all(1)
+            candidates = Candidates(ellipses[keep], candidates.polarity[keep])
+        return candidates
+
+    def judge(self, candidates: Candidates, edges: Edges, limits: SizePrior) -> Judged:
+        """Returns the candidates with enough support of the right kind."""
+        s = self.settings
+        candidates = candidates[self._sized(candidates.ellipses, limits, 1.0) & self._inside(candidates.ellipses, edges)]
+        e = candidates.ellipses
+        if not len(e):
+            return Judged(candidates, np.empty((0, NUM_SAMPLES), int), np.empty(0), np.empty(0), np.empty(0))
+        support, off, along = self._gather(candidates, edges, ANGLES, TIGHT)
+        there = support >= 0
+        length = conic.sample(e, ANGLES)[2]
+        coverage = (length * there).sum(1) / length.sum(1)
+        count = np.maximum(there.sum(1), 1)
+        rms = np.sqrt((off**2 * there).sum(1) / count)
+        spread, angle = (
+            ellipse_support.typical(np.abs(off), there),
+            ellipse_support.typical(np.arccos(np.clip(along, -1, 1)), there),
+        )
+        size = np.sqrt(e[:, 2] * e[:, 3])
+        rms_limit = (s.rms_px + s.rms_relative * size) * coverage
+        angle_limit = (s.angle_rms_rad + s.angle_rms_small / size) * coverage
+        good = (coverage >= s.coverage) & (spread <= rms_limit) & (angle <= angle_limit)
+        good &= ellipse_support.evidence(coverage, angle, conic.perimeter(e[:, 2], e[:, 3]), s.angle_rad) >= s.evidence
+        candidates, support, length = candidates[good], support[good], length[good]
+        rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
+        rms_limit, angle_limit = rms_limit[good], angle_limit[good]
+        good = ellipse_support.gap(support >= 0, length) <= s.gap
+        good &= ellipse_support.purity(edges, support, length) >= s.purity
+        good &= ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses)) <= s.departure
+        score = coverage * np.clip(1 - 0.5 * spread / rms_limit, 0, 1) * np.clip(1 - 0.5 * angle / angle_limit, 0, 1)
+        return Judged(candidates[good], support[good], rms[good], coverage[good], score[good])
+
+    def _gather(
+        self, candidates: Candidates, edges: Edges, angles_rad: np.ndarray, tight: float = 1.0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return ellipse_support.gather(
+            candidates, edges, angles_rad, tight * self._reach(candidates.ellipses), self.settings.angle_rad
+        )
+
+    def _sized(self, ellipses: np.ndarray, limits: SizePrior, slack: float) -> np.ndarray:
+        a, b = ellipses[:, 2], ellipses[:, 3]
+        with np.errstate(invalid="ignore"):
+            return (
+                (a * slack >= limits.lowest_px)
+                & (a <= limits.highest_px * slack)
+                & (b * slack >= self.settings.smallest_px)
+                & (b * slack >= a * self.settings.flattest)
+            )
+
+    def _inside(self, ellipses: np.ndarray, edges: Edges) -> np.ndarray:
+        """Says which centres lie in the picture."""
+        height, width = edges.nearest.shape
+        x, y = ellipses[:, 0], ellipses[:, 1]
+        return (x >= 0) & (y >= 0) & (x < width) & (y < height)
+
+    def _reach(self, ellipses: np.ndarray) -> np.ndarray:
+        size = np.sqrt(ellipses[:, 2] * ellipses[:, 3])
+        return np.clip(self.settings.reach_relative * size, self.settings.reach_px, 4.0 * self.settings.reach_px)
+
+
+def _seeds(groups: np.ndarray) -> np.ndarray:
+    """Returns evenly spread points of each group of spans `(C, G, 2)`, of each span as many as it is long, `(C, NUM_SEEDS)`."""
+    ends = np.cumsum(groups[..., 1] - groups[..., 0], 1)
+    place = (np.arange(NUM_SEEDS) + 0.5) / NUM_SEEDS * ends[:, -1:]
+    number = (place[..., None] >= ends[:, None]).sum(-1)
+    rows = np.arange(len(groups))[:, None]
+    before = np.concatenate([np.zeros((len(ends), 1), int), ends], 1)[rows, number]
+    return (groups[rows, number, 0] + place - before).astype(int)
+
+
+def _free(spans: np.ndarray, claimed: np.ndarray) -> np.ndarray:
+    """Returns the spans most of whose points no ellipse has claimed."""
+    total = np.concatenate([[0], np.cumsum(claimed)])
+    taken = total[spans[:, 1]] - total[spans[:, 0]]
+    return spans[taken < 0.5 * (spans[:, 1] - spans[:, 0])]

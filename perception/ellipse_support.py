@@ -1,0 +1,118 @@
+"""What supports an ellipse: edge points along it, and what speaks against it. Axes: `C` candidates, `P` places around each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception import conic
+from perception.ellipse_edges import Edges
+
+NUM_SAMPLES = 96
+"""Places around an ellipse at which its support is looked for."""
+ANGLES = np.arange(NUM_SAMPLES) * (2 * np.pi / NUM_SAMPLES)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Ellipses that are judged, `C` of them.
+
+    Attributes:
+        ellipses: `(C, 5)`.
+        polarity: +1 where it is brighter outside, -1 where it is brighter inside, `(C,)`.
+    """
+
+    ellipses: np.ndarray
+    polarity: np.ndarray
+
+    def __getitem__(self, keep: np.ndarray | slice) -> Candidates:
+        return Candidates(self.ellipses[keep], self.polarity[keep])
+
+
+def gather(
+    candidates: Candidates, edges: Edges, angles_rad: np.ndarray, reach_px: np.ndarray, angle_rad: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the edge points that support each candidate at each eccentric angle, `(C, P)` each.
+
+    A supporting point lies within reach, and its gradient along the normal, with the candidate's polarity. Returns the number
+    of the point, -1 where there is none, its distance along the normal, and the cosine between gradient and normal.
+    """
+    points, outward, _ = conic.sample(candidates.ellipses, angles_rad)
+    found = edges.nearest[_pixels(points, edges.nearest.shape)]
+    apart = edges.points[found] - points
+    off = (apart * outward).sum(-1)
+    along = (edges.directions[found] * outward).sum(-1) * candidates.polarity[:, None]
+    side = np.abs(apart[..., 0] * outward[..., 1] - apart[..., 1] * outward[..., 0])
+    good = (np.abs(off) < reach_px[:, None]) & (side < 2.0)
+    good &= along > np.cos(angle_rad)
+    return np.where(good, found, -1), off, along
+
+
+def purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Returns how much of the convex arcs that support each candidate lies on it, in the mean over the support, `(C,)`.
+
+    An arc of an ellipse that something hides ends where it is hidden; an arc of a spiral or a heart goes on elsewhere.
+    """
+    there = support >= 0
+    arc = np.where(there, edges.arc[support], -1)
+    known = arc >= 0
+    ds = length * (2 * np.pi / support.shape[1])
+    key = np.arange(len(support))[:, None] * (len(edges.arcs) + 1) + arc + 1
+    _, number, inverse = np.unique(key[known], return_index=True, return_inverse=True)
+    share = np.bincount(inverse, ds[known], minlength=len(number)) / edges.arc_length[arc[known]][number]
+    each = np.ones(support.shape)
+    each[known] = np.minimum(share, 1.3)[inverse]  # of short arcs a sample more or less
+    return np.minimum((each * ds * there).sum(1) / np.maximum((ds * there).sum(1), 1e-9), 1.0)
+
+
+def departure(candidates: Candidates, edges: Edges, support: np.ndarray, length: np.ndarray, reach_px: np.ndarray) -> np.ndarray:
+    """Returns the part of the circumference without support where a chain that supports the rest runs on beside the ellipse."""
+    e = candidates.ellipses
+    if not len(e):
+        return np.empty(0)
+    points, outward, _ = conic.sample(e, ANGLES)
+    number = int(edges.chain.max()) + 1
+    rows = np.repeat(np.arange(len(e)), NUM_SAMPLES).reshape(support.shape)
+    mine = np.unique((rows * number + edges.chain[support])[support >= 0])
+    reach, wide = reach_px[:, None], np.clip(0.3 * np.sqrt(e[:, 2] * e[:, 3]), 3.0, 12.0)[:, None]
+    beside = np.zeros(support.shape, bool)
+    for part in (-1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0):
+        found = edges.nearest[_pixels(points + (part * wide)[..., None] * outward, edges.nearest.shape)]
+        off = np.abs(((edges.points[found] - points) * outward).sum(-1))
+        along = (edges.directions[found] * outward).sum(-1) * candidates.polarity[:, None]
+        hit = (along > 0.85) & (off > reach) & (off <= wide)
+        beside |= hit & np.isin(rows * number + edges.chain[found], mine)
+    return (length * (beside & (support < 0))).sum(1) / length.sum(1)
+
+
+def gap(there: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Returns the longest stretch without support as a part of the circumference, `(C,)`."""
+    run, longest = np.zeros(len(there)), np.zeros(len(there))
+    for k in range(2 * there.shape[1]):  # twice around: a stretch may run over the end
+        column = k % there.shape[1]
+        run = np.where(there[:, column], 0.0, run + length[:, column])
+        longest = np.maximum(longest, run)
+    return np.minimum(longest / length.sum(1), 1.0)
+
+
+def typical(values: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Returns the standard deviation of each row's values `(C, P)` that the nearest 70 % tell, whatever the others are."""
+    ordered = np.sort(np.where(there, values, np.inf), 1)
+    place = np.maximum((0.7 * there.sum(1)).astype(int) - 1, 0)
+    return ordered[np.arange(len(values)), place] / 1.036
+
+
+def evidence(coverage: np.ndarray, angle_rms_rad: np.ndarray, perimeter_px: np.ndarray, angle_rad: float) -> np.ndarray:
+    """Returns the decimal exponent of the chance that so many gradients point so well along the normal by accident (Chernoff)."""
+    chance = np.clip(2.0 * angle_rms_rad, 0.1, angle_rad) / np.pi
+    with np.errstate(divide="ignore", invalid="ignore"):
+        absent = np.where(coverage < 1, (1 - coverage) * np.log10((1 - coverage) / (1 - chance)), 0.0)
+        return np.where(coverage > chance, (coverage * np.log10(coverage / chance) + absent) * perimeter_px / 2, 0.0)
+
+
+def _pixels(points: np.ndarray, shape: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Returns row and column of the pixel of each point; those outside the picture get its corner, which has no edge."""
+    x, y = np.rint(points[..., 0]).astype(int), np.rint(points[..., 1]).astype(int)
+    inside = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    return np.where(inside, y, 0), np.where(inside, x, 0)

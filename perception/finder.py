@@ -1,0 +1,186 @@
+"""From a frame to holes: segmenter, ellipses, poses, filter, with every refusal and the time of every stage."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.sight import (
+    Ellipse,
+    EllipseSpec,
+    FilterSpec,
+    HolePose,
+    PoseSpec,
+    Rejection,
+    SegmenterSpec,
+    Sighting,
+    SizePrior,
+    Target,
+)  # fmt: skip
+from brokk_rl.signals import Borehole, Frame
+from brokk_rl.spec import spec
+from perception.pose import gray_of
+
+
+@spec
+class Perception:
+    """Looks for boreholes in frames: a segmenter, an ellipse detector, a pose estimator and a filter, each to be swapped.
+
+    Attributes:
+        segmenter: Says where the block is.
+        ellipse: Finds ellipses on it.
+        pose: Makes holes of them.
+        filter: Makes one target of many frames.
+        radius_m: Radius of the holes, for the size that their ellipses may have.
+        size_slack: By how much that size may be off, as a part of it.
+        smallest_block: Least part of the picture that must be block.
+        block_probability: From which a pixel is block.
+        roi: Where ellipses are looked for: on the `mask` of the block, or in its bounding `box`.
+        apart: Holes nearer to each other than so many radii are one; the outer rim is taken.
+    """
+
+    segmenter: SegmenterSpec
+    ellipse: EllipseSpec
+    pose: PoseSpec
+    filter: FilterSpec
+    radius_m: float
+    size_slack: float
+    smallest_block: float
+    block_probability: float
+    roi: str
+    apart: float
+
+    def check(self) -> None:
+        if self.roi not in ("mask", "box"):
+            raise ConfigError(f"perception.roi: expected mask or box, got '{self.roi}'")
+        if self.radius_m <= 0 or self.size_slack < 0:
+            raise ConfigError(f"perception: expected radius_m > 0 and size_slack >= 0, got {self.radius_m} and {self.size_slack}")
+
+    def build(self) -> Finder:
+        """Returns a finder."""
+        return Finder(self)
+
+
+class Finder:
+    """See `Perception`. `find` and `look` answer for one frame; `follow` remembers."""
+
+    def __init__(self, settings: Perception) -> None:
+        self.settings = settings
+        self._segmenter, self.detector = settings.segmenter.build(), settings.ellipse.build()
+        self._pose = settings.pose.build()
+        self._filter = settings.filter.build()
+
+    def find(self, frame: Frame) -> Borehole | None:
+        """Returns the borehole in the base frame, or `None` when there is none to be sure of in this frame."""
+        if frame.base_from_camera is None:
+            raise FrameError(f"{frame.name or 'frame'}: nobody knows where the camera is (T_base_cam); run mode=calibrate first")
+        try:
+            sighting = self.look(frame)
+        except FrameError:
+            return None
+        return sighting.holes[0].borehole() if sighting.holes else None
+
+    def follow(self, sighting: Sighting, t_s: float) -> Target | None:
+        """Returns what the filter holds to be true after this sighting as well."""
+        return self._filter.update(sighting.holes, t_s)
+
+    def look(self, frame: Frame) -> Sighting:
+        """Returns everything that one frame says; in the base frame where the camera's pose is known, else in the camera's.
+
+        Raises:
+            FrameError: the segmenter cannot use the frame.
+        """
+        s = self.settings
+        ms: dict[str, float] = {}
+        with _timed(ms, "frame"):
+            frame = rectified(frame)
+        with _timed(ms, "segment"):
+            masks = self._segmenter.segment(frame)
+        roi = masks.block > s.block_probability
+        share = float(roi.mean())
+        if share < s.smallest_block:
+            return Sighting([], [Rejection("segment", "part of the picture that is block", share, s.smallest_block)], [], masks, ms)
+        with _timed(ms, "ellipse"):
+            ellipses = self.detector.detect(gray_of(frame), self._region(roi), self._prior(frame, roi))
+        with _timed(ms, "pose"):
+            judged = [(ellipse, self._pose.estimate(frame, masks, ellipse)) for ellipse in ellipses]
+            found = [(e, pose) for e, pose in judged if isinstance(pose, HolePose)]
+            refused = [pose for _, pose in judged if isinstance(pose, Rejection)]
+            holes, doubles = self._single(found)
+        if not ellipses:
+            refused = [Rejection("ellipse", "ellipses of a possible size on the block", 0.0, 1.0)]
+        if frame.base_from_camera is not None:
+            holes = [(ellipse, pose.moved(frame.base_from_camera)) for ellipse, pose in holes]
+        rejected = [*refused, *doubles]
+        shown = [e for e, _ in holes] + [r.ellipse for r in rejected if r.ellipse is not None]
+        ms["total"] = sum(ms.values())
+        return Sighting([pose for _, pose in holes], rejected, shown, masks, ms)
+
+    def _region(self, roi: np.ndarray) -> np.ndarray:
+        """Returns where ellipses are looked for: the mask with its gaps closed, or its bounding box."""
+        region = np.zeros(roi.shape, bool)
+        if self.settings.roi == "box":
+            rows, columns = np.flatnonzero(roi.any(1)), np.flatnonzero(roi.any(0))
+            region[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
+            return region
+        step = 4  # holes are gaps of the mask where the segmenter does not count them to the block
+        small = np.ascontiguousarray(roi[::step, ::step]).astype(np.uint8)
+        size = max(3, round(0.06 * small.shape[1])) | 1
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        padded = cv2.copyMakeBorder(small, size, size, size, size, cv2.BORDER_CONSTANT, value=0)
+        closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[size:-size, size:-size]
+        large = cv2.resize(closed, roi.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        return large | roi
+
+    def _prior(self, frame: Frame, roi: np.ndarray) -> SizePrior | None:
+        """Returns the size that a hole's ellipse may have at the depths of the block; `None` where no depth is known."""
+        depth = frame.depth_m[::4, ::4][roi[::4, ::4]]
+        depth = depth[np.isfinite(depth)]
+        if len(depth) < 50:
+            return None
+        near, far = np.percentile(depth, (2.0, 98.0))
+        size = float(np.sqrt(frame.camera_matrix[0, 0] * frame.camera_matrix[1, 1])) * self.settings.radius_m
+        slack = 1.0 + self.settings.size_slack
+        return SizePrior(float(size / far / slack), float(size / near * slack))
+
+    def _single(self, found: Sequence[tuple[Ellipse, HolePose]]) -> tuple[list[tuple[Ellipse, HolePose]], list[Rejection]]:
+        """Returns each hole once, the best first: of rims within each other the outer one, which is the near one."""
+        kept: list[tuple[Ellipse, HolePose]] = []
+        doubles = []
+        limit = self.settings.apart * self.settings.radius_m
+        best = max((e.score for e, _ in found), default=0.0)
+        strong = [(e.score >= 0.5 * best, pose.radius_m) for e, pose in found]
+        for k in sorted(range(len(found)), key=lambda k: strong[k], reverse=True):
+            ellipse, pose = found[k]
+            distance = min((float(np.linalg.norm(pose.center_m - other.center_m)) for _, other in kept), default=np.inf)
+            if distance < limit:
+                doubles.append(Rejection("pose", "distance to a larger rim, m", distance, limit, ellipse))
+            else:
+                kept.append((ellipse, pose))
+        return sorted(kept, key=lambda one: -one[1].score), doubles
+
+
+def rectified(frame: Frame) -> Frame:
+    """Returns the frame without lens distortion; depth is moved, never mixed between pixels."""
+    if frame.distortion is None or not np.any(frame.distortion):
+        return frame
+    height, width = frame.depth_m.shape
+    maps = cv2.initUndistortRectifyMap(
+        frame.camera_matrix, frame.distortion, np.eye(3), frame.camera_matrix, (width, height), cv2.CV_32FC1
+    )
+    color = cv2.remap(frame.color, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    depth = cv2.remap(frame.depth_m, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+    return replace(frame, color=np.asarray(color, np.uint8), depth_m=np.asarray(depth, np.float32), distortion=None)
+
+
+@contextmanager
+def _timed(ms: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    ms[stage] = 1000.0 * (time.perf_counter() - start)

@@ -1,0 +1,172 @@
+"""The block's face around a hole: a plane fitted to inverse depth.
+
+Inverse depth is linear in the picture on a plane, `1/z = m · (x, y, 1)` with `(x, y, 1)` the ray of a pixel, and a stereo matcher's
+noise in it is the same at every distance: least squares in it weigh depth by `1/z^4`, as they should. The plane's normal is `m`
+made a unit vector, and `1/|m|` its distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception import conic
+
+TUKEY = 4.685
+"""Residual, in standard deviations, from which a point counts nothing; 95 % efficient with Gaussian noise."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane in camera coordinates.
+
+    Attributes:
+        m: `(3,)` 1/m; the points `P` with `m · P = 1`.
+        cov: Covariance of `m`, `(3, 3)`.
+        sigma: Standard deviation of the residuals of inverse depth, 1/m.
+        num_points: Points that count.
+        extent: Of the support around the ellipse, in radii.
+    """
+
+    m: np.ndarray
+    cov: np.ndarray
+    sigma: float
+    num_points: int
+    extent: float
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit normal towards the camera, `(3,)`."""
+        return -self.m / np.linalg.norm(self.m)
+
+    def normal_cov_rad2(self) -> np.ndarray:
+        """Returns the covariance of the normal, `(3, 3)`, singular along it."""
+        length = np.linalg.norm(self.m)
+        project = (np.eye(3) - np.outer(self.normal, self.normal)) / length
+        return project @ self.cov @ project
+
+    def point(self, ray: np.ndarray) -> np.ndarray:
+        """Returns where a ray `(3,)` with z = 1 meets it."""
+        return ray / float(self.m @ ray)
+
+
+@dataclass(frozen=True)
+class Support:
+    """Pixels of the face around an ellipse.
+
+    Attributes:
+        rays: `(P, 3)`, z = 1.
+        inverse: Inverse depth, `(P,)` 1/m.
+        radii: Distance from the ellipse's centre in its own radii, `(P,)`.
+        cell: Number of the square of the picture in which a pixel lies, `(P,)`; noise is alike within one.
+    """
+
+    rays: np.ndarray
+    inverse: np.ndarray
+    radii: np.ndarray
+    cell: np.ndarray
+
+
+def support(
+    depth_m: np.ndarray,
+    allowed: np.ndarray,
+    camera_matrix: np.ndarray,
+    ellipse: np.ndarray,
+    inner: float,
+    outer: float,
+    most: int,
+    cell_px: int,
+) -> Support:
+    """Returns the pixels with known depth between `inner` and `outer` radii of an ellipse `(5,)`.
+
+    Args:
+        depth_m: `(h, w)`.
+        allowed: Pixels of the face, `(h, w)` bool.
+        camera_matrix: `(3, 3)`.
+        ellipse: Centre, semi-axes, direction.
+        inner: In radii of the ellipse; keeps the rim's bleeding out.
+        outer: In radii.
+        most: Pixels beyond so many are left out on a regular grid.
+        cell_px: Side of the squares in which noise is alike.
+    """
+    height, width = depth_m.shape
+    x, y, a = ellipse[0], ellipse[1], ellipse[2] * outer
+    left, right = max(0, int(x - a)), min(width, int(x + a) + 2)
+    top, bottom = max(0, int(y - a)), min(height, int(y + a) + 2)
+    area = max(right - left, 0) * max(bottom - top, 0)
+    step = max(1, int(np.sqrt(area / most)))
+    rows, columns = np.mgrid[top:bottom:step, left:right:step]
+    depth = depth_m[top:bottom:step, left:right:step]
+    value = np.einsum("...i,ij,...j->...", *_homogeneous(columns, rows, conic.form(ellipse)))
+    radii = np.sqrt(np.maximum(value + 1.0, 0.0))
+    good = allowed[top:bottom:step, left:right:step] & np.isfinite(depth) & (depth > 0) & (radii > inner) & (radii < outer)
+    u, v = columns[good].astype(float), rows[good].astype(float)
+    rays = np.column_stack([u, v, np.ones_like(u)]) @ np.linalg.inv(camera_matrix).T
+    cell = (v // cell_px).astype(np.int64) * (width // cell_px + 1) + (u // cell_px).astype(np.int64)
+    return Support(rays, 1.0 / depth[good].astype(float), radii[good], cell)
+
+
+def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.random.Generator) -> Plane | None:
+    """Returns the plane that the points around the ellipse lie on, grown from the ring near it outwards; `None` for too few points.
+
+    Args:
+        points: Support.
+        rings: Outer limits in radii, from the ring in which the plane is found to the last one across which it is grown.
+        floor: Least standard deviation of inverse depth, 1/m: of a matcher that repeats itself.
+        generator: Draws the triples of the first guess.
+    """
+    near = points.radii < rings[0]
+    if near.sum() < 30:
+        near = points.radii < rings[min(1, len(rings) - 1)]
+    if near.sum() < 30:
+        return None
+    m = _guess(points.rays[near], points.inverse[near], generator)
+    extent = rings[0]
+    sigma, weight = floor, np.zeros(len(points.inverse))
+    for ring in rings:
+        inside = points.radii < ring
+        for _ in range(4):
+            residual = points.inverse - points.rays @ m
+            tight = np.abs(residual[inside])
+            scale = max(1.4826 * float(np.median(tight[tight < max(8 * sigma, np.median(tight) * 1.5)])), floor)
+            sigma = scale if ring == rings[0] else min(scale, 1.5 * sigma)  # what else comes into sight is no noise
+            weight = np.where(inside, np.maximum(1 - (residual / (TUKEY * sigma)) ** 2, 0.0) ** 2, 0.0)
+            if (weight > 0).sum() < 30:
+                return None
+            heavy = points.rays * weight[:, None]
+            m = np.linalg.solve(heavy.T @ points.rays, heavy.T @ points.inverse)
+        extent = ring
+    residual = points.inverse - points.rays @ m
+    return Plane(m, _covariance(points, weight, residual), sigma, int((weight > 0).sum()), extent)
+
+
+def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 60) -> np.ndarray:
+    """Returns the plane through three points that most points lie nearest to (least median of squares)."""
+    best, least = np.linalg.lstsq(rays, inverse, rcond=None)[0], np.inf
+    judge = generator.integers(len(rays), size=min(len(rays), 400))
+    for triple in generator.integers(len(rays), size=(trials, 3)):
+        matrix = rays[triple]
+        if abs(np.linalg.det(matrix)) < 1e-9:
+            continue
+        m = np.linalg.solve(matrix, inverse[triple])
+        spread = float(np.median(np.abs(inverse[judge] - rays[judge] @ m)))
+        if spread < least:
+            best, least = m, spread
+    return best
+
+
+def _covariance(points: Support, weight: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Returns the covariance of the plane, `(3, 3)`: the sandwich estimate over cells, within which noise may do as it likes."""
+    heavy = points.rays * weight[:, None]
+    bread = np.linalg.inv(heavy.T @ points.rays)
+    _, cell = np.unique(points.cell, return_inverse=True)
+    push = heavy * residual[:, None]
+    sums = np.column_stack([np.bincount(cell, push[:, k]) for k in range(3)])
+    num = max(int(cell.max()) + 1, 4)
+    return bread @ (sums.T @ sums) @ bread * num / (num - 3)
+
+
+def _homogeneous(columns: np.ndarray, rows: np.ndarray, form: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    place = np.stack([columns, rows, np.ones_like(rows)], -1).astype(float)
+    return place, form, place
