@@ -1,0 +1,50 @@
+"""`brokk mode=label`: makes masks for real footage of a block, so that the segmenter can be trained on it."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from brokk_rl.session import Session, write_json
+from brokk_rl.sight import Labelling
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class Label:
+    """Labels frames of a block that does not move.
+
+    Attributes:
+        session: Folder to write into.
+        label: What is labelled, and how.
+    """
+
+    session: Session
+    label: Labelling
+
+    def run(self) -> None:
+        """Writes `frames`, which `mode=train_perception` takes, `overlays` to look at, and `labels.json`.
+
+        Raises:
+            FrameError: no frame can be labelled.
+        """
+        result = self.label.label(self.session.folder)
+        write_json(self.session.folder / "labels.json", result)
+        _show(result)
+        log.info("training.frames=%s", self.session.folder / "frames")
+
+
+def _show(result: dict[str, Any]) -> None:
+    table = Table(title=f"{result['num_labelled']} of {len(result['frames'])} frames labelled", box=None)
+    for name in ("frame", "board [px]", "outline [px]", "depth agrees", "left out because"):
+        table.add_column(name, justify="left" if name in ("frame", "left out because") else "right")
+    for name, entry in result["frames"].items():
+        board, outline = (f"{entry[key]:.2f}" if entry[key] is not None else "–" for key in ("board_px", "outline_px"))
+        share = "–" if entry["depth_share"] is None else f"{entry['depth_share']:.0%}"
+        table.add_row(name, board, outline, share, entry["left_out"] or "")
+    Console().print(table)

@@ -1,0 +1,179 @@
+"""A block of concrete in the world as a cuboid with round mouths in one face, and how it looks through a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from brokk_rl.signals import Frame
+
+FACES = ((2, 1), (2, -1), (0, 1), (0, -1), (1, 1), (1, -1))
+"""Axis and side of each face; the first is the drilled one, at z = 0, whose normal is +z."""
+
+
+@dataclass(frozen=True)
+class Mouth:
+    """The rim of a hole in the drilled face: its centre in the face's coordinates and its radius, m."""
+
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
+@dataclass(frozen=True)
+class Cuboid:
+    """A block. Its own coordinates: one corner of the drilled face at the origin, the face along +x and +y, the block towards -z.
+
+    Attributes:
+        rotation: From its coordinates to the world, `(3, 3)`.
+        origin_m: That corner in the world, `(3,)`.
+        size_m: Width and height of the face, thickness behind it, `(3,)`.
+        mouths: Mouths of holes in the face.
+    """
+
+    rotation: np.ndarray
+    origin_m: np.ndarray
+    size_m: np.ndarray
+    mouths: tuple[Mouth, ...] = ()
+
+    @property
+    def low_m(self) -> np.ndarray:
+        """Lower bounds in its own coordinates, `(3,)`."""
+        return np.array([0.0, 0.0, -self.size_m[2]])
+
+    @property
+    def high_m(self) -> np.ndarray:
+        """Upper bounds in its own coordinates, `(3,)`."""
+        return np.array([self.size_m[0], self.size_m[1], 0.0])
+
+    def world(self, points_m: np.ndarray) -> np.ndarray:
+        """Returns points of its own coordinates, `(…, 3)`, in the world."""
+        return points_m @ self.rotation.T + self.origin_m
+
+    def own(self, points_m: np.ndarray) -> np.ndarray:
+        """Returns points of the world, `(…, 3)`, in its own coordinates."""
+        return (points_m - self.origin_m) @ self.rotation
+
+    def moved(self, change: np.ndarray) -> Cuboid:
+        """Returns it turned about its face's middle, shifted, and with another face: `change` is rad (3), m (3), m (2)."""
+        middle = self.world(self.high_m * [0.5, 0.5, 0.0])
+        turn = Rotation.from_rotvec(change[:3]).as_matrix()
+        size_m = self.size_m + np.array([change[6], change[7], 0.0])
+        rotation = turn @ self.rotation
+        # the face grows on both sides of its middle, and the mouths stay where they are on it
+        origin_m = middle + change[3:6] - rotation @ (size_m * [0.5, 0.5, 0.0])
+        mouths = tuple(replace(one, x_m=one.x_m + change[6] / 2, y_m=one.y_m + change[7] / 2) for one in self.mouths)
+        return Cuboid(rotation, origin_m, size_m, mouths)
+
+    def edges(self, eye_m: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Returns the edges of faces that can be seen from `eye_m` (world), as end points in its own coordinates."""
+        eye = self.own(eye_m)
+        low, high = self.low_m, self.high_m
+        visible = {face for face in FACES if (eye[face[0]] > high[face[0]] if face[1] > 0 else eye[face[0]] < low[face[0]])}
+        found = []
+        for axis in range(3):
+            one, two = (axis + 1) % 3, (axis + 2) % 3
+            for first in (-1, 1):
+                for second in (-1, 1):
+                    if (one, first) in visible or (two, second) in visible:
+                        begin = np.where(np.arange(3) == one, high if first > 0 else low, high if second > 0 else low)
+                        begin, end = begin.copy(), begin.copy()
+                        begin[axis], end[axis] = low[axis], high[axis]
+                        found.append((begin, end))
+        return found
+
+
+@dataclass(frozen=True)
+class Look:
+    """A cuboid as a camera sees it; all `(h, w)`.
+
+    Attributes:
+        depth_m: Depth along z of what is seen of it, infinite beside it.
+        face: Number of the face that is seen (`FACES`), -1 beside it.
+        mouth: Where a mouth is seen, bool.
+    """
+
+    depth_m: np.ndarray
+    face: np.ndarray
+    mouth: np.ndarray
+
+
+def look(cuboid: Cuboid, rays: np.ndarray, world_from_camera: np.ndarray) -> Look:
+    """Follows rays until they meet the cuboid.
+
+    Args:
+        cuboid: The block.
+        rays: Lines of sight at depth 1 in the camera's frame, `(…, 3)`, see `sight_lines`.
+        world_from_camera: Pose of the camera, `(4, 4)`.
+    """
+    eye = cuboid.own(world_from_camera[:3, 3])
+    along = rays @ (world_from_camera[:3, :3].T @ cuboid.rotation)
+    along = np.where(np.abs(along) < 1e-9, 1e-9, along)
+    low, high = (cuboid.low_m - eye) / along, (cuboid.high_m - eye) / along
+    first = np.minimum(low, high)
+    axis = first.argmax(-1)
+    enters, leaves = first.max(-1), np.maximum(low, high).min(-1)
+    hit = (enters > 0) & (enters < leaves)
+    positive = np.take_along_axis(along, axis[..., None], -1)[..., 0] < 0  # it comes from the positive side
+    face = np.full(axis.shape, -1)
+    for number, (of, side) in enumerate(FACES):
+        face[hit & (axis == of) & (positive == (side > 0))] = number
+    point = eye + along * np.where(hit, enters, 0.0)[..., None]
+    mouth = np.zeros(hit.shape, bool)
+    for one in cuboid.mouths:
+        mouth |= (face == 0) & (np.hypot(point[..., 0] - one.x_m, point[..., 1] - one.y_m) < one.radius_m)
+    return Look(np.where(hit, enters, np.inf), face, mouth)
+
+
+def sight_lines(frame: Frame, step: int = 1) -> np.ndarray:
+    """Returns the line of sight of every `step`-th pixel at depth 1, `(h, w, 3)`, lens distortion taken out."""
+    height, width = frame.color.shape[:2]
+    columns, rows = np.meshgrid(np.arange(0, width, step, dtype=float), np.arange(0, height, step, dtype=float))
+    return sight(frame, np.stack([columns, rows], axis=-1))
+
+
+def sight(frame: Frame, pixels: np.ndarray) -> np.ndarray:
+    """Returns the lines of sight of pixels `(…, 2)` at depth 1, `(…, 3)`."""
+    matrix = np.asarray(frame.camera_matrix, float)
+    if frame.distortion is None or not np.any(frame.distortion):
+        flat = (pixels - matrix[:2, 2]) / [matrix[0, 0], matrix[1, 1]]
+    else:
+        flat = np.asarray(cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, frame.distortion)).reshape(pixels.shape)
+    return np.concatenate([flat, np.ones((*pixels.shape[:-1], 1))], axis=-1)
+
+
+def project(points_m: np.ndarray, frame: Frame, world_from_camera: np.ndarray) -> np.ndarray:
+    """Returns where points of the world, `(n, 3)`, are seen, `(n, 2)` px; NaN behind the camera."""
+    local = (points_m - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    ahead = local[:, 2] > 0.05
+    pixels = np.full((len(points_m), 2), np.nan)
+    if ahead.any():
+        zero = np.zeros(3)
+        there = np.ascontiguousarray(local[ahead])
+        seen, _ = cv2.projectPoints(there, zero, zero, np.asarray(frame.camera_matrix, float), frame.distortion)
+        pixels[ahead] = np.asarray(seen).reshape(-1, 2)
+    return pixels
+
+
+def cuboid_of(corners_m: np.ndarray, thickness_m: float, eye_m: np.ndarray, mouths_m: Sequence[tuple[np.ndarray, float]]) -> Cuboid:
+    """Returns the block whose drilled face has three known corners.
+
+    Args:
+        corners_m: A corner and its two neighbours on the face, `(3, 3)`, world.
+        thickness_m: Of the block behind the face.
+        eye_m: A point in front of the face, world.
+        mouths_m: Centre in the world and radius of each mouth.
+    """
+    one, two = corners_m[1] - corners_m[0], corners_m[2] - corners_m[0]
+    if np.cross(one, two) @ (eye_m - corners_m[0]) < 0:
+        one, two = two, one
+    x = one / np.linalg.norm(one)
+    z = np.cross(one, two) / np.linalg.norm(np.cross(one, two))
+    y = np.cross(z, x)
+    block = Cuboid(np.stack([x, y, z], axis=1), corners_m[0], np.array([np.linalg.norm(one), two @ y, thickness_m]))
+    places = [(block.own(center_m), radius_m) for center_m, radius_m in mouths_m]
+    return replace(block, mouths=tuple(Mouth(float(at[0]), float(at[1]), radius_m) for at, radius_m in places))
