@@ -113,16 +113,17 @@ class LiveSource:
         """
         if self._lens is None:
             raise FrameError(f"{self._name}: not open; use it in a `with` block")
-        until, oldest_s = time.monotonic() + self._fresh.timeout_s, None
-        while (left := until - time.monotonic()) > 0:
+        left, oldest_s = self._fresh.timeout_s, None
+        until = time.monotonic() + left
+        while left > 0:
             capture = self._device.capture(left)
-            if capture is None or capture.t_s <= self._last_s:
-                continue
-            age_s = self._device.now_s() - capture.t_s
-            if age_s <= self._fresh.max_age_s:
-                self._last_s = capture.t_s
-                return self._frame(capture, self._lens)
-            oldest_s = age_s if oldest_s is None else max(oldest_s, age_s)
+            if capture is not None and capture.t_s > self._last_s:
+                age_s = self._device.now_s() - capture.t_s
+                if age_s <= self._fresh.max_age_s:
+                    self._last_s = capture.t_s
+                    return self._frame(capture, self._lens)
+                oldest_s = max(age_s, oldest_s or 0.0)
+            left = until - time.monotonic()
         stale = (
             "" if oldest_s is None else f"; the frames that came were up to {oldest_s:.2f} s old, {self._fresh.max_age_s:g} allowed"
         )

@@ -1,0 +1,298 @@
+"""Rendered frames are what the mathematics says, to the pixel; worked by hand or by OpenCV's own projection."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from composed import names, option
+
+from brokk_rl.errors import ConfigError, FrameError
+from perception import dataset
+from perception.concrete import frame_of
+from perception.drawing import compose, hidden_part, rim_points
+from perception.render.drilled import Block, Chip, Disc, Hole
+from perception.render.sensor import Exposure, dust, photograph
+from perception.render.solids import Box, Cylinder, Plane, Pose
+from perception.render.texture import Material
+from perception.render.tracer import Light, Pinhole, Tracer
+from perception.rig import Rig
+from perception.scenes import Scenes
+from perception.studio import Studio
+
+GREY = Material((0.5, 0.5, 0.5), 0.0, 0.001)
+STONE = Material((0.5, 0.5, 0.5), 0.25, 0.0006, 2)
+NOON = Light(np.array([0.0, 0.0, -1.0]), 1.0, 0.5)
+"""Light from behind the camera."""
+SMALL = Pinhole(320, 240, 400.0, np.zeros(3))
+FACING = np.diag([1.0, -1.0, -1.0])
+"""A block's pose with its drilled face towards the camera."""
+
+
+def drilled(rotation: np.ndarray, center_m: np.ndarray, material: Material = GREY, **extra: Any) -> Block:
+    """Returns a block, 1 x 0.8 x 0.6 m, with one hole of 50 mm, 0.3 m deep, in the middle of the face, which lies at `center_m`."""
+    half = np.array([0.5, 0.4, 0.3])
+    hole = Hole(np.array([0.0, 0.0, half[2]]), 0.05, 0.3)
+    pose = Pose(rotation, center_m - rotation @ hole.center_m)
+    return Block(pose, half, (material,) * 12, (hole,), **extra)
+
+
+def seen(solids: list[Any], camera: Pinhole = SMALL, light: Light = NOON) -> Any:
+    return Tracer(solids, light, (0.0, 0.0, 0.0)).view(camera)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The default rig at a quarter of its size."""
+    return replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
+
+
+def kind(name: str) -> Scenes:
+    return option("scene", name)
+
+
+def studio(name: str, rig: Rig, depth: str = "exact") -> Studio:
+    return Studio(rig=rig, scene=kind(name), stereo=option("stereo", "sgbm"), depth=depth)  # type: ignore[arg-type]
+
+
+def test_depths_into_a_hole_are_those_worked_by_hand() -> None:
+    # f = 400 px: the pixel 8 px right of the axis looks along x / z = 0.02. The face is at z = 2 m, so x = 0.04 m there: inside the
+    # rim of 0.05 m. It would meet the wall at z = 0.05 / 0.02 = 2.5 m, and meets the floor at 2.3 m before. 9.6 px: x / z = 0.024,
+    # the wall at z = 0.05 / 0.024 = 2.0833 m. 12 px: x = 0.06 m, on the face.
+    camera = Pinhole(321, 241, 400.0, np.zeros(3))  # its axis goes through pixel (160, 120)
+    tracer = Tracer([drilled(FACING, np.array([0.0, 0.0, 2.0]))], NOON, (0.0, 0.0, 0.0))
+    rays = camera.rays(np.array([[160.0, 120.0], [168.0, 120.0], [169.6, 120.0], [172.0, 120.0], [160.0, 129.6], [160.0, 20.0]]))
+    depth, _, part = tracer.first(np.zeros(3), rays)
+    np.testing.assert_allclose(depth[:5], [2.3, 2.3, 0.05 / 0.024, 2.0, 0.05 / 0.024], atol=1e-5)
+    assert part[0] == part[1] == 7 and part[2] == part[4] == 6 and part[3] == 5  # floor, wall, face
+    assert depth[5] > 50  # over the block's edge at y = -0.4 m there is nothing
+
+
+@pytest.mark.parametrize("obliquity", [0.0, 0.61, 1.05])
+def test_the_mouth_is_the_projected_circle(obliquity: float) -> None:
+    rotation = FACING @ cv2.Rodrigues(np.array([obliquity, 0.0, 0.0]))[0] @ cv2.Rodrigues(np.array([0.0, 0.0, 0.4]))[0]
+    center = np.array([0.05, -0.03, 0.8])
+    view = seen([drilled(rotation, center)])
+    angle = np.linspace(0, 2 * np.pi, 2000)
+    rim = center + 0.05 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) @ rotation.T
+    pixels = cv2.projectPoints(rim, np.zeros(3), np.zeros(3), SMALL.matrix, None)[0][:, 0].astype(np.float32)
+    inside = [[cv2.pointPolygonTest(pixels, (float(x), float(y)), False) > 0 for x in range(320)] for y in range(240)]
+    wrong = np.array(inside) != view.mouth
+    assert view.mouth.sum() > 500
+    assert wrong.sum() <= 2  # the polygon of 2000 points against the circle
+
+
+def test_a_tilted_face_has_the_depth_of_its_plane() -> None:
+    rotation, center = frame_of(np.array([0.3, -0.5, -0.8]), 0.3), np.array([0.05, 0.02, 1.5])
+    view = seen([drilled(rotation, center)])
+    normal = rotation[:, 2]
+    y, x = np.mgrid[:240, :320]
+    plane = (center @ normal) / (((x - 159.5) * normal[0] + (y - 119.5) * normal[1]) / 400.0 + normal[2])
+    on_face = (view.solid == 0) & ~view.mouth & (np.abs(x - 176) < 25) & (np.abs(y - 125) < 25)
+    assert on_face.sum() > 1000
+    np.testing.assert_allclose(view.depth_m[on_face], plane[on_face], atol=2e-6)
+
+
+def test_a_ray_goes_through_a_chip_into_the_hole_and_out_of_neither() -> None:
+    chip = Chip(np.array([0.05, 0.0, 0.31]), 0.025)  # on the rim, 1 cm above the face: a bowl 22.9 mm wide, 15 mm deep
+    plain, chipped = (drilled(FACING, np.array([0.0, 0.0, 1.0]), chips=chips) for chips in ((), (chip,)))
+    before, after = seen([plain]), seen([chipped])
+    np.testing.assert_array_equal(before.mouth, after.mouth)  # the drilled circle stays what it is
+    deeper = after.depth_m - before.depth_m
+    assert np.nanmin(deeper) > -1e-6
+    # straight ahead through the bowl beside the rim: at x = 0.06 m the ball ends sqrt(25^2 - 10^2) - 10 = 12.91 mm below the face
+    t, _, part = Tracer([chipped], NOON, (0, 0, 0)).first(np.array([0.06, 0.0, 0.0]), np.array([[0.0, 0.0, 1.0]], np.float32))
+    assert t[0] == pytest.approx(1.0 + 0.01291, abs=1e-5) and part[0] == chipped.break_part
+
+
+def test_a_cylinder_and_a_box_are_where_they_should_be() -> None:
+    post = Cylinder("arm", Pose(np.eye(3)[:, [2, 0, 1]], np.array([0.1, 0.0, 1.0])), 0.05, 0.2, (GREY,))  # upright
+    crate = Box("clutter", Pose(np.eye(3), np.array([-0.2, 0.0, 1.0])), np.array([0.1, 0.1, 0.1]), (GREY,))
+    t, solid, _ = Tracer([post, crate], NOON, (0, 0, 0)).first(
+        np.zeros(3), np.array([[0.1, 0.0, 1.0], [-0.2, 0.0, 1.0], [0.0, 0.0, 1.0]], np.float32)
+    )
+    # along (0.1, 0, 1) s the post's axis is hit at s = 1, its skin 0.05 / |(0.1, 1)| of the way before
+    assert t[0] == pytest.approx(1.0 - 0.05 / np.hypot(0.1, 1.0), abs=1e-5)
+    assert t[1] == pytest.approx(0.9, abs=1e-6)
+    assert solid.tolist() == [0, 1, -1]
+
+
+def test_a_shadow_lies_where_the_light_is_blocked() -> None:
+    wall = Plane("ground", Pose(FACING, np.array([0.0, 0.0, 2.0])), (GREY,))
+    board = Box("arm", Pose(np.eye(3), np.array([0.5, 0.0, 1.0])), np.array([0.1, 0.1, 0.01]), (GREY,))
+    to_sun = np.array([1.0, 0.0, -2.0]) / np.sqrt(5)  # from x = 0 on the wall through x = 0.5, z = 1: the middle of the board
+    view = seen([wall, board], light=Light(to_sun, 1.0, 0.5))
+    lit, dark = 0.5 * (0.5 + 2 / np.sqrt(5)), 0.5 * 0.5
+    np.testing.assert_allclose(view.radiance[120, 160], dark, rtol=1e-3)  # the shadow is 0.2 m wide: 20 px about x = 0
+    np.testing.assert_allclose(view.radiance[120, 160 + 30], lit, rtol=1e-3)
+    np.testing.assert_allclose(view.radiance[120, 160 - 30], lit, rtol=1e-3)
+
+
+def test_it_grows_darker_down_a_hole_and_stays_even_on_a_painted_disc() -> None:
+    shade = Light(np.array([0.0, 0.0, 1.0]), 0.0, 1.0)  # light from everywhere alone
+    paint = Disc(np.array([-0.2, 0.0, 0.3]), 0.05, "paint")
+    rotation, center = FACING @ cv2.Rodrigues(np.array([0.7, 0.0, 0.0]))[0], np.array([0.1, 0.0, 0.8])
+    view = seen([drilled(rotation, center, discs=(paint,))], light=shade)
+    inside = np.flatnonzero(view.mouth[:, int(SMALL.project(center)[0])])
+    column = view.radiance[inside[2:-2], int(SMALL.project(center)[0]), 0]
+    assert column.max() > 3 * column.min()  # the wall's gradient, which a flat disc has not
+    middle = SMALL.project(center + rotation @ [-0.2, 0.0, 0.0]).astype(int)
+    assert not view.mouth[middle[1], middle[0]]
+    assert np.ptp(view.radiance[middle[1] - 5 : middle[1] + 5, middle[0], 0]) < 1e-6
+
+
+def test_both_pictures_show_the_same_texture() -> None:
+    camera, partner = SMALL, Pinhole(320, 240, 400.0, np.array([0.12, 0.0, 0.0]))
+    tracer = Tracer([drilled(frame_of(np.array([0.2, -0.4, -0.9]), 0.0), np.array([0.1, 0.0, 1.2]), STONE)], NOON, (0, 0, 0))
+    left, right = tracer.view(camera), tracer.view(partner)
+    y, x = np.mgrid[:240, :320].astype(np.float32)
+    moved = cv2.remap(right.radiance, (x - 400.0 * 0.12 / left.depth_m).astype(np.float32), y, cv2.INTER_CUBIC)
+    inner = cv2.erode(((left.solid == 0) & ~cv2.dilate(left.mouth.astype(np.uint8), np.ones((9, 9))).astype(bool)).astype(np.uint8),
+                      np.ones((9, 9))).astype(bool)  # fmt: skip
+    inner[:, :90] = False  # out of the right picture
+    error, contrast = (moved - left.radiance)[inner][:, 0], left.radiance[inner][:, 0].std()
+    assert inner.sum() > 5000
+    assert error.std() < 0.35 * contrast  # resampling of grain as fine as a pixel; unrelated textures would give 1.4
+    assert abs(error.mean()) < 0.01 * left.radiance[inner].mean()
+
+
+def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Rig) -> None:
+    full = replace(rig, width=960, height=540, focal_px=1056.0)  # the middle of a 1080p picture
+    rotation, center = frame_of(np.array([0.1, -0.57, -0.82]), 0.3), np.array([0.0, 0.0, 2.5])
+    tracer = Tracer(
+        [drilled(rotation, center, STONE), Plane("ground", Pose(FACING, np.array([0.0, 0.0, 5.0])), (STONE,))], NOON, (0, 0, 0)
+    )
+    exposure, chance = Exposure(1.0, 0.0, 0.0, 0.0, 0.5, 8000.0, 8.0, 1.0, 0.0), np.random.default_rng(0)
+    views = [tracer.view(camera) for camera in (full.left, full.right)]
+    left, right = (photograph(view.radiance, view.depth_m, exposure, dust(0.0, chance), chance) for view in views)
+    stereo = option("stereo", "sgbm")
+    face = cv2.erode((views[0].solid == 0).astype(np.uint8), np.ones((21, 21))).astype(bool)
+    face &= ~cv2.dilate(views[0].mouth.astype(np.uint8), np.ones((21, 21))).astype(bool)
+    error, known = {}, {}
+    for name, matcher in (("refined", stereo), ("plain", replace(stereo, refinements=0))):
+        depth = matcher.depth_m(left, right, 1056.0, 0.12)
+        wrong = (1056.0 * 0.12 * (1 / depth - 1 / views[0].depth_m))[face]
+        known[name], error[name] = np.isfinite(wrong).mean(), wrong[np.isfinite(wrong)]
+    assert known["refined"] > 0.9
+    assert abs(np.median(error["refined"])) < 0.02 < abs(np.median(error["plain"]))
+    spread = 1.48 * np.median(np.abs(error["refined"] - np.median(error["refined"])))
+    assert 0.03 < spread < 0.35  # 0.29 px on real pairs with dense truth
+    assert np.isnan(stereo.depth_m(left, right, 1056.0, 0.12)[:, :20]).all()  # what the right camera does not see
+
+
+def test_dust_takes_contrast_as_it_says() -> None:
+    depth = np.full((40, 60), 2.0, np.float32)
+    light = np.where(np.arange(60) < 30, 0.2, 0.8).astype(np.float32)[None, :, None] * np.ones((40, 1, 3), np.float32)
+    thick = Exposure(1.0, np.log(4.0) / 2.0, 0.6, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0)  # a quarter is left after 2 m
+    taken = photograph(light, depth, thick, dust(0.0, np.random.default_rng(0)), np.random.default_rng(0))
+    assert taken[0, 0, 0] == pytest.approx(255 * (0.2 / 4 + 0.6 * 3 / 4), abs=1)
+    assert taken[0, -1, 0] == pytest.approx(255 * (0.8 / 4 + 0.6 * 3 / 4), abs=1)
+
+
+def test_noise_in_the_dark_is_that_of_the_electrons() -> None:
+    light, depth = np.full((200, 200, 3), 0.5, np.float32), np.ones((200, 200), np.float32)
+    dim = Exposure(0.15, 0.0, 0.0, 0.0, 0.0, 8000.0, 8.0, 1.0, 0.0)
+    taken = photograph(light, depth, dim, dust(0.0, np.random.default_rng(0)), np.random.default_rng(1)).astype(float)
+    # 0.075 of 8000 electrons are 600; their noise sqrt(600 + 8^2) is 25.8 electrons or 0.82 of 255 steps, rounding adds 1 / 12
+    assert taken.mean() == pytest.approx(0.075 * 255, abs=0.1)
+    assert taken.std() == pytest.approx(np.hypot(25.77 / 8000 * 255, np.sqrt(1 / 12)), rel=0.05)
+
+
+@pytest.mark.parametrize("name", names("scene"))
+def test_truth_and_masks_agree_in_every_kind_of_scene(name: str, rig: Rig) -> None:
+    chance = np.random.default_rng(3)
+    for _ in range(1 if name != "varied" else 3):
+        shot = studio(name, rig).shot(compose(kind(name), rig, chance), chance)
+        assert shot.color.shape == shot.right.shape == (270, 480, 3)
+        assert not (shot.label.mouth & ~shot.label.block).any() and not (shot.label.arm & shot.label.block).any()
+        if not any(hole.hidden < 1 for hole in shot.truth.holes):
+            assert not shot.label.mouth.any()
+        for hole in shot.truth.holes[:1]:
+            center, base = np.array(hole.center_m), rig.base_from_camera
+            assert np.array(hole.axis) @ center < 0  # out of the hole, towards the camera
+            np.testing.assert_allclose(base[:3, :3] @ center + base[:3, 3], hole.center_in_base_m, atol=1e-9)
+            x, y = rig.left.project(center)
+            if hole.hidden == 0:
+                assert shot.label.mouth[round(y), round(x)]
+                assert shot.exact_depth_m[round(y), round(x)] > center[2] - 0.06  # the rim or deeper
+            assert hole.in_view
+
+
+def test_the_conditions_of_the_benchmark_are_what_they_are_called(rig: Rig) -> None:
+    chance = np.random.default_rng(5)
+    scenes = {name: [compose(kind(name), rig, chance) for _ in range(4)] for name in ("hidden", "decoy", "empty", "dark", "haze")}
+    assert all(abs(scene.hidden[0] - 0.3) < 0.02 for scene in scenes["hidden"])
+    assert all(scene.block and len(scene.block.discs) >= 1 and scene.hidden[0] == 0 for scene in scenes["decoy"])
+    assert all(not scene.hidden for scene in scenes["empty"])
+    assert {scene.block is None for scene in scenes["empty"]} == {True, False}
+    assert all(scene.conditions["light"] == pytest.approx(0.15) for scene in scenes["dark"])
+    assert all(scene.conditions["transmission"] == pytest.approx(0.25) for scene in scenes["haze"])
+
+
+def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: Rig) -> None:
+    chance = np.random.default_rng(7)
+    large = replace(rig, width=640, height=360, focal_px=352.0)
+    near = replace(kind("hidden"), sight=replace(kind("hidden").sight, distance_m=(0.8, 0.8)))
+    for _ in range(2):
+        scene = compose(near, large, chance)
+        shot = studio("hidden", large).shot(scene, chance)
+        assert scene.block is not None
+        pixel = np.round(large.left.project(rim_points(scene.block, 0))).astype(int)
+        covered = shot.label.arm[pixel[:, 1], pixel[:, 0]].mean()
+        assert covered == pytest.approx(scene.hidden[0], abs=0.05)
+        assert hidden_part([], scene.block, 0) == 0.0
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def test_the_command_renders_the_same_bytes_again_and_goes_on_where_it_stopped(brokk: Callable[..., Any], tmp_path: Path) -> None:
+    size = ("rig.width=320", "rig.height=180", "rig.focal_px=176.0", "render.count=3")
+    done = brokk("mode=render", "scene=varied", "session.out=one", *size)
+    assert done.code == 0, done.err
+    first = digests(tmp_path / "one" / "frames")
+    assert len(first) == 1 + 3 * 5
+    (tmp_path / "one" / "frames" / "00001.truth.json").unlink()  # as if stopped while writing this one
+    assert brokk("mode=render", "scene=varied", "session.out=one", *size).code == 2  # without resume it is somebody's run
+    assert brokk("mode=render", "scene=varied", "session.out=one", "resume=one", *size).code == 0
+    assert digests(tmp_path / "one" / "frames") == first
+    assert brokk("mode=render", "scene=varied", "session.out=two", "session.seed=1", *size).code == 0
+    assert digests(tmp_path / "two" / "frames")["00000.color.png"] != first["00000.color.png"]
+
+
+def test_truth_and_masks_come_back_as_they_were_written(rig: Rig, tmp_path: Path) -> None:
+    chance, stem = np.random.default_rng(2), tmp_path / "00000"
+    maker = studio("decoy", rig)
+    shot = maker.shot(compose(kind("decoy"), rig, chance), chance)
+    dataset.write_frame(stem, shot.color, shot.depth_m, shot.right, shot.label, shot.truth)
+    again = dataset.read_truth(stem)
+    assert again.holes[0].radius_m == shot.truth.holes[0].radius_m and len(again.decoys) == len(shot.truth.decoys)
+    np.testing.assert_allclose(again.holes[0].center_m, shot.truth.holes[0].center_m)
+    np.testing.assert_array_equal(dataset.read_label(stem).mouth, shot.label.mouth)
+    assert dataset.stems(tmp_path) == [stem]
+    with pytest.raises(FrameError, match="no truth"):
+        dataset.read_truth(tmp_path / "other")
+    with pytest.raises(FrameError, match="no such folder"):
+        dataset.stems(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "told"),
+    [
+        ("sight", {"distance_m": (3.0, 2.0)}, "ends before it begins"),
+        ("block", {"width_m": (0.1, 1.0)}, "no room"),
+        ("block", {"depth_m": (0.2, 0.9)}, "go through"),
+        ("light", {"transmission": (0.0, 1.0)}, "transmission"),
+    ],
+)
+def test_ranges_that_make_no_scene_are_refused(part: str, change: dict[str, Any], told: str) -> None:
+    clean = kind("clean")
+    with pytest.raises(ConfigError, match=told):
+        replace(clean, **{part: replace(getattr(clean, part), **change)})

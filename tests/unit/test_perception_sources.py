@@ -1,0 +1,421 @@
+"""Sources hand out sound frames only, and say of every other which it is and why."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from composed import option
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.signals import Frame
+from perception import dataset
+from perception.rig import Rig
+from perception.sources import realsense, simulator, zed
+from perception.sources.folder import Folder
+from perception.sources.live import Capture, Freshness, Lens, LiveSource
+
+HEIGHT, WIDTH = 90, 160
+MATRIX = np.array([[88.0, 0.0, 79.5], [0.0, 88.0, 44.5], [0.0, 0.0, 1.0]])
+POSE = np.array([[0.0, 0.0, 1.0, 0.3], [-1.0, 0.0, 0.0, 0.4], [0.0, -1.0, 0.0, 1.9], [0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    """A folder of two sound frames, 00000 and 00001."""
+    chance = np.random.default_rng(0)
+    dataset.write_camera(tmp_path, MATRIX, POSE, 0.12)
+    for number in range(2):
+        color = chance.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        depth = np.full((HEIGHT, WIDTH), 2.0 + number, np.float32)
+        depth[:10] = np.nan
+        dataset.write_frame(tmp_path / f"{number:05d}", color, depth)
+    return tmp_path
+
+
+def folder(path: Path, **changes: Any) -> Folder:
+    return Folder(
+        folder=str(path),
+        **({"rate_hz": 10.0, "least_known": 0.01, "pictures_only": False, "stereo": option("stereo", "sgbm")} | changes),
+    )
+
+
+def read(path: Path, **changes: Any) -> list[Frame]:
+    with folder(path, **changes).build() as source:
+        return list(iter(source.read_latest, None))
+
+
+def test_frames_come_back_as_they_were_written(frames: Path) -> None:
+    first, second = read(frames)
+    assert first.name == str(frames / "00000") and second.name == str(frames / "00001")
+    assert (first.t_s, second.t_s) == (0.0, 0.1)
+    np.testing.assert_array_equal(first.camera_matrix, MATRIX)
+    np.testing.assert_array_equal(first.base_from_camera, POSE)
+    assert first.distortion is None and first.right is None and first.baseline_m == 0.12
+    assert np.isnan(first.depth_m[:10]).all() and (first.depth_m[10:] == 2.0).all() and (second.depth_m[10:] == 3.0).all()
+    blue_first = cv2.imread(str(frames / "00000.color.png"))
+    assert blue_first is not None
+    np.testing.assert_array_equal(first.color, blue_first[..., ::-1])
+    assert folder(frames).build().num_frames == 2
+
+
+def test_depth_in_millimetres_is_depth_in_metres(frames: Path) -> None:
+    (frames / "00000.depth.npy").unlink()
+    values = np.full((HEIGHT, WIDTH), 1234, np.uint16)
+    values[0, 0] = 0
+    dataset.write_picture(frames / "00000.depth.png", values)
+    depth = read(frames)[0].depth_m
+    assert np.isnan(depth[0, 0]) and depth[1, 1] == np.float32(1.234) and depth.dtype == np.float32
+
+
+def test_zero_and_infinity_are_no_depths(frames: Path) -> None:
+    depth = np.full((HEIGHT, WIDTH), 2.0)
+    depth[0, :4] = [0.0, np.inf, -np.inf, -1.0]
+    np.save(frames / "00000.depth.npy", depth)
+    found = read(frames)[0].depth_m
+    assert np.isnan(found[0, :4]).all() and (found[0, 4:] == 2.0).all() and found.dtype == np.float32
+
+
+def camera(frames: Path, **changes: Any) -> None:
+    path = frames / "camera.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | changes))
+
+
+def cut(path: Path, part: float) -> None:
+    path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(bytes(data))
+
+
+def save(path: Path, values: np.ndarray) -> None:
+    path.with_name(path.name.replace(".png", ".npy")).unlink(missing_ok=True)
+    dataset.write_picture(path, values) if path.suffix == ".png" else np.save(path, values)
+
+
+SIZE = (HEIGHT, WIDTH)
+BREACHES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no depth": (lambda f: (f / "00000.depth.npy").unlink(), r"00000: no depth; expected 00000.depth.npy"),
+    "truncated colour": (lambda f: cut(f / "00000.color.png", 0.6), r"00000.color.png: truncated or damaged"),
+    "colour without its end": (lambda f: cut(f / "00000.color.png", 0.999), r"00000.color.png: truncated or damaged"),
+    "damaged colour": (lambda f: flip(f / "00000.color.png"), r"00000.color.png: truncated or damaged"),
+    "empty colour": (lambda f: cut(f / "00000.color.png", 0.0), r"00000.color.png: empty"),
+    "no picture": (lambda f: (f / "00000.color.png").write_text("hello"), r"00000.color.png: truncated or no picture"),
+    "truncated depth": (lambda f: cut(f / "00000.depth.npy", 0.5), r"00000.depth.npy: truncated"),
+    "grey": (lambda f: save(f / "00000.color.png", np.zeros(SIZE, np.uint8)), r"00000.color.png: a grey picture, expected colour"),
+    "16 bit colour": (lambda f: save(f / "00000.color.png", np.zeros((*SIZE, 3), np.uint16)), r"uint16 in each channel"),
+    "8 bit depth": (lambda f: save(f / "00000.depth.png", np.full(SIZE, 9, np.uint8)), r"00000.depth.png: uint8, expected 16 bits"),
+    "coloured depth": (lambda f: save(f / "00000.depth.png", np.zeros((*SIZE, 3), np.uint16)), r"3 channels, expected one"),
+    "unknown depth": (lambda f: save(f / "00000.depth.png", np.zeros(SIZE, np.uint16)), r"known for 0 % of the picture"),
+    "NaN depth": (lambda f: save(f / "00000.depth.npy", np.full(SIZE, np.nan)), r"known for 0 % of the picture"),
+    "depth in mm": (lambda f: save(f / "00000.depth.npy", np.full(SIZE, 2000.0)), r"median depth is 2000 m; is it in mm"),
+    "depth in integers": (lambda f: save(f / "00000.depth.npy", np.full(SIZE, 2000)), r"expected float32 in m"),
+    "depth of three axes": (lambda f: save(f / "00000.depth.npy", np.ones((*SIZE, 1))), r"expected \(height, width\)"),
+    "misaligned depth": (lambda f: save(f / "00000.depth.npy", np.ones((HEIGHT // 2, WIDTH // 2))), r"depth has 80 x 45 pixels"),
+    "misaligned right": (lambda f: save(f / "00000.right.png", np.zeros((9, 9, 3), np.uint8)), r"right picture has 9 x 9 pixels"),
+    "another resolution": (lambda f: camera(f, K=(MATRIX * [[4], [4], [1]]).tolist()), r"cx is 318 px in a picture of 160 x 90"),
+    "long lens": (lambda f: camera(f, K=(MATRIX + np.diag([9e3, 9e3, 0])).tolist()), r"9088 px is absurd"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("breach", BREACHES)
+def test_a_frame_that_breaks_the_format_is_refused_by_name_and_the_next_one_read(breach: str, frames: Path) -> None:
+    spoil, told = BREACHES[breach]
+    spoil(frames)
+    with folder(frames).build() as source:
+        with pytest.raises(FrameError, match=told):
+            source.read_latest()
+        if breach not in ("another resolution", "long lens"):  # these are the camera's, and so every frame's
+            after = source.read_latest()
+            assert after is not None and after.name.endswith("00001")
+            assert source.read_latest() is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"K": [[88, 0, 80], [0, 88, 45]]}, r"K has shape \(2, 3\)"),
+        ({"K": [[-88, 0, 80], [0, 88, 45], [0, 0, 1]]}, "expected more than 0"),
+        ({"K": [[float("nan"), 0, 80], [0, 88, 45], [0, 0, 1]]}, "no numbers"),
+        ({"K": [[88, 0, 80], [0, 300, 45], [0, 0, 1]]}, "about equal"),
+        ({"K": [[88, 0, 80], [0, 88, 45], [0, 1, 1]]}, "no camera matrix"),
+        ({"K": "wide"}, "no numbers"),
+        ({"dist": [0.1, 0.2, 0.3]}, "3 coefficients, expected 0, 4, 5, 8, 12, 14"),
+        ({"dist": [1e6, 0, 0, 0]}, "absurd"),
+        ({"baseline_m": 120.0}, "is it in mm"),
+        ({"baseline_m": -0.12}, "baseline_m is -0.12"),
+        ({"T_base_cam": (np.eye(4) * [[2], [1], [1], [1]]).tolist()}, "no rigid transform"),
+        ({"T_base_cam": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, "no rigid transform"),
+        ({"T_base_cam": np.eye(3).tolist()}, r"shape \(3, 3\)"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(changes: dict[str, Any], told: str, frames: Path) -> None:
+    camera(frames, **changes)
+    with pytest.raises(FrameError, match=rf"(?s)camera.yaml.*{told}"):
+        folder(frames).build().__enter__()
+
+
+def test_a_folder_without_camera_or_frames_is_refused(frames: Path, tmp_path: Path) -> None:
+    (frames / "camera.yaml").write_text("K: [1, 2\n")
+    with pytest.raises(FrameError, match="cannot be read as YAML"):
+        read(frames)
+    (frames / "camera.yaml").write_text("[]")
+    with pytest.raises(FrameError, match="K is missing"):
+        read(frames)
+    (frames / "camera.yaml").unlink()
+    with pytest.raises(FrameError, match=r"camera.yaml: no such file"):
+        read(frames)
+    with pytest.raises(FrameError, match="no such folder"):
+        read(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FrameError, match="no frames"):
+        read(tmp_path / "empty")
+
+
+def test_a_camera_without_a_place_or_a_baseline_is_welcome(frames: Path) -> None:
+    (frames / "camera.yaml").write_text(yaml.safe_dump({"K": MATRIX.tolist()}))
+    first = read(frames)[0]
+    assert first.base_from_camera is None and first.baseline_m is None and first.distortion is None
+
+
+def test_photographs_alone_will_do_for_ellipses(tmp_path: Path) -> None:
+    save(tmp_path / "grey.color.png", np.full(SIZE, 90, np.uint8))
+    found = read(tmp_path, pictures_only=True)[0]
+    assert found.color.shape == (*SIZE, 3) and (found.color == 90).all() and np.isnan(found.depth_m).all()
+
+
+def test_a_pair_without_depth_is_matched(tmp_path: Path) -> None:
+    chance = np.random.default_rng(1)
+    grain = cv2.GaussianBlur(chance.standard_normal((120, 400)).astype(np.float32), (0, 0), 1.0)
+    wide = np.repeat(np.clip(128 + 120 * grain, 0, 255).astype(np.uint8)[..., None], 3, 2)
+    matrix = np.array([[200.0, 0.0, 119.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
+    dataset.write_camera(tmp_path, matrix, None, 0.12)
+    dataset.write_frame(tmp_path / "00000", wide[:, 100:340], None, wide[:, 112:352])  # all of it 12 px: 200 * 0.12 / 12 = 2 m
+    found = read(tmp_path)[0]
+    assert np.nanmedian(found.depth_m) == pytest.approx(2.0, abs=0.005)
+    camera(tmp_path, dist=[0.1, 0.0, 0.0, 0.0])
+    with pytest.raises(FrameError, match="rectified camera"):
+        read(tmp_path)
+
+
+class Clock:
+    """A camera of 10 Hz whose frames reach us `lag_s` after they were taken; `grabs` says what each call finds."""
+
+    def __init__(self, stamps: list[float | None], lag_s: float = 0.0) -> None:
+        self.stamps, self.lag_s, self.now, self.closed, self.opened = stamps, lag_s, 0.0, 0, True
+
+    def open(self) -> Lens:
+        if not self.opened:
+            raise FrameError("no camera")
+        return Lens(MATRIX, None, 0.12)
+
+    def capture(self, timeout_s: float) -> Capture | None:
+        if not self.stamps:
+            return None
+        stamp = self.stamps.pop(0)
+        if stamp is None:
+            return None
+        self.now = stamp + self.lag_s
+        return Capture(np.zeros((*SIZE, 3), np.uint8), np.full(SIZE, 2.0, np.float32), stamp)
+
+    def now_s(self) -> float:
+        return self.now
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+FRESH = Freshness(timeout_s=0.3, max_age_s=0.2, least_known=0.01)
+
+
+def test_a_live_source_gives_each_frame_once_and_no_stale_one() -> None:
+    device = Clock([1.0, 1.0, None, 1.1])
+    with LiveSource(device, "camera", FRESH, POSE) as source:
+        stamps = [frame.t_s for frame in (source.read_latest(), source.read_latest()) if frame]
+        assert stamps == [1.0, 1.1]
+        with pytest.raises(FrameError, match=r"no new frame for 0.3 s\. Is it plugged in"):
+            source.read_latest()
+    assert device.closed == 1
+    with (
+        LiveSource(Clock([1.0, 1.1], lag_s=0.6), "camera", FRESH, POSE) as source,
+        pytest.raises(FrameError, match=r"up to 0.60 s old, 0.2"),
+    ):
+        source.read_latest()
+
+
+def test_a_live_source_is_closed_when_opening_fails_and_read_only_when_open() -> None:
+    device = Clock([1.0])
+    device.opened = False
+    with pytest.raises(FrameError, match="no camera"), LiveSource(device, "camera", FRESH, None):
+        pass
+    assert device.closed == 1
+    with pytest.raises(FrameError, match="not open"):
+        LiveSource(Clock([1.0]), "camera", FRESH, None).read_latest()
+
+
+class StubZed:
+    """What `pyzed.sl.Camera` did on a ZED 2i with SDK 4: the recorded answers, for a picture that is small."""
+
+    status, opened = "SUCCESS", None
+
+    def open(self, init: Any) -> str:
+        StubZed.opened = init
+        return self.status
+
+    def grab(self, runtime: Any) -> str:
+        self.fill = runtime.enable_fill_mode
+        return "SUCCESS"
+
+    def get_camera_information(self) -> Any:
+        left = SimpleNamespace(fx=88.0, fy=88.0, cx=79.5, cy=44.5, disto=[-0.04, 0.01, 0, 0, 0])
+        calibration = SimpleNamespace(left_cam=left, get_camera_baseline=lambda: 0.11986)
+        return SimpleNamespace(camera_configuration=SimpleNamespace(calibration_parameters=calibration))
+
+    def retrieve_image(self, mat: Any, view: str) -> None:
+        mat.values = np.full((*SIZE, 4), {"left": 10, "right": 20}[view], np.uint8) + np.array([0, 1, 2, 0], np.uint8)
+
+    def retrieve_measure(self, mat: Any, measure: str) -> None:
+        mat.values = np.full(SIZE, 1.5, np.float32)
+        mat.values[0, :3] = [np.nan, np.inf, -np.inf]
+
+    def get_timestamp(self, reference: str) -> Any:
+        return SimpleNamespace(get_nanoseconds=lambda: 1_700_000_000_000_000_000 + (50_000_000 if reference == "current" else 0))
+
+    def close(self) -> None:
+        StubZed.opened = None
+
+
+class Mat:
+    """`sl.Mat`: memory of the SDK's own."""
+
+    values = np.zeros(0)
+
+    def get_data(self) -> np.ndarray:
+        return self.values
+
+
+def pyzed(monkeypatch: pytest.MonkeyPatch) -> None:
+    sl: Any = ModuleType("pyzed.sl")
+    sl.Camera, sl.Mat = StubZed, Mat
+    sl.InitParameters = sl.RuntimeParameters = lambda: SimpleNamespace(enable_fill_mode=True)
+    sl.ERROR_CODE = SimpleNamespace(SUCCESS="SUCCESS")
+    sl.RESOLUTION, sl.DEPTH_MODE = SimpleNamespace(HD1080="HD1080"), SimpleNamespace(NEURAL="NEURAL")
+    sl.UNIT, sl.COORDINATE_SYSTEM = SimpleNamespace(METER="metre"), SimpleNamespace(IMAGE="image")
+    sl.VIEW, sl.MEASURE = SimpleNamespace(LEFT="left", RIGHT="right"), SimpleNamespace(DEPTH="depth")
+    sl.TIME_REFERENCE = SimpleNamespace(IMAGE="image", CURRENT="current")
+    monkeypatch.setitem(sys.modules, "pyzed", ModuleType("pyzed"))
+    monkeypatch.setitem(sys.modules, "pyzed.sl", sl)
+
+
+def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    pyzed(monkeypatch)
+    with option("perception/source", "zed").build() as source:
+        assert StubZed.opened is not None and StubZed.opened.coordinate_units == "metre"
+        frame = source.read_latest()
+        assert source._device._camera.fill is False
+    assert StubZed.opened is None
+    assert frame is not None and frame.right is not None
+    assert frame.color[0, 0].tolist() == [12, 11, 10] and frame.right[0, 0].tolist() == [22, 21, 20]  # the SDK gives BGRA
+    assert np.isnan(frame.depth_m[0, :3]).all() and (frame.depth_m[1:] == 1.5).all()
+    assert frame.t_s == pytest.approx(1.7e9) and frame.baseline_m == pytest.approx(0.11986)
+    assert frame.distortion is None  # the picture is rectified; the coefficients are those of the raw one
+    np.testing.assert_array_equal(frame.camera_matrix, MATRIX)
+
+
+def test_a_zed_that_is_not_there_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyzed", None)
+    with pytest.raises(FrameError, match="comes with the ZED SDK"):
+        option("perception/source", "zed").build().__enter__()
+    pyzed(monkeypatch)
+    monkeypatch.setattr(StubZed, "status", "CAMERA NOT DETECTED")
+    with pytest.raises(FrameError, match="CAMERA NOT DETECTED"):
+        option("perception/source", "zed").build().__enter__()
+    with pytest.raises(FrameError, match="this SDK does not know"):
+        replace(option("perception/source", "zed"), depth_mode="ULTRA").build().__enter__()
+
+
+def test_depth_that_is_filled_in_is_refused() -> None:
+    with pytest.raises(ConfigError, match="invents depth"):
+        replace(option("perception/source", "zed"), sensing="fill")
+
+
+def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+    rs: Any = ModuleType("pyrealsense2")
+    streams: list[Any] = []
+    rs.stream, rs.format = SimpleNamespace(depth="depth", color="color"), SimpleNamespace(z16="z16", rgb8="rgb8")
+    rs.config = lambda: SimpleNamespace(enable_stream=lambda *stream: streams.append(stream))
+    lens = SimpleNamespace(fx=88.0, fy=88.0, ppx=79.5, ppy=44.5, coeffs=[0.0] * 5)
+    profile = SimpleNamespace(
+        get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: SimpleNamespace(get_depth_scale=lambda: 0.001)),
+        get_stream=lambda _: SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens)),
+    )
+    z16 = np.full(SIZE, 1500, np.uint16)
+    z16[0] = 0
+    frames = SimpleNamespace(
+        get_depth_frame=lambda: SimpleNamespace(get_data=lambda: z16),
+        get_color_frame=lambda: SimpleNamespace(
+            get_data=lambda: np.full((*SIZE, 3), 7, np.uint8), get_timestamp=lambda: 1000 * realsense.time.time()
+        ),
+    )
+    waits: list[int] = []
+
+    def wait(ms: int) -> Any:
+        waits.append(ms)
+        if len(waits) > 1:
+            raise RuntimeError("Frame didn't arrive within 1")
+        return frames
+
+    stopped: list[bool] = []
+    rs.pipeline = lambda: SimpleNamespace(start=lambda _: profile, wait_for_frames=wait, stop=lambda: stopped.append(True))
+    rs.align = lambda to: SimpleNamespace(process=lambda found: found if to == "color" else None)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", rs)
+    with replace(option("perception/source", "realsense"), fresh=FRESH, serial=None).build() as source:
+        frame = source.read_latest()
+        with pytest.raises(FrameError, match="no new frame"):
+            source.read_latest()
+    assert stopped == [True]
+    assert frame is not None and np.isnan(frame.depth_m[0]).all() and frame.depth_m[1, 0] == pytest.approx(1.5)
+    assert ("color", 1280, 720, "rgb8", 15) in streams
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    with pytest.raises(FrameError, match="not installed"):
+        option("perception/source", "realsense").build().__enter__()
+
+
+def test_the_simulated_camera_sees_the_hole_of_the_task() -> None:
+    rig: Rig = replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
+    spec: simulator.Simulated = replace(option("perception/source", "simulator"), rig=rig, num_frames=1)
+    with spec.build() as source:
+        source.show((2.4, 0.1, 0.7, 0.3, 1.0, 0.06), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 2.6], [2.0, 0.0, 2.4], [2.0, 0.0, 1.6]]))
+        frame = source.read_latest()
+        assert frame is not None and source.read_latest() is None
+        shot = source.shot(np.random.default_rng(0))
+    np.testing.assert_allclose(shot.truth.holes[0].center_in_base_m, [2.4, 0.1, 0.7], atol=1e-9)
+    np.testing.assert_allclose(shot.truth.holes[0].axis_in_base, [0.0, 0.0, 1.0], atol=1e-9)
+    assert shot.truth.holes[0].radius_m == 0.06 and shot.label.arm.any() and shot.label.mouth.any()
+    pixel = np.round(rig.left.project(np.array(shot.truth.holes[0].center_m))).astype(int)
+    assert shot.label.mouth[pixel[1], pixel[0]]
+    np.testing.assert_array_equal(frame.camera_matrix, rig.left.matrix)
+    with spec.build() as source:
+        source.show((-3.0, 0.0, 0.7, 0.0, 1.0, 0.05), np.zeros((0, 3)))
+        with pytest.raises(FrameError, match="behind the camera"):
+            source.read_latest()
+
+
+def test_devices_close_twice_without_complaint() -> None:
+    for device in (
+        zed.ZedDevice(option("perception/source", "zed")),
+        realsense.RealSenseDevice(option("perception/source", "realsense")),
+    ):
+        device.close()
+        device.close()
