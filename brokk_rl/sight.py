@@ -229,6 +229,46 @@ class TargetFilter(Protocol):
         ...
 
 
+class Observer(Protocol):
+    """A finder that shows its work: what `build` of an option of `conf/perception` returns when it looks at pictures."""
+
+    def find(self, frame: Frame) -> Borehole | None:
+        """Returns the borehole in the base frame, or `None` when there is none to be sure of."""
+        ...
+
+    def look(self, frame: Frame) -> Sighting:
+        """Returns everything that one frame says.
+
+        Raises:
+            FrameError: nothing can be made of the frame.
+        """
+        ...
+
+    def follow(self, sighting: Sighting, t_s: float) -> Target | None:
+        """Returns what the filter holds to be true after this sighting as well."""
+        ...
+
+    def ellipses(self, frame: Frame) -> list[Ellipse]:
+        """Returns the ellipses of the whole picture, the best first, of any size; needs no depth."""
+        ...
+
+    def explain(self, rejection: Rejection) -> str:
+        """Returns in words what was refused, why, and what could be done."""
+        ...
+
+
+class Overlay(Protocol):
+    """Draws what was seen into the picture in which it was seen."""
+
+    def write(self, path: Path, frame: Frame, sighting: Sighting) -> None:
+        """Writes a picture file.
+
+        Raises:
+            StorageError: it could not be written.
+        """
+        ...
+
+
 class SourceSpec(Protocol):
     """A spec in `conf/perception/source`."""
 

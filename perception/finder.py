@@ -25,6 +25,7 @@ from brokk_rl.sight import (
 )  # fmt: skip
 from brokk_rl.signals import Borehole, Frame
 from brokk_rl.spec import spec
+from perception import explain
 from perception.pose import gray_of
 
 
@@ -72,7 +73,7 @@ class Finder:
 
     def __init__(self, settings: Perception) -> None:
         self.settings = settings
-        self._segmenter, self.detector = settings.segmenter.build(), settings.ellipse.build()
+        self._segmenter, self._detector = settings.segmenter.build(), settings.ellipse.build()
         self._pose = settings.pose.build()
         self._filter = settings.filter.build()
 
@@ -107,7 +108,7 @@ class Finder:
         if share < s.smallest_block:
             return Sighting([], [Rejection("segment", "part of the picture that is block", share, s.smallest_block)], [], masks, ms)
         with _timed(ms, "ellipse"):
-            ellipses = self.detector.detect(gray_of(frame), self._region(roi), self._prior(frame, roi))
+            ellipses = self._detector.detect(gray_of(frame), self._region(roi), self._prior(frame, roi))
         with _timed(ms, "pose"):
             judged = [(ellipse, self._pose.estimate(frame, masks, ellipse)) for ellipse in ellipses]
             found = [(e, pose) for e, pose in judged if isinstance(pose, HolePose)]
@@ -121,6 +122,14 @@ class Finder:
         shown = [e for e, _ in holes] + [r.ellipse for r in rejected if r.ellipse is not None]
         ms["total"] = sum(ms.values())
         return Sighting([pose for _, pose in holes], rejected, shown, masks, ms)
+
+    def ellipses(self, frame: Frame) -> list[Ellipse]:
+        """Returns the ellipses of the whole picture, the best first, of any size; needs no depth."""
+        return self._detector.detect(gray_of(rectified(frame)), None, None)
+
+    def explain(self, rejection: Rejection) -> str:
+        """Returns in words what was refused, why, and what could be done."""
+        return explain.words(rejection)
 
     def _region(self, roi: np.ndarray) -> np.ndarray:
         """Returns where ellipses are looked for: the mask with its gaps closed, or its bounding box."""
