@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from brokk_rl import open_loop, record
-from brokk_rl.errors import RecordingError
+from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.split import COMMANDED
@@ -74,7 +75,19 @@ def load(folder: Path, machine: Machine) -> Case:
         if not any(part.glob("*.parquet")):
             why = "the simulator is fitted to it; without one give diagnosis.field=<glob> and actuator=<simulator>"
             raise RecordingError(f"{folder}: no {name}/*.parquet; a case has both" + (f" ({why})" if name == "reference" else ""))
-    return Case(machine, *(record.read_all(str(part / "*.parquet"), machine) for part in parts.values()))
+    read = [record.read_all(str(part / "*.parquet"), machine) for part in parts.values()]
+    for recording in (one for part in read for one in part):
+        if stamp := recording.metadata.get("fingerprint"):
+            _check_stamp(stamp, recording, machine)
+    return Case(machine, *read)
+
+
+def _check_stamp(stamp: str, recording: Recording, machine: Machine) -> None:
+    """Raises a `RecordingError` when a recording was made on a machine with other joints, limits or control rate."""
+    try:
+        machine.check_fingerprint(json.loads(stamp), str(recording.path))
+    except (CheckpointError, ValueError) as error:
+        raise RecordingError(f"{recording.path}: {error}") from error
 
 
 def running_s(recordings: Sequence[Recording]) -> list[float]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from brokk_rl.diagnosis import engine, gap, verdict
-from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
+from brokk_rl.contracts import Excitation
+from brokk_rl.diagnosis import engine, gap, separation, verdict
+from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Ranked, Selected, Where
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.engine import Findings, Prices, Tell
 from brokk_rl.diagnosis.free_runs import FreeRuns
@@ -20,6 +21,8 @@ from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.survey import survey
 from brokk_rl.inspection import Thresholds
 
+NEAR = 0.6
+"""A rival that earns so much of what a selected effect earns is worth an experiment."""
 DECIDED_BY = {
     frozenset({"flow_gain", "encoder_scale"}): "an outside measurement of the angle (inclinometer, laser) at two positions",
     frozenset({"dead_time", "clock_offset"}): "one clock for commands and positions, or a pulse that both record",
@@ -37,7 +40,8 @@ class Diagnosis:
         kinds: The library.
         prices: What effects must earn.
         thresholds: When a stretch of a recording is worth telling.
-        generator: Draws bootstraps and permutations.
+        excitations: Experiments that could follow, by name.
+        generator: Draws bootstraps, permutations and excitations.
     """
 
     case: Case
@@ -45,6 +49,7 @@ class Diagnosis:
     kinds: Sequence[Kind]
     prices: Prices
     thresholds: Thresholds
+    excitations: Mapping[str, Excitation]
     generator: np.random.Generator
 
     def run(self, tell: Tell) -> Outcome:
@@ -79,7 +84,7 @@ class Diagnosis:
             ranking=tuple(verdict.ranking(findings, selected, self.prices, machine, self._unknown_chance(findings))),
             where=seen.where(),
             gap=Gap(gap.rmse(square), gap.rmse(left), gap.rmse(floors), share),
-            next_experiment=None,
+            next_experiment=self._next(findings, selected),
             reason=self._reason(told, findings, selected),
             more=seen.more() | self._more(findings, share),
         )
@@ -125,6 +130,26 @@ class Diagnosis:
             after = repair(evidence, subsets, findings.rays, start, steps=2).after
         before, left = gap.rmse(square), gap.rmse(gap.squares(after, evidence.candidates.cut.measured))
         return (before - left) / max(before - gap.rmse(floors), 0.02 * before)
+
+    def _next(self, findings: Findings, selected: Sequence[Selected]) -> NextExperiment | None:
+        """Returns the experiment that would separate what is left open: classes, and rivals that earn nearly as much."""
+        kinds, rivals = {kind.name: kind for kind in self.kinds}, []
+        undecided = next((one for one in selected if one.same_as), None)
+        for one in selected:
+            swaps = [] if one.effect not in findings.chosen.names else verdict.rivals(findings, one.effect)
+            near = {swap.name: max(0.0, swap.share) for swap in swaps[:3] if swap.share > NEAR}
+            if near and (undecided is None or one is undecided):
+                rivals = [separation.Rival(kinds[one.effect], verdict.values(findings, one.effect, one.effect), one.probability)]
+                rivals += [
+                    separation.Rival(kinds[name], verdict.values(findings, one.effect, name), share * one.probability)
+                    for name, share in near.items()
+                ]
+                break
+        noises = self.base.field.evidence.noise or []
+        found = separation.best(self.base.actuator, noises, rivals, self.excitations, self.case.machine, self.generator)
+        if found is None and undecided and undecided.decided_by:
+            return NextExperiment("", (undecided.effect, *undecided.same_as), f"no excitation does; {undecided.decided_by} would")
+        return found
 
     def _floor(self) -> FreeRuns | None:
         if not self.base.nulls:

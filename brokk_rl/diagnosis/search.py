@@ -85,18 +85,17 @@ class Table:
         def net(subset: Subset) -> float:
             return self.score(subset).total - sum(price[name] for name in subset)
 
-        level = [frozenset({name}) for name in self.shapes]
-        single = sorted(level, key=net, reverse=True)
-        for size in range(2, most + 1):
-            best = sorted(level, key=net, reverse=True)[:KEPT]
-            if size == 2:
-                level = [a | b for a, b in combinations(single[: KEPT + 1], 2)]
-            else:
-                level = []
-            level = list({*level, *(one | {name} for one in best for name in self.shapes if name not in one)})
-            gained = max((net(one) for one in level), default=0.0)
-            if size > 2 and gained <= max((net(one) for one in best), default=0.0):
-                break
+        single = sorted((frozenset({name}) for name in self.shapes), key=net, reverse=True)
+        level = [a | b for a, b in combinations(single[: KEPT + 1], 2)]
+        best = sorted([*single, *level], key=net, reverse=True)[:KEPT]
+        if not best or net(best[0]) <= 0.0:
+            return  # a joint without a gap
+        for _ in range(2, most + 1):
+            before = net(best[0])
+            level = {one | {name} for one in best for name in self.shapes if name not in one and len(one) < most}
+            best = sorted({*best, *level}, key=net, reverse=True)[:KEPT]
+            if net(best[0]) <= before:
+                return
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from brokk_rl.diagnosis.noise import loss, weight
 
-STEPS = 8
+STEPS = 6
 """Gauss-Newton steps at most."""
 PRIOR = 1.0
 """Standard deviation of a size, over the typical one: tells nothing where the recordings do, and settles what they leave open."""

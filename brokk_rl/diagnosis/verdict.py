@@ -48,6 +48,19 @@ def same_as(swaps: Sequence[Swap], own: float) -> tuple[str, ...]:
     return tuple(swap.name for swap in swaps if swap.share > SAME or own - swap.earned < AS_GOOD)[:3]
 
 
+def values(findings: Findings, name: str, other: str) -> dict[str, np.ndarray]:
+    """Returns the numbers of `other` in the place of the chosen effect `name`, each `(1, J)` or `(1, 1)`."""
+    ways = findings.rays[other]
+    sizes = np.zeros((len(ways), len(findings.tables)))
+    for j, subset in enumerate(findings.chosen.subsets):
+        if name in subset:
+            sizes[:, j] = findings.tables[j].score(subset - {name} | {other}).sizes[other]
+    found: dict[str, np.ndarray] = {}
+    for ray, size in zip(ways, sizes, strict=True):
+        found |= ray.values(size[None])
+    return found
+
+
 def own_gain(findings: Findings, name: str) -> float:
     """Returns what a chosen effect adds to the rest of the set, on all joints that have it."""
     subsets = [(t, s) for t, s in zip(findings.tables, findings.chosen.subsets, strict=True) if name in s]

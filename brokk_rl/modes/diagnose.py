@@ -11,7 +11,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from brokk_rl import record
-from brokk_rl.contracts import Actuator, ActuatorFit
+from brokk_rl.contracts import Actuator, ActuatorFit, Excitation
 from brokk_rl.diagnosis import answer, case, library, page, prescription, simulator
 from brokk_rl.diagnosis.answer import Answer
 from brokk_rl.diagnosis.case import Case
@@ -60,6 +60,7 @@ class Diagnose:
         fit: How the simulator is made from `reference/`.
         actuator: The simulator that `diagnosis.field` is held against.
         thresholds: When a stretch of a recording is worth telling.
+        excitation: Experiments that could follow, by name.
         diagnosis: What is diagnosed.
     """
 
@@ -68,6 +69,7 @@ class Diagnose:
     fit: ActuatorFit
     actuator: Actuator | None
     thresholds: Thresholds
+    excitation: dict[str, Excitation]
     diagnosis: Subject
 
     def run(self) -> None:
@@ -85,7 +87,8 @@ class Diagnose:
         with Progress(transient=True) as progress:
             task = progress.add_task("simulator", total=1.0)
             base = self._base(given)
-            work = Diagnosis(given, base, kinds, self.diagnosis.prices, self.thresholds, self.session.generator("diagnosis"))
+            generator = self.session.generator("diagnosis")
+            work = Diagnosis(given, base, kinds, self.diagnosis.prices, self.thresholds, self.excitation, generator)
             outcome = work.run(lambda doing, done: progress.update(task, description=doing, completed=done))
         folder = self.session.folder
         outcome.save(folder)

@@ -1,0 +1,198 @@
+"""A diagnosis finds what was put into a machine, with its size, and finds nothing where nothing was put."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+
+from actuators.effects.affected import Affected
+from actuators.effects.command import DeadBand
+from actuators.effects.speed import FlowGain
+from actuators.lag import Lag
+from brokk_rl import record
+from brokk_rl.contracts import Effect
+from brokk_rl.diagnosis import answer, case, library, prescription, simulator
+from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, JointGap, NextExperiment, Ranked, RegimeGap, Selected, Where
+from brokk_rl.diagnosis.case import Case
+from brokk_rl.diagnosis.conclusion import Diagnosis
+from brokk_rl.diagnosis.engine import Prices
+from brokk_rl.errors import RecordingError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+CPU = torch.device("cpu")
+PLANT = Lag(dead_time_s=0.31, dead_band_extend=0.07, dead_band_retract=0.1, gain=0.9, time_constant_s=0.08, spread={})
+PRICES = Prices(
+    joint=8.0, reference=1.5, name=20.0, partial=15.0, share=0.03, temperature=8.0, remainder=30.0, explained=0.45, scatter=1.6,
+    tool=2.0,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def axis(machine: Machine) -> Machine:
+    """A single servo axis, known by nothing but its limits."""
+    joint = dataclasses.replace(machine.joints[2], body=None)
+    return dataclasses.replace(machine, name="axis", mjcf=None, tool_m=None, joints=(joint,), exclusive=(), levers=())
+
+
+def driven(machine: Machine, effects: dict[str, Effect], count: int, seconds: float, seed: int) -> list[Recording]:
+    """Returns recordings of the plant with effects under levels and rests, its speed wandering by a percent or two."""
+    random, steps = np.random.default_rng(seed), round(seconds / machine.period_s)
+    model = Affected(actuator=PLANT, effects=effects).build(machine, count, CPU)
+    shape = (count, machine.num_history, machine.num_joints)
+    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
+    history.reset(torch.ones(count, dtype=torch.bool), torch.as_tensor(machine.home, dtype=torch.float32).expand(count, -1))
+    level, left, wander = np.zeros(shape[::2]), np.zeros(shape[::2]), np.zeros(shape[::2])
+    commands, positions, margin = [], [], 0.2 * (machine.upper - machine.lower)
+    for _ in range(steps):
+        q = history.q[:, -1].numpy()
+        fresh = random.uniform(-0.9, 0.9, level.shape) * (random.random(level.shape) > 0.2)
+        level = np.where(left <= 0, fresh, level)
+        left = np.where(left <= 0, random.uniform(0.4, 2.5, level.shape), left) - machine.period_s
+        level = np.where((q > machine.upper - margin) & (level > 0), -0.6, level)
+        level = np.where((q < machine.lower + margin) & (level < 0), 0.6, level)
+        commands.append(level)
+        positions.append(q + 2e-4 * random.standard_normal(q.shape))
+        history.push_u(torch.as_tensor(level, dtype=torch.float32))
+        wander = 0.99 * wander + 0.003 * random.standard_normal(wander.shape)
+        before = history.q[:, -1].clone()
+        history.push_q(before + (model.step(history) - before) * torch.as_tensor(1.0 + wander, dtype=torch.float32))
+    u, q = (np.stack(rows, 1).astype(np.float32) for rows in (commands, positions))
+    return [
+        Recording(
+            machine=machine.name, joints=machine.joint_names, units=("rad",) * machine.num_joints, rate_hz=20.0,
+            t_s=np.arange(steps) * 0.05, u=u[n], q=q[n], metadata={"run": f"{seed}.{n}"},
+        )
+        for n in range(count)
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def reference(axis: Machine) -> list[Recording]:
+    return driven(axis, {}, 3, 120.0, 1)
+
+
+def diagnosed(axis: Machine, reference: Sequence[Recording], effects: dict[str, Effect], folder: Path) -> Answer:
+    given = Case(axis, reference, driven(axis, effects, 2, 100.0, 2))
+    base = simulator.fitted(given, option("fit", "valve"), folder, 0, CPU)
+    thresholds, generator = option("thresholds", "default"), np.random.default_rng(0)
+    excitations = {"levels": option("excitation", "levels")}
+    work = Diagnosis(given, base, library.load(axis), PRICES, thresholds, excitations, generator)
+    outcome = work.run(lambda doing, done: None)
+    outcome.save(folder)
+    return answer.read(folder / answer.FILE)
+
+
+def test_a_speed_that_changed_is_found_on_a_single_axis_without_geometry(
+    axis: Machine, reference: list[Recording], tmp_path: Path
+) -> None:
+    found = diagnosed(axis, reference, {"flow_gain": FlowGain(joints="all", gain=0.8)}, tmp_path)
+    assert found.verdict == "effects"
+    one = found.selected[0]
+    assert {one.effect, *one.same_as} >= {"flow_gain"} and len(found.selected) == 1
+    assert one.probability > 0.9 and one.joints == ("q3",)
+    if one.effect == "flow_gain":
+        assert one.parameters["gain"]["q3"].mean == pytest.approx(0.8, abs=0.02)
+    assert found.gap and found.gap.closed and found.gap.after < 0.6 * found.gap.before
+    assert found.gap.closed.mean > 0.8
+
+
+def test_nothing_is_found_where_nothing_was_changed(axis: Machine, reference: list[Recording], tmp_path: Path) -> None:
+    found = diagnosed(axis, reference, {}, tmp_path)
+    assert found.verdict == "none" and not found.selected
+    assert found.ranking[0].effect == "none"
+
+
+@pytest.mark.slow
+def test_a_dead_band_is_not_taken_for_a_speed(axis: Machine, reference: list[Recording], tmp_path: Path) -> None:
+    found = diagnosed(axis, reference, {"dead_band": DeadBand(joints="all", extend=0.08, retract=0.08)}, tmp_path)
+    assert [one.effect for one in found.selected] == ["dead_band"]
+    assert found.selected[0].parameters["extend"]["q3"].mean == pytest.approx(0.08, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda r: dataclasses.replace(r, t_s=r.t_s[:500], u=r.u[:500], q=r.q[:500]), "last 25 s"),
+        (lambda r: dataclasses.replace(r, u=np.zeros_like(r.u)), "no joint is ever commanded"),
+        (lambda r: dataclasses.replace(r, u=np.full_like(r.u, 0.4)), "commands never change"),
+    ],
+)
+def test_recordings_that_can_tell_nothing_get_no_confident_name(
+    axis: Machine, reference: list[Recording], change: Callable[[Recording], Recording], reason: str
+) -> None:
+    doubts = Case(axis, reference, [change(reference[0])]).doubts()
+    assert any(reason in doubt for doubt in doubts)
+
+
+def test_a_case_without_its_half_is_refused(tmp_path: Path, machine: Machine) -> None:
+    with pytest.raises(RecordingError, match="no such folder"):
+        case.load(tmp_path / "nowhere", machine)
+    (tmp_path / "field").mkdir()
+    with pytest.raises(RecordingError, match=r"no reference/.*diagnosis.field"):
+        case.load(tmp_path, machine)
+
+
+def test_recordings_of_another_machine_are_refused(tmp_path: Path, machine: Machine) -> None:
+    stretched = dataclasses.replace(machine.joints[2].upper, value=1.9)
+    other = dataclasses.replace(
+        machine, joints=(*machine.joints[:2], dataclasses.replace(machine.joints[2], upper=stretched), *machine.joints[3:])
+    )
+    for part in ("reference", "field"):
+        one = driven(other, {}, 1, 10.0, 3)[0]
+        record.write(dataclasses.replace(one, metadata={"fingerprint": record.stamp(other)}), tmp_path / part / "a.parquet")
+    with pytest.raises(RecordingError, match="limits differ"):
+        case.load(tmp_path, machine)
+
+
+def test_too_little_reference_to_judge_by_is_refused(axis: Machine, reference: list[Recording], tmp_path: Path) -> None:
+    given = Case(axis, reference[:1], reference[1:])
+    with pytest.raises(RecordingError, match="not fitted to"):
+        simulator.fitted(given, option("fit", "valve"), tmp_path, 0, CPU)
+
+
+def said() -> Answer:
+    """An answer with everything in it."""
+    selected = Selected(
+        effect="backlash", joints=("q3",), probability=0.97,
+        parameters={"gap_rad": {"q3": Estimate(0.031, (0.028, 0.034))}}, gap_closed=Estimate(0.91, (0.86, 0.95)),
+        same_as=("lag",), decided_by="a dial gauge",
+    )  # fmt: skip
+    where = Where({"q3": JointGap(0.03, 0.002, 1.0)}, (RegimeGap("q3", "after a reversal", 0.8),), "actuation", {"q3": "rad"})
+    return Answer(
+        verdict="effects", selected=(selected,), ranking=(Ranked("backlash", ("q3",), 0.97),), where=where,
+        gap=Gap(0.03, 0.004, 0.002, Estimate(0.93, (0.88, 0.96))),
+        next_experiment=NextExperiment("reversals", ("backlash", "lag"), "because"), reason="play", more={"sanity": [{"a": 1}]},
+    )  # fmt: skip
+
+
+def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "diagnosis.json"
+    said().write(path)
+    found = json.loads(path.read_text())
+    assert found["schema"] == 1 and found["sanity"] == [{"a": 1}]
+    assert found["selected"][0]["parameters"]["gap_rad"]["q3"] == {"mean": 0.031, "ci95": [0.028, 0.034]}
+    assert found["where"]["joints"]["q3"] == {"rmse_rad": 0.03, "floor_rad": 0.002, "share": 1.0}
+    assert found["gap"]["before"] == {"rmse_rad": 0.03}
+    assert answer.read(path) == said()
+    path.write_text(json.dumps(found | {"schema": 2}))
+    with pytest.raises(RecordingError, match="schema 2"):
+        answer.read(path)
+
+
+def test_training_takes_the_found_effects_as_they_are(tmp_path: Path, machine: Machine, brokk: Callable[..., Any]) -> None:
+    path = tmp_path / prescription.FILE
+    prescription.write(said(), library.load(machine), path)
+    done = brokk("mode=train", f"effect=@{path}", "--cfg", "job")
+    assert done.code == 0, done.err
+    text = done.out[done.out.index("backlash:") :]
+    assert "q3: 0.031" in text and "other: 0.0" in text

@@ -1,0 +1,146 @@
+"""Noise, sizes and sets of effects, against data that are made with known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from actuators.valve import Pose
+from brokk_rl.diagnosis import gap, noise
+from brokk_rl.diagnosis.noise import Noise
+from brokk_rl.diagnosis.search import Table, choose
+from brokk_rl.diagnosis.sizes import Shape, earned, fitted, plain
+from brokk_rl.gravity import Gravity
+from brokk_rl.machine import Machine
+
+
+def motion(random: np.random.Generator, rows: int = 80, steps: int = 60) -> np.ndarray:
+    """Returns increments of a joint that moves in levels, `(B, S)`."""
+    return np.repeat(random.uniform(-0.05, 0.05, (rows, steps // 6)), 6, 1)
+
+
+def test_errors_of_a_wandering_speed_are_white_after_division_by_their_noise() -> None:
+    random, truth = np.random.default_rng(0), Noise(sensor=4e-4, change=0.04, wander=0.05, memory=15.0)
+    way = motion(random)
+    error = np.stack([np.linalg.cholesky(c) @ random.standard_normal(len(c)) for c in truth.covariance(way)])
+    z = (truth.whitener(way) @ error[..., None])[..., 0]
+    assert z.std() == pytest.approx(1.0, abs=0.03)
+    assert abs(np.corrcoef(z[:, :-1].ravel(), z[:, 1:].ravel())[0, 1]) < 0.05
+    found = noise.fit(error, way)
+    assert found.sensor == pytest.approx(truth.sensor, rel=0.2)
+    assert found.wander == pytest.approx(truth.wander, rel=0.25)
+
+
+def test_increments_add_up_to_the_way_since_the_start() -> None:
+    random = np.random.default_rng(1)
+    paths, start = random.standard_normal((2, 3, 20, 1)), random.standard_normal((3, 1))
+    found = noise.increments(paths, start)
+    assert found.shape == (2, 3, 20 // noise.SPAN, 1)
+    np.testing.assert_allclose(found.sum(2), paths[:, :, -1] - start, atol=1e-12)
+
+
+def joint(z: np.ndarray, shapes: dict[str, list[Shape]], faults: list[Shape] | None = None) -> Table:
+    block = np.arange(len(z)) // 80
+    return Table(plain(z, faults or [], block % 2), shapes, block)
+
+
+def line(column: np.ndarray) -> Shape:
+    """An effect that grows in proportion."""
+    sizes = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    return Shape(sizes, sizes[:, None] * column)
+
+
+def bend(column: np.ndarray) -> Shape:
+    """An effect that only begins half way."""
+    sizes = np.array([0.0, 0.5, 1.0, 2.0])
+    return Shape(sizes, np.maximum(sizes - 0.5, 0.0)[:, None] * column)
+
+
+def test_the_size_of_an_effect_is_found_though_it_does_not_grow_in_proportion() -> None:
+    random = np.random.default_rng(2)
+    column = 2.0 * random.standard_normal(800)
+    z = 0.7 * column + random.standard_normal(800)  # size 1.2: (1.2 - 0.5) = 0.7
+    assert fitted(z, [bend(column)])[0] == pytest.approx(1.2, abs=0.06)
+
+
+def test_what_earns_nothing_on_the_other_half_earns_nothing() -> None:
+    random, gains = np.random.default_rng(3), []
+    for _ in range(40):
+        z, column = random.standard_normal(800), random.standard_normal(800)
+        gains.append(earned(plain(z, [], np.arange(800) // 80 % 2), [line(column)])[0].sum())
+    assert np.mean(gains) < 0.2 and np.max(gains) < 6.0
+
+
+def test_a_pair_is_found_of_which_neither_pays_alone() -> None:
+    random = np.random.default_rng(4)
+    a, b, c = random.standard_normal((3, 1600))
+    b = a * 0.999 + b * np.sqrt(1 - 0.999**2)  # nearly the same: only their difference shows
+    z = 12.0 * (a - b) + random.standard_normal(1600)
+    shapes = {"a": [line(8.0 * a)], "b": [line(8.0 * b)], "c": [line(c)]}
+    table = joint(z, shapes)
+    table.explore(dict.fromkeys(shapes, 5.0), 3)
+    chosen = choose([table], lambda j, subset: 5.0 * len(subset), 5.0, 0.03)
+    assert table.score(frozenset("a")).total < 20.0 and table.score(frozenset("b")).total < 20.0
+    assert chosen.names == {"a", "b"}
+
+
+def test_a_fault_of_the_simulator_itself_is_no_evidence_for_an_effect_like_it() -> None:
+    random = np.random.default_rng(5)
+    column = random.standard_normal(1600)
+    z = 0.25 * column + random.standard_normal(1600)
+    fault = Shape(np.array([-6.0, 0.0, 6.0]), np.array([-6.0, 0.0, 6.0])[:, None] * 0.1 * column)
+    free, excused = joint(z, {"a": [line(column)]}), joint(z, {"a": [line(column)]}, [fault])
+    assert free.score(frozenset("a")).total > 30.0
+    assert excused.score(frozenset("a")).total < 8.0
+
+
+def test_two_joints_with_the_same_cause_get_one_name_where_another_would_hardly_earn_more() -> None:
+    random = np.random.default_rng(6)
+    columns = random.standard_normal((2, 1600))
+    near = columns + 0.05 * random.standard_normal(columns.shape)
+    z = columns + random.standard_normal(columns.shape)
+    tables = []
+    for j, (own, like) in enumerate(zip(columns, near, strict=True)):
+        names = ("a", "b") if j == 0 else ("b", "a")  # on the second joint b is a little nearer to the truth
+        tables.append(joint(z[j], {names[0]: [line(own)], names[1]: [line(like)]}))
+        tables[-1].explore({"a": 5.0, "b": 5.0}, 3)
+    chosen = choose(tables, lambda j, subset: 5.0 * len(subset), 2.0, 0.1)
+    assert len(chosen.names) == 1 and all(chosen.subsets)
+
+
+def test_an_effect_with_one_cause_for_all_joints_is_not_found_on_one_of_many() -> None:
+    random = np.random.default_rng(7)
+    columns = random.standard_normal((4, 800))
+    z = random.standard_normal(columns.shape)
+    z[0] += 0.35 * columns[0]
+    tables = [joint(z[j], {"clock": [line(columns[j])]}) for j in range(4)]
+    for table in tables:
+        table.explore({"clock": 5.0}, 3)
+    price = {"price": lambda j, subset: 5.0 * len(subset), "name_price": 5.0, "share": 0.03}
+    assert choose(tables, **price).names == {"clock"}
+    assert not choose(tables, **price, shared=frozenset({"clock"}), partial=30.0).names
+
+
+def test_the_closed_share_of_a_worked_example() -> None:
+    generator = np.random.default_rng(8)
+    before, after, floor = (np.full(40, value**2) for value in (0.03, 0.012, 0.01))
+    found = gap.closed(before, after, floor, generator)
+    assert found and found.mean == pytest.approx(0.9) and found.ci95 == pytest.approx((0.9, 0.9))
+    assert gap.closed(floor, floor, floor, generator) is None
+
+
+def test_shares_of_effects_that_pay_only_together_are_equal_and_add_up() -> None:
+    value = {frozenset(): 0.0, frozenset("a"): 0.0, frozenset("b"): 0.35, frozenset("ab"): 0.53}
+    found = gap.shapley(["a", "b"], lambda names: value[names])
+    assert found["a"] == pytest.approx(0.09) and found["b"] == pytest.approx(0.44)
+    assert sum(found.values()) == pytest.approx(0.53)
+
+
+def test_the_weight_of_a_planar_arm_by_sums_of_angles_is_that_of_the_mechanics(machine: Machine) -> None:
+    pose = Pose(machine, torch.device("cpu"))
+    lower, upper = (torch.as_tensor(side, dtype=torch.float32) for side in (machine.lower, machine.upper))
+    q = lower + (upper - lower) * torch.rand(50, 5, generator=torch.Generator().manual_seed(9))
+    force = torch.tensor([body.yield_force.value for body in machine.bodies])
+    weight = Gravity(machine, torch.device("cpu")).load(q) / force
+    torch.testing.assert_close(pose.features(q)[..., 0], weight.float(), atol=1e-3, rtol=1e-3)
