@@ -1,0 +1,180 @@
+"""Segmenters: planes in depth against a renderer's masks, windows there and back, what stands in files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cuboid
+import numpy as np
+import pytest
+import torch
+from composed import option
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brokk_rl.errors import CheckpointError, ConfigError, FrameError
+from brokk_rl.signals import Frame
+from perception import dataset, export
+from perception.dataset import Label
+from perception.segment_network import NetworkSegmenter
+from perception.segment_plane import onto_edges
+from perception.segment_window import Window, around, block_box, whole
+from perception.unet import UNet
+
+SIZE_PX = (640, 360)
+
+
+@pytest.mark.parametrize("distance_m", [1.3, 2.0, 3.0, 4.0])
+@pytest.mark.parametrize("around_rad", [0.2, 0.7, 1.2])
+def test_planes_before_their_surroundings_are_the_block(distance_m: float, around_rad: float) -> None:
+    eye = (-distance_m * np.cos(around_rad), -distance_m * np.sin(around_rad), 1.1)
+    view = cuboid.seen(cuboid.looking(eye, (0.1, 0.0, 0.3)), SIZE_PX, noise_per_m=0.0024)
+    masks = option("perception/segmenter", "depth_plane").build().segment(view.frame)
+    assert masks.mouth is None
+    assert masks.block.shape == view.block.shape and masks.block.dtype == np.float32
+    assert masks.block.min() >= 0.0 and masks.block.max() <= 1.0
+    found = masks.block > 0.5
+    assert (found & view.block).sum() > 0.97 * found.sum()
+    front_and_side = 0.8 if distance_m < 3 else 0.7  # a top seen at a grazing angle is thinner than a matcher's noise
+    assert cuboid.overlap(found, view.block) > front_and_side
+
+
+def test_ground_alone_is_no_block_and_the_same_frame_gives_the_same_mask() -> None:
+    segmenter = option("perception/segmenter", "depth_plane").build()
+    empty = cuboid.seen(cuboid.looking((-2.0, 0.4, 1.0), (0.0, 0.0, 0.3)), SIZE_PX, 0.0024, with_box=False)
+    assert segmenter.segment(empty.frame).block.max() < 0.5
+    view = cuboid.seen(cuboid.looking((-2.0, 0.4, 1.0), (0.0, 0.0, 0.3)), SIZE_PX, 0.0024)
+    np.testing.assert_array_equal(segmenter.segment(view.frame).block, segmenter.segment(view.frame).block)
+
+
+def test_what_stands_before_a_face_is_not_part_of_it_and_a_mouth_is() -> None:
+    view = cuboid.seen(cuboid.looking((-1.6, -0.3, 0.8), (0.1, 0.0, 0.3)), SIZE_PX, 0.0024, occluder_m=(-0.4, -0.2, 0.45))
+    found = option("perception/segmenter", "depth_plane").build().segment(view.frame).block > 0.5
+    assert view.occluder.sum() > 1000
+    assert (found & view.occluder).mean() < 0.1 * view.occluder.mean()
+    assert (found & view.mouth).sum() > 0.9 * view.mouth.sum()
+
+
+def test_a_frame_without_depth_is_refused_by_name() -> None:
+    view = cuboid.seen(cuboid.looking((-2.0, 0.0, 1.0), (0.0, 0.0, 0.3)), (320, 180))
+    blind = replace(view.frame, depth_m=np.full_like(view.frame.depth_m, np.nan), name="folder/0007")
+    with pytest.raises(FrameError, match=r"folder/0007: depth is known in 0\.0% of the pixels, depth_plane needs 5%"):
+        option("perception/segmenter", "depth_plane").build().segment(blind)
+
+
+def test_a_sloppy_edge_moves_onto_that_of_the_picture() -> None:
+    gray = np.full((180, 320), 60, np.uint8)
+    gray[:, 160:] = 180
+    sloppy = np.zeros((90, 160), np.float32)
+    sloppy[:, 78:] = 1.0  # two pixels, four of the picture, off
+    moved = onto_edges(sloppy, gray, 4, 0.04)
+    plain = np.abs(np.repeat(np.repeat(sloppy, 2, 0), 2, 1) - (gray > 100)).mean()
+    assert np.abs((moved > 0.5) - (gray > 100).astype(float)).mean() < 0.5 * plain
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(-80, 200), st.integers(-60, 150), st.integers(40, 400), st.data())
+def test_a_window_brings_back_what_it_took(left: int, top: int, width: int, data: st.DataObject) -> None:
+    size_px = (80, 48)
+    window = Window(left, top, width, round(width * 48 / 80))
+    picture = np.zeros((120, 160), np.float32)
+    middle = (data.draw(st.integers(10, 149)), data.draw(st.integers(10, 109)))
+    columns, rows = np.meshgrid(np.arange(160), np.arange(120))
+    picture[:] = np.exp(-((columns - middle[0]) ** 2 + (rows - middle[1]) ** 2) / (2 * 12.0**2))
+    back = np.full_like(picture, -1.0)
+    window.put(window.take(picture, size_px), back)
+    covered = back >= 0
+    inside = (columns >= left) & (columns < left + width) & (rows >= top) & (rows < top + window.height)
+    assert (covered & ~inside).sum() == 0
+    if covered.sum() > 400:
+        # a pixel of the window may be several of the picture
+        assert np.abs(back - picture)[covered].max() < 0.05 + 0.06 * width / 80
+
+
+def test_windows_keep_the_shape_and_hold_what_they_are_around() -> None:
+    for shape in ((1080, 1920, 3), (480, 640, 3), (720, 1280, 3)):
+        window = whole(shape, (320, 192))
+        assert window.left <= 0 and window.top <= 0
+        assert window.left + window.width >= shape[1] and window.top + window.height >= shape[0]
+        assert window.width / window.height == pytest.approx(320 / 192, rel=0.01)
+    closer = around((100, 50, 40, 60), (320, 192), 0.25)
+    assert (closer.width, closer.height) == (150, 90)  # 60 px high, a quarter on each side
+    assert (closer.left + closer.width / 2, closer.top + closer.height / 2) == (120, 80)
+    block = np.zeros((50, 50), np.float32)
+    assert block_box(block, 0.5, 0.2) is None
+    block[10:30, 20:40], block[45:47, 0:2] = 1.0, 1.0  # a speck that does not count
+    assert block_box(block, 0.5, 0.2) == (20, 10, 20, 20)
+
+
+def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
+    frame = Frame(
+        color=np.zeros((360, 640, 3), np.uint8), depth_m=np.ones((360, 640), np.float32), camera_matrix=np.eye(3),
+        base_from_camera=None, t_s=0.0,
+    )  # fmt: skip
+    frame.color[100:200, 300:450] = 128  # the block
+    frame.color[140:150, 380:390] = 255  # its mouth, two pixels at the first look
+    shown = []
+
+    def infer(picture: np.ndarray) -> np.ndarray:
+        shown.append(picture)
+        bright = picture[0]
+        return np.stack([bright > 0.3, (bright > 0.95) & ((bright > 0.95).sum() > 20)]).astype(np.float32)
+
+    once = NetworkSegmenter(infer, (160, 96), None).segment(frame)
+    assert once.mouth is not None and once.mouth.max() == 0.0
+    twice = NetworkSegmenter(infer, (160, 96), 0.15).segment(frame)
+    assert len(shown) == 3 and shown[2].shape == (3, 96, 160)
+    true_mouth, true_block = frame.color[..., 0] == 255, frame.color[..., 0] > 0
+    assert twice.mouth is not None and cuboid.overlap(twice.mouth > 0.5, true_mouth) > 0.7
+    assert cuboid.overlap(twice.block > 0.5, true_block) > 0.95
+
+
+def test_the_truth_is_what_lies_beside_the_frame(tmp_path: Path) -> None:
+    view = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90))
+    stem = tmp_path / "0001"
+    dataset.write_frame(stem, view.frame.color, None, label=Label(view.block, view.mouth, view.occluder))
+    truth = option("perception/segmenter", "truth").build()
+    masks = truth.segment(replace(view.frame, name=str(stem)))
+    np.testing.assert_array_equal(masks.block > 0.5, view.block)
+    assert masks.mouth is not None
+    np.testing.assert_array_equal(masks.mouth > 0.5, view.mouth)
+    with pytest.raises(FrameError, match="live source"):
+        truth.segment(view.frame)
+    with pytest.raises(FrameError, match="no mask"):
+        truth.segment(replace(view.frame, name=str(tmp_path / "0002")))
+
+
+def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = UNet((4, 8, 8)).eval().requires_grad_(False)
+    header = export.header_of(network, (64, 32), {"update": 7})
+    export.write(tmp_path / "a.safetensors", network, header)
+    parity = export.write_onnx(tmp_path / "a.onnx", network, header, torch.rand(3, 3, 32, 64))
+    assert parity < 1e-5
+    view = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90))
+    found = []
+    for name, file in (("unet", "a.safetensors"), ("onnx", "a.onnx")):
+        segmenter = replace(option("perception/segmenter", name), weights=str(tmp_path / file)).build()
+        found.append(segmenter.segment(view.frame))
+    np.testing.assert_allclose(found[0].block, found[1].block, atol=1e-4)
+    np.testing.assert_allclose(found[0].mouth, found[1].mouth, atol=1e-4)
+
+
+def test_files_that_are_no_network_of_ours_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "broken.onnx").write_bytes(b"no network at all")
+    (tmp_path / "broken.safetensors").write_bytes(b"no network at all")
+    onnx, unet = option("perception/segmenter", "onnx"), option("perception/segmenter", "unet")
+    with pytest.raises(CheckpointError, match="corrupt or no ONNX file"):
+        replace(onnx, weights=str(tmp_path / "broken.onnx")).build()
+    with pytest.raises(CheckpointError, match="corrupt or no segmenter"):
+        replace(unet, weights=str(tmp_path / "broken.safetensors")).build()
+    with pytest.raises(CheckpointError, match=r"there is no file 'nowhere\.onnx'"):
+        replace(onnx, weights="nowhere.onnx").build()
+    network = UNet((4, 8)).eval()
+    other = export.header_of(network, (64, 32), {}) | {"channels": ["cat", "dog"]}
+    export.write_onnx(tmp_path / "other.onnx", network, other, torch.rand(1, 3, 32, 64))
+    with pytest.raises(CheckpointError, match="channels block, mouth"):
+        replace(onnx, weights=str(tmp_path / "other.onnx")).build()
+    with pytest.raises(ConfigError, match="margin"):
+        replace(onnx, margin=-0.1)

@@ -1,0 +1,107 @@
+"""The network and its training: it learns, goes on exactly where it was stopped, and leaves files that say the same."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cuboid
+import numpy as np
+import pytest
+import torch
+
+from perception import dataset, training, training_report
+from perception.dataset import Label
+from perception.unet import UNet, loss
+
+SMALL = (
+    "training.size_px=[64,40]", "training.widths=[6,12,16]", "training.batch=6", "training.workers=0", "training.rate=0.01",
+    "session.device=cpu",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of small frames with masks."""
+    folder, generator = tmp_path_factory.mktemp("frames"), np.random.default_rng(0)
+    for number in range(14):
+        angle, distance_m = generator.uniform(-0.6, 0.6), generator.uniform(1.0, 1.6)
+        eye = (-distance_m * np.cos(angle), -distance_m * np.sin(angle), generator.uniform(0.4, 0.9))
+        view = cuboid.seen(cuboid.looking(eye, (0.0, 0.0, 0.3)), (160, 90), with_box=number != 5)
+        dataset.write_frame(folder / f"{number:02d}", view.frame.color, None, label=Label(view.block, view.mouth, view.occluder))
+    return folder
+
+
+def test_the_loss_of_a_worked_example_is_right() -> None:
+    logits = torch.full((1, 2, 1, 2), 0.0)
+    target = torch.tensor([[[[1.0, 0.0]], [[0.0, 0.0]]]])
+    # probabilities are one half everywhere: entropy ln 2; Dice (2 * 0.5 + 1) / (2 + 1) and 1 / (1 + 1)
+    expected = np.log(2.0) + 1.0 - (2.0 / 3.0 + 1.0 / 2.0) / 2.0
+    assert float(loss(logits, target)) == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_shipped_widths_make_less_than_three_megabytes() -> None:
+    network = UNet((16, 32, 64, 96, 128))
+    assert 0.3e6 < sum(value.numel() for value in network.parameters()) < 0.75e6
+    assert network(torch.zeros(1, 3, 32, 48)).shape == (1, 2, 32, 48)
+
+
+def test_figures_of_a_worked_example_are_right() -> None:
+    known = torch.zeros(2, 2, 2, 4, 6, dtype=torch.bool)
+    known[0, 0, 0, :, :4] = True  # 16 px of block
+    known[0, 1, 1, 0, 0] = known[0, 1, 1, 3, 4:] = True  # two mouths
+    said = torch.zeros(2, 2, 2, 4, 6)
+    said[0, 0, 0, :, :5] = 0.9  # 20 px
+    said[0, 1, 1, 3, 3:] = 0.9  # the second mouth, one pixel too much: overlap 2 / 3
+    said[1, 1, 1, 0, 0] = 0.9  # a mouth where there is none
+    table = training_report.judged(said, known, ["clean", "empty"])
+    assert table["all"] == {"block": pytest.approx(0.8), "mouth": pytest.approx(0.4), "found": 0.5, "false": 0.5, "frames": 2}
+    assert table["empty"] == {"block": None, "mouth": None, "found": None, "false": 1.0, "frames": 1}
+
+
+def test_a_small_network_learns_the_block_in_seconds(brokk: Callable[..., Any], frames: Path) -> None:
+    done = brokk(
+        "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=60", "training.validate_every=30",
+        "training.hold_out=4", "session.out=run",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    result = json.loads(Path("run/training.json").read_text())
+    assert result["conditions"]["all"]["block"] > 0.6
+    assert result["parity"] < 1e-4
+    assert {path.name for path in Path("run").iterdir()} >= {
+        "segmenter.onnx", "segmenter.safetensors", "curve.png", "samples.png", "training.json",
+    }  # fmt: skip
+
+
+def test_an_interrupted_training_goes_on_exactly(brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = (
+        "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=9", "training.validate_every=3",
+    )  # fmt: skip
+    assert brokk(*command, "session.out=whole").code == 0
+    step, count = training._Training._step, 0
+
+    def until_the_fifth(self: Any, *batch: torch.Tensor) -> torch.Tensor:
+        nonlocal count
+        count += 1
+        if count == 5:
+            raise KeyboardInterrupt
+        return step(self, *batch)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training._Training, "_step", until_the_fifth)
+        assert brokk(*command, "session.out=parts").code == 130
+    assert brokk(*command, "session.out=parts", "resume=parts").code == 0
+    one, other = (json.loads(Path(name, "training.json").read_text()) for name in ("whole", "parts"))
+    assert one["curve"] == other["curve"]
+    assert Path("whole/segmenter.safetensors").read_bytes() == Path("parts/segmenter.safetensors").read_bytes()
+    refused = brokk(*command, "session.out=parts", "resume=parts", "training.rate=0.02")
+    assert refused.code == 2 and "its settings differ" in refused.err
+
+
+def test_folders_without_masks_are_refused(brokk: Callable[..., Any], tmp_path: Path) -> None:
+    done = brokk("mode=train_perception", f"training.frames={tmp_path}", "session.out=run")
+    assert done.code == 2 and "mode=render" in done.err and not Path("run").exists()
+    done = brokk("mode=train_perception", "training.frames=x", "training.size_px=[100,48]", "session.out=run")
+    assert done.code == 2 and "multiples of 16" in done.err
