@@ -181,7 +181,7 @@ class Search:
         self.tell("the same on the reference", 0.7)
         prices = self.prices
         shared = frozenset(kind.name for kind in self.kinds if getattr(kind.target, "shared", False))
-        chosen = choose(tables, price, prices.name, prices.share, shared, prices.partial)
+        chosen = choose(tables, price, prices.name, prices.share, shared, prices.partial, prices.joint)
         start = [table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)]
         return tables, chosen, repair(evidence, chosen.subsets, grown, start) if chosen.names else None
 

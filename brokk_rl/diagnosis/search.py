@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
-from brokk_rl.diagnosis.sizes import Plain, Shape, earned
+from brokk_rl.diagnosis.sizes import Plain, Shape, alone, earned
 
 MOST = 4
 """Effects in a set."""
@@ -60,12 +60,15 @@ class Table:
         joint: The joint's errors over the noise.
         shapes: By effect: one shape a ray; effects that do nothing to the joint are absent.
         block: Part of the recordings, the same for neighbours, of each entry.
+        scored: What subsets earn, as far as they were tried.
+        single: Best sizes of shapes by themselves, by their identity.
     """
 
     joint: Plain
     shapes: dict[str, list[Shape]]
     block: np.ndarray
     scored: dict[Subset, Scored] = field(default_factory=dict)
+    single: dict[int, float] = field(default_factory=dict)
 
     def score(self, subset: Subset) -> Scored:
         """Returns what a subset earns."""
@@ -74,10 +77,17 @@ class Table:
             shapes = [shape for name in names for shape in self.shapes[name]]
             if not shapes:
                 return Scored(np.zeros(len(self.joint.z)), {})
-            gain, sizes = earned(self.joint, shapes)
+            start = [self.alone(shape) for shape in shapes]
+            gain, sizes = earned(self.joint, shapes, np.array(start) * (1.0 if len(shapes) == 1 else 0.7))
             ends = np.cumsum([len(self.shapes[name]) for name in names])[:-1]
             self.scored[subset] = Scored(gain, dict(zip(names, np.split(sizes, ends), strict=True)))
         return self.scored[subset]
+
+    def alone(self, shape: Shape) -> float:
+        """Returns the size of a shape that explains the joint's errors best by itself."""
+        if id(shape) not in self.single:
+            self.single[id(shape)] = alone(self.joint.z, shape)
+        return self.single[id(shape)]
 
     def explore(self, price: Mapping[str, float], most: int) -> None:
         """Tries all single effects, and larger subsets that contain one of the best of the size below."""
@@ -117,7 +127,13 @@ class Chosen:
 
 
 def choose(
-    tables: Sequence[Table], price: Price, name_price: float, share: float, shared: Subset = frozenset(), partial: float = 0.0
+    tables: Sequence[Table],
+    price: Price,
+    name_price: float,
+    share: float,
+    shared: Subset = frozenset(),
+    partial: float = 0.0,
+    least: float = 0.0,
 ) -> Chosen:
     """Returns the set that is worth most, or one of fewer effects that is not surely worth less.
 
@@ -128,14 +144,15 @@ def choose(
         share: Part of what a joint's subset earns that each of its effects must add.
         shared: Effects with one cause for all joints.
         partial: What such an effect costs for each joint that could show it and does not.
+        least: No effect costs less on a joint; what earns less is not priced at all.
     """
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
-        promising = sorted((s for s in table.scored if s), key=lambda s: table.scored[s].total, reverse=True)[:TRIED]
-        promising += [s for s in table.scored if len(s) == 1 and table.scored[s].total > 0 and s not in promising]
+        paying = [s for s in table.scored if s and table.scored[s].total > least * len(s) and _each_adds(s, table, share)]
+        paying.sort(key=lambda s: table.scored[s].total, reverse=True)
+        promising = [s for place, s in enumerate(paying) if place < TRIED or len(s) == 1]
         priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising}
-        whole = [s for s in priced if priced[s] > 0 and _each_adds(s, table, share)]
-        worth.append({subset: priced[subset] for subset in whole})
+        worth.append({subset: value for subset, value in priced.items() if value > 0})
     felt = [shared & table.shapes.keys() for table in tables]
     best = _best(worth, felt, name_price, partial)
     while simpler := _simpler(best, worth, tables, felt, name_price, partial, share):

@@ -20,8 +20,6 @@ SHAPES = (0.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
 SMALL = (0.12, 0.5)
 """Sizes at which effects are simulated on the reference: what they find there is small."""
-WIDE = 6.0
-"""Faults of the simulator reach so many times their prior standard deviation."""
 FELT = 1e-3
 """An effect that changes errors over the noise by less does nothing to a joint."""
 
@@ -56,8 +54,7 @@ def plain_joints(evidence: Evidence, scatter: np.ndarray | None = None) -> list[
     by = np.ones(len(evidence.z)) if scatter is None else 1.0 / np.sqrt(scatter)
     joints = []
     for j, z in enumerate(evidence.z):
-        faults = [Shape(np.array([-WIDE, 0.0, WIDE]), np.stack([-WIDE * c, 0.0 * c, WIDE * c]) * by[j]) for c in evidence.faults[j]]
-        joints.append(plain(z * by[j], faults, evidence.fold))
+        joints.append(plain(z * by[j], evidence.faults[j] * by[j], evidence.fold))
     return joints
 
 

@@ -12,31 +12,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brokk_rl.diagnosis.noise import loss, weight
+from brokk_rl.diagnosis.noise import FREEDOM, loss, weight
 
 STEPS = 6
 """Gauss-Newton steps at most."""
+ENOUGH = 0.02
+"""Gain in log likelihood below which the steps end."""
+FAULTS = 6.0
+"""Faults of a simulator are no larger, in standard deviations."""
 PRIOR = 1.0
 """Standard deviation of a size, over the typical one: tells nothing where the recordings do, and settles what they leave open."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What growing along a ray does to one joint: `change` `(S, E)` at `sizes` `(S,)`, which are `prior` wide beforehand."""
+    """What growing along a ray does to one joint: `change` `(S, E)` at `sizes` `(S,)`."""
 
     sizes: np.ndarray
     change: np.ndarray
-    prior: float = PRIOR
 
     def at(self, size: float) -> tuple[np.ndarray, np.ndarray]:
         """Returns the change at a size and its slope over the size, each `(E,)`."""
-        cell = int(np.clip(np.searchsorted(self.sizes, size, side="right") - 1, 0, len(self.sizes) - 2))
+        cell = min(max(int(np.searchsorted(self.sizes, size, side="right")) - 1, 0), len(self.sizes) - 2)
         slope = (self.change[cell + 1] - self.change[cell]) / (self.sizes[cell + 1] - self.sizes[cell])
         return self.change[cell] + (size - self.sizes[cell]) * slope, slope
-
-    def part(self, rows: np.ndarray) -> Shape:
-        """Returns the shape on some entries only."""
-        return Shape(self.sizes, self.change[:, rows], self.prior)
 
 
 def predicted(shapes: Sequence[Shape], sizes: np.ndarray) -> np.ndarray:
@@ -44,46 +43,70 @@ def predicted(shapes: Sequence[Shape], sizes: np.ndarray) -> np.ndarray:
     return np.sum([shape.at(size)[0] for shape, size in zip(shapes, sizes, strict=True)], 0)
 
 
-def fitted(z: np.ndarray, shapes: Sequence[Shape], start: np.ndarray | None = None) -> np.ndarray:
-    """Returns the sizes that explain the errors `z` `(E,)` best: most likely under a t distribution and a wide prior."""
-    if not shapes:
-        return np.zeros(0)
-    low, high = (np.array([shape.sizes[end] for shape in shapes]) for end in (0, -1))
-    prior = np.array([shape.prior for shape in shapes])
-    size = np.array([_best(z, shape) for shape in shapes]) if start is None else start.copy()
-    if len(shapes) > 1 and start is None:
-        size *= 0.7
+def fitted(
+    z: np.ndarray,
+    shapes: Sequence[Shape],
+    start: np.ndarray | None = None,
+    faults: np.ndarray | None = None,
+    used: np.ndarray | None = None,
+) -> np.ndarray:
+    """Returns the sizes that explain the errors best: most likely under a t distribution and a wide prior.
 
-    def total(at: np.ndarray) -> float:
-        return float(loss(z - predicted(shapes, at))) + 0.5 * float(np.square(at / prior).sum())
+    Args:
+        z: Errors over the noise, `(E,)`.
+        shapes: What effects change.
+        start: Sizes from which the search begins; `None`: what each would be alone.
+        faults: What small faults of the simulator change, in standard deviations of theirs, `(P, E)`.
+        used: Weight of each entry, `(E,)`; `None`: all count.
 
-    now = total(size)
-    damping = 1e-3
+    Returns:
+        Sizes of the shapes, then those of the faults.
+    """
+    count = len(shapes)
+    lines = np.zeros((0, len(z))) if faults is None else faults
+    used = np.ones(len(z)) if used is None else used
+    if start is None:
+        start = np.array([alone(z, shape, used) for shape in shapes]) * (1.0 if count == 1 else 0.7)
+    size = np.concatenate([start, np.zeros(count + len(lines) - len(start))])
+    if not len(size):
+        return size
+    high = np.concatenate([[shape.sizes[-1] for shape in shapes], np.full(len(lines), FAULTS)])
+    low = np.concatenate([[shape.sizes[0] for shape in shapes], np.full(len(lines), -FAULTS)])
+    precision = np.concatenate([np.full(count, PRIOR**-2.0), np.ones(len(lines))])
+
+    def left_at(at: np.ndarray) -> np.ndarray:
+        return z - at[count:] @ lines - sum((shape.at(one)[0] for shape, one in zip(shapes, at, strict=False)), np.zeros(len(z)))
+
+    def total(left: np.ndarray, at: np.ndarray) -> float:
+        return 0.5 * (FREEDOM + 1.0) * float(used @ np.log1p(np.square(left) / FREEDOM)) + 0.5 * float(precision @ np.square(at))
+
+    left = left_at(size)
+    now, damping = total(left, size), 1e-3
     for _ in range(STEPS):
-        pairs = [shape.at(one) for shape, one in zip(shapes, size, strict=True)]
-        left, slope = z - np.sum([pair[0] for pair in pairs], 0), np.stack([pair[1] for pair in pairs])
-        weighted = slope * weight(left)
-        normal = weighted @ slope.T + np.diag(prior**-2.0)
-        gradient = weighted @ left - size / prior**2
-        improved = False
+        slope = np.concatenate([*(shape.at(one)[1][None] for shape, one in zip(shapes, size, strict=False)), lines])
+        weighted = slope * (weight(left) * used)
+        normal, gradient = weighted @ slope.T + np.diag(precision), weighted @ left - precision * size
+        gain = 0.0
         for _ in range(3):
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-            trial = np.clip(size + step, low, high)
-            then = total(trial)
+            trial = np.clip(size + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), low, high)
+            remains = left_at(trial)
+            then = total(remains, trial)
             if then < now - 1e-9:
-                improved = now - then > 1e-2
-                size, now, damping = trial, then, damping / 5
+                gain, size, left, now, damping = now - then, trial, remains, then, damping / 5
                 break
             damping = 10 * max(damping, 1e-3)
-        if not improved:
+        if gain < ENOUGH:
             break
     return size
 
 
-def _best(z: np.ndarray, shape: Shape) -> float:
+def alone(z: np.ndarray, shape: Shape, used: np.ndarray | None = None) -> float:
     """Returns the best of the simulated sizes and those in the middle between them."""
-    trials = np.unique(np.concatenate([shape.sizes, (shape.sizes[1:] + shape.sizes[:-1]) / 2]))
-    totals = [float(loss(z - shape.at(size)[0])) + 0.5 * size**2 / shape.prior**2 for size in trials]
+    used = np.ones(len(z)) if used is None else used
+    middle = (shape.change[1:] + shape.change[:-1]) / 2
+    trials = np.concatenate([shape.sizes, (shape.sizes[1:] + shape.sizes[:-1]) / 2])
+    left = z - np.concatenate([shape.change, middle])
+    totals = 0.5 * (FREEDOM + 1.0) * np.log1p(np.square(left) / FREEDOM) @ used + 0.5 * np.square(trials / PRIOR)
     return float(trials[int(np.argmin(totals))])
 
 
@@ -94,43 +117,42 @@ class Plain:
     Attributes:
         z: Errors over the noise, `(E,)`.
         fold: Half of the recordings of each entry.
-        faults: What the simulator's own numbers change.
+        faults: What the simulator's own numbers change, `(P, E)`.
         loss: Loss of each entry where faults were fitted to the other half.
     """
 
     z: np.ndarray
     fold: np.ndarray
-    faults: Sequence[Shape]
+    faults: np.ndarray
     loss: np.ndarray
 
 
-def plain(z: np.ndarray, faults: Sequence[Shape], fold: np.ndarray) -> Plain:
-    """Returns a joint's errors with the simulator's faults fitted crosswise."""
-    return Plain(z, fold, faults, _each(z - crossed(z, faults, fold, fitted(z, faults))))
+def plain(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray, fold: np.ndarray) -> Plain:
+    """Returns a joint's errors with the simulator's faults, `(P, E)`, fitted crosswise."""
+    lines = np.reshape(np.asarray(faults, dtype=float), (-1, len(z)))
+    return Plain(z, fold, lines, _each(z - _crossed(z, [], lines, fold, fitted(z, [], faults=lines))))
 
 
-def crossed(z: np.ndarray, shapes: Sequence[Shape], fold: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Returns what shapes change, `(E,)`, on each half with sizes fitted to the other."""
+def _crossed(z: np.ndarray, shapes: Sequence[Shape], faults: np.ndarray, fold: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Returns what shapes and faults change, `(E,)`, on each half with sizes fitted to the other."""
     change = np.zeros(len(z))
     for half in (0, 1):
-        own, other = fold != half, fold == half
-        if shapes and own.any() and other.any():
-            size = fitted(z[own], [shape.part(own) for shape in shapes], start)
-            change[other] = predicted([shape.part(other) for shape in shapes], size)
+        other = fold == half
+        if other.any() and not other.all():
+            size = fitted(z, shapes, start, faults, np.where(other, 0.0, 1.0))
+            whole = size[len(shapes) :] @ faults + (predicted(shapes, size[: len(shapes)]) if shapes else 0.0)
+            change[other] = whole[other]
     return change
 
 
-def earned(joint: Plain, shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
+def earned(joint: Plain, shapes: Sequence[Shape], start: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Returns by how much shapes fitted to one half of the entries lower the loss of the other, entry by entry `(E,)`.
 
     Returns:
         What each entry earns, and the sizes fitted to all.
     """
-    every = [*shapes, *joint.faults]
-    alone = fitted(joint.z, shapes)
-    start = np.concatenate([alone, np.zeros(len(joint.faults))])
-    whole = fitted(joint.z, every, start)
-    return joint.loss - _each(joint.z - crossed(joint.z, every, joint.fold, whole)), whole[: len(shapes)]
+    whole = fitted(joint.z, shapes, start, joint.faults)
+    return joint.loss - _each(joint.z - _crossed(joint.z, shapes, joint.faults, joint.fold, whole)), whole[: len(shapes)]
 
 
 def _each(z: np.ndarray) -> np.ndarray:
