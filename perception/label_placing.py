@@ -19,7 +19,7 @@ EXAMPLE = """expected YAML such as
   corners_px: [[512, 300], [840, 310], [505, 560]]  # a corner of the drilled face, then its two neighbours; or corners_m, touched
   thickness_m: 0.6                                # of the block behind the face
   mouths: [{center_px: [660, 420], radius_m: 0.05}]  # or center_m"""
-TRIMS = 5
+TRIALS, JUDGES, TRIMS = 400, 800, 3
 
 
 @dataclass(frozen=True)
@@ -104,12 +104,17 @@ def _face_plane(frame: Frame, corners_px: np.ndarray) -> np.ndarray:
         raise FrameError(f"{frame.name}: depth is known at {len(rows)} pixels between the clicked corners, 50 are needed")
     lines = sight(frame, np.stack([columns, rows], axis=1).astype(float))
     inverse = 1.0 / frame.depth_m[rows, columns].astype(float)
-    kept = np.ones(len(rows), bool)
-    plane = np.zeros(3)
-    for _ in range(TRIMS):  # a mouth, an arm before the face, wild matches: least squares without what does not fit
-        plane = np.linalg.lstsq(lines[kept], inverse[kept], rcond=None)[0]
+    generator = np.random.default_rng(0)
+    triples = generator.integers(len(rows), size=(TRIALS, 3))
+    triples = triples[np.abs(np.linalg.det(lines[triples])) > 1e-7]
+    trials = np.linalg.solve(lines[triples], inverse[triples][..., None])[..., 0]
+    judge = generator.integers(len(rows), size=JUDGES)
+    # least median of squares (Rousseeuw, 1984): up to half of what lies between the corners may be an arm, a mouth, a wild match
+    plane = trials[np.median(np.abs(trials @ lines[judge].T - inverse[judge]), axis=1).argmin()]
+    for _ in range(TRIMS):
         away = np.abs(lines @ plane - inverse)
-        kept = away <= 3.0 * 1.4826 * np.median(away[kept]) + 1e-9
+        kept = away <= 2.5 * 1.4826 * np.median(away) + 1e-9
+        plane = np.linalg.lstsq(lines[kept], inverse[kept], rcond=None)[0]
     return plane
 
 
