@@ -18,7 +18,7 @@ _SMOOTH_PX = 0.8
 _LARGEST_STEP_PX = 0.5
 _LARGEST_CHANGE_PX = 1.0
 """Where refinement wants to move further than this the match was wrong."""
-_LEAST_SLOPE = 0.05
+_LEAST_SLOPE = 0.01
 """Mean squared slope of the grey values per pixel below which there is nothing to refine by."""
 
 

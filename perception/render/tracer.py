@@ -108,7 +108,7 @@ class Tracer:
     """Draws solids in a light, from any camera.
 
     Args:
-        solids: What there is to see.
+        solids: What there is to see; bars in a block come after it.
         light: How it is lit.
         sky: Radiance where nothing is, RGB.
     """
@@ -156,7 +156,10 @@ class Tracer:
                 continue
             to = nearer if rows is None else rows[nearer]
             t[to], solid[to], part[to] = hits.t[nearer], number, hits.part[nearer]
-            mouth[to] = False if hits.mouth is None else hits.mouth[nearer]
+            if hits.mouth is not None:
+                mouth[to] = hits.mouth[nearer]
+            elif thing.role != "block":  # a bar inside a hole is still seen through its rim
+                mouth[to] = False
         return t, solid, part, mouth
 
     def _shoot(self, camera: Pinhole, pixel: np.ndarray) -> _Seen:

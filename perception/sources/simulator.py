@@ -11,15 +11,15 @@ import numpy as np
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception.concrete import frame_of, materials_of
-from perception.drawing import surround
+from perception.render.concrete import frame_of, materials_of
+from perception.render.drawing import surround
 from perception.render.drilled import FRONT, Block, Hole
+from perception.render.rig import Rig
+from perception.render.scenes import Scenes
 from perception.render.solids import Cylinder, Pose, Solid
+from perception.render.studio import Shot, Studio
 from perception.render.texture import Material
-from perception.rig import Rig
-from perception.scenes import Scenes
 from perception.stereo import Stereo
-from perception.studio import Shot, Studio
 
 
 @spec

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,16 @@ from composed import names, option
 
 from brokk_rl.errors import ConfigError, FrameError
 from perception import dataset
-from perception.concrete import frame_of
-from perception.drawing import compose, hidden_part, rim_points
+from perception.render.concrete import frame_of
+from perception.render.drawing import compose, hidden_part, rim_points
 from perception.render.drilled import Block, Chip, Disc, Hole
+from perception.render.rig import Rig
+from perception.render.scenes import Scenes
 from perception.render.sensor import Exposure, dust, photograph
 from perception.render.solids import Box, Cylinder, Plane, Pose
+from perception.render.studio import Studio
 from perception.render.texture import Material
 from perception.render.tracer import Light, Pinhole, Tracer
-from perception.rig import Rig
-from perception.scenes import Scenes
-from perception.studio import Studio
 
 GREY = Material((0.5, 0.5, 0.5), 0.0, 0.001)
 STONE = Material((0.5, 0.5, 0.5), 0.25, 0.0006, 2)
@@ -53,6 +54,7 @@ def rig() -> Rig:
     return replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
 
 
+@lru_cache
 def kind(name: str) -> Scenes:
     return option("scene", name)
 
@@ -109,6 +111,16 @@ def test_a_ray_goes_through_a_chip_into_the_hole_and_out_of_neither() -> None:
     # straight ahead through the bowl beside the rim: at x = 0.06 m the ball ends sqrt(25^2 - 10^2) - 10 = 12.91 mm below the face
     t, _, part = Tracer([chipped], NOON, (0, 0, 0)).first(np.array([0.06, 0.0, 0.0]), np.array([[0.0, 0.0, 1.0]], np.float32))
     assert t[0] == pytest.approx(1.0 + 0.01291, abs=1e-5) and part[0] == chipped.break_part
+
+
+def test_a_bar_in_the_concrete_is_seen_through_the_hole_alone() -> None:
+    # the bar, 10 mm thick, lies 50 mm below the face across the whole block
+    bar = Cylinder("block", Pose(np.eye(3)[:, [1, 2, 0]], np.array([0.0, 0.0, 1.05])), 0.005, 0.4, (GREY,))
+    view = seen([drilled(FACING, np.array([0.0, 0.0, 1.0])), bar])
+    assert (view.solid == 1).sum() > 100 and view.mouth[view.solid == 1].all()
+    # half a pixel beside its middle: 0.5 / 400 of 1.045 m, 1.3 mm
+    assert view.depth_m[120, 160] == pytest.approx(1.05 - np.sqrt(0.005**2 - 0.0013065**2), abs=1e-5)
+    assert view.depth_m[120, 160 + 25] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_cylinder_and_a_box_are_where_they_should_be() -> None:
@@ -243,10 +255,10 @@ def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: Rig
         scene = compose(near, large, chance)
         shot = studio("hidden", large).shot(scene, chance)
         assert scene.block is not None
-        pixel = np.round(large.left.project(rim_points(scene.block, 0))).astype(int)
+        pixel = np.round(large.left.project(rim_points(scene.block, scene.block.holes[0]))).astype(int)
         covered = shot.label.arm[pixel[:, 1], pixel[:, 0]].mean()
         assert covered == pytest.approx(scene.hidden[0], abs=0.05)
-        assert hidden_part([], scene.block, 0) == 0.0
+        assert hidden_part([], scene.block, scene.block.holes[0]) == 0.0
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -18,7 +18,7 @@ from composed import option
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
-from perception.rig import Rig
+from perception.render.rig import Rig
 from perception.sources import realsense, simulator, zed
 from perception.sources.folder import Folder
 from perception.sources.live import Capture, Freshness, Lens, LiveSource

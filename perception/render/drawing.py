@@ -1,4 +1,4 @@
-"""One scene out of the ranges of `perception.scenes`: where everything stands, and how it is lit."""
+"""One scene out of the ranges of `perception.render.scenes`: where everything stands, and how it is lit."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from perception.arm import arm_over
-from perception.concrete import block_at, frame_of
-from perception.render.drilled import Block
+from perception.render.arm import arm_over
+from perception.render.concrete import bars_in, block_at, frame_of
+from perception.render.drilled import Block, Disc, Hole
+from perception.render.rig import Rig
+from perception.render.scenes import Scene, Scenes, integer, logarithmic, uniform
 from perception.render.sensor import Exposure
 from perception.render.solids import Box, Plane, Pose, Solid
 from perception.render.texture import NUM_TEXTURES, SIDE, Material
 from perception.render.tracer import Light
-from perception.rig import Rig
-from perception.scenes import Scene, Scenes, integer, logarithmic, uniform
 
 NUM_RIM_POINTS = 360
 _CLUTTER_TRIES = 30
@@ -30,7 +30,7 @@ def compose(kind: Scenes, rig: Rig, generator: np.random.Generator) -> Scene:
         block = block_at(kind.block, target, normal, turn, generator)
     hidden = uniform(kind.around.hidden, generator)
     if generator.random() < kind.around.arm:
-        rim = rim_points(block, 0) if block and block.holes else target + 0.05 * frame_of(normal, turn)[:, :2].T
+        rim = rim_points(block, block.holes[0]) if block and block.holes else target + 0.05 * frame_of(normal, turn)[:, :2].T
         arm = arm_over(rim, rig, hidden, generator)
     return surround(kind, rig, block, arm, target, normal, generator)
 
@@ -62,13 +62,14 @@ def surround(
         ground_m = max(0.5, float((block.corners_m @ down).max())) if block else float(target @ down) + 0.2
     solids: list[Solid] = [*_setting(kind, down, ground_m, generator)]
     if block:
-        solids.append(block)
+        solids += [block, *bars_in(kind.block, block, generator)]
     solids += arm
     solids += _clutter(kind, rig, block, down, ground_m, generator)
     light = _light(kind, down, target, generator)
     exposure, level = _exposure(kind, light, normal, target, generator)
     sky = (0.8 * light.ambient, 0.8 * light.ambient, 0.8 * light.ambient)
-    hidden_parts = tuple(hidden_part(solids, block, number) for number in range(len(block.holes))) if block else ()
+    hidden_parts = tuple(hidden_part(solids, block, hole) for hole in block.holes) if block else ()
+    hidden_discs = tuple(hidden_part(solids, block, disc) for disc in block.discs) if block else ()
     sight = target / np.linalg.norm(target)
     conditions = {
         "distance_m": float(np.linalg.norm(target)),
@@ -79,25 +80,23 @@ def surround(
         "arm": float(bool(arm)),
         "decoys": float(len(block.discs)) if block else 0.0,
     }
-    return Scene(tuple(solids), block, light, exposure, sky, hidden_parts, conditions)
+    return Scene(tuple(solids), block, light, exposure, sky, hidden_parts, hidden_discs, conditions)
 
 
-def rim_points(block: Block, number: int) -> np.ndarray:
-    """Returns points on the rim of a hole in camera coordinates, `(NUM_RIM_POINTS, 3)`."""
-    hole = block.holes[number]
+def rim_points(block: Block, circle: Hole | Disc) -> np.ndarray:
+    """Returns points on the rim of a hole or disc of the block in camera coordinates, `(NUM_RIM_POINTS, 3)`."""
+    axis = circle.axis if isinstance(circle, Hole) else 2
     angle = np.linspace(0, 2 * np.pi, NUM_RIM_POINTS, endpoint=False)
-    local = np.repeat(hole.center_m[None], NUM_RIM_POINTS, 0)
-    local[:, (hole.axis + 1) % 3] += hole.radius_m * np.cos(angle)
-    local[:, (hole.axis + 2) % 3] += hole.radius_m * np.sin(angle)
+    local = np.repeat(circle.center_m[None], NUM_RIM_POINTS, 0)
+    local[:, (axis + 1) % 3] += circle.radius_m * np.cos(angle)
+    local[:, (axis + 2) % 3] += circle.radius_m * np.sin(angle)
     return block.pose.point(local)
 
 
-def hidden_part(solids: Sequence[Solid], block: Block | None, number: int) -> float:
-    """Returns the part of a hole's rim that other solids, or the block itself, hide from the left camera."""
-    if block is None:
-        return 0.0
-    rim = rim_points(block, number)
-    outward = block.pose.rotation @ block.holes[number].outward
+def hidden_part(solids: Sequence[Solid], block: Block, circle: Hole | Disc) -> float:
+    """Returns the part of the rim of a hole or disc that other solids, or the block itself, hide from the left camera."""
+    rim = rim_points(block, circle)
+    outward = block.pose.rotation @ (circle.outward if isinstance(circle, Hole) else np.array([0.0, 0.0, 1.0]))
     if (outward @ rim.mean(0)) >= 0:  # on a face that looks away
         return 1.0
     shut = np.zeros(len(rim), bool)
@@ -172,7 +171,7 @@ def _clutter(
         reach = float(np.linalg.norm(half))
         if block and np.linalg.norm(place - block.pose.center_m) < reach + np.linalg.norm(block.half_m):
             continue
-        if block and any(hidden_part([thing], block, number) > 0 for number in range(len(block.holes))):
+        if block and any(hidden_part([thing], block, hole) > 0 for hole in block.holes):
             continue
         found.append(thing)
     return found

@@ -53,6 +53,7 @@ class Concrete:
         fill_brightness: Of the floor.
         lamp: Light inside a hole, relative to daylight.
         lamp_probability: That there is any.
+        bar_probability: That a reinforcing bar crosses a hole.
         edge_m: Concrete left between a hole and the edge of the face.
         chips: Pieces broken off each rim.
         chip_m: Size of each, along the face.
@@ -77,6 +78,7 @@ class Concrete:
     fill_brightness: Range
     lamp: Range
     lamp_probability: float
+    bar_probability: float
     edge_m: Range
     chips: Count
     chip_m: Range
@@ -172,6 +174,7 @@ class Scene:
         exposure: How the pictures are taken.
         sky: Radiance where nothing is.
         hidden: Part of each rim that something else hides from the left camera, one for each hole.
+        hidden_discs: Likewise for the discs.
         conditions: What was drawn, for statistics.
     """
 
@@ -181,12 +184,13 @@ class Scene:
     exposure: Exposure
     sky: tuple[float, float, float]
     hidden: tuple[float, ...]
+    hidden_discs: tuple[float, ...]
     conditions: dict[str, float]
 
 
 @spec
 class Scenes:
-    """A kind of scene; `perception.drawing.compose` draws one.
+    """A kind of scene; `perception.render.drawing.compose` draws one.
 
     Attributes:
         name: What it is called in truth files and tables.

@@ -11,11 +11,11 @@ import numpy as np
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.dataset import Circle, Label, Truth
-from perception.drawing import compose
+from perception.render.drawing import compose
+from perception.render.rig import Rig
+from perception.render.scenes import Scene, Scenes
 from perception.render.sensor import dust, photograph
 from perception.render.tracer import Tracer
-from perception.rig import Rig
-from perception.scenes import Scene, Scenes
 from perception.stereo import Stereo
 
 
@@ -96,8 +96,8 @@ class Studio:
             for hole, hidden in zip(block.holes, scene.hidden, strict=True)
         )
         decoys = tuple(
-            self._circle(block.pose.point(disc.center_m), block.pose.rotation[:, 2], disc.radius_m, 0.0, 0.0)
-            for disc in block.discs
+            self._circle(block.pose.point(disc.center_m), block.pose.rotation[:, 2], disc.radius_m, 0.0, hidden)
+            for disc, hidden in zip(block.discs, scene.hidden_discs, strict=True)
         )
         place = {name: np.asarray(value).tolist() for name, value in
                  (("center_m", block.pose.center_m), ("rotation", block.pose.rotation), ("half_m", block.half_m))}  # fmt: skip

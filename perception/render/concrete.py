@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from perception.render.drilled import FRONT, Block, Chip, Disc, Hole
-from perception.render.solids import Pose
+from perception.render.solids import Cylinder, Pose, Solid
 from perception.render.texture import NUM_TEXTURES, SIDE, Material
 
 if TYPE_CHECKING:
-    from perception.scenes import Concrete
+    from perception.render.scenes import Concrete
 
 MARK_M = 0.002
 """Texel of painted marks: stains, wet patches, cracks."""
@@ -84,6 +84,25 @@ def _side_hole(kind: Concrete, half: np.ndarray, radius: float, edge: float, gen
         room = max(half[other] - radius - edge, 0.0)
         center[other] = generator.uniform(-room, room)
     return Hole(center, radius, min(0.05, kind.depth_m[0]), part, 0.0)
+
+
+def bars_in(kind: Concrete, block: Block, generator: np.random.Generator) -> list[Solid]:
+    """Returns reinforcing bars, cut bare by some of the holes: cylinders in the concrete, seen through a rim only."""
+    bars: list[Solid] = []
+    for hole in block.holes:
+        if hole.part != FRONT or generator.random() >= kind.bar_probability:
+            continue
+        angle, below = generator.uniform(-np.pi, np.pi), float(generator.uniform(0.03, hole.depth_m + 0.02))
+        along = block.pose.rotation @ [np.cos(angle), np.sin(angle), 0.0]
+        aside = 0.7 * hole.radius_m * generator.uniform(-1, 1) * np.array([-np.sin(angle), np.cos(angle), 0.0])
+        place = block.pose.point(hole.center_m + aside - [0.0, 0.0, below])
+        rust = Material((0.25, 0.16, 0.1), 0.3, 0.001, 2)
+        bars.append(
+            Cylinder(
+                "block", Pose(frame_of(along, 0.0), place), float(generator.uniform(0.005, 0.012)), 1.2 * hole.radius_m, (rust,)
+            )
+        )
+    return bars
 
 
 def _chips(kind: Concrete, hole: Hole, generator: np.random.Generator) -> list[Chip]:

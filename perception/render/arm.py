@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.concrete import frame_of
+from perception.render.concrete import frame_of
+from perception.render.rig import Rig
 from perception.render.solids import Box, Cylinder, Pose, Solid
 from perception.render.texture import Material
-from perception.rig import Rig
 
 _CLEAR = 1.6
 """Where the arm hides nothing it stays away from the rim's centre by this factor of the rim's size at least."""
