@@ -45,7 +45,7 @@ class ContourArcs:
         angle_rms_rad: Largest standard deviation of the support's angles, plus `angle_rms_small` over the geometric mean semi-axis
             in px; for an ellipse seen in part, as large a part of that.
         angle_rms_small: See `angle_rms_rad`.
-        purity: Least part of the supporting arcs that lies on the ellipse.
+        purity: Least part of the supporting edges, from corner to corner, that lies on the ellipse.
         departure: Largest part of the circumference where the supporting chains run on beside the ellipse (spirals, hearts).
         evidence: Least decimal exponent by which the support is no accident.
         smallest_px: Least minor semi-axis.
@@ -124,12 +124,12 @@ class ArcDetector:
         part = gray[top:bottom, left:right]
         if min(part.shape) < 8:
             return []
-        edges = ellipse_edges.find(
-            part, None if roi is None else roi[top:bottom, left:right], s.sigma_px, s.percentile, s.noise, s.low
-        ).cut(s.arc_tolerance_px, s.corner_rad, s.arc_points)
+        limits = prior or SizePrior(0.0, float(max(part.shape)))
+        where = None if roi is None else roi[top:bottom, left:right]
+        edges = ellipse_edges.find(part, where, s.sigma_px, s.percentile, s.noise, s.low, s.arc_points)
         if not len(edges.points):
             return []
-        limits = prior or SizePrior(0.0, float(max(part.shape)))
+        edges = edges.cut(s.arc_tolerance_px, s.corner_rad, max(s.arc_points, int(0.5 * limits.lowest_px)))
         found = self.on(edges, limits)
         shift = np.array([left, top, 0.0, 0.0, 0.0])
         return [
@@ -142,21 +142,21 @@ class ArcDetector:
         s = self.settings
         claimed = np.zeros(len(edges.points), bool)
         found: list[tuple[np.ndarray, float, float, float]] = []
-        spans = edges.spans[edges.spans[:, 1] - edges.spans[:, 0] >= s.arc_points]
-        self._try(spans[:, None], edges, limits, claimed, found)
+        spans = self._compact(edges.spans[edges.spans[:, 1] - edges.spans[:, 0] >= s.arc_points], edges, limits)
+        self._try(_seeds(spans[:, None]), edges, limits, claimed, found)
         whole = set(map(tuple, spans.tolist()))
         parts = np.array([arc for arc in edges.arcs.tolist() if tuple(arc) not in whole], int).reshape(-1, 2)
-        self._try(_free(parts, claimed)[:, None], edges, limits, claimed, found)
-        arcs = _free(edges.arcs, claimed)
-        for number in (4, 3, 2):
-            self._try(arcs[ellipse_groups.find(arcs, edges, number)], edges, limits, claimed, found)
+        self._try(_seeds(self._compact(_free(parts, claimed), edges, limits)[:, None]), edges, limits, claimed, found)
+        arcs = self._compact(_free(edges.arcs, claimed), edges, limits)
+        groups = ellipse_groups.find(arcs, edges, (4, 3, 2))
+        self._try(np.concatenate([_seeds(arcs[group]) for group in groups]), edges, limits, claimed, found)
         return sorted(found, key=lambda one: -one[3])
 
-    def _try(self, groups: np.ndarray, edges: Edges, limits: SizePrior, claimed: np.ndarray, found: list) -> None:
-        """Fits, refines and judges candidates of groups of spans `(C, G, 2)`, adds to `found` and marks the points behind them."""
-        if not len(groups):
+    def _try(self, seeds: np.ndarray, edges: Edges, limits: SizePrior, claimed: np.ndarray, found: list) -> None:
+        """Fits, refines and judges candidates of seed points `(C, P)`, adds to `found` and marks the points behind them."""
+        if not len(seeds):
             return
-        judged = self.judge(self.refine(self.first(_seeds(groups), edges, limits), edges), edges, limits)
+        judged = self.judge(self.refine(self.first(seeds, edges, limits), edges), edges, limits)
         for k in np.argsort(-judged.score, kind="stable"):
             mine = judged.support[k][judged.support[k] >= 0]
             if claimed[mine].mean() > 0.4:
@@ -222,8 +222,9 @@ class ArcDetector:
             ellipse_support.typical(np.arccos(np.clip(along, -1, 1)), there),
         )
         size = np.sqrt(e[:, 2] * e[:, 3])
-        rms_limit = (s.rms_px + s.rms_relative * size) * coverage
-        angle_limit = (s.angle_rms_rad + s.angle_rms_small / size) * coverage
+        whole = np.clip(2 * coverage - 1, 0.0, 1.0)  # what is seen in part must fit the better: a lobe of a heart nearly does
+        rms_limit = s.rms_px * coverage + s.rms_relative * size * whole
+        angle_limit = s.angle_rms_rad * coverage**1.5 + s.angle_rms_small / size * coverage
         good = (coverage >= s.coverage) & (spread <= rms_limit) & (angle <= angle_limit)
         good &= ellipse_support.evidence(coverage, angle, conic.perimeter(e[:, 2], e[:, 3]), s.angle_rad) >= s.evidence
         candidates, support, length = candidates[good], support[good], length[good]
@@ -257,6 +258,14 @@ class ArcDetector:
         height, width = edges.nearest.shape
         x, y = ellipses[:, 0], ellipses[:, 1]
         return (x >= 0) & (y >= 0) & (x < width) & (y < height)
+
+    def _compact(self, spans: np.ndarray, edges: Edges, limits: SizePrior) -> np.ndarray:
+        """Returns the spans that are neither larger nor smaller than a good part of an ellipse can be."""
+        if not len(spans):
+            return spans
+        places = edges.points[(spans[:, :1] + np.linspace(0, 1, 9) * (spans[:, 1:] - 1 - spans[:, :1])).astype(int)]
+        extent = np.ptp(places, axis=1)
+        return spans[(extent.max(1) <= 2.2 * limits.highest_px) & (np.hypot(*extent.T) >= 0.5 * limits.lowest_px)]
 
     def _reach(self, ellipses: np.ndarray) -> np.ndarray:
         size = np.sqrt(ellipses[:, 2] * ellipses[:, 3])

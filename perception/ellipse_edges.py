@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -14,6 +13,10 @@ SCALE = 16.0
 
 END_PX = 3.0
 """Of each arc: where it ends the edges of two things meet and are bent by the blur."""
+BLUNT_PX = 5.0
+"""A side of a polygon shorter than this may be a corner that the blur has cut off."""
+CLOSE = 4
+"""Points from the ends of a closed line at which its directions are compared."""
 NO_SPANS = np.empty((0, 2), int)
 
 
@@ -28,8 +31,8 @@ class Edges:
         nearest: Number of the edge point nearest to each pixel, `(h, w)`.
         spans: Pieces of chains without a branch, `(S, 2)`: first point and one past the last.
         arcs: Convex arcs, spans too, `(A, 2)`.
-        arc: Number of the arc of each point, `(E,)`, -1 for none.
-        arc_length: `(A,)` px.
+        run: Number of the piece between two corners of each point, `(E,)`, -1 for a short one.
+        run_length: Length of each such piece, px.
     """
 
     points: np.ndarray
@@ -38,22 +41,37 @@ class Edges:
     nearest: np.ndarray
     spans: np.ndarray
     arcs: np.ndarray
-    arc: np.ndarray
-    arc_length: np.ndarray
+    run: np.ndarray
+    run_length: np.ndarray
 
     def cut(self, tolerance_px: float, corner_rad: float, least: int) -> Edges:
-        """Returns the same edges with their convex arcs; see `_arcs`."""
-        arcs = _arcs(self, tolerance_px, corner_rad, least)
+        """Returns the same edges with their convex arcs and their runs from corner to corner; see `_pieces`."""
+        arcs, runs = _pieces(self, tolerance_px, corner_rad, least)
         step = np.zeros(len(self.points))
         step[2:-2] = np.linalg.norm(self.points[4:] - self.points[:-4], axis=1) / 4  # over four points: they scatter
         way = np.cumsum(np.minimum(step, 1.5))
-        arc = np.full(len(self.points), -1)
-        for number, (start, stop) in enumerate(arcs):
-            arc[start:stop] = number
-        return replace(self, arcs=arcs, arc=arc, arc_length=np.maximum(way[arcs[:, 1] - 1] - way[arcs[:, 0]] - END_PX, 1.0))
+        run = np.full(len(self.points), -1)
+        for number, (start, stop) in enumerate(runs.tolist()):
+            run[start:stop] = number
+        length = way[runs[:, 1] - 1] - way[runs[:, 0]] - END_PX
+        for start, stop in self._closed().tolist():  # a closed line begins somewhere; that is no corner
+            first, last = run[start], run[stop - 1]
+            if first != last and min(first, last) >= 0:
+                run[run == last] = first
+                length[first] += length[last]
+        return replace(self, arcs=arcs, run=run, run_length=np.maximum(length, 1.0))
+
+    def _closed(self) -> np.ndarray:
+        """Returns the spans that end where they begin, without a corner there, `(S, 2)`."""
+        start, stop = self.spans[self.spans[:, 1] - self.spans[:, 0] > 4 * CLOSE].T
+        near = np.linalg.norm(self.points[start] - self.points[stop - 1], axis=1) < 3
+        smooth = (self.directions[start + CLOSE] * self.directions[stop - 1 - CLOSE]).sum(1) > 0.8
+        return np.column_stack([start, stop])[near & smooth]
 
 
-def find(gray: np.ndarray, roi: np.ndarray | None, sigma_px: float, percentile: float, noise: float, low: float) -> Edges:
+def find(
+    gray: np.ndarray, roi: np.ndarray | None, sigma_px: float, percentile: float, noise: float, low: float, least: int
+) -> Edges:
     """Returns the edges of a picture.
 
     Thresholds follow the picture, so that dark and hazy ones have edges too: the upper one is the given percentile of the gradient,
@@ -66,6 +84,7 @@ def find(gray: np.ndarray, roi: np.ndarray | None, sigma_px: float, percentile: 
         percentile: Of the gradient's magnitude, 0 to 100.
         noise: Upper threshold in standard deviations of the gradient of noise, as the median magnitude tells it.
         low: Lower threshold as a part of the upper one.
+        least: Contours with fewer points are left out.
     """
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma_px)
     gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0))
@@ -80,63 +99,70 @@ def find(gray: np.ndarray, roi: np.ndarray | None, sigma_px: float, percentile: 
     if roi is not None:
         canny[~roi] = 0
     canny[[0, -1]] = canny[:, [0, -1]] = 0
-    contours, _ = cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    contours = [c for c in cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0] if len(c) >= least]
     if not contours:
         return _none(gray.shape)
-    pixels, chain, spans = _chains(contours, gray.shape, canny)
+    pixels, chain, spans = _chains(contours, gray.shape, canny, least)
+    if not len(pixels):
+        return _none(gray.shape)
     points, directions = _refined(pixels, gx, gy, magnitude)
     return Edges(points, directions, chain, _nearest(pixels, gray.shape), spans, NO_SPANS, np.full(len(points), -1), np.empty(0))
 
 
-def _arcs(edges: Edges, tolerance_px: float, corner_rad: float, least: int) -> np.ndarray:
-    """Returns convex arcs as spans of edge points, `(A, 2)`: pieces of chains cut where they bend back and at corners.
+def _pieces(edges: Edges, tolerance_px: float, corner_rad: float, least: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns convex arcs and runs as spans of edge points, `(A, 2)`: chains cut at corners, arcs also where they bend back.
+
+    A polygon that follows a circle within the tolerance turns by eight times it over the length of its sides at each vertex; one
+    that turns by more than that and `corner_rad` together has a corner there.
 
     Args:
         edges: Edges.
         tolerance_px: How closely a polygon follows a piece; what bends less is straight.
-        corner_rad: A polygon that turns by more at a vertex has a corner there.
-        least: Arcs with fewer points are left out.
+        corner_rad: See above.
+        least: Pieces with fewer points are left out.
     """
-    found = []
-    for start, stop in edges.spans:
-        if stop - start < least:
-            continue
-        curve = np.round(edges.points[start:stop] * 16).astype(np.int32)
-        corners = cv2.approxPolyDP(curve[:, None], tolerance_px * 16, False)[:, 0]
-        cuts = _cuts(corners / 16.0, tolerance_px, corner_rad)
-        if len(cuts):
-            places = _places(curve, corners)[cuts]
-            bounds = np.concatenate([[0], places, [stop - start]]) + start
-        else:
-            bounds = np.array([start, stop])
-        found += [(int(i), int(j)) for i, j in pairwise(bounds) if j - i >= least]
-    return np.array(found, dtype=int).reshape(-1, 2)
-
-
-def _cuts(corners: np.ndarray, tolerance_px: float, corner_rad: float) -> np.ndarray:
-    """Returns the vertices of a polygon at which it has a corner or begins to bend the other way.
-
-    A polygon that follows a circle within the tolerance turns by eight times it over the length of its sides at each vertex, and
-    a corner by more than that and `corner_rad` together.
-    """
-    if len(corners) < 3:
-        return np.empty(0, int)
-    steps = np.diff(corners.astype(float), axis=0)
+    spans = edges.spans[edges.spans[:, 1] - edges.spans[:, 0] >= least]
+    if not len(spans):
+        return NO_SPANS, NO_SPANS
+    fine = np.round(edges.points * 16).astype(np.int32)
+    polygons = [cv2.approxPolyDP(fine[start:stop, None], tolerance_px * 16, False)[:, 0] for start, stop in spans.tolist()]
+    owner = np.repeat(np.arange(len(spans)), [len(polygon) for polygon in polygons])
+    corners = np.concatenate(polygons)
+    steps = np.diff(corners / 16.0, axis=0)
     turn = np.arctan2(steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0], (steps[:-1] * steps[1:]).sum(1))
     size = np.linalg.norm(steps, axis=1)
-    sharp = np.abs(turn) > corner_rad + 16 * tolerance_px / (size[1:] + size[:-1])
-    back = np.concatenate([[False], turn[1:] * turn[:-1] < 0])
-    return np.flatnonzero(sharp | back) + 1
+    inner = owner[2:] == owner[:-2]
+    half = 4 * tolerance_px / np.maximum(size, 1.0)  # of the turn of a circle's chord of this length
+    sharp = np.abs(turn) > corner_rad + half[1:] + half[:-1]
+    cut_off = (size[1:-1] < BLUNT_PX) & inner[1:] & inner[:-1]  # a corner that the blur has cut off
+    cut_off &= np.abs(turn[1:] + turn[:-1]) > corner_rad + half[2:] + half[:-2]
+    sharp[:-1] |= cut_off
+    sharp[1:] |= cut_off
+    back = np.concatenate([[False], (turn[1:] * turn[:-1] < 0) & inner[1:] & inner[:-1]])
+    found = []
+    for cuts in ((sharp | back) & inner, sharp & inner):
+        cut = np.flatnonzero(cuts) + 1
+        bounds = np.unique(np.concatenate([spans.ravel(), _places(fine, spans, corners[cut], owner[cut])]))
+        pieces = np.column_stack([bounds[:-1], bounds[1:]])
+        within = np.searchsorted(spans[:, 0], pieces[:, 0], side="right") - 1
+        found.append(pieces[(pieces[:, 1] <= spans[within, 1]) & (pieces[:, 1] - pieces[:, 0] >= least)])
+    return found[0], found[1]
 
 
-def _places(curve: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Returns where the vertices of a polygon stand in the curve that it approximates, in order."""
-    keys = {tuple(point): i for i, point in reversed(list(enumerate(curve.tolist())))}
-    places = np.array([keys[tuple(corner)] for corner in corners.tolist()])
-    return np.maximum.accumulate(places)
+def _places(fine: np.ndarray, spans: np.ndarray, corners: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """Returns the number of the edge point at which each corner of the polygon of a span stands."""
+    member = np.concatenate([np.arange(start, stop) for start, stop in spans.tolist()])
+    span = np.repeat(np.arange(len(spans)), spans[:, 1] - spans[:, 0])
+
+    def key(number: np.ndarray, points: np.ndarray) -> np.ndarray:
+        return (number.astype(np.int64) << 40) + (points[:, 1].astype(np.int64) + 64 << 20) + points[:, 0] + 64
+
+    keys = key(span, fine[member])
+    order = np.argsort(keys, kind="stable")
+    return member[order[np.searchsorted(keys[order], key(owner, corners))]]
 
 
-def _chains(contours: Sequence, shape: tuple, canny: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _chains(contours: Sequence, shape: tuple, canny: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns edge pixels `(E, 2)` in order, each once, their chains, and unbranched spans.
 
     A contour runs around a line of edge pixels: along both sides of an open one, inside and outside of a closed one. Taking each
@@ -153,23 +179,24 @@ def _chains(contours: Sequence, shape: tuple, canny: np.ndarray) -> tuple[np.nda
     cut = np.flatnonzero((step > 1) | (np.diff(contour) != 0)) + 1
     bounds = np.concatenate([[0], cut, [len(pixels)]])
     pieces = np.column_stack([bounds[:-1], bounds[1:]])
+    pieces = pieces[pieces[:, 1] > pieces[:, 0]]
+    start, following = pieces[:-1, 0], pieces[1:, 0]
+    halves = (contour[start] == contour[following]) & (np.abs(pixels[start].astype(int) - pixels[following]).max(1) <= 1)
+    halves &= pieces[:-1, 1] - start > 1
+    halves[1:] &= ~halves[:-1]
     place = np.arange(len(pixels))
-    joined, skip = [], False
-    for k, (start, stop) in enumerate(pieces):
-        if skip:
-            skip = False
-            continue
-        if k + 1 < len(pieces) and contour[start] == contour[pieces[k + 1][0]]:
-            other = pieces[k + 1]
-            if np.abs(pixels[start].astype(int) - pixels[other[0]]).max() <= 1 and stop - start > 1:
-                place[start:stop] = place[start:stop][::-1]
-                joined.append((start, other[1]))
-                skip = True
-                continue
-        joined.append((start, stop))
-    pixels = pixels[place]
+    for begin, end in pieces[:-1][halves].tolist():
+        place[begin:end] = place[begin:end][::-1]
+    ends = np.append(pieces[:-1, 1], pieces[-1:, 1])
+    ends[:-1][halves] = pieces[1:, 1][halves]
+    joined = np.column_stack([pieces[:, 0], ends])[np.append(True, ~halves)]
+    length = joined[:, 1] - joined[:, 0]
+    long = length >= least  # what is left over beside a line two pixels wide is no edge of its own
+    pixels = pixels[place][np.repeat(long, length)]
+    ends = np.cumsum(length[long])
+    joined = np.column_stack([ends - length[long], ends])
     chain = cv2.connectedComponents(canny, connectivity=8, ltype=cv2.CV_32S)[1][pixels[:, 1], pixels[:, 0]]
-    return pixels, chain, np.array(joined, dtype=int).reshape(-1, 2)
+    return pixels, chain, joined
 
 
 def _refined(pixels: np.ndarray, gx: np.ndarray, gy: np.ndarray, magnitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -15,22 +17,22 @@ STRAIGHT_PX = 0.35
 """What deviates less from its chord bends nowhere."""
 
 
-def find(arcs: np.ndarray, edges: Edges, number: int) -> np.ndarray:
-    """Returns groups of `number` arcs, `(M, number)`, numbers into `arcs`, each the likeliest next one of the one before.
+def find(arcs: np.ndarray, edges: Edges, numbers: Sequence[int]) -> list[np.ndarray]:
+    """Returns groups of so many arcs each, `(M, number)`, numbers into `arcs`, each the likeliest next one of the one before.
 
     Where a circle's arc ends and its next one begins, the chord between them halves the angle between their tangents; of an ellipse
     nearly so. Both bend to the same side, with the bright on the same side, about as strongly.
     """
-    if len(arcs) < number:
-        return np.empty((0, number), int)
-    following = _next(arcs, edges)
-    groups = np.flatnonzero(following >= 0)[:, None]
-    for _ in range(number - 1):
-        groups = groups[following[groups[:, -1]] >= 0]
-        groups = np.column_stack([groups, following[groups[:, -1]]])
-    different = np.array([len(set(row)) == number for row in groups.tolist()], bool)
-    groups = groups[different] if len(groups) else groups.reshape(0, number)
-    return np.unique(np.sort(groups, 1), axis=0) if len(groups) else groups
+    following = _next(arcs, edges) if len(arcs) > 1 else np.full(len(arcs), -1)
+    found = []
+    for number in numbers:
+        groups = np.flatnonzero(following >= 0)[:, None]
+        for _ in range(number - 1):
+            groups = groups[following[groups[:, -1]] >= 0]
+            groups = np.column_stack([groups, following[groups[:, -1]]])
+        groups = np.sort(groups, 1)
+        found.append(np.unique(groups[(np.diff(groups, axis=1) > 0).all(1)], axis=0).reshape(-1, number))
+    return found
 
 
 def _next(arcs: np.ndarray, edges: Edges) -> np.ndarray:

@@ -50,19 +50,19 @@ def gather(
 
 
 def purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Returns how much of the convex arcs that support each candidate lies on it, in the mean over the support, `(C,)`.
+    """Returns how much of the runs that support each candidate lies on it, in the mean over the support, `(C,)`.
 
-    An arc of an ellipse that something hides ends where it is hidden; an arc of a spiral or a heart goes on elsewhere.
+    The edge of an ellipse that something hides ends there with a corner; that of a spiral or a heart goes on smoothly elsewhere.
     """
     there = support >= 0
-    arc = np.where(there, edges.arc[support], -1)
-    known = arc >= 0
+    run = np.where(there, edges.run[support], -1)
+    known = run >= 0
     ds = length * (2 * np.pi / support.shape[1])
-    key = np.arange(len(support))[:, None] * (len(edges.arcs) + 1) + arc + 1
+    key = np.arange(len(support))[:, None] * (len(edges.run_length) + 1) + run + 1
     _, number, inverse = np.unique(key[known], return_index=True, return_inverse=True)
-    share = np.bincount(inverse, ds[known], minlength=len(number)) / edges.arc_length[arc[known]][number]
+    share = np.bincount(inverse, ds[known], minlength=len(number)) / edges.run_length[run[known]][number]
     each = np.ones(support.shape)
-    each[known] = np.minimum(share, 1.3)[inverse]  # of short arcs a sample more or less
+    each[known] = np.minimum(share, 1.3)[inverse]  # of short runs a sample more or less
     return np.minimum((each * ds * there).sum(1) / np.maximum((ds * there).sum(1), 1e-9), 1.0)
 
 

@@ -126,7 +126,7 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
     sigma, weight = floor, np.zeros(len(points.inverse))
     for ring in rings:
         inside = points.radii < ring
-        for _ in range(4):
+        for _ in range(3):
             residual = points.inverse - points.rays @ m
             tight = np.abs(residual[inside])
             scale = max(1.4826 * float(np.median(tight[tight < max(8 * sigma, np.median(tight) * 1.5)])), floor)
@@ -141,7 +141,7 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
     return Plane(m, _covariance(points, weight, residual), sigma, int((weight > 0).sum()), extent)
 
 
-def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 60) -> np.ndarray:
+def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40) -> np.ndarray:
     """Returns the plane through three points that most points lie nearest to (least median of squares)."""
     best, least = np.linalg.lstsq(rays, inverse, rcond=None)[0], np.inf
     judge = generator.integers(len(rays), size=min(len(rays), 400))
