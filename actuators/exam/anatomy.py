@@ -34,8 +34,8 @@ RANGES = {
 NUISANCES = {
     "hysteresis": (0.006, 0.02),  # play between command and spool, of full command
     "wave": (0.01, 0.03),  # waviness of the flow curve
-    "wander": (0.02, 0.05),  # standard deviation of the slow change of speed
-    "wander_s": (3.0, 15.0),  # its correlation time
+    "wander": (0.03, 0.04),  # standard deviation of the slow change of speed
+    "wander_s": (5.0, 11.0),  # its correlation time
     "droop": (0.01, 0.03),  # loss of speed at full demand after a few seconds
     "warm_up": (-0.01, 0.03),  # change of speed over the first half hour
 }
