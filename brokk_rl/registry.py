@@ -20,7 +20,7 @@ ENTRY_POINTS = "brokk_rl.conf"
 CORE = "conf"
 SETTINGS = ("hydra",)
 """Groups of Hydra's own settings: no registry of ours."""
-SAME_SPEC = ("machine", "session")
+SAME_SPEC = ("machine", "rig", "scene", "session")
 """Groups whose options differ in their numbers only, so that the spec says nothing about one of them."""
 
 
