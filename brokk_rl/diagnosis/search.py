@@ -148,7 +148,7 @@ def choose(
     """
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
-        paying = [s for s in table.scored if s and table.scored[s].total > least * len(s) and _each_adds(s, table, share)]
+        paying = [s for s in list(table.scored) if s and table.scored[s].total > least * len(s) and _each_adds(s, table, share)]
         paying.sort(key=lambda s: table.scored[s].total, reverse=True)
         promising = [s for place, s in enumerate(paying) if place < TRIED or len(s) == 1]
         priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising}
