@@ -91,14 +91,15 @@ class Labelling:
         placing, tracker = label_placing.read(Path(self.placing)), self.camera.build()
         poses, told, clicked = self._poses(tracker, placing.frame)
         cuboid = label_placing.placed(placing, *clicked)
-        shift_m = 0.0
+        before, views = cuboid.world(np.array([cuboid.low_m, cuboid.high_m])), []
         if self.num_refined:
             names = sorted(poses)
             chosen = {names[k] for k in np.linspace(0, len(names) - 1, min(self.num_refined, len(names))).round().astype(int)}
             views = [label_refine.seen(frame, poses[frame.name].world_from_camera) for frame in self._frames(chosen)]
-            before = cuboid.world(np.array([cuboid.low_m, cuboid.high_m]))
             cuboid = label_refine.refined(cuboid, views, self.noise_per_m, self.reach_px)
-            shift_m = float(np.linalg.norm(cuboid.world(np.array([cuboid.low_m, cuboid.high_m])) - before, axis=1).max())
+        shift_m = float(np.linalg.norm(cuboid.world(np.array([cuboid.low_m, cuboid.high_m])) - before, axis=1).max())
+        cuboid = label_placing.with_mouths(cuboid, placing, *clicked)
+        cuboid = label_refine.refined_mouths(cuboid, views, self.noise_per_m, self.reach_px) if views else cuboid
         self._write(cuboid, poses, told, folder)
         good = [entry for entry in told.values() if entry["left_out"] is None]
         if not good:
@@ -172,7 +173,7 @@ class Labelling:
 
     def _outline_px(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> float | None:
         """Returns the mean distance between outline and edges, each point by its steepest edge within reach."""
-        outline = block_outline(cuboid, frame, pose, self.noise_per_m, 0.0)
+        outline = block_outline(cuboid, frame, pose, self.noise_per_m, self.reach_px)
         if len(outline.points_m) < MIN_POINTS:
             return None
         away = np.abs(offsets(outline, smooth_gray(frame), self.reach_px, np.inf))

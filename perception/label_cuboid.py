@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -159,14 +158,13 @@ def project(points_m: np.ndarray, frame: Frame, world_from_camera: np.ndarray) -
     return pixels
 
 
-def cuboid_of(corners_m: np.ndarray, thickness_m: float, eye_m: np.ndarray, mouths_m: Sequence[tuple[np.ndarray, float]]) -> Cuboid:
+def cuboid_of(corners_m: np.ndarray, thickness_m: float, eye_m: np.ndarray) -> Cuboid:
     """Returns the block whose drilled face has three known corners.
 
     Args:
         corners_m: A corner and its two neighbours on the face, `(3, 3)`, world.
         thickness_m: Of the block behind the face.
         eye_m: A point in front of the face, world.
-        mouths_m: Centre in the world and radius of each mouth.
     """
     one, two = corners_m[1] - corners_m[0], corners_m[2] - corners_m[0]
     if np.cross(one, two) @ (eye_m - corners_m[0]) < 0:
@@ -174,6 +172,4 @@ def cuboid_of(corners_m: np.ndarray, thickness_m: float, eye_m: np.ndarray, mout
     x = one / np.linalg.norm(one)
     z = np.cross(one, two) / np.linalg.norm(np.cross(one, two))
     y = np.cross(z, x)
-    block = Cuboid(np.stack([x, y, z], axis=1), corners_m[0], np.array([np.linalg.norm(one), two @ y, thickness_m]))
-    places = [(block.own(center_m), radius_m) for center_m, radius_m in mouths_m]
-    return replace(block, mouths=tuple(Mouth(float(at[0]), float(at[1]), radius_m) for at, radius_m in places))
+    return Cuboid(np.stack([x, y, z], axis=1), corners_m[0], np.array([np.linalg.norm(one), two @ y, thickness_m]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import yaml
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
-from perception.label_cuboid import Cuboid, cuboid_of, sight
+from perception.label_cuboid import Cuboid, Mouth, cuboid_of, sight
 
 EXAMPLE = """expected YAML such as
   frame: "00012"                                  # where it was clicked
@@ -61,7 +61,7 @@ def read(path: Path) -> Placing:
 
 
 def placed(placing: Placing, frame: Frame, world_from_camera: np.ndarray) -> Cuboid:
-    """Returns the block as it was placed.
+    """Returns the block as it was placed, its mouths still missing.
 
     Args:
         placing: What a person has said.
@@ -72,17 +72,25 @@ def placed(placing: Placing, frame: Frame, world_from_camera: np.ndarray) -> Cub
         FrameError: there is too little depth between the clicked corners.
     """
     corners = placing.corners
-    plane = None
     if corners.shape[1] == 2:
-        plane = _face_plane(frame, corners)
-        corners = _on_plane(frame, corners, plane) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+        lines = sight(frame, corners)
+        local = lines / (lines @ _face_plane(frame, corners))[:, None]
+        corners = local @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+    return cuboid_of(corners, placing.thickness_m, world_from_camera[:3, 3])
+
+
+def with_mouths(cuboid: Cuboid, placing: Placing, frame: Frame, world_from_camera: np.ndarray) -> Cuboid:
+    """Returns the block with its mouths: where the clicked sight meets the face, or the touched point lies."""
+    eye = cuboid.own(world_from_camera[:3, 3])
     mouths = []
     for center, radius_m in placing.mouths:
         if len(center) == 2:
-            plane = _plane_through(corners, world_from_camera) if plane is None else plane
-            center = _on_plane(frame, center[None], plane)[0] @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
-        mouths.append((center, radius_m))
-    return cuboid_of(corners, placing.thickness_m, world_from_camera[:3, 3], mouths)
+            along = sight(frame, center[None])[0] @ world_from_camera[:3, :3].T @ cuboid.rotation
+            at = eye - along * eye[2] / along[2]
+        else:
+            at = cuboid.own(center)
+        mouths.append(Mouth(float(at[0]), float(at[1]), radius_m))
+    return replace(cuboid, mouths=tuple(mouths))
 
 
 def _center(told: dict[str, Any]) -> np.ndarray:
@@ -116,15 +124,3 @@ def _face_plane(frame: Frame, corners_px: np.ndarray) -> np.ndarray:
         kept = away <= 2.5 * 1.4826 * np.median(away) + 1e-9
         plane = np.linalg.lstsq(lines[kept], inverse[kept], rcond=None)[0]
     return plane
-
-
-def _plane_through(corners_m: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
-    """Returns the plane `n / d`, `(3,)`, camera coordinates, through three points of the world."""
-    local = (corners_m - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
-    return np.linalg.solve(local, np.ones(3))
-
-
-def _on_plane(frame: Frame, pixels: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Returns where the sight of pixels, `(n, 2)`, meets a plane, `(n, 3)`, camera coordinates."""
-    lines = sight(frame, pixels)
-    return lines / (lines @ plane)[:, None]

@@ -17,8 +17,6 @@ ROUNDS = 8
 DEPTH_STEP = 8
 """Every so many pixels one is compared in depth, both ways."""
 EDGE_SIGMA_PX = 1.0
-SLACK = 2.0
-"""What seems to hide the outline hides it only if it is further before it than the placing may be off, this many times over."""
 REACH_END = 0.25
 """Reach of the last round over that of the first."""
 
@@ -66,7 +64,7 @@ def refined(cuboid: Cuboid, views: Sequence[Seen], noise_per_m: float, reach_px:
     """
     for number in range(ROUNDS):
         reach = reach_px * REACH_END ** (number / (ROUNDS - 1))
-        edges = [_edges(block_outline(cuboid, view.frame, view.pose, noise_per_m, SLACK * reach), view, reach) for view in views]
+        edges = [_edges(block_outline(cuboid, view.frame, view.pose, noise_per_m, reach), view, reach) for view in views]
         depths = [_depths(cuboid, view, noise_per_m, reach) for view in views]
 
         def misfit(
@@ -82,6 +80,11 @@ def refined(cuboid: Cuboid, views: Sequence[Seen], noise_per_m: float, reach_px:
 
         found = least_squares(misfit, np.zeros(8), loss="soft_l1", x_scale=[0.01] * 3 + [0.01] * 5, max_nfev=20)
         cuboid = cuboid.moved(found.x)
+    return cuboid
+
+
+def refined_mouths(cuboid: Cuboid, views: Sequence[Seen], noise_per_m: float, reach_px: float) -> Cuboid:
+    """Returns the block with its mouths moved to where the pictures have their rims; arguments as `refined`."""
     for number in range(len(cuboid.mouths)):
         cuboid = _with_mouth(cuboid, number, views, noise_per_m, reach_px)
     return cuboid
@@ -91,9 +94,7 @@ def _with_mouth(cuboid: Cuboid, number: int, views: Sequence[Seen], noise_per_m:
     """Returns the block with the centre of one mouth moved to where the rim's edges are."""
     for turn in range(ROUNDS):
         reach = reach_px * REACH_END ** (turn / (ROUNDS - 1))
-        edges = [
-            _edges(mouth_outline(cuboid, number, view.frame, view.pose, noise_per_m, SLACK * reach), view, reach) for view in views
-        ]
+        edges = [_edges(mouth_outline(cuboid, number, view.frame, view.pose, noise_per_m, reach), view, reach) for view in views]
         if not sum(len(edge.points_m) for edge in edges):
             return cuboid
 

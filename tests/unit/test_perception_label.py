@@ -104,6 +104,7 @@ def test_rays_meet_a_cuboid_where_a_second_renderer_says(footage: tuple[Path, li
     view = cuboid.seen(cuboid.looking(EYES_M[0], (0.1, 0.0, 0.3)), SIZE_PX)
     placing = label_placing.Placing(None, CORNERS_M, 1.2, ((cuboid.HOLE_M, cuboid.RADIUS_M),))
     block = label_placing.placed(placing, view.frame, view.world_from_camera)
+    block = label_placing.with_mouths(block, placing, view.frame, view.world_from_camera)
     seen = look(block, sight_lines(view.frame), view.world_from_camera)
     np.testing.assert_array_equal(seen.face >= 0, view.block)
     np.testing.assert_array_equal(seen.mouth, view.mouth)
