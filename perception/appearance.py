@@ -20,15 +20,15 @@ class Interior:
 
     Attributes:
         darkness: Brightness of its darkest quarter over that of the face around it.
-        slope: How much brighter the wall that the camera sees is than the opposite side, over the face's brightness.
-        unevenness: Standard deviation of smoothed brightness inside over that of the face.
+        slope: Change of brightness over one radius in the direction in which the hole goes on behind the face, over the contrast
+            between face and darkest quarter. Of the wall the camera sees the sunlit or sky-lit end near the rim on the far side of
+            the hole and the dark depth on the near side: clearly negative in a hole, about zero on a disc.
         deeper: Part of the known depth inside that lies clearly behind the face.
         unknown: Part of the inside without depth.
     """
 
     darkness: float
     slope: float
-    unevenness: float
     deeper: float
     unknown: float
 
@@ -47,20 +47,25 @@ def interior(
     radii = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", place, conic.form(ellipse), place) + 1.0, 0.0))
     inside, ring = radii < INSIDE, (radii > RING[0]) & (radii < RING[1])
     if inside.sum() < 8 or ring.sum() < 8:
-        return Interior(np.nan, np.nan, np.nan, np.nan, np.nan)
+        return Interior(np.nan, np.nan, np.nan, np.nan)
     face = max(float(np.median(part[ring])), 1.0)
     smooth = cv2.GaussianBlur(part, (0, 0), max(0.15 * float(np.sqrt(ellipse[2] * ellipse[3])), 0.6))
+    depth = depth_m[top:bottom, left:right]
+    known = np.isfinite(depth)
+    if plane is not None:
+        behind = (place @ np.linalg.inv(camera_matrix).T) @ plane.m - 1.0 / np.where(known, depth, np.inf)
+        before = (known & (behind < -4 * plane.sigma)).astype(np.uint8)  # an arm that hides a part of it
+        inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
+        if inside.sum() < 8:
+            return Interior(np.nan, np.nan, np.nan, np.nan)
     values = smooth[inside]
     darkness = float(np.percentile(values, 25.0)) / face
-    depth = depth_m[top:bottom, left:right][inside]
-    unknown = float(np.mean(~np.isfinite(depth)))
+    unknown = float(np.mean(~known[inside]))
     slope = deeper = np.nan
     if plane is not None:
-        rays = place[inside] @ np.linalg.inv(camera_matrix).T
-        behind = rays @ plane.m - 1.0 / np.where(np.isfinite(depth), depth, np.inf)
-        known = np.isfinite(depth)
-        deeper = float(np.mean(behind[known] > 4 * plane.sigma)) if known.any() else 0.0
-        into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * rays.mean(0)[:2])
+        deeper = float(np.mean(behind[inside & known] > 4 * plane.sigma)) if (inside & known).any() else 0.0
+        middle = np.linalg.solve(camera_matrix, np.array([x, y, 1.0]))
+        into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
         along = (place[inside][:, :2] - (x, y)) @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
-        slope = float(np.polyfit(along, values, 1)[0]) / face
-    return Interior(darkness, slope, float(values.std()) / face, deeper, unknown)
+        slope = float(np.polyfit(along, values, 1)[0]) / max(face * (1.0 - darkness), 1.0)
+    return Interior(darkness, slope, deeper, unknown)

@@ -15,7 +15,7 @@ from perception.ellipse_support import ANGLES, NUM_SAMPLES, Candidates
 
 NUM_SEEDS = 64
 """Points that stand for an arc in its first fit."""
-ROUNDS_PX = (1.0, 0.5, 0.3)
+ROUNDS_PX = (1.0, 0.5, 0.3, 0.2)
 """Rounds of refinement: the distance at which a point counts a quarter."""
 TIGHT = 0.7
 """Of the reach, once the ellipse is refined."""
@@ -48,6 +48,8 @@ class ContourArcs:
         purity: Least part of the supporting edges, from corner to corner, that lies on the ellipse.
         departure: Largest part of the circumference where the supporting chains run on beside the ellipse (spirals, hearts).
         evidence: Least decimal exponent by which the support is no accident.
+        prior_slack: By how much wider the limits of residual, angle and departure are, and the one of purity lower, where a size is
+            given: it shuts out most of what else they do, and rims are chipped.
         smallest_px: Least minor semi-axis.
         flattest: Least ratio of the semi-axes.
     """
@@ -71,6 +73,7 @@ class ContourArcs:
     purity: float
     departure: float
     evidence: float
+    prior_slack: float
     smallest_px: float
     flattest: float
 
@@ -138,25 +141,20 @@ class ArcDetector:
         ]
 
     def on(self, edges: Edges, limits: SizePrior) -> list[tuple[np.ndarray, float, float, float]]:
-        """Returns ellipses with residual, coverage and score: first whole contours, then single arcs, then groups of arcs."""
-        s = self.settings
-        claimed = np.zeros(len(edges.points), bool)
-        found: list[tuple[np.ndarray, float, float, float]] = []
-        spans = self._compact(edges.spans[edges.spans[:, 1] - edges.spans[:, 0] >= s.arc_points], edges, limits)
-        self._try(_seeds(spans[:, None]), edges, limits, claimed, found)
+        """Returns ellipses with residual, coverage and score: of whole contours, single arcs and groups of arcs, the best first."""
+        spans = self._compact(edges.spans, edges, limits)
+        arcs = self._compact(edges.arcs, edges, limits)
         whole = set(map(tuple, spans.tolist()))
-        parts = np.array([arc for arc in edges.arcs.tolist() if tuple(arc) not in whole], int).reshape(-1, 2)
-        self._try(_seeds(self._compact(_free(parts, claimed), edges, limits)[:, None]), edges, limits, claimed, found)
-        arcs = self._compact(_free(edges.arcs, claimed), edges, limits)
-        groups = ellipse_groups.find(arcs, edges, (4, 3, 2))
-        self._try(np.concatenate([_seeds(arcs[group]) for group in groups]), edges, limits, claimed, found)
+        parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int).reshape(-1, 2)
+        groups = [arcs[group] for group in ellipse_groups.find(arcs, edges, (4, 3, 2))]
+        seeds = np.concatenate([_seeds(some) for some in (spans[:, None], parts[:, None], *groups)])
+        found = self._chosen(self.judge(self.refine(self.first(seeds, edges, limits), edges), edges, limits), edges)
         return sorted(found, key=lambda one: -one[3])
 
-    def _try(self, seeds: np.ndarray, edges: Edges, limits: SizePrior, claimed: np.ndarray, found: list) -> None:
-        """Fits, refines and judges candidates of seed points `(C, P)`, adds to `found` and marks the points behind them."""
-        if not len(seeds):
-            return
-        judged = self.judge(self.refine(self.first(seeds, edges, limits), edges), edges, limits)
+    def _chosen(self, judged: Judged, edges: Edges) -> list[tuple[np.ndarray, float, float, float]]:
+        """Returns the candidates that share their support with no better one."""
+        claimed = np.zeros(len(edges.points), bool)
+        found = []
         for k in np.argsort(-judged.score, kind="stable"):
             mine = judged.support[k][judged.support[k] >= 0]
             if claimed[mine].mean() > 0.4:
@@ -167,6 +165,7 @@ class ArcDetector:
             dense = self._gather(one, edges, np.arange(number) * (2 * np.pi / number))[0][0]
             claimed[dense[dense >= 0]] = True
             found.append((one.ellipses[0], judged.rms_px[k], judged.coverage[k], judged.score[k]))
+        return found
 
     def first(self, seeds: np.ndarray, edges: Edges, limits: SizePrior) -> Candidates:
         """Returns the candidates of seed points `(C, P)` that lie on an ellipse of a possible size, their gradients all one way."""
@@ -223,16 +222,19 @@ class ArcDetector:
         )
         size = np.sqrt(e[:, 2] * e[:, 3])
         whole = np.clip(2 * coverage - 1, 0.0, 1.0)  # what is seen in part must fit the better: a lobe of a heart nearly does
-        rms_limit = s.rms_px * coverage + s.rms_relative * size * whole
-        angle_limit = s.angle_rms_rad * coverage**1.5 + s.angle_rms_small / size * coverage
+        slack = s.prior_slack if limits.lowest_px > 0 else 1.0
+        rms_limit = slack * (s.rms_px * coverage + s.rms_relative * size * whole)
+        angle_limit = slack * (s.angle_rms_rad * coverage**1.5 + s.angle_rms_small / size * coverage)
         good = (coverage >= s.coverage) & (spread <= rms_limit) & (angle <= angle_limit)
         good &= ellipse_support.evidence(coverage, angle, conic.perimeter(e[:, 2], e[:, 3]), s.angle_rad) >= s.evidence
         candidates, support, length = candidates[good], support[good], length[good]
         rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
         rms_limit, angle_limit = rms_limit[good], angle_limit[good]
         good = ellipse_support.gap(support >= 0, length) <= s.gap
-        good &= ellipse_support.purity(edges, support, length) >= s.purity
-        good &= ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses)) <= s.departure
+        good &= ellipse_support.purity(edges, support, length) >= s.purity / slack
+        good &= (
+            ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses)) <= s.departure * slack
+        )
         score = coverage * np.clip(1 - 0.5 * spread / rms_limit, 0, 1) * np.clip(1 - 0.5 * angle / angle_limit, 0, 1)
         return Judged(candidates[good], support[good], rms[good], coverage[good], score[good])
 
@@ -280,10 +282,3 @@ def _seeds(groups: np.ndarray) -> np.ndarray:
     rows = np.arange(len(groups))[:, None]
     before = np.concatenate([np.zeros((len(ends), 1), int), ends], 1)[rows, number]
     return (groups[rows, number, 0] + place - before).astype(int)
-
-
-def _free(spans: np.ndarray, claimed: np.ndarray) -> np.ndarray:
-    """Returns the spans most of whose points no ellipse has claimed."""
-    total = np.concatenate([[0], np.cumsum(claimed)])
-    taken = total[spans[:, 1]] - total[spans[:, 0]]
-    return spans[taken < 0.5 * (spans[:, 1] - spans[:, 0])]

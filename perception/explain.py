@@ -22,7 +22,7 @@ WORDS = {
     ),
     "brightness inside over outside": ("it is not dark inside", "A ring, a filled hole, or a lamp in it."),
     "mouth probability inside": ("the network does not take it for the mouth of a hole", "A flat dark disc looks like this."),
-    "unevenness inside": ("it is evenly dark and as deep as the face", "A flat dark disc looks like this."),
+    "slope of brightness inside": ("it is evenly dark, and as deep as the face", "A flat dark disc looks like this."),
     "distance to a larger rim, m": ("it lies within a larger rim", "The far rim or the floor of a hole."),
     "known depth at the centre": (
         "the depth at its centre is unknown",

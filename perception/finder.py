@@ -108,7 +108,8 @@ class Finder:
         if share < s.smallest_block:
             return Sighting([], [Rejection("segment", "part of the picture that is block", share, s.smallest_block)], [], masks, ms)
         with _timed(ms, "ellipse"):
-            ellipses = self._detector.detect(gray_of(frame), self._region(roi), self._prior(frame, roi))
+            prior = self._prior(frame, roi)
+            ellipses = self._detector.detect(gray_of(frame), self._region(roi, prior), prior)
         with _timed(ms, "pose"):
             judged = [(ellipse, self._pose.estimate(frame, masks, ellipse)) for ellipse in ellipses]
             found = [(e, pose) for e, pose in judged if isinstance(pose, HolePose)]
@@ -131,21 +132,23 @@ class Finder:
         """Returns in words what was refused, why, and what could be done."""
         return explain.words(rejection)
 
-    def _region(self, roi: np.ndarray) -> np.ndarray:
-        """Returns where ellipses are looked for: the mask with its gaps closed, or its bounding box."""
+    def _region(self, roi: np.ndarray, prior: SizePrior | None) -> np.ndarray:
+        """Returns where ellipses are looked for: the mask and a hole's width around it, or its bounding box.
+
+        A hole is a gap of the mask where the segmenter does not count it to the block, and lies at its border where something
+        stands before half of it.
+        """
         region = np.zeros(roi.shape, bool)
         if self.settings.roi == "box":
             rows, columns = np.flatnonzero(roi.any(1)), np.flatnonzero(roi.any(0))
             region[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
             return region
-        step = 4  # holes are gaps of the mask where the segmenter does not count them to the block
+        step = 4
         small = np.ascontiguousarray(roi[::step, ::step]).astype(np.uint8)
-        size = max(3, round(0.06 * small.shape[1])) | 1
+        width = prior.highest_px / step if prior else 0.03 * small.shape[1]
+        size = 2 * max(1, round(width)) + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-        padded = cv2.copyMakeBorder(small, size, size, size, size, cv2.BORDER_CONSTANT, value=0)
-        closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[size:-size, size:-size]
-        large = cv2.resize(closed, roi.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-        return large | roi
+        return cv2.resize(cv2.dilate(small, kernel), roi.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
 
     def _prior(self, frame: Frame, roi: np.ndarray) -> SizePrior | None:
         """Returns the size that a hole's ellipse may have at the depths of the block; `None` where no depth is known."""

@@ -21,13 +21,15 @@ class Looks:
     Attributes:
         darkness: Largest brightness of the darkest quarter inside over that of the face.
         mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives one.
-        unevenness: Least unevenness of brightness inside over that of the face, where depth inside says nothing.
-        deeper: Part of the depth inside that lies behind the face from which brightness need not be uneven.
+        sure_mouth: From which the mouth channel needs no other witness.
+        slope: Largest slope of brightness inside, see `Interior`; asked where depth inside says nothing.
+        deeper: Part of the depth inside that lies behind the face from which depth says that it is a hole.
     """
 
     darkness: float
     mouth: float
-    unevenness: float
+    sure_mouth: float
+    slope: float
     deeper: float
 
 
@@ -161,8 +163,10 @@ class PlaneConicEstimator:
             mouth = inner_mean(masks.mouth, row)
             if mouth < looks.mouth:
                 return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
-        elif inside.deeper < looks.deeper and inside.unevenness < looks.unevenness:
-            return Rejection("pose", "unevenness inside", inside.unevenness, looks.unevenness, ellipse)
+            if mouth >= looks.sure_mouth:
+                return None
+        if not inside.deeper >= looks.deeper and not inside.slope <= looks.slope:
+            return Rejection("pose", "slope of brightness inside", inside.slope, looks.slope, ellipse)
         return None
 
 
