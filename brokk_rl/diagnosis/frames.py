@@ -46,10 +46,17 @@ class Delays:
     Attributes:
         value: In periods, `(D,)`.
         error: Their standard errors, `(D,)`.
+        joint: Number of the joint of each, `(D,)`.
     """
 
     value: np.ndarray
     error: np.ndarray
+    joint: np.ndarray
+
+    def of(self, joint: int) -> Delays:
+        """Returns those of one joint."""
+        mine = self.joint == joint
+        return Delays(self.value[mine], self.error[mine], self.joint[mine])
 
 
 @dataclass(frozen=True)
@@ -100,12 +107,12 @@ class Changes:
             deviation.append(errors[sure])
             joint.append(np.full(sure.sum(), j))
         if not value:
-            return Delays(np.zeros(0), np.zeros(0))
+            return Delays(np.zeros(0), np.zeros(0), np.zeros(0))
         value, deviation, joint = np.concatenate(value), np.concatenate(deviation), np.concatenate(joint)
         for j in np.unique(joint):
             mine = joint == j
             value[mine] -= np.average(value[mine], weights=deviation[mine] ** -2)
-        return Delays(value, deviation)
+        return Delays(value, deviation, joint)
 
 
 def search(
@@ -136,6 +143,8 @@ def search(
         drawn = [_thinned(one) for one in _drawn(changes, kind)]
         gains[kind.name] = np.array([_gain(seen, one, scale) for one in drawn])
         best = drawn[int(np.argmax(gains[kind.name]))]
+        if any(_gain(one, best, scale) < 0.0 for one in map(seen.of, np.unique(seen.joint)) if len(one.value) >= FEWEST):
+            gains[kind.name] = gains[kind.name] * 0.0  # frames are late for all joints or for none
         share = [len(seen.value) / max(1, len(one.value)) for one in known]
         earned[kind.name] = max(0.0, *(_gain(one, best, scale) * part for one, part in zip(known, share, strict=True)))
     worth = {name: float(gain.max()) - price - 1.5 * earned[name] - name_price for name, gain in gains.items()}
