@@ -13,6 +13,9 @@ from perception.plane import Plane
 INSIDE, RING = 0.8, (1.15, 1.6)
 """Radii: the inside without the rim's blur, and the ring around that shows how bright the face is."""
 
+CLEARLY_M = 0.03
+"""How far behind the face depth must be to be taken for the inside of a hole, whatever the noise."""
+
 
 @dataclass(frozen=True)
 class Interior:
@@ -63,8 +66,9 @@ def interior(
     unknown = float(np.mean(~known[inside]))
     slope = deeper = np.nan
     if plane is not None:
-        deeper = float(np.mean(behind[inside & known] > 4 * plane.sigma)) if (inside & known).any() else 0.0
         middle = np.linalg.solve(camera_matrix, np.array([x, y, 1.0]))
+        clearly = max(4 * plane.sigma, CLEARLY_M * float(plane.m @ middle) ** 2)
+        deeper = float(np.mean(behind[inside & known] > clearly)) if (inside & known).any() else 0.0
         into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
         along = (place[inside][:, :2] - (x, y)) @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
         slope = float(np.polyfit(along, values, 1)[0]) / max(face * (1.0 - darkness), 1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -48,6 +50,8 @@ class PlaneConic:
         cell_px: Side of the squares within which depth noise is taken to be alike.
         noise_floor_per_m: Least standard deviation of inverse depth, 1/m.
         noise_limit_per_m: Largest standard deviation of inverse depth on the face, 1/m.
+        alike: By how much the covariance of the plane is larger than its residuals say: a matcher errs alike over wide stretches.
+        bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual shows, 1/m.
         center_px: Standard deviation of an ellipse's centre that no residual shows, px.
         min_points: Least number of pixels of the face.
         looks: What it must look like.
@@ -64,6 +68,8 @@ class PlaneConic:
     cell_px: int
     noise_floor_per_m: float
     noise_limit_per_m: float
+    alike: float
+    bias_per_m: float
     center_px: float
     min_points: int
     looks: Looks
@@ -117,6 +123,7 @@ class PlaneConicEstimator:
         if isinstance(shape, Rejection):
             return shape
         center, radius = shape
+        face = replace(face, cov=face.cov * s.alike)
         gray = gray_of(frame)
         inside = appearance.interior(gray, frame.depth_m, row, frame.camera_matrix, face)
         refused = self._looks(inside, masks, row, ellipse)
@@ -126,7 +133,7 @@ class PlaneConicEstimator:
             center_m=center,
             axis=face.normal,
             radius_m=radius,
-            cov_m2=covariance(face, center, ellipse, frame.camera_matrix, s.center_px),
+            cov_m2=covariance(face, center, ellipse, frame.camera_matrix, s.center_px, s.bias_per_m),
             axis_cov_rad2=face.normal_cov_rad2(),
             frame="camera",
             score=float(ellipse.score),
@@ -170,13 +177,15 @@ class PlaneConicEstimator:
         return None
 
 
-def covariance(face: Plane, center: np.ndarray, ellipse: Ellipse, camera_matrix: np.ndarray, center_px: float) -> np.ndarray:
+def covariance(
+    face: Plane, center: np.ndarray, ellipse: Ellipse, camera_matrix: np.ndarray, center_px: float, bias_per_m: float
+) -> np.ndarray:
     """Returns the covariance of a centre on a plane, `(3, 3)` m²: along the ray by the plane's, across it by the ellipse's.
 
     The points of an ellipse are alike over about two pixels, and one that is seen in part has its centre less surely.
     """
     ray = center / center[2]
-    depth_var = center[2] ** 4 * float(ray @ face.cov @ ray)
+    depth_var = center[2] ** 4 * (float(ray @ face.cov @ ray) + bias_per_m**2)
     number = max(float(conic.perimeter(np.array(ellipse.a), np.array(ellipse.b))) * ellipse.coverage / 2, 4.0)
     std_px = np.hypot(center_px, 2 * ellipse.rms_px / np.sqrt(number) / ellipse.coverage**2)
     across = np.linalg.inv(camera_matrix)[:, :2] * (std_px * center[2])
