@@ -67,14 +67,13 @@ def write(found: Mapping[str, Any], folder: Path) -> None:
 
 def table(page: Page, found: Mapping[str, Any]) -> None:
     """Adds success and time to insert of each policy on each plant."""
+    best = max(found["success"].values(), key=lambda shares: shares["machine"]["mean"])
     rows = []
     for policy, shares in found["success"].items():
         times = found["time_to_insert_s"][policy]
         cells = [
             Cell(
-                f"{100 * shares[plant]['mean']:.1f}",
-                _note(shares[plant], times[plant]),
-                best=policy == AFTER and plant == "machine",
+                f"{100 * shares[plant]['mean']:.1f}", _note(shares[plant], times[plant]), best=shares is best and plant == "machine"
             )
             for plant in PLANTS
         ]
