@@ -19,8 +19,6 @@ from brokk_rl.signals import Borehole, Frame
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from brokk_rl.session import Session
-
 
 @dataclass(frozen=True)
 class Masks:
@@ -306,20 +304,4 @@ class FilterSpec(Protocol):
 
     def build(self) -> TargetFilter:
         """Returns a filter without memory yet."""
-        ...
-
-
-class SegmenterFit(Protocol):
-    """A spec that trains a segmenter: the node `training` of `mode=train_perception`."""
-
-    def fit(self, session: Session, resume: bool) -> dict[str, Any]:
-        """Trains into the session's folder, going on where it was stopped if `resume`; returns what `training.json` says."""
-        ...
-
-
-class Labelling(Protocol):
-    """A spec that makes masks for real footage: the node `label` of `mode=label`."""
-
-    def label(self, folder: Path) -> dict[str, Any]:
-        """Labels into `folder`; returns what `labels.json` says."""
         ...

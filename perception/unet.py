@@ -10,6 +10,8 @@ from torch.nn import functional
 
 CHANNELS = ("block", "mouth")
 """What the network tells apart; channels overlap: a mouth lies in its block."""
+DARKEST = 0.01
+"""Contrast below which a picture is not stretched any more: a few grey levels of 255."""
 
 
 class UNet(nn.Module):
@@ -40,7 +42,10 @@ class UNet(nn.Module):
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
         """Returns logits, `(B, 2, h, w)`, of RGB pictures `(B, 3, h, w)` in [0, 1]."""
-        x, bridges = picture * 4.0 - 2.0, []
+        # each picture by its own brightness and contrast: dusk and dust are the same picture then, but for the noise
+        mean = picture.mean((1, 2, 3), keepdim=True)
+        spread = (picture - mean).square().mean((1, 2, 3), keepdim=True).sqrt()
+        x, bridges = (picture - mean) / (spread + DARKEST), []
         for number, pair in enumerate(self.down):
             x = pair(x if number == 0 else functional.max_pool2d(x, 2))
             bridges.append(x)

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.table import Table
 
 from brokk_rl.session import Session, write_json
-from brokk_rl.sight import Labelling
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
+
+
+class Labelling(Protocol):
+    """Makes masks for footage."""
+
+    def label(self, folder: Path) -> dict[str, Any]:
+        """Labels into `folder`; returns what `labels.json` says."""
+        ...
 
 
 @spec

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.table import Table
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session, write_json
-from brokk_rl.sight import SegmenterFit
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
+
+
+class SegmenterFit(Protocol):
+    """Trains a segmenter."""
+
+    def fit(self, session: Session, resume: bool) -> dict[str, Any]:
+        """Trains into the session's folder, going on where it was stopped if `resume`; returns what `training.json` says."""
+        ...
 
 
 @spec
