@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import torch
 from composed import option
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
-from brokk_rl import open_loop, record
+from brokk_rl import record
 from brokk_rl.diagnosis import answer
 from brokk_rl.diagnosis.answer import FILE
 from brokk_rl.diagnosis.exam import paper, seal, sitting
@@ -201,25 +200,3 @@ def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_pa
         )
         with pytest.raises(RecordingError, match=message):
             command.answer(tmp_path, tmp_path / "out", machine)
-
-
-@pytest.mark.slow
-def test_a_mild_floor_is_as_stated(brokk: Callable[..., Any], machine: Machine, tmp_path: Path) -> None:
-    # the machine of seed 2 is the make that simulates fastest; benchmarks/exam/floors.py does the same for any number of others
-    shares = "exam.mix.shares={none: 1.0, faint: 0, one: 0, several: 0, outside: 0}"
-    few = (
-        "mode=exam",
-        "session.seed=2",
-        "exam.mix.num_cases=1",
-        shares,
-        "exam.reference.file_s=110",
-        "exam.field.programs=[[levels],[levels]]",
-    )
-    made = brokk(*few, f"session.out={tmp_path / 'exam'}")
-    assert made.code == 0, made.err
-    case = tmp_path / "exam" / paper.CASES / "0000"
-    reference, field = (record.read_all(str(case / half / "*.parquet"), machine) for half in ("reference", "field"))
-    base = option("fit", "valve").fit(machine, reference, [], tmp_path, 0, torch.device("cpu"))
-    cut = open_loop.windows(field, machine, 5.0, 2.5)
-    error = open_loop.free_run(base, machine, cut, torch.device("cpu")) - cut.measured
-    assert 0.005 < np.sqrt(np.square(error).mean()) < 0.014

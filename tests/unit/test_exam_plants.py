@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 import torch
+from composed import option
 
 from actuators.exam import strangers
 from actuators.exam.anatomy import MAKES, Anatomy, drawn
@@ -16,7 +17,7 @@ from actuators.exam.linkage import Arm
 from actuators.exam.plant import Plant
 from actuators.exam.valve import Valve
 from brokk_rl.kinematics import Kinematics
-from brokk_rl.machine import Machine
+from brokk_rl.machine import Machine, exclusive_mask
 from brokk_rl.signals import Command
 
 Q3 = 2
@@ -251,6 +252,26 @@ def test_a_run_is_the_same_whatever_runs_beside_it_and_machines_differ(machine: 
     assert np.abs(together[0] - together[1]).max() > 0.005
 
 
+@pytest.mark.parametrize(("roughness", "low_rad", "high_rad"), [("mild", 0.005, 0.011), ("strong", 0.011, 0.025)])
+def test_chance_alone_leaves_most_of_the_stated_floor(machine: Machine, roughness: str, low_rad: float, high_rad: float) -> None:
+    # the same machines twice under the same commands: what differs over 5 s no model can know
+    rough = option("exam_plants", "valves").roughness[roughness]
+    numbers = [found for seed in range(24) for make, found in [drawn(machine, seed, rough)] if make == "throttled"]
+    count, steps = len(numbers), 1200
+    none, zeros = [None] * 2 * count, np.zeros(2 * count)
+    twice = Plant(machine, "throttled", numbers * 2, none, list(range(2 * count)), zeros, [False] * 2 * count, steps)
+    generator, shape = np.random.default_rng(0), (steps // 30, count, machine.num_joints)
+    levels = generator.uniform(-1.0, 1.0, shape) * (generator.random(shape) > 0.3)  # as excitation=levels: 0.3 of them rest
+    levels *= exclusive_mask(machine.is_exclusive, generator.random(shape[:2]) < 0.3)
+    path = []
+    for u in np.repeat(levels, 30, 0):
+        path.append(twice.read().q)
+        twice.send(Command(np.concatenate([u, u])))
+    apart = np.diff(np.array(path).reshape(steps, 2, count, -1), axis=1)[:, 0]
+    growth = np.stack([apart[k : k + 100] - apart[k] for k in range(0, steps - 100, 100)])
+    assert low_rad < np.sqrt(np.square(growth).mean() / 2.0) < high_rad
+
+
 def test_each_ailment_shows_and_a_machine_of_severity_zero_is_well(machine: Machine) -> None:
     well = clean(machine, "throttled")
     u = np.concatenate([step(machine, level, 60) for level in (0.8, 0.8, 0.8, -0.8, 0.3, -0.3)])
@@ -274,8 +295,6 @@ def test_every_fault_is_neutral_where_a_joint_has_not_got_it(
 
 @pytest.fixture
 def mix_sizes(machine: Machine) -> Callable[[str], dict[str, np.ndarray]]:
-    from composed import option
-
     mix = option("exam_mix", "main")
 
     def sizes(effect: str) -> dict[str, np.ndarray]:
