@@ -154,25 +154,34 @@ class PlaneSegmenter:
         support = (known & (np.abs(excess) < self._tolerance)).astype(np.uint8)
         support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-        count, labels, stats, centres = cv2.connectedComponentsWithStats(support, connectivity=4)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=4)
+        large = [label for label in range(1, count) if stats[label, cv2.CC_STAT_AREA] >= settings.min_area * support.size]
+        nearer = known & (excess > self._tolerance)
+        pieces = [_filled((labels == label).astype(np.uint8), nearer) for label in large]
         faces = np.zeros_like(support)
-        for label in range(1, count):
-            if stats[label, cv2.CC_STAT_AREA] < settings.min_area * support.size:
-                continue
-            piece = _filled((labels == label).astype(np.uint8), known & (excess > self._tolerance))
-            column, row = (round(float(value)) for value in centres[label])
-            sight = grid[row, column]
-            tilt_rad = np.arccos(np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0))
-            extents_m = _extents(piece, plane, grid)
-            if (
-                tilt_rad > settings.max_tilt_rad
-                or extents_m.min() < settings.min_extent_m
-                or extents_m.max() > settings.max_extent_m
-            ):
-                continue
-            if self._front(piece, excess, known) >= settings.min_front:
+        for piece in pieces:
+            if self._fits(piece, plane, grid) and self._front(piece, excess, known) >= settings.min_front:
+                faces |= piece
+        # an arm before a face cuts it in pieces, of which the smaller ones have little but the arm around them
+        for piece in pieces if faces.any() else ():
+            if _extents(faces | piece, plane, grid).max() <= settings.max_extent_m:
                 faces |= piece
         return faces
+
+    def _fits(self, piece: np.ndarray, plane: np.ndarray, grid: np.ndarray) -> bool:
+        """Says whether a piece of a plane has the size of a face and looks at the camera."""
+        settings = self._settings
+        rows, columns = np.nonzero(piece)
+        if not len(rows):
+            return False
+        sight = grid[round(float(rows.mean())), round(float(columns.mean()))]
+        tilt_rad = np.arccos(np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0))
+        extents_m = _extents(piece, plane, grid)
+        return bool(
+            tilt_rad <= settings.max_tilt_rad
+            and extents_m.min() >= settings.min_extent_m
+            and extents_m.max() <= settings.max_extent_m
+        )
 
     def _front(self, piece: np.ndarray, excess: np.ndarray, known: np.ndarray) -> float:
         """Returns which part of what surrounds a piece lies behind its plane, a half where nothing speaks for either side."""
