@@ -53,14 +53,15 @@ def interior(
         return Interior(np.nan, np.nan, np.nan, np.nan)
     face = max(float(np.median(part[ring])), 1.0)
     smooth = cv2.GaussianBlur(part, (0, 0), max(0.15 * float(np.sqrt(ellipse[2] * ellipse[3])), 0.6))
+    inside &= smooth < face  # what is brighter is the lit arm before it, where it has no depth
     depth = depth_m[top:bottom, left:right]
     known = np.isfinite(depth)
     if plane is not None:
         behind = (place @ np.linalg.inv(camera_matrix).T) @ plane.m - 1.0 / np.where(known, depth, np.inf)
         before = (known & (behind < -4 * plane.sigma)).astype(np.uint8)  # an arm that hides a part of it
         inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
-        if inside.sum() < 8:
-            return Interior(np.nan, np.nan, np.nan, np.nan)
+    if inside.sum() < 8:
+        return Interior(np.nan, np.nan, np.nan, np.nan)
     values = smooth[inside]
     darkness = float(np.percentile(values, 25.0)) / face
     unknown = float(np.mean(~known[inside]))

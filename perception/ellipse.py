@@ -17,6 +17,8 @@ NUM_SEEDS = 64
 """Points that stand for an arc in its first fit."""
 ROUNDS_PX = (1.0, 0.5, 0.3, 0.2)
 """Rounds of refinement: the distance at which a point counts a quarter."""
+TAIL = 2.0
+"""Of the limit of what is typical, which holds for the residuals of all the support."""
 TIGHT = 0.7
 """Of the reach, once the ellipse is refined."""
 
@@ -225,7 +227,7 @@ class ArcDetector:
         slack = s.prior_slack if limits.lowest_px > 0 else 1.0
         rms_limit = slack * (s.rms_px * coverage + s.rms_relative * size * whole)
         angle_limit = slack * (s.angle_rms_rad * coverage**1.5 + s.angle_rms_small / size * coverage)
-        good = (coverage >= s.coverage) & (spread <= rms_limit) & (angle <= angle_limit)
+        good = (coverage >= s.coverage) & (spread <= rms_limit) & (rms <= TAIL * rms_limit) & (angle <= angle_limit)
         good &= ellipse_support.evidence(coverage, angle, conic.perimeter(e[:, 2], e[:, 3]), s.angle_rad) >= s.evidence
         candidates, support, length = candidates[good], support[good], length[good]
         rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))

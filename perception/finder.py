@@ -133,7 +133,7 @@ class Finder:
         return explain.words(rejection)
 
     def _region(self, roi: np.ndarray, prior: SizePrior | None) -> np.ndarray:
-        """Returns where ellipses are looked for: the mask and a hole's width around it, or its bounding box.
+        """Returns where ellipses are looked for: the mask and as much around it as a hole is wide, or its bounding box.
 
         A hole is a gap of the mask where the segmenter does not count it to the block, and lies at its border where something
         stands before half of it.

@@ -16,6 +16,9 @@ from perception import conic
 TUKEY = 4.685
 """Residual, in standard deviations, from which a point counts nothing; 95 % efficient with Gaussian noise."""
 
+LEAST = 60
+"""Points in which a plane is looked for."""
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -116,11 +119,10 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
         floor: Least standard deviation of inverse depth, 1/m: of a matcher that repeats itself.
         generator: Draws the triples of the first guess.
     """
-    near = points.radii < rings[0]
-    if near.sum() < 30:
-        near = points.radii < rings[min(1, len(rings) - 1)]
-    if near.sum() < 30:
+    rings = tuple(ring for ring in rings if (points.radii < ring).sum() >= LEAST)  # near what hides it a matcher sees nothing
+    if not rings:
         return None
+    near = points.radii < rings[0]
     m = _guess(points.rays[near], points.inverse[near], generator)
     extent = rings[0]
     sigma, weight = floor, np.zeros(len(points.inverse))
@@ -132,7 +134,7 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
             scale = max(1.4826 * float(np.median(tight[tight < max(8 * sigma, np.median(tight) * 1.5)])), floor)
             sigma = scale if ring == rings[0] else min(scale, 1.5 * sigma)  # what else comes into sight is no noise
             weight = np.where(inside, np.maximum(1 - (residual / (TUKEY * sigma)) ** 2, 0.0) ** 2, 0.0)
-            if (weight > 0).sum() < 30:
+            if (weight > 0).sum() < LEAST // 2:
                 return None
             heavy = points.rays * weight[:, None]
             m = np.linalg.solve(heavy.T @ points.rays, heavy.T @ points.inverse)

@@ -53,7 +53,6 @@ class PlaneConic:
         alike: By how much the covariance of the plane is larger than its residuals say: a matcher errs alike over wide stretches.
         bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual shows, 1/m.
         center_px: Standard deviation of an ellipse's centre that no residual shows, px.
-        min_points: Least number of pixels of the face.
         looks: What it must look like.
         without_depth: What is tried where the face has no depth; `null` for nothing.
     """
@@ -71,7 +70,6 @@ class PlaneConic:
     alike: float
     bias_per_m: float
     center_px: float
-    min_points: int
     looks: Looks
     without_depth: PoseSpec | None
 
@@ -104,22 +102,14 @@ class PlaneConicEstimator:
         if masks.mouth is not None:
             allowed &= masks.mouth < 0.5
         points = plane.support(frame.depth_m, allowed, frame.camera_matrix, row, s.inner, s.rings[-1], s.max_pixels, s.cell_px)
-        near = (
-            plane.fit(points, s.rings[:1], s.noise_floor_per_m, np.random.default_rng(0))
-            if len(points.inverse) >= s.min_points
-            else None
-        )
-        if near is None:
-            if self._without_depth is not None:
+        face = plane.fit(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
+        if face is None:
+            if self._without_depth is not None and frame.base_from_camera is not None:
                 return self._without_depth.estimate(frame, masks, ellipse)
-            return Rejection("pose", "pixels of the face with depth", float(len(points.inverse)), float(s.min_points), ellipse)
-        rough = self._shape(near, row, frame, ellipse, slack=1.5)
-        if isinstance(rough, Rejection):
-            return rough
-        face = plane.fit(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0)) or near
+            return Rejection("pose", "pixels of the face with depth", float(len(points.inverse)), float(plane.LEAST), ellipse)
         if face.sigma > s.noise_limit_per_m:
             return Rejection("pose", "depth noise on the face, 1/m", face.sigma, s.noise_limit_per_m, ellipse)
-        shape = self._shape(face, row, frame, ellipse, slack=1.0)
+        shape = self._shape(face, row, frame, ellipse)
         if isinstance(shape, Rejection):
             return shape
         center, radius = shape
@@ -140,9 +130,7 @@ class PlaneConicEstimator:
             t_s=frame.t_s,
         )
 
-    def _shape(
-        self, face: Plane, row: np.ndarray, frame: Frame, ellipse: Ellipse, slack: float
-    ) -> tuple[np.ndarray, float] | Rejection:
+    def _shape(self, face: Plane, row: np.ndarray, frame: Frame, ellipse: Ellipse) -> tuple[np.ndarray, float] | Rejection:
         """Returns centre and radius on the face, or which gate of geometry is not passed."""
         s = self.settings
         ray = np.linalg.solve(frame.camera_matrix, np.array([row[0], row[1], 1.0]))
@@ -154,12 +142,12 @@ class PlaneConicEstimator:
         if not np.isfinite(axes).all():
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
-        tolerance = s.radius_tolerance * slack * s.radius_m
+        tolerance = s.radius_tolerance * s.radius_m
         if abs(radius - s.radius_m) > tolerance:
             limit = s.radius_m + np.sign(radius - s.radius_m) * tolerance
             return Rejection("pose", "radius, m", radius, float(limit), ellipse)
-        if ratio < s.axis_ratio / slack:
-            return Rejection("pose", "axis ratio on the face", ratio, s.axis_ratio / slack, ellipse)
+        if ratio < s.axis_ratio:
+            return Rejection("pose", "axis ratio on the face", ratio, s.axis_ratio, ellipse)
         return center, radius
 
     def _looks(self, inside: Interior, masks: Masks, row: np.ndarray, ellipse: Ellipse) -> Rejection | None:

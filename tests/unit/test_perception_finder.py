@@ -1,0 +1,84 @@
+"""The finder puts the stages together, keeps every refusal, and its figures are counted right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from composed import option
+from drawn import AXIS, CENTER, drawn
+
+from brokk_rl.errors import FrameError
+from brokk_rl.sight import HolePose, Masks
+from perception import dataset
+from perception.bench import Tally, compare
+from perception.finder import Finder, rectified
+
+
+def finder_with(masks: Masks) -> Finder:
+    """Returns the default finder with a segmenter that always says the same."""
+    segmenter = SimpleNamespace(build=lambda: SimpleNamespace(segment=lambda frame: masks))
+    return replace(option("perception", "plane_conic"), segmenter=segmenter).build()
+
+
+def test_a_hole_is_found_from_picture_and_depth_alone() -> None:
+    frame, masks, _ = drawn(noise=0.001)
+    sighting = finder_with(masks).look(frame)
+    assert len(sighting.holes) == 1
+    assert sighting.holes[0].center_m == pytest.approx(CENTER, abs=1e-3)
+    assert float(sighting.holes[0].axis @ AXIS) > np.cos(np.radians(0.3))
+    assert {"segment", "ellipse", "pose", "total"} <= set(sighting.ms)
+
+
+def test_the_base_frame_is_where_the_camera_is_said_to_be() -> None:
+    frame, masks, _ = drawn()
+    moved = np.eye(4)
+    moved[:3, 3] = 1.0, 2.0, 3.0
+    found = finder_with(masks).find(replace(frame, base_from_camera=moved))
+    assert found is not None
+    assert found.center_in_base_m == pytest.approx(CENTER + moved[:3, 3], abs=1e-3)
+    with pytest.raises(FrameError, match="where the camera is"):
+        finder_with(masks).find(replace(frame, base_from_camera=None))
+
+
+def test_without_a_block_nothing_is_looked_at_and_it_is_said() -> None:
+    frame, masks, _ = drawn()
+    sighting = finder_with(Masks(np.zeros_like(masks.block), None)).look(frame)
+    assert not sighting.holes and sighting.rejected[0].stage == "segment"
+
+
+def test_a_flat_disc_is_refused_in_words() -> None:
+    frame, masks, _ = drawn(depth_m=0.0)
+    finder = finder_with(masks)
+    sighting = finder.look(frame)
+    assert not sighting.holes
+    assert any("flat dark disc" in finder.explain(one) for one in sighting.rejected)
+
+
+def test_lens_distortion_is_taken_out() -> None:
+    frame, _, _ = drawn()
+    bent = replace(frame, distortion=np.array([0.05, 0.0, 0.0, 0.0]))
+    straight = rectified(bent)
+    assert straight.distortion is None
+    known = straight.depth_m[np.isfinite(straight.depth_m)]
+    assert np.isin(known, frame.depth_m).all()
+    assert rectified(replace(frame, distortion=np.zeros(5))).color is frame.color
+
+
+def test_figures_are_counted_as_by_hand() -> None:
+    def circle(x: float, depth_m: float) -> dataset.Circle:
+        return dataset.Circle((x, 0, 2), (0, 0, -1), (x, 0, 2), (0, 0, -1), 0.05, depth_m, 0.0, True)
+
+    def pose(x: float, z: float = 2.0) -> HolePose:
+        axis_cov = np.diag([1e-6, 1e-6, 0])
+        return HolePose(np.array([x, 0, z]), np.array([0, 0, -1.0]), 0.05, np.eye(3) * 1e-6, axis_cov, "camera", 1.0, 0.0)
+
+    truth = dataset.Truth("test", {}, (circle(0.0, 0.3), circle(0.5, 0.3)), (circle(1.0, 0.0),), {})
+    tally = Tally()
+    compare([pose(0.0, 2.003), pose(1.01), pose(3.0)], truth, drawn()[0], tally)
+    assert (tally.true, tally.found, tally.decoys, tally.fooled, tally.false) == (2, 1, 1, 1, 1)
+    assert tally.position_m == pytest.approx([0.003])
+    assert tally.along_sigmas == pytest.approx([3.0])
+    assert tally.row()["precision"] == pytest.approx(1 / 3)

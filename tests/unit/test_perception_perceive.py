@@ -1,0 +1,72 @@
+"""`mode=perceive` end to end on a small folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from drawn import CENTER, K, drawn
+
+from perception import dataset
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    place = tmp_path / "frames"
+    place.mkdir()
+    dataset.write_camera(place, K, np.eye(4), None)
+    frame, masks, _ = drawn()
+    label = dataset.Label(masks.block > 0.5, np.zeros(masks.block.shape, bool), np.zeros(masks.block.shape, bool))
+    for number in range(3):
+        dataset.write_frame(place / f"{number:05d}", frame.color, frame.depth_m, label=label)
+    cut = (place / "00001.color.png").read_bytes()
+    (place / "00001.color.png").write_bytes(cut[: len(cut) // 2])
+    return place
+
+
+def test_holes_overlays_and_refusals_are_written(folder: Path, brokk: Callable) -> None:
+    done = brokk(
+        "mode=perceive", f"perceive.input={folder}", "session.out=out", "perception/segmenter=truth",
+        "perception.pose.looks.mouth=0", "perception.filter.confirm=1",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    frames = json.loads(Path("out/holes.json").read_text())["frames"]
+    assert [("refused" in frame) for frame in frames] == [False, True, False]
+    assert "truncated" in frames[1]["refused"] and "00001" in frames[1]["refused"]
+    hole = frames[0]["holes"][0]
+    assert hole["center_m"] == pytest.approx(CENTER.tolist(), abs=1e-3)
+    assert hole["frame"] == "base" and np.array(hole["cov_m2"]).shape == (3, 3)
+    assert frames[2]["target"]["num_frames"] == 2
+    assert cv2.imread("out/overlays/00000.png") is not None and not Path("out/overlays/00001.png").exists()
+    assert "1 hole" in Path("out/explain.txt").read_text()
+
+
+def test_ellipses_of_any_pictures_need_no_depth(tmp_path: Path, brokk: Callable) -> None:
+    picture = np.full((120, 160), 200, np.uint8)
+    cv2.ellipse(picture, (80, 60), (30, 20), 10, 0, 360, 30, -1, cv2.LINE_AA)
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos" / "grey.pgm"), picture)
+    (tmp_path / "photos" / "empty.jpg").write_bytes(b"")
+    done = brokk("mode=perceive", "perceive.input=photos", "perceive.until=ellipses", "session.out=out")
+    assert done.code == 0, done.err
+    frames = {frame["name"]: frame for frame in json.loads(Path("out/holes.json").read_text())["frames"]}
+    found = frames["grey"]["ellipses"]
+    assert len(found) == 1
+    assert [found[0][key] for key in "xyab"] == pytest.approx([80, 60, 30, 20], abs=0.7)
+    assert found[0]["theta_rad"] == pytest.approx(np.radians(10), abs=0.05)
+
+
+def test_a_folder_of_nothing_is_refused(tmp_path: Path, brokk: Callable) -> None:
+    (tmp_path / "photos").mkdir()
+    done = brokk("mode=perceive", "perceive.input=photos", "perceive.until=ellipses", "session.out=out")
+    assert done.code != 0 and "no pictures" in done.err + done.out
+    assert not Path("out").exists()
+
+
+def test_perception_that_looks_at_nothing_is_refused(folder: Path, brokk: Callable) -> None:
+    done = brokk("mode=perceive", f"perceive.input={folder}", "perception=truth", "session.out=out")
+    assert done.code != 0 and "plane_conic" in done.err + done.out

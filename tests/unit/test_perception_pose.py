@@ -1,0 +1,95 @@
+"""Poses agree with the geometry they were drawn from, and what is no hole is refused for the right reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from composed import option
+from drawn import AXIS, CENTER, drawn
+
+from brokk_rl.sight import HolePose, Rejection
+from perception import plane
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    return option("perception/pose", "plane_conic").build()
+
+
+def test_a_hole_is_where_it_was_drawn(estimator) -> None:
+    pose = estimator.estimate(*drawn())
+    assert isinstance(pose, HolePose)
+    assert pose.center_m == pytest.approx(CENTER, abs=2e-4)
+    assert pose.axis == pytest.approx(AXIS, abs=1e-3)
+    assert pose.radius_m == pytest.approx(0.05, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("hole", "reason"), [({"radius_m": 0.035}, "radius"), ({"radius_m": 0.07}, "radius"), ({"depth_m": 0.0}, "slope of brightness")]
+)
+def test_what_is_no_hole_of_this_kind_is_refused(hole: dict[str, float], reason: str, estimator) -> None:
+    refused = estimator.estimate(*drawn(**hole))
+    assert isinstance(refused, Rejection)
+    assert refused.reason.startswith(reason)
+
+
+def test_an_ellipse_that_is_no_circle_on_the_face_is_refused(estimator) -> None:
+    frame, masks, ellipse = drawn()
+    refused = estimator.estimate(frame, masks, replace(ellipse, a=ellipse.a * 1.2, b=ellipse.b / 1.2))
+    assert isinstance(refused, Rejection) and refused.reason == "axis ratio on the face"
+
+
+def test_the_mouth_channel_is_believed(estimator) -> None:
+    frame, masks, ellipse = drawn()
+    refused = estimator.estimate(frame, replace(masks, mouth=np.zeros_like(masks.block)), ellipse)
+    assert isinstance(refused, Rejection) and refused.reason == "mouth probability inside"
+
+
+def test_without_depth_the_known_radius_tells_the_pose(estimator) -> None:
+    frame, masks, ellipse = drawn()
+    turn = np.eye(4)
+    turn[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # up is -y of the camera
+    blind = replace(frame, depth_m=np.full_like(frame.depth_m, np.nan), base_from_camera=turn)
+    pose = option("perception/pose", "mono_circle").build().estimate(blind, masks, ellipse)
+    refused = replace(option("perception/pose", "mono_circle"), normal_rad=0.1).build().estimate(blind, masks, ellipse)
+    assert isinstance(refused, Rejection) and refused.reason.startswith("angle")
+    loose = replace(option("perception/pose", "mono_circle"), normal_rad=1.2).build().estimate(blind, masks, ellipse)
+    assert isinstance(loose, HolePose) and isinstance(pose, (HolePose, Rejection))
+    assert loose.center_m == pytest.approx(CENTER, abs=1e-3)
+    no_place = estimator.estimate(replace(blind, base_from_camera=None), masks, ellipse)
+    assert isinstance(no_place, Rejection) and no_place.reason.startswith("pixels of the face")
+
+
+def test_the_papers_estimate_looks_into_the_hole() -> None:
+    pose = option("perception/pose", "centre_depth").build().estimate(*drawn())
+    assert isinstance(pose, HolePose)
+    assert 0.02 < np.linalg.norm(pose.center_m - CENTER) < 0.4
+    assert pose.axis == pytest.approx(AXIS, abs=0.05)
+
+
+def test_the_covariance_of_a_plane_is_that_of_its_repetitions() -> None:
+    generator = np.random.default_rng(1)
+    rays = np.column_stack([generator.uniform(-0.1, 0.1, (2000, 2)), np.ones(2000)])
+    m, sigma = np.array([0.1, 0.4, 0.7]), 0.002
+    cell = np.arange(2000) // 4
+    fits = []
+    for _ in range(60):
+        support = plane.Support(rays, rays @ m + generator.normal(0, sigma, 2000), np.full(2000, 2.0), cell)
+        found = plane.fit(support, (3.0,), 1e-5, generator)
+        assert found is not None
+        fits.append(found)
+    spread, claimed = np.std([fit.m for fit in fits], axis=0), np.mean([np.sqrt(np.diag(fit.cov)) for fit in fits], axis=0)
+    assert claimed == pytest.approx(spread, rel=0.35)
+
+
+def test_a_plane_ignores_another_face() -> None:
+    generator = np.random.default_rng(2)
+    rays = np.column_stack([generator.uniform(-0.3, 0.3, (4000, 2)), np.ones(4000)])
+    m = np.array([0.0, 0.4, 0.7])
+    inverse = np.where(rays[:, 0] < 0.15, rays @ m, rays @ np.array([1.5, 0.4, 0.475])) + generator.normal(0, 0.002, 4000)
+    radii = 1.25 + 30 * np.linalg.norm(rays[:, :2], axis=1)
+    found = plane.fit(plane.Support(rays, inverse, radii, np.arange(4000) // 10), (2.6, 4.0, 7.0, 12.0), 2e-4, generator)
+    assert found is not None
+    assert found.m == pytest.approx(m, abs=2e-3)
