@@ -46,8 +46,11 @@ class Group:
         if error is None:
             dist.barrier()
             dist.destroy_process_group()
-        elif isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and _from_a_collective(str(error))):
-            # nothing is destroyed after an error: NCCL would wait for those that are gone
+            return
+        if self.device.type == "cpu":  # gloo's threads must end before the interpreter does, or it aborts
+            dist.destroy_process_group()
+        if isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and _from_a_collective(str(error))):
+            # between GPUs nothing is destroyed after an error: NCCL would wait for those that are gone
             raise DistributedError(
                 f"rank {self.rank.index}: another process of this training has ended; its own message says why "
                 f"({str(error).splitlines()[0]})"
