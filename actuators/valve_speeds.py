@@ -96,7 +96,9 @@ class Speeds:
         joints, count, half = self.machine.num_joints, len(self._u), len(self._knots) - 1
         spool = [np.stack([self._spool(n, j, dynamics[j]) for j in range(joints)], 1) for n in range(count)]
         basis = [[self._basis(spool[n][:, j], j) for j in range(joints)] for n in range(count)]
-        found = Statics(np.zeros((joints, 2 * half)), np.zeros((joints, 2, self.num_pose)), np.full(joints, 0.55) if demand is None else demand)
+        found = Statics(
+            np.zeros((joints, 2 * half)), np.zeros((joints, 2, self.num_pose)), np.full(joints, 0.55) if demand is None else demand
+        )
         opening = [np.abs(s) for s in spool]
         noise, free = self._noise.copy(), self._free.copy()
 
