@@ -15,7 +15,7 @@ from brokk_rl.signals import Frame
 from perception import dataset
 
 NEAR_M = 0.05
-"""A found hole belongs to a true one within this distance: its radius."""
+"""A found hole belongs to a true one whose line of sight it lies this near to: its radius. How deep it lies is its error."""
 ONE_SIGMA_2D = 1.515
 """Radius that holds 68.3 % of a round Gaussian in two dimensions, in standard deviations of one."""
 
@@ -114,33 +114,35 @@ def judge(observer: Observer, source: FrameSource, tally: Tally, limit: int | No
 
 
 def compare(holes: Sequence[HolePose], truth: dataset.Truth, frame: Frame, tally: Tally) -> None:
-    """Adds one frame: each true hole is found by the nearest target within its radius, each target finds one at most.
+    """Adds one frame: each true hole is found by the target nearest to its line of sight, each target finds one at most.
 
     Holes of which more than half of the rim is hidden, or that leave the picture, need not be found; found, they are no mistake.
     """
     left = list(holes)
+    eye = np.zeros(3)
     in_base = bool(left) and left[0].frame == "base"
+    if in_base and frame.base_from_camera is not None:
+        eye = frame.base_from_camera[:3, 3]
     for hole in truth.holes:
         center, axis = (np.array(v) for v in _in(hole, in_base))
         due = hole.in_view and hole.hidden <= 0.5
         tally.true += due
-        near = min(left, key=lambda pose: float(np.linalg.norm(pose.center_m - center)), default=None)
-        if near is None or np.linalg.norm(near.center_m - center) > NEAR_M:
+        near = min(left, key=lambda pose: _beside(pose, center, eye), default=None)
+        if near is None or _beside(near, center, eye) > NEAR_M:
             continue
         left = [pose for pose in left if pose is not near]
         if due:
             tally.found += 1
-            _measure(near, center, axis, frame if in_base else None, tally)
+            _measure(near, center, axis, eye, tally)
     discs = [np.array(_in(disc, in_base)[0]) for disc in truth.decoys]
     tally.decoys += sum(disc.in_view for disc in truth.decoys)
     for pose in left:
-        fooled = any(np.linalg.norm(pose.center_m - disc) <= NEAR_M for disc in discs)
+        fooled = any(_beside(pose, disc, eye) <= NEAR_M for disc in discs)
         tally.fooled += fooled
         tally.false += not fooled
 
 
-def _measure(pose: HolePose, center: np.ndarray, axis: np.ndarray, frame: Frame | None, tally: Tally) -> None:
-    eye = frame.base_from_camera[:3, 3] if frame is not None and frame.base_from_camera is not None else np.zeros(3)
+def _measure(pose: HolePose, center: np.ndarray, axis: np.ndarray, eye: np.ndarray, tally: Tally) -> None:
     ray = (center - eye) / np.linalg.norm(center - eye)
     error = pose.center_m - center
     side = np.linalg.svd(ray[None])[2][1:]
@@ -155,6 +157,13 @@ def _measure(pose: HolePose, center: np.ndarray, axis: np.ndarray, frame: Frame 
     tally.normal_rad.append(float(np.arccos(np.clip(pose.axis @ axis, -1, 1))))
     spread = tilt @ pose.axis_cov_rad2 @ tilt.T + np.eye(2) * 1e-14
     tally.normal_sigmas.append(float(np.sqrt(turn @ np.linalg.solve(spread, turn))))
+
+
+def _beside(pose: HolePose, center: np.ndarray, eye: np.ndarray) -> float:
+    """Returns how far from the line of sight to a true centre a found one lies, m."""
+    ray = (center - eye) / np.linalg.norm(center - eye)
+    apart = pose.center_m - center
+    return float(np.linalg.norm(apart - (apart @ ray) * ray))
 
 
 def _in(circle: dataset.Circle, in_base: bool) -> tuple[tuple[float, ...], tuple[float, ...]]:
