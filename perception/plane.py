@@ -16,6 +16,8 @@ from perception import conic
 TUKEY = 4.685
 """Residual, in standard deviations, from which a point counts nothing; 95 % efficient with Gaussian noise."""
 
+GROWING = 3.0
+"""The same while the plane is grown: beyond an edge of the block another face begins at the same depth."""
 LEAST = 60
 """Points in which a plane is looked for."""
 
@@ -125,19 +127,22 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
     near = points.radii < rings[0]
     m = _guess(points.rays[near], points.inverse[near], generator)
     extent = rings[0]
-    sigma, weight = floor, np.zeros(len(points.inverse))
+    first = sigma = floor
+    weight = np.zeros(len(points.inverse))
     for ring in rings:
         inside = points.radii < ring
         for _ in range(3):
             residual = points.inverse - points.rays @ m
             tight = np.abs(residual[inside])
             scale = max(1.4826 * float(np.median(tight[tight < max(8 * sigma, np.median(tight) * 1.5)])), floor)
-            sigma = scale if ring == rings[0] else min(scale, 1.5 * sigma)  # what else comes into sight is no noise
-            weight = np.where(inside, np.maximum(1 - (residual / (TUKEY * sigma)) ** 2, 0.0) ** 2, 0.0)
+            sigma = scale if ring == rings[0] else min(scale, 1.2 * first)  # what else comes into sight is no noise
+            reach = (TUKEY if ring == rings[0] else GROWING) * sigma
+            weight = np.where(inside, np.maximum(1 - (residual / reach) ** 2, 0.0) ** 2, 0.0)
             if (weight > 0).sum() < LEAST // 2:
                 return None
             heavy = points.rays * weight[:, None]
             m = np.linalg.solve(heavy.T @ points.rays, heavy.T @ points.inverse)
+        first = sigma if ring == rings[0] else first
         extent = ring
     residual = points.inverse - points.rays @ m
     return Plane(m, _covariance(points, weight, residual), sigma, int((weight > 0).sum()), extent)
