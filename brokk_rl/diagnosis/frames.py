@@ -26,6 +26,8 @@ CHANGE = 0.06
 """Smaller changes of a command tell nothing about when it arrived."""
 WIDE = 1.5
 """Prior standard deviation of a delay, periods."""
+NEAR = 0.1
+"""Delays that differ by so few periods are the same: a simulator's own timing is no better."""
 SURE = 0.4
 """Largest standard error, in periods, of a delay that counts."""
 FEWEST = 20
@@ -194,7 +196,7 @@ def _gain(seen: Delays, drawn: np.ndarray, scale: float) -> float:
     """Returns the log likelihood of the delays seen, where true ones are like those drawn, over that without any."""
     if not len(seen.value):
         return 0.0
-    width = scale * seen.error[:, None]
+    width = np.hypot(scale * seen.error, NEAR)[:, None]
     off = (seen.value[:, None] - drawn[None]) / width
     likely = stats.t.pdf(off, FREEDOM).mean(1)
     return float(np.log(likely + 1e-12).sum() - stats.t.logpdf(seen.value / width[:, 0], FREEDOM).sum())

@@ -22,7 +22,9 @@ from brokk_rl.record import Recording
 SIZES = np.geomspace(0.05, 6.0, 25)
 AT_REST, MOVING = 0.01, 0.08
 """Mean speed over a second, of full speed, below which a joint rests and above which it moves."""
-BLUR = np.array([0.08, 0.08, 0.03, 0.03])
+FEWEST = 20
+"""Fewer steps do not show the smallest."""
+BLUR = np.array([0.08, 0.08, 0.03, 0.03, 0.08, 0.08])
 """Differences in the statistics that say nothing: sensors are not quite the same from day to day."""
 MOST = 60.0
 """Evidence is not counted beyond this: the statistics are no exact likelihood."""
@@ -31,19 +33,24 @@ TINY = 2e-6
 
 
 def statistics(q: np.ndarray, machine: Machine) -> np.ndarray:
-    """Returns, by joint, the log scatter of second differences at rest and in motion, and the share of equal neighbours in both."""
+    """Returns, by joint, at rest and in motion: scatter of second differences, share of equal neighbours, smallest steps, `(J, F)`.
+
+    Scatter and steps are logarithms. The smallest steps are those of the sensor, where it has any.
+    """
     second = max(2, round(1.0 / machine.period_s))
     speed = np.zeros_like(q)
     speed[second // 2 : second // 2 + len(q) - second] = (q[second:] - q[:-second]) / second
     speed = np.abs(speed) / (machine.max_speed * machine.period_s)
     bend, step = np.abs(np.diff(q, 2, axis=0)), np.abs(np.diff(q, axis=0))[1:]
-    found = np.full((q.shape[1], 4), np.nan)
+    found = np.full((q.shape[1], 6), np.nan)
     for j in range(q.shape[1]):
         for place, rows in enumerate((speed[1:-1, j] < AT_REST, speed[1:-1, j] > MOVING)):
             if rows.sum() >= 3 * second:
-                cut = np.minimum(bend[rows, j], 6 * np.median(bend[rows, j]) + TINY)
+                cut = np.minimum(bend[rows, j], 4 * np.sqrt(np.mean(bend[rows, j] ** 2)))
                 found[j, place] = np.log(np.sqrt(np.mean(cut**2)) + TINY)
                 found[j, 2 + place] = np.mean(step[rows, j] < TINY / 2)
+                moved = step[rows, j][step[rows, j] >= TINY / 2]
+                found[j, 4 + place] = np.log(np.quantile(moved, 0.2) if len(moved) > FEWEST else TINY)
     return found
 
 
@@ -55,13 +62,12 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
     kinds = [kind for kind in kinds if kind.target.side == "measurement" and (kind.target.stochastic or not kind.target.smooth)]
     seen = np.nanmean([statistics(r.q.astype(float), machine) for r in field], 0)
     plain = np.stack([statistics(r.q.astype(float), machine) for r in reference])  # (P, J, F)
-    spread = np.sqrt(np.nanvar(plain, 0, ddof=1) * (1.0 + 1.0 / len(reference)) + BLUR**2)
-    none = _likelihood(seen, plain, spread)
-    likelihood = {}
-    for kind in kinds:
-        likelihood[kind.name] = np.stack([_likelihood(seen, _with(kind, s, reference, machine), spread) for s in SIZES])
-    gain = {name: np.minimum(values.max(0) - none, MOST) for name, values in likelihood.items()}
-    best = [max(gain, key=lambda name: gain[name][j]) for j in range(machine.num_joints)] if gain else []
+    none = _likelihood(seen, plain, plain)
+    drawn = {kind.name: [_with(kind, size, reference, machine) for size in SIZES] for kind in kinds}
+    likelihood = {name: np.stack([_likelihood(seen, one, plain) for one in by_size]) for name, by_size in drawn.items()}
+    highest = {name: values.max(0) for name, values in likelihood.items()}
+    gain = {name: np.minimum(values - none, MOST) for name, values in highest.items()}
+    best = [max(highest, key=lambda name: highest[name][j]) for j in range(machine.num_joints)] if highest else []
     found = []
     for kind in kinds:
         mask = np.array([best[j] == kind.name and gain[kind.name][j] > price for j in range(machine.num_joints)])
@@ -74,17 +80,22 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
             for name in kind.fitted:
                 mean, low, high = kind.numbers[name].none + kind.size(name) * ends
                 parameters.setdefault(name, {})[machine.joint_names[j]] = Estimate(float(mean), (float(low), float(high)))
-        rivals = {name: float(gain[name][mask].sum()) for name in gain if name != kind.name}
-        fit = np.stack([likelihood[kind.name][:, j].max() for j in np.flatnonzero(mask)])
-        closed = float(np.clip(1.0 - np.mean(fit / np.minimum(none[mask], -1e-9)), 0.0, 1.0))
-        found.append(Found(kind, mask, parameters, worth, float(gain[kind.name][mask].sum()), closed, rivals))
+        earned = float(gain[kind.name][mask].sum())
+        rivals = {name: earned - float((highest[kind.name] - highest[name])[mask].sum()) for name in gain if name != kind.name}
+        after = np.stack([drawn[kind.name][int(np.argmax(row))].mean(0)[j] for j, row in enumerate(likelihood[kind.name].T)])
+        closed = 1.0 - np.nansum(np.square((seen - after) / BLUR)[mask]) / np.nansum(np.square((seen - plain.mean(0)) / BLUR)[mask])
+        found.append(Found(kind, mask, parameters, worth, earned, float(np.clip(closed, 0.0, 1.0)), rivals))
     return found
 
 
-def _likelihood(seen: np.ndarray, drawn: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Returns the log likelihood of the field's statistics `(J, F)` where those of the parts `(P, J, F)` are typical, `(J,)`."""
-    off = (seen - np.nanmean(drawn, 0)) / spread
-    return -0.5 * np.nansum(np.square(off), 1)
+def _likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
+    """Returns the log likelihood of the field's statistics `(J, F)` where those of the parts `(P, J, F)` are typical, `(J,)`.
+
+    Parts scatter at least as they do without an effect, `plain` `(P, J, F)`: a few of them may agree by chance.
+    """
+    variance = np.fmax(np.nanvar(drawn, 0, ddof=1), np.nanvar(plain, 0, ddof=1)) * (1.0 + 1.0 / len(drawn)) + BLUR**2
+    off = np.square(seen - np.nanmean(drawn, 0)) / variance
+    return -0.5 * np.nansum(off + np.where(np.isfinite(off), np.log(variance), 0.0), 1)
 
 
 def _with(kind: Kind, size: float, reference: Sequence[Recording], machine: Machine) -> np.ndarray:

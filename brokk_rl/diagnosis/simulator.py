@@ -143,19 +143,20 @@ def fitted(case: Case, fit: ActuatorFit, folder: Path, seed: int, device: torch.
 def given(case: Case, actuator: Actuator, seed: int) -> Base:
     """Returns a configured simulator held against the field; without reference its noise is that of the field's own errors."""
     field = held(actuator, _begun(case.field), case.machine, seed)
-    return Base(actuator, replace(field, evidence=replace(field.evidence, noise=_noises([field], case.machine))), [])
+    return Base(actuator, replace(field, evidence=replace(field.evidence, noise=noises([field], case.machine))), [])
 
 
 def _noised(nulls: Sequence[Held], machine: Machine) -> list[Held]:
-    noises = _noises(nulls, machine)
-    return [replace(one, evidence=replace(one.evidence, noise=noises)) for one in nulls]
+    known = noises(nulls, machine)
+    return [replace(one, evidence=replace(one.evidence, noise=known)) for one in nulls]
 
 
 def _begun(recordings: Sequence[Recording]) -> Begun:
     return list(zip(recordings, running_s(recordings), strict=True))
 
 
-def _noises(nulls: Sequence[Held], machine: Machine) -> list[Noise]:
+def noises(nulls: Sequence[Held], machine: Machine) -> list[Noise]:
+    """Returns the noise of each joint from a simulator's errors on recordings that it was not fitted to."""
     found = []
     for j in range(machine.num_joints):
         error, way = ([_rows(getattr(one.evidence, name)[..., j]) for one in nulls] for name in ("error", "way"))

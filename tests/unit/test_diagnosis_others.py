@@ -1,0 +1,124 @@
+"""What free runs do not show: sensors by their scatter, frames by hidden delays, geometry by measured tool points."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from actuators.lag import Lag
+from brokk_rl.diagnosis import frames, library, sensors, simulator, tool
+from brokk_rl.diagnosis.case import Case
+from brokk_rl.diagnosis.found import interval
+from brokk_rl.history import History
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+CPU = torch.device("cpu")
+PLANT = Lag(dead_time_s=0.3, dead_band_extend=0.05, dead_band_retract=0.05, gain=1.0, time_constant_s=0.1, spread={})
+
+
+def swept(machine: Machine, seconds: float, seed: int, noise: float = 3e-4) -> Recording:
+    """Returns a recording in which all joints move to and fro at steady speeds and rest in between."""
+    random, count = np.random.default_rng(seed), round(seconds / machine.period_s)
+    q, u = np.zeros((count, machine.num_joints)), np.zeros((count, machine.num_joints))
+    for j, speed in enumerate(machine.max_speed):
+        level, at = 0.0, machine.home[j]
+        for t in range(count):
+            if t % 40 == 0:
+                middle = (machine.lower[j] + machine.upper[j]) / 2
+                level = 0.0 if random.random() < 0.3 else -np.sign(at - middle + 0.2 * random.standard_normal())
+            u[t, j], q[t, j] = 0.5 * level, at
+            at += 0.5 * level * speed * machine.period_s
+    q += noise * random.standard_normal(q.shape)
+    return Recording(
+        machine=machine.name, joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(count) * 0.05,
+        u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": f"{seed}"},
+    )  # fmt: skip
+
+
+def test_a_coarse_sensor_and_a_noisy_one_are_told_apart_with_their_sizes(machine: Machine) -> None:
+    reference, field = [swept(machine, 100.0, seed) for seed in (0, 1, 2)], swept(machine, 100.0, 3)
+    q = field.q.copy()
+    q[:, 1] += 1.5e-3 * np.random.default_rng(4).standard_normal(len(q))
+    q[:, 3] = np.round(q[:, 3] / 0.004) * 0.004
+    found = sensors.search(Case(machine, reference, [dataclasses.replace(field, q=q)]), library.load(machine), 8.0, 12.0)
+    names = {one.kind.name: one for one in found}
+    assert names.keys() == {"sensor_noise", "quantisation"}
+    assert names["sensor_noise"].joints.tolist() == [False, True, False, False, False]
+    assert names["sensor_noise"].parameters["sigma_rad"]["q2"].mean == pytest.approx(1.5e-3, rel=0.15)
+    assert names["quantisation"].parameters["step_rad"]["q4"].mean == pytest.approx(0.004, rel=0.15)
+    assert not sensors.search(Case(machine, reference, [field]), library.load(machine), 8.0, 12.0)
+
+
+def tracked(recording: Recording, machine: Machine, bias: np.ndarray, tilt_rad: float, seed: int) -> Recording:
+    """Returns a recording with tool points as measured beside a machine whose encoders show too much and whose base is tilted."""
+    tip = Kinematics(machine, CPU).pose(torch.as_tensor(recording.q - bias, dtype=torch.float32)).tip_in_base_m.numpy()
+    turn = np.array([[1, 0, 0], [0, np.cos(tilt_rad), -np.sin(tilt_rad)], [0, np.sin(tilt_rad), np.cos(tilt_rad)]])
+    seen = tip @ turn.T + 2e-3 * np.random.default_rng(seed).standard_normal(tip.shape)
+    return dataclasses.replace(recording, extra=dict(zip(tool.COLUMNS, seen.T, strict=True)))
+
+
+def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Machine) -> None:
+    none, bias = np.zeros(5), np.array([0.0, 0.0, 0.015, 0.0, 0.0])
+    reference = tracked(swept(machine, 120.0, 5), machine, none, 0.0, 6)
+    kinds = library.load(machine)
+    biased, tilted = (tracked(swept(machine, 120.0, 7), machine, b, tilt, 8) for b, tilt in ((bias, 0.0), (none, 0.03)))
+    one = tool.search(Case(machine, [reference], [biased]), kinds, 8.0, 12.0)
+    assert [found.kind.name for found in one.found] == ["encoder_bias"] and one.left < 1.2
+    assert one.found[0].parameters["bias_rad"]["q3"].mean == pytest.approx(0.015, abs=0.002)
+    other = tool.search(Case(machine, [reference], [tilted]), kinds, 8.0, 12.0)
+    assert [found.kind.name for found in other.found] == ["base_tilt"]
+    assert other.found[0].parameters["roll_rad"]["machine"].mean == pytest.approx(0.03, abs=0.003)
+    assert not tool.search(Case(machine, [reference], [reference]), kinds, 8.0, 12.0).found
+
+
+def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) -> None:
+    one = swept(machine, 20.0, 9)
+    assert tool.search(Case(machine, [one], [one]), library.load(machine), 8.0, 12.0) == tool.Seen([], 1.0)
+
+
+def held_over(machine: Machine, lost: float, seed: int) -> Recording:
+    """Returns two minutes of a lag plant under levels to and fro, each lost frame holding the level before for a period more."""
+    random = np.random.default_rng(seed)
+    levels = random.uniform(0.3, 0.8, (120, 5)) * np.where(np.arange(120) % 2, -1.0, 1.0)[:, None]
+    u = np.repeat(levels, 20, 0)
+    sent, missing = u.copy(), random.random(len(u)) < lost
+    for t in range(1, len(u)):
+        sent[t] = sent[t - 1] if missing[t] else u[t]
+    model, size = PLANT.build(machine, 1, CPU), machine.num_history
+    known = torch.as_tensor(np.concatenate([np.zeros((size - 1, 5)), sent])[None], dtype=torch.float32)
+    q = torch.as_tensor(machine.home, dtype=torch.float32)[None]
+    model.reset(torch.ones(1, dtype=torch.bool))
+    path = [q[0].numpy()]
+    for t in range(len(u) - 1):
+        q = model.step(History(q=q[:, None].repeat(1, size, 1), u=known[:, t : t + size]))
+        path.append(q[0].numpy())
+    wander = 1.0 + 0.02 * np.repeat(random.standard_normal((len(u) // 40, 5)), 40, 0)
+    steps = np.diff(path, axis=0, prepend=path[:1]) * wander
+    measured = path[0] + np.cumsum(steps, 0) + 2e-4 * random.standard_normal(u.shape)
+    blank = swept(machine, 1.0, 0)
+    return dataclasses.replace(
+        blank, t_s=np.arange(len(u)) * 0.05, u=u.astype(np.float32), q=measured.astype(np.float32), metadata={"run": f"{seed}"}
+    )
+
+
+def test_frames_that_were_lost_are_counted_by_where_joints_end_up(machine: Machine) -> None:
+    rows = [held_over(machine, lost, seed) for lost, seed in ((0.0, 10), (0.0, 11), (0.2, 12))]
+    held = [simulator.held(PLANT, [(one, 0.0)], machine, 0) for one in rows]
+    noises = simulator.noises(held[:2], machine)
+    whole, other, lossy = (dataclasses.replace(one.evidence, noise=noises) for one in held)
+    kinds = library.load(machine, ["frame_loss", "delay_jitter"])
+    found = frames.search(lossy, lossy.error, [whole, other], kinds, 8.0, 12.0)
+    assert found and found.kind.name == "frame_loss" and found.joints.all()
+    assert found.parameters["probability"]["q1"].mean == pytest.approx(0.2, abs=0.08)
+    assert frames.search(other, other.error, [whole], kinds, 8.0, 12.0) is None
+
+
+def test_the_interval_of_a_gaussian_likelihood_is_its_own() -> None:
+    sizes = np.geomspace(0.5, 2.0, 25)
+    mean, low, high = interval(sizes, -0.5 * np.square((sizes - 1.0) / 0.1))
+    assert (mean, low, high) == pytest.approx((1.0, 0.804, 1.196), abs=0.02)
