@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from brokk_rl.errors import FrameError
-from brokk_rl.sight import FrameSource, HolePose, Observer, Sighting
+from brokk_rl.sight import HolePose, Observer, Sighting
 from brokk_rl.signals import Frame
 from perception import dataset
 
@@ -52,7 +52,7 @@ class Tally:
     position_m: list[float] = field(default_factory=list)
     normal_rad: list[float] = field(default_factory=list)
     along_m: list[float] = field(default_factory=list)
-    across_m: list[np.ndarray] = field(default_factory=list)
+    across_m: list[list[float]] = field(default_factory=list)
     along_sigmas: list[float] = field(default_factory=list)
     across_sigmas: list[float] = field(default_factory=list)
     normal_sigmas: list[float] = field(default_factory=list)
@@ -90,27 +90,31 @@ class Tally:
             "across_std_m": float(np.sqrt(np.mean(np.square(self.across_m)))) if self.across_m else None,
         }
 
+    @property
+    def is_perfect(self) -> bool:
+        """Every hole that could be found was, and nothing else."""
+        return self.found == self.true and not (self.refused or self.false or self.fooled)
 
-def judge(observer: Observer, source: FrameSource, tally: Tally, limit: int | None = None) -> None:
-    """Adds to `tally` what the finder makes of the frames of an open source, which lie on disk with their truth beside them."""
-    while limit is None or tally.frames < limit:
-        try:
-            frame = source.read_latest()
-        except FrameError:
-            tally.frames, tally.refused = tally.frames + 1, tally.refused + 1
-            continue
-        if frame is None:
-            return
-        tally.frames += 1
-        start = time.perf_counter()
-        try:
-            sighting = observer.look(frame)
-        except FrameError:
-            tally.refused += 1
-            sighting = Sighting([], [], [], None)
-        for stage, value in {**sighting.ms, "total": 1000 * (time.perf_counter() - start)}.items():
-            tally.ms.setdefault(stage, []).append(value)
-        compare(sighting.holes, dataset.read_truth(Path(frame.name)), frame, tally)
+    def __add__(self, other: Tally) -> Tally:
+        """Returns what was counted by both."""
+        both: dict[str, Any] = {name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "ms"}
+        stages = dict.fromkeys((*self.ms, *other.ms))
+        return Tally(**both, ms={stage: self.ms.get(stage, []) + other.ms.get(stage, []) for stage in stages})
+
+
+def judge(observer: Observer, frame: Frame, truth: dataset.Truth) -> tuple[Tally, Sighting]:
+    """Returns what was counted on one frame, and what the finder saw in it: nothing where it refused the frame as a whole."""
+    tally = Tally(frames=1)
+    start = time.perf_counter()
+    try:
+        sighting = observer.look(frame)
+    except FrameError:
+        tally.refused = 1
+        sighting = Sighting([], [], [], None)
+    for stage, value in {**sighting.ms, "total": 1000 * (time.perf_counter() - start)}.items():
+        tally.ms[stage] = [value]
+    compare(sighting.holes, truth, frame, tally)
+    return tally, sighting
 
 
 def compare(holes: Sequence[HolePose], truth: dataset.Truth, frame: Frame, tally: Tally) -> None:
@@ -149,7 +153,7 @@ def _measure(pose: HolePose, center: np.ndarray, axis: np.ndarray, eye: np.ndarr
     along, across = float(error @ ray), side @ error
     tally.position_m.append(float(np.linalg.norm(error)))
     tally.along_m.append(along)
-    tally.across_m.append(across)
+    tally.across_m.append(across.tolist())
     tally.along_sigmas.append(abs(along) / float(np.sqrt(ray @ pose.cov_m2 @ ray)))
     tally.across_sigmas.append(float(np.sqrt(across @ np.linalg.solve(side @ pose.cov_m2 @ side.T, across))))
     tilt = np.linalg.svd(axis[None])[2][1:]

@@ -1,19 +1,24 @@
 """The table of perception: rendered scenes of each condition and distance, any options of perception side by side.
 
-    python benchmarks/perception/table.py <scenes> <out> --count 200 plane_conic paper 'plane_conic perception/segmenter=onnx'
+    python benchmarks/perception/table.py <out> --count 200 --processes 64 plane_conic paper 'plane_conic perception/segmenter=onnx'
 
-Scenes are rendered into <scenes>/<condition>_<distance>m where they are missing (`brokk mode=render`, fixed seed). Writes
-`table.json`, `table.csv` and `table.png` into <out>, and the error model for `task.noise` into `noise.json`.
+Each scene is rendered, looked at and forgotten; what came of it is a line of `<out>/frames.jsonl`. Called again, it goes on where
+it stopped, with more scenes or more options too. Writes `table.json`, `table.csv`, `table.png`, the error model for `task.noise`
+into `noise.json`, and pictures of what went wrong, with the reasons, into `failures/`. A fixed seed: the same scenes everywhere.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import functools
 import json
-import subprocess
-import sys
+import multiprocessing
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import hydra
@@ -23,96 +28,187 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from brokk_rl.session import Session
+from brokk_rl.sight import Observer, Overlay, Sighting
+from brokk_rl.signals import Frame
 from perception.bench import Tally, judge
+from perception.render.drawing import compose
+from perception.render.studio import Studio
 
 CONDITIONS = ("clean", "haze", "dark", "hidden", "decoy", "empty")
 SHOWN = (
-    "recall", "precision", "decoys_accepted", "position_mm_median", "position_mm_p95", "normal_deg_p95",
+    "recall", "precision", "decoys_accepted", "position_mm_median", "position_mm_p95", "times_better", "normal_deg_p95",
     "along_inside_1_sigma", "across_inside_1_sigma", "normal_inside_1_sigma", "false", "ms_median",
 )  # fmt: skip
+BASELINE = "paper"
+
+
+@dataclass(frozen=True)
+class Task:
+    """One scene to render and to look at with some options of perception."""
+
+    condition: str
+    distance_m: float
+    number: int
+    options: tuple[str, ...]
+    seed: int
+    failures: Path
+    pictures: int
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument(
         "options", nargs="+", help="an option of perception, with overrides after it: 'plane_conic perception.apart=2'"
     )
-    parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--count", type=int, default=200, help="scenes of each condition and distance")
     parser.add_argument("--conditions", nargs="+", default=CONDITIONS)
     parser.add_argument("--distances", nargs="+", type=float, default=(1.0, 2.0, 3.0, 4.0))
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=1, help="of the scenes; networks are trained on those of others")
+    parser.add_argument("--pictures", type=int, default=12, help="at most so many pictures of failures of each row")
     given = parser.parse_args()
-    cv2.setNumThreads(given.threads)
     given.out.mkdir(parents=True, exist_ok=True)
-    rows, noise = [], {}
-    for condition in given.conditions:
-        for distance_m in given.distances:
-            folder = render(given.scenes, condition, distance_m, given.count)
-            for option in given.options:
-                tally = look(option, folder, given.count)
-                rows.append({"perception": option, "condition": condition, "distance_m": distance_m, **tally.row()})
-                noise[f"{option}, {condition}, {distance_m:g} m"] = tally.noise()
-                write(given.out, rows, noise)
-    show(rows)
+    path = given.out / "frames.jsonl"
+    done = {(line["condition"], line["distance_m"], line["number"], line["option"]) for line in read(path)}
+    tasks = []
+    for number in range(given.count):  # scene by scene over all rows: stopped early, all of them have as many
+        for condition in given.conditions:
+            for distance_m in given.distances:
+                left = tuple(option for option in given.options if (condition, distance_m, number, option) not in done)
+                if left:
+                    tasks.append(Task(condition, distance_m, number, left, given.seed, given.out / "failures", given.pictures))
+    if tasks:
+        work(tasks, path, given.processes)
+    write(given.out, rows(path, given.options))
 
 
-def render(scenes: Path, condition: str, distance_m: float, count: int) -> Path:
-    """Returns the folder of frames of a row; renders those that are missing."""
-    out = scenes / f"{condition}_{distance_m:g}m"
-    if len(list((out / "frames").glob("*.truth.json"))) < count:
-        resume = [f"resume={out}"] if out.exists() else []
-        subprocess.run(
-            [Path(sys.executable).with_name("brokk"), "mode=render", f"scene={condition}",
-             f"scene.sight.distance_m=[{distance_m},{distance_m}]", f"render.count={count}", f"session.out={out}", *resume],
-            check=True,
-        )  # fmt: skip
-    return out / "frames"
+def work(tasks: list[Task], path: Path, processes: int) -> None:
+    """Renders and looks, in as many processes; each line is written as it comes."""
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(min(processes, len(tasks)), cv2.setNumThreads, (1,)) as pool, path.open("a") as file, Progress() as progress:
+        for lines in progress.track(pool.imap_unordered(look, tasks), total=len(tasks), description="scenes"):
+            file.writelines(json.dumps(line) + "\n" for line in lines)
+            file.flush()
 
 
-def look(option: str, folder: Path, count: int) -> Tally:
-    """Returns what an option of perception makes of a folder of frames."""
+def look(task: Task) -> list[dict[str, Any]]:
+    """Returns what each option makes of one scene."""
+    studio = renderer(task.condition, task.distance_m)
+    generator = scenes(task.seed).generator(f"scene/{task.number}")
+    shot = studio.shot(compose(studio.scene, studio.rig, generator), generator)
+    frame = Frame(
+        color=shot.color, depth_m=shot.depth_m, camera_matrix=studio.rig.left.matrix, base_from_camera=studio.rig.base_from_camera,
+        t_s=0.0, right=shot.right, baseline_m=studio.rig.baseline_m,
+    )  # fmt: skip
+    lines = []
+    for option in task.options:
+        seer = observer(option)
+        tally, sighting = judge(seer, frame, shot.truth)
+        place = {"condition": task.condition, "distance_m": task.distance_m, "number": task.number, "option": option}
+        lines.append({**place, "tally": asdict(tally)})
+        if not tally.is_perfect:
+            name = f"{option.replace(' ', '_').replace('/', '-')}_{task.condition}_{task.distance_m:g}m"
+            show_failure(task, name, frame, sighting, seer)
+    return lines
+
+
+def show_failure(task: Task, name: str, frame: Frame, sighting: Sighting, seer: Observer) -> None:
+    """Writes the picture of what went wrong and why, unless there are enough of its kind."""
+    task.failures.mkdir(parents=True, exist_ok=True)
+    if len(list(task.failures.glob(f"{name}_*.png"))) < task.pictures:
+        drawing().write(task.failures / f"{name}_{task.number:04d}.png", frame, sighting)
+        told = [
+            f"score {hole.score:.2f}, radius {hole.radius_m:.4f} m at {hole.center_m.round(4).tolist()}" for hole in sighting.holes
+        ]
+        told += [seer.explain(one) for one in sighting.rejected]
+        (task.failures / f"{name}_{task.number:04d}.txt").write_text("\n".join(told) + "\n")
+
+
+@functools.cache
+def renderer(condition: str, distance_m: float) -> Studio:
+    return composed("studio", "mode=render", f"scene={condition}", f"scene.sight.distance_m=[{distance_m},{distance_m}]")
+
+
+@functools.cache
+def observer(option: str) -> Observer:
     name, *overrides = option.split()
+    return composed("perception", "mode=perceive", f"perception={name}", "perceive.input=.", *overrides).build()
+
+
+@functools.cache
+def drawing() -> Overlay:
+    return composed("overlay", "mode=perceive", "perceive.input=.")
+
+
+@functools.cache
+def scenes(seed: int) -> Session:
+    return composed("session", "mode=render", f"session.seed={seed}", "session.out=.")
+
+
+def composed(key: str, *overrides: str) -> Any:
+    """Returns one part of a mode's configuration, instantiated."""
     with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", ["mode=perceive", f"perception={name}", f"perceive.input={folder}", *overrides])
-    observer, source = (instantiate(cfg[key], _convert_="all").build() for key in ("perception", "source"))
-    tally = Tally()
-    with source, Progress(transient=True) as progress:
-        task = progress.add_task(f"{option}, {folder.parent.name}", total=count)
-        for number in range(count):
-            judge(observer, source, tally, number + 1)
-            progress.update(task, completed=number + 1)
-    return tally
+        return instantiate(hydra.compose("config", list(overrides))[key], _convert_="all")
 
 
-def write(out: Path, rows: list[dict], noise: dict) -> None:
-    (out / "table.json").write_text(json.dumps(rows, indent=1) + "\n")
+def read(path: Path) -> Iterator[dict[str, Any]]:
+    """Yields the lines of a file that are whole; one that was cut off is done again."""
+    for line in path.read_text().splitlines() if path.exists() else ():
+        try:
+            yield json.loads(line)
+        except json.JSONDecodeError:
+            continue
+
+
+def rows(path: Path, options: list[str]) -> list[dict[str, Any]]:
+    """Returns the rows of the table, each with how many times smaller its median error is than that of the baseline."""
+    tallies: dict[tuple, Tally] = defaultdict(Tally)
+    for line in read(path):
+        if line["option"] in options:
+            tallies[line["option"], line["condition"], line["distance_m"]] += Tally(**line["tally"])
+    order = {name: number for number, name in enumerate((*options, *CONDITIONS))}
+    found = []
+    for option, condition, distance_m in sorted(tallies, key=lambda key: (order[key[0]], order[key[1]], key[2])):
+        tally = tallies[option, condition, distance_m]
+        row = {"perception": option, "condition": condition, "distance_m": distance_m, **tally.row()}
+        other = (
+            tallies[BASELINE, condition, distance_m].row()["position_mm_median"]
+            if (BASELINE, condition, distance_m) in tallies
+            else None
+        )
+        mine = row["position_mm_median"]
+        found.append({**row, "times_better": other / mine if other and mine else None, **tally.noise()})
+    return found
+
+
+def write(out: Path, found: list[dict[str, Any]]) -> None:
+    """Writes the table as JSON, CSV, picture and error model, and shows it."""
+    (out / "table.json").write_text(json.dumps(found, indent=1) + "\n")
+    noise = {f"{row['perception']}, {row['condition']}, {row['distance_m']:g} m":
+             {name: row[name] for name in ("target_bias_m", "along_std_m", "across_std_m")} for row in found}  # fmt: skip
     (out / "noise.json").write_text(json.dumps(noise, indent=1) + "\n")
     with (out / "table.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
+        writer = csv.DictWriter(file, found[0].keys())
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(found)
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
     for axis, key in zip(axes, ("position_mm_p95", "normal_deg_p95", "recall"), strict=True):
-        for option, condition in dict.fromkeys((row["perception"], row["condition"]) for row in rows):
-            line = [row for row in rows if (row["perception"], row["condition"]) == (option, condition) and row[key] is not None]
+        for option, condition in dict.fromkeys((row["perception"], row["condition"]) for row in found):
+            line = [row for row in found if (row["perception"], row["condition"]) == (option, condition) and row[key] is not None]
             if line:
-                axis.plot(
-                    [row["distance_m"] for row in line], [row[key] for row in line], marker="o", label=f"{option}, {condition}"
-                )
+                place = [row["distance_m"] for row in line]
+                axis.plot(place, [row[key] for row in line], marker="o", label=f"{option}, {condition}")
         axis.set(xlabel="distance, m", title=key, yscale="linear" if key == "recall" else "log")
     axes[0].legend(fontsize=6)
     figure.savefig(out / "table.png", dpi=150)
     plt.close(figure)
-
-
-def show(rows: list[dict]) -> None:
     table = Table("perception", "condition", "m", "frames", *SHOWN)
-    for row in rows:
+    for row in found:
         cells = ["–" if row[key] is None else f"{row[key]:.3g}" for key in SHOWN]
         table.add_row(row["perception"], row["condition"], f"{row['distance_m']:g}", str(row["frames"]), *cells)
-    Console(width=200).print(table)
+    Console(width=220).print(table)
 
 
 if __name__ == "__main__":

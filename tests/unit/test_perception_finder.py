@@ -13,7 +13,7 @@ from drawn import AXIS, CENTER, drawn
 from brokk_rl.errors import FrameError
 from brokk_rl.sight import HolePose, Masks
 from perception import dataset
-from perception.bench import Tally, compare
+from perception.bench import Tally, compare, judge
 from perception.finder import Finder, rectified
 
 
@@ -82,3 +82,16 @@ def test_figures_are_counted_as_by_hand() -> None:
     assert tally.position_m == pytest.approx([0.003])
     assert tally.along_sigmas == pytest.approx([3.0])
     assert tally.row()["precision"] == pytest.approx(1 / 3)
+    assert (tally + tally).row() == {**tally.row(), "false": 2}
+
+
+def test_a_frame_that_is_refused_counts_as_one_in_which_nothing_was_found() -> None:
+    frame, masks, _ = drawn()
+    hole = dataset.Circle(tuple(CENTER), tuple(AXIS), tuple(CENTER), tuple(AXIS), 0.05, 0.3, 0.0, True)
+    truth = dataset.Truth("test", {}, (hole,), (), {})
+    seen, _ = judge(finder_with(masks), frame, truth)
+    assert seen.is_perfect and seen.row()["position_mm_median"] < 2.0
+    blind = option("perception", "plane_conic").build()
+    missed, sighting = judge(blind, replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), truth)
+    assert (missed.refused, missed.true, missed.found, missed.is_perfect) == (1, 1, 0, False)
+    assert not sighting.holes
