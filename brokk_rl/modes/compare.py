@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from matplotlib.figure import Figure
 from rich.console import Console
-from rich.table import Table
 
+from brokk_rl.comparison_picture import MEASURES, RATES, as_table, draw
 from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import student, wilson
 from brokk_rl.session import RESOLVED, Session, read_record, write_json, write_text
@@ -27,19 +26,10 @@ from brokk_rl.spec import spec
 log = logging.getLogger(__name__)
 
 EVALUATION = "evaluation.json"
-RATES = ("success_strict", "success_paper")
-MEASURES = ("time_to_insert_s", "lateral_error_m", "peak_force_n", "valve_travel")
-HEADINGS = {
-    "success_strict": "strict",
-    "success_paper": "paper's",
-    "time_to_insert_s": "time, s",
-    "lateral_error_m": "lateral, mm",
-    "peak_force_n": "force, kN",
-    "valve_travel": "travel, 1/s",
-}
-SCALES = {"lateral_error_m": 1e3, "peak_force_n": 1e-3}
 NOT_COMPARED = ("session", "mode", "hydra", "ablation", "preset")
 """Choices and overrides that say how a run was started, not what it was."""
+EVALUATED_ON = "evaluated on"
+"""Column of the actuator on which policies of other runs were evaluated."""
 
 
 @spec
@@ -84,12 +74,14 @@ class Run:
         evaluation: Its `evaluation.json`.
         record: Its `session.json`, empty where there is none.
         values: Its `resolved.yaml`, flat: dotted key to value.
+        training: The run that made the policy which this one evaluated, where it is at hand.
     """
 
     folder: Path
     evaluation: dict[str, Any]
     record: dict[str, Any]
     values: dict[str, Any]
+    training: Run | None = None
 
     @property
     def choices(self) -> dict[str, Any]:
@@ -99,6 +91,10 @@ class Run:
             found.setdefault("actuator", self.evaluation["actuator"])
         return found
 
+    def says(self, column: str) -> Any:
+        """Returns what this run was made with: a group's option or a single value."""
+        return self.choices.get(column, self.values.get(column))
+
     @property
     def overridden(self) -> set[str]:
         """Dotted keys that were set by hand or by the sweep."""
@@ -107,13 +103,18 @@ class Run:
 
     def results(self, columns: Sequence[str]) -> list[dict[str, Any]]:
         """Returns the figures of each policy that was evaluated in this run."""
-        policies = self.evaluation.get("policies") or {str(self.evaluation.get("policy", "trained")): self.evaluation}
-        variation = {column: self.choices.get(column, self.values.get(column)) for column in columns}
-        seed = self.record.get("seed", self.evaluation.get("seed"))
-        return [
-            {"folder": str(self.folder), "policy": policy, "seed": seed, "variation": variation, **_figures(self.folder, figures)}
-            for policy, figures in policies.items()
-        ]
+        main = str(self.evaluation.get("policy", "trained"))
+        policies = self.evaluation.get("policies") or {main: self.evaluation}
+        found = []
+        for policy, figures in policies.items():
+            made = self.training if self.training and policy == main else self
+            variation = {column: made.says(column) for column in columns if column != EVALUATED_ON}
+            if EVALUATED_ON in columns:
+                variation[EVALUATED_ON] = self.choices.get("actuator")
+            seed = made.record.get("seed", self.evaluation.get("seed"))
+            about = {"folder": str(self.folder), "policy": policy, "seed": seed, "variation": variation}
+            found.append({**about, **_figures(self.folder, figures)})
+        return found
 
 
 def find(patterns: Sequence[str]) -> list[Path]:
@@ -146,16 +147,33 @@ def load(folder: Path) -> Run:
         values = _flat(yaml.safe_load(path.read_text())) if path.exists() else {}
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise ConfigError(f"{path} cannot be read ({error}); evaluate the run again or leave it out of compare.runs") from error
-    return Run(folder, evaluation, read_record(folder) or {}, values)
+    return Run(folder, evaluation, read_record(folder) or {}, values, _training(folder, values))
 
 
 def differing(runs: Sequence[Run]) -> list[str]:
-    """Returns what differs between the runs: choices of groups first, then single values that were overridden."""
-    groups = sorted({key for run in runs for key in run.choices})
-    groups = [key for key in groups if len({repr(run.choices.get(key)) for run in runs}) > 1]
-    keys = sorted({key for run in runs for key in run.overridden})
-    keys = [key for key in keys if len({repr(run.values.get(key)) for run in runs}) > 1]
-    return groups + keys
+    """Returns what differs between the runs: choices of groups first, then single values that were overridden.
+
+    An evaluation of a trained policy counts as what the policy was trained with; on what it was evaluated is then a column.
+    """
+    made = [run.training or run for run in runs]
+    groups = sorted({key for run in made for key in run.choices})
+    groups = [key for key in groups if len({repr(run.choices.get(key)) for run in made}) > 1]
+    above = {key for run in made for key in run.overridden}
+    keys = sorted({key for run in made for key in run.values if any(key == top or key.startswith(top + ".") for top in above)})
+    keys = [key for key in keys if len({repr(run.values.get(key)) for run in made}) > 1]
+    elsewhere = [EVALUATED_ON] if any(run.training for run in runs) else []
+    return groups + keys + elsewhere
+
+
+def _training(folder: Path, values: dict[str, Any]) -> Run | None:
+    """Returns the run whose policy was evaluated in a folder; runs may have been moved together."""
+    named = values.get("policy.folder")
+    if not isinstance(named, str):
+        return None
+    for place in (Path(named), folder.parent / Path(named).name):
+        if place.resolve() != folder.resolve() and (place / EVALUATION).is_file() and (place / RESOLVED).is_file():
+            return load(place)
+    return None
 
 
 def grouped(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -195,42 +213,6 @@ def as_csv(columns: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def as_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Table:
-    """Returns the table for a person."""
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-    for heading in ("policy", *columns, "seeds"):
-        table.add_column(heading, no_wrap=heading == "policy", overflow="fold")
-    for name in (*RATES, *MEASURES):
-        table.add_column(HEADINGS[name], justify="right", min_width=7)
-    for group in groups:
-        setting = [str(group["variation"][column]) for column in columns]
-        figures = [_text(group[name], SCALES.get(name, 1.0), name in RATES) for name in (*RATES, *MEASURES)]
-        table.add_row(group["policy"], *setting, str(group["runs"]), *figures)
-    return table
-
-
-def draw(groups: Sequence[dict[str, Any]]) -> Figure:
-    """Draws success with its interval, one row for each policy and variation."""
-    labels = [", ".join([group["policy"], *(f"{key} {value}" for key, value in group["variation"].items())]) for group in groups]
-    figure = Figure(figsize=(8.0, 1.2 + 0.4 * len(groups)), layout="constrained")
-    axes = figure.subplots()
-    rows = np.arange(len(groups))[::-1]
-    for shift, rate, mark in ((0.12, "success_strict", "o"), (-0.12, "success_paper", "s")):
-        for row, group in zip(rows, groups, strict=True):
-            if group[rate]["mean"] is None:
-                continue
-            color = "#1f5f8b" if rate == "success_strict" else "#c27c2c"
-            axes.plot(group[rate]["mean"], row + shift, mark, color=color, label=HEADINGS[rate] if row == rows[0] else None)
-            if interval := group[rate]["ci95"]:
-                axes.plot(np.clip(interval, 0, 1), [row + shift] * 2, "-", color=color, linewidth=1.5)
-    axes.set(yticks=rows, yticklabels=labels, xlim=(-0.02, 1.02), xlabel="success rate, 95 % interval")
-    axes.grid(axis="x", linewidth=0.4)
-    axes.spines[["top", "right", "left"]].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    figure.legend(title="criterion", loc="outside right upper", frameon=False)
-    return figure
-
-
 def _figures(folder: Path, evaluation: dict[str, Any]) -> dict[str, Any]:
     """Returns the compared figures of one policy, each with mean and interval."""
     try:
@@ -261,15 +243,6 @@ def _over_seeds(figures: Sequence[dict[str, Any]], is_rate: bool) -> dict[str, A
     if interval and is_rate:
         interval = max(0.0, interval[0]), min(1.0, interval[1])
     return {"mean": float(np.mean(values)) if values else None, "ci95": interval}
-
-
-def _text(figure: dict[str, Any], scale: float, with_interval: bool) -> str:
-    if figure["mean"] is None:
-        return "–"
-    text = f"{figure['mean'] * scale:.3g}"
-    if figure["ci95"] and with_interval:
-        text += f"\n[dim]{figure['ci95'][0]:.2f}–{figure['ci95'][1]:.2f}[/dim]"
-    return text
 
 
 def _flat(node: Any, prefix: str = "") -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from brokk_rl.comparison_picture import unlike_most
 from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import student, wilson
 from brokk_rl.modes.compare import differing, find, grouped, load
@@ -117,3 +118,36 @@ def test_the_command_writes_table_csv_and_picture(sweep: Path, brokk: Callable[.
     assert [row["success_strict"] for row in rows] == ["0.2", "0.4", "0.9", "0.9"]
     assert rows[2]["peak_force_n"] == "1500.0"
     assert (tmp_path / "compared" / "comparison.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_an_evaluation_elsewhere_belongs_to_the_run_that_trained(tmp_path: Path) -> None:
+    for seed, actuator in ((0, "ideal"), (1, "ideal"), (0, "mlp"), (1, "mlp")):
+        trained = tmp_path / f"{actuator}_{seed}"
+        write_run(trained, actuator, seed, 0.9)
+        (trained / "resolved.yaml").write_text("task: {memory: 13}\n")
+        elsewhere = tmp_path / f"{actuator}_{seed}_there"
+        write_run(elsewhere, "hydraulic", 0, 0.5 if actuator == "ideal" else 0.7)
+        # it was written on another machine; both folders were moved together
+        (elsewhere / "resolved.yaml").write_text(f"policy: {{folder: /gone/{trained.name}}}\n")
+    runs = [load(folder) for folder in find([str(tmp_path / "*_there")])]
+    columns = differing(runs)
+    assert columns == ["actuator", "evaluated on"]
+    ideal, mlp = grouped([result for run in runs for result in run.results(columns)])
+    assert (ideal["variation"], ideal["seeds"]) == ({"actuator": "ideal", "evaluated on": "hydraulic"}, [0, 1])
+    assert (ideal["success_strict"]["mean"], mlp["success_strict"]["mean"]) == (0.5, 0.7)
+
+
+def test_a_sweep_over_a_whole_node_is_told_apart_by_its_values(tmp_path: Path) -> None:
+    for index, weight in enumerate((0.5, 0.0)):
+        write_run(tmp_path / str(index), "mlp", 0, 0.9)
+        record = json.loads((tmp_path / str(index) / "session.json").read_text())
+        record["overrides"] = [f"task.reward={{progress:{{weight:{weight}}}}}"]
+        (tmp_path / str(index) / "session.json").write_text(json.dumps(record))
+        (tmp_path / str(index) / "resolved.yaml").write_text(f"task: {{reward: {{progress: {{weight: {weight}}}}}}}\n")
+    assert differing([load(folder) for folder in find([str(tmp_path)])]) == ["task.reward.progress.weight"]
+
+
+def test_a_row_says_only_what_most_others_do_not_share() -> None:
+    rows = [{"task.noise.a": 1, "rl.a": 2}, {"task.noise.a": 1, "rl.a": 3}, {"task.noise.a": 4, "rl.a": 2}]
+    assert unlike_most([{"variation": row} for row in rows]) == ["", "rl.a 3", "noise.a 4"]
+    assert unlike_most([{"variation": {"task.memory": 13}}, {"variation": {"task.memory": 1}}]) == ["memory 13", "memory 1"]
