@@ -14,9 +14,10 @@ T = TypeVar("T")
 def spec(cls: type[T]) -> type[T]:
     """Makes `cls` a spec: a frozen, keyword-only dataclass whose fields are checked against their annotations.
 
-    A YAML list becomes a tuple, an integer given for a float becomes a float; any other mismatch is a `ConfigError` that names the
-    field, what was expected and what came. A spec may define `check(self)` for rules between fields. Specs are pure data: a number
-    lives in one YAML file, so fields have no defaults here.
+    A YAML list becomes a tuple, an integer given for a float becomes a float, and a whole number such as 48e6 given for an
+    integer an integer; any other mismatch is a `ConfigError` that names the field, what was expected and what came. A spec may
+    define `check(self)` for rules between fields. Specs are pure data: a number lives in one YAML file, so fields have no
+    defaults here.
     """
     cls.__post_init__ = _post_init  # type: ignore[attr-defined]
     return dataclass(frozen=True, kw_only=True)(cls)
@@ -52,6 +53,8 @@ def _fitted(value: Any, hint: Any, where: str) -> Any:
     plain = origin or hint
     if plain is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
+    if plain is int and isinstance(value, float) and value.is_integer():
+        return int(value)
     protocol = getattr(plain, "_is_protocol", False)
     wrong_bool = isinstance(value, bool) and plain in (int, float)
     if not protocol and (wrong_bool or not isinstance(value, plain)):
