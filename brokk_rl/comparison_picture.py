@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
@@ -23,11 +23,17 @@ HEADINGS = {
     "valve_travel": "travel, 1/s",
 }
 SCALES = {"lateral_error_m": 1e3, "peak_force_n": 1e-3}
+SUCCESS = "episode/success_strict"
+REACHED = 0.95
+"""Success whose time is said and drawn."""
 LABEL_WIDTH = 42
 """Characters in a line beside the picture's rows."""
 MOST_COLUMNS = 4
 UNLIKE_MOST, UNLIKE_MOST_WIDTH = "unlike most", 24
 """With more columns than these, what sets a row apart from most others is said in one."""
+
+Curve = dict[str, list[float]]
+"""Columns of a run's progress: seconds, control steps and strict success of training episodes."""
 
 
 def as_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Table:
@@ -82,6 +88,35 @@ def draw(groups: Sequence[dict[str, Any]]) -> Figure:
     return figure
 
 
+def draw_learning(curves: Mapping[str, Sequence[Curve]]) -> Figure:
+    """Draws strict success of training episodes over time and control steps: a colour for each variation, a line for each run.
+
+    Args:
+        curves: Learning curves of the runs of each variation.
+    """
+    figure = Figure(figsize=(11.0, 4.2), layout="constrained")
+    for axes, name, scale, heading in zip(
+        figure.subplots(1, 2, sharey=True),
+        ("seconds", "env_steps"),
+        (1.0, 1e-6),
+        ("wall clock of training, s", "control steps, millions"),
+        strict=True,
+    ):
+        for index, (label, members) in enumerate(curves.items()):
+            for number, curve in enumerate(members):
+                x = scale * np.asarray(curve[name])
+                axes.plot(x, curve[SUCCESS], color=f"C{index % 10}", linewidth=1.0, alpha=0.8, label=None if number else label)
+        axes.axhline(REACHED, color="#888888", linewidth=0.8, linestyle="--")
+        axes.set(xlabel=heading, ylim=(0.0, 1.0))
+        axes.set_xlim(left=0.0)
+        axes.grid(linewidth=0.4)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel("strict success while learning")
+    if len(curves) > 1:
+        figure.axes[0].legend(loc="lower right", frameon=False, fontsize=8)
+    return figure
+
+
 def _marks(
     axes: Axes, rows: np.ndarray, figures: Sequence[dict[str, Any]], scale: float, color: str, mark: str, label: str | None
 ) -> None:
@@ -114,5 +149,6 @@ def _text(figure: dict[str, Any], scale: float, with_interval: bool) -> str:
         return "–"
     text = f"{figure['mean'] * scale:.3g}"
     if figure["ci95"] and with_interval:
-        text += f"\n[dim]{figure['ci95'][0]:.2f}–{figure['ci95'][1]:.2f}[/dim]"
+        low, high = figure["ci95"]
+        text += f"\n[dim]±{(high - low) / 2:.3f}[/dim]"
     return text

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from brokk_rl.comparison_picture import MEASURES, RATES, as_table, draw
+from brokk_rl.comparison_picture import MEASURES, RATES, REACHED, SUCCESS, Curve, as_table, draw, draw_learning, unlike_most
 from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import student, wilson
 from brokk_rl.session import RESOLVED, Session, read_record, write_json, write_text
@@ -28,6 +28,9 @@ log = logging.getLogger(__name__)
 EVALUATION = "evaluation.json"
 NOT_COMPARED = ("session", "mode", "hydra", "ablation", "preset")
 """Choices and overrides that say how a run was started, not what it was."""
+PROGRESS_COLUMNS = ("seconds", "env_steps", SUCCESS)
+MOST_ROWS = 250
+"""Rows of a learning curve that `learning.csv` keeps: as many as a picture shows."""
 EVALUATED_ON = "evaluated on"
 """Column of the actuator on which policies of other runs were evaluated."""
 
@@ -45,13 +48,13 @@ class Runs:
 
 @spec
 class Compare:
-    """Compares runs: what differs between them, their success with 95 % intervals, their figures; as table, CSV and picture."""
+    """Compares runs: what differs, success with 95 % intervals, other figures, how they learned; as tables and pictures."""
 
     session: Session
     compare: Runs
 
     def run(self) -> None:
-        """Prints the table and writes `comparison.json`, `comparison.csv` and `comparison.png`."""
+        """Prints the table and writes `comparison.{json,csv,png}`, and `learning.{csv,png}` where runs trained."""
         patterns = (self.compare.runs,) if isinstance(self.compare.runs, str) else self.compare.runs
         runs = [load(folder) for folder in find(patterns)]
         columns = differing(runs)
@@ -61,8 +64,29 @@ class Compare:
         write_json(folder / "comparison.json", {"schema": 1, "columns": columns, "groups": groups, "runs": results})
         write_text(folder / "comparison.csv", as_csv(columns, results))
         draw(groups).savefig(folder / "comparison.png", dpi=150)
+        self._learning(runs, columns)
         Console().print(as_table(columns, groups))
         log.info("%d runs compared in %s", len(runs), folder)
+
+    def _learning(self, runs: Sequence[Run], columns: Sequence[str]) -> None:
+        trained = [(run, curve) for run in runs if (curve := progress(run.folder))]
+        if not trained:
+            return
+        variations = unlike_most([{"variation": {column: run.says(column) for column in columns}} for run, _ in trained])
+        curves: dict[str, list[Curve]] = {}
+        lines = []
+        for (run, curve), variation in zip(trained, variations, strict=True):
+            seed = run.record.get("seed")
+            curves.setdefault(variation, []).append(curve)
+            reached = next((curve["seconds"][row] for row, rate in enumerate(curve[SUCCESS]) if rate >= REACHED), None)
+            when = f"after {reached:.1f} s" if reached is not None else f"not in {curve['seconds'][-1]:.0f} s"
+            log.info("%s: strict success of %.2f while learning %s", run.folder.name, REACHED, when)
+            rows = list(zip(*curve.values(), strict=True))
+            lines += [(run.folder, seed, *row) for row in rows[:: -(-len(rows) // MOST_ROWS)]]
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([("folder", "seed", *PROGRESS_COLUMNS), *lines])
+        write_text(self.session.folder / "learning.csv", text.getvalue())
+        draw_learning(curves).savefig(self.session.folder / "learning.png", dpi=150)
 
 
 @dataclass(frozen=True)
@@ -148,6 +172,19 @@ def load(folder: Path) -> Run:
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise ConfigError(f"{path} cannot be read ({error}); evaluate the run again or leave it out of compare.runs") from error
     return Run(folder, evaluation, read_record(folder) or {}, values, _training(folder, values))
+
+
+def progress(folder: Path) -> Curve | None:
+    """Returns the learning curve of a run; none where nothing was trained."""
+    path = folder / "progress.csv"
+    if not path.is_file():
+        return None
+    with path.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row.get(SUCCESS)]
+    try:
+        return {name: [float(row[name]) for row in rows] for name in PROGRESS_COLUMNS} if rows else None
+    except (KeyError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}); leave the run out of compare.runs") from error
 
 
 def differing(runs: Sequence[Run]) -> list[str]:

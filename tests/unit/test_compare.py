@@ -147,6 +147,20 @@ def test_a_sweep_over_a_whole_node_is_told_apart_by_its_values(tmp_path: Path) -
     assert differing([load(folder) for folder in find([str(tmp_path)])]) == ["task.reward.progress.weight"]
 
 
+def test_learning_curves_are_thinned_and_say_when_success_was_reached(
+    sweep: Path, brokk: Callable[..., Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lines = ["seconds,env_steps,episode/success_strict", "0.5,0,"]  # no episode had ended yet
+    lines += [f"{second},{10 * second},{min(second, 600) / 600}" for second in range(1, 1001)]
+    (sweep / "2_mlp" / "progress.csv").write_text("\n".join(lines))
+    with caplog.at_level("INFO"):
+        brokk("mode=compare", f"compare.runs={sweep}", "session.out=compared")
+    assert "2_mlp: strict success of 0.95 while learning after 570.0 s" in caplog.messages
+    rows = list(csv.DictReader((tmp_path / "compared" / "learning.csv").read_text().splitlines()))
+    assert [float(row["seconds"]) for row in rows[:3]] == [1.0, 5.0, 9.0]
+    assert (tmp_path / "compared" / "learning.png").read_bytes()[:4] == b"\x89PNG"
+
+
 def test_a_row_says_only_what_most_others_do_not_share() -> None:
     rows = [{"task.noise.a": 1, "rl.a": 2}, {"task.noise.a": 1, "rl.a": 3}, {"task.noise.a": 4, "rl.a": 2}]
     assert unlike_most([{"variation": row} for row in rows]) == ["", "rl.a 3", "noise.a 4"]
