@@ -7,6 +7,7 @@ import io
 import logging
 import math
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -42,6 +43,8 @@ class SegmenterTraining:
         size_px: Width and height of the network's picture.
         widths: Channels of the network at each size, the full picture first.
         updates: Steps of the optimiser.
+        max_seconds: It ends after as many seconds too, those before a resume included; `null` for no such end. What was learned
+            until then depends on the speed of the machine.
         batch: Samples a step.
         rate: Learning rate at its highest; it rises for a twentieth of the updates, then falls as a cosine to nothing.
         decay: Weight decay.
@@ -59,6 +62,7 @@ class SegmenterTraining:
     size_px: tuple[int, int]
     widths: tuple[int, ...]
     updates: int
+    max_seconds: float | None
     batch: int
     rate: float
     decay: float
@@ -76,8 +80,10 @@ class SegmenterTraining:
                 f"training.size_px: {len(self.widths)} widths halve it {len(self.widths) - 1} times, so expected multiples of "
                 f"{multiple}, got {list(self.size_px)}"
             )
-        if min(self.updates, self.batch, self.validate_every) < 1 or self.hold_out < 2 or self.rate <= 0:
-            raise ConfigError("training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or more, rate above 0")
+        if min(self.updates, self.batch, self.validate_every) < 1 or self.hold_out < 2:
+            raise ConfigError("training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or more")
+        if min(self.rate, math.inf if self.max_seconds is None else self.max_seconds) <= 0:
+            raise ConfigError("training: expected rate and max_seconds above 0")
 
     def fit(self, session: Session, resume: bool) -> dict[str, Any]:
         """Trains; leaves the network as safetensors and ONNX, curve and samples as PNG in the session's folder.
@@ -103,6 +109,7 @@ class _Training:
         self._network = UNet(settings.widths).to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimizer = torch.optim.AdamW(self._network.parameters(), lr=settings.rate, weight_decay=settings.decay)
         self._update, self._best, self._curve = 0, {"score": -1.0, "update": 0}, []
+        self._seconds = 0.0
         self._best_tensors: dict[str, torch.Tensor] = {}
         self._stamp = self._identity()
         if resume:
@@ -112,18 +119,22 @@ class _Training:
         settings = self._settings
         pictures, known = training_report.looked_at(self._unseen, settings.size_px)
         total = torch.zeros((), device=self._device)
-        count = settings.updates - self._update
         log.info("%d frames to train on, %d to judge by, %s", len(self._train), len(self._unseen), self._device)
+        begun = time.monotonic() - self._seconds
         with _progress(self._update, settings.updates) as advance:
-            for picture, target in self._loader(count):
+            for picture, target in self._loader():
                 total += self._step(picture, target)
                 self._update += 1
+                self._seconds = time.monotonic() - begun
                 advance()
-                if self._update % settings.validate_every == 0 or self._update == settings.updates:
+                over = self._spent() >= 1.0
+                if self._update % settings.validate_every == 0 or over:
                     since = self._update - (self._curve[-1]["update"] if self._curve else 0)
                     self._validate(pictures, known, float(total) / since)
                     total.zero_()
                     self._save()
+                if over:
+                    break
         return self._finish(pictures, known)
 
     def _views(self) -> tuple[Views, Views]:
@@ -142,15 +153,15 @@ class _Training:
         number = np.arange(len(both))
         return both.part(number[: len(stems)]), both.part(number[len(stems) :])
 
-    def _loader(self, count: int) -> DataLoader:
+    def _loader(self) -> DataLoader:
         settings = self._settings
         samples = Samples(
             self._train, settings.crop, settings.augment, settings.size_px, settings.closer, self._session.stream("samples")
         )
-        workers = _cores() - 1 if settings.workers is None else settings.workers
+        workers = len(os.sched_getaffinity(0)) - 1 if settings.workers is None else settings.workers
         return DataLoader(
             samples,
-            batch_sampler=Batches(settings.updates - count, settings.updates, settings.batch),
+            batch_sampler=Batches(self._update, settings.updates, settings.batch),
             num_workers=workers,
             pin_memory=self._device.type == "cuda",
             prefetch_factor=4 if workers else None,
@@ -169,10 +180,15 @@ class _Training:
         self._optimizer.step()
         return value.detach()
 
+    def _spent(self) -> float:
+        """Returns which part of the training is over, by updates or by seconds, in [0, 1]."""
+        in_time = self._seconds / (self._settings.max_seconds or math.inf)
+        return min(1.0, max(self._update / self._settings.updates, in_time))
+
     def _rate(self) -> float:
-        rise = max(1.0, self._settings.updates / 20.0)
-        fall = 0.5 * (1.0 + math.cos(math.pi * self._update / self._settings.updates))
-        return self._settings.rate * min(1.0, (self._update + 1) / rise) * fall
+        fall = 0.5 * (1.0 + math.cos(math.pi * self._spent()))
+        rise = 20.0 * (self._spent() + 1.0 / self._settings.updates)
+        return self._settings.rate * min(1.0, rise) * fall
 
     def _validate(self, pictures: torch.Tensor, known: torch.Tensor, mean_loss: float) -> None:
         probabilities = training_report.predicted(self._network, pictures, self._device)
@@ -211,6 +227,7 @@ class _Training:
             "conditions": conditions,
             "best_update": self._best["update"],
             "updates": self._update,
+            "seconds": self._seconds,
             "parameters": sum(value.numel() for value in network.parameters()),
             "onnx_bytes": (self._folder / export.ONNX).stat().st_size,
             "parity": parity,
@@ -234,7 +251,7 @@ class _Training:
         content = io.BytesIO()
         torch.save(
             {
-                "stamp": self._stamp, "update": self._update, "best": self._best, "curve": self._curve,
+                "stamp": self._stamp, "update": self._update, "best": self._best, "curve": self._curve, "seconds": self._seconds,
                 "network": self._network.state_dict(), "optimizer": self._optimizer.state_dict(),
                 "best_tensors": self._best_tensors,
             },
@@ -259,16 +276,12 @@ class _Training:
             )
         self._network.load_state_dict(state["network"])
         self._optimizer.load_state_dict(state["optimizer"])
-        self._update, self._best, self._curve = state["update"], state["best"], state["curve"]
+        self._update, self._best, self._curve, self._seconds = (state[key] for key in ("update", "best", "curve", "seconds"))
         self._best_tensors = {name: value.cpu() for name, value in state["best_tensors"].items()}
 
 
 def _several(folders: str | tuple[str, ...]) -> tuple[str, ...]:
     return (folders,) if isinstance(folders, str) else folders
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
 
 
 def _alone(_: int) -> None:

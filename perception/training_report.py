@@ -56,7 +56,7 @@ def judged(probabilities: torch.Tensor, known: torch.Tensor, conditions: Sequenc
     """
     said = probabilities > THRESHOLD
     block, mouth = (said[:, 0, 0], known[:, 0, 0]), (said[:, 1, 1], known[:, 1, 1])
-    counts = np.array([_pieces(a.numpy(), b.numpy()) for a, b in zip(*mouth, strict=True)]).reshape(-1, 3)
+    counts = np.array([pieces(a.numpy(), b.numpy()) for a, b in zip(*mouth, strict=True)]).reshape(-1, 3)
     table = {}
     for name in ("all", *sorted(set(conditions))):
         chosen = np.array([name in ("all", condition) for condition in conditions])
@@ -76,7 +76,7 @@ def _iou(said: torch.Tensor, known: torch.Tensor) -> float | None:
     return float((said & known).sum() / (said | known).sum()) if known.any() else None
 
 
-def _pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
+def pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
     """Returns how many mouths were found, how many there are, and how many pieces of `said` touch none."""
     num_said, said_labels = cv2.connectedComponents(said.astype(np.uint8))
     num_known, known_labels = cv2.connectedComponents(known.astype(np.uint8))

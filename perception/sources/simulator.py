@@ -70,7 +70,7 @@ class SimulatedSource:
 
     def __init__(self, settings: Simulated) -> None:
         self._settings = settings
-        self._studio = Studio(rig=settings.rig, scene=settings.surroundings, stereo=settings.stereo, depth="matched")
+        self._studio = Studio(rig=settings.rig, scene=settings.surroundings, stereo=settings.stereo, depth="matched", pair=True)
         self._scene: tuple[float, ...] = settings.task_scene
         self._chain = np.zeros((0, 3))
         self._count = -1

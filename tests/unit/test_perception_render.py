@@ -60,7 +60,7 @@ def kind(name: str) -> Scenes:
 
 
 def studio(name: str, rig: Rig, depth: str = "exact") -> Studio:
-    return Studio(rig=rig, scene=kind(name), stereo=option("stereo", "sgbm"), depth=depth)  # type: ignore[arg-type]
+    return Studio(rig=rig, scene=kind(name), stereo=option("stereo", "sgbm"), depth=depth, pair=True)  # type: ignore[arg-type]
 
 
 def test_depths_into_a_hole_are_those_worked_by_hand() -> None:
@@ -277,6 +277,16 @@ def test_the_command_renders_the_same_bytes_again_and_goes_on_where_it_stopped(b
     assert digests(tmp_path / "one" / "frames") == first
     assert brokk("mode=render", "scene=varied", "session.out=two", "session.seed=1", *size).code == 0
     assert digests(tmp_path / "two" / "frames")["00000.color.png"] != first["00000.color.png"]
+
+
+def test_the_left_picture_alone_is_that_of_a_pair(brokk: Callable[..., Any], tmp_path: Path) -> None:
+    size = ("rig.width=160", "rig.height=90", "rig.focal_px=88.0", "render.count=1", "studio.depth=none")
+    assert brokk("mode=render", "session.out=pair", *size).code == 0
+    assert brokk("mode=render", "session.out=alone", "studio.pair=false", *size).code == 0
+    pair, alone = (digests(tmp_path / name / "frames") for name in ("pair", "alone"))
+    assert pair.pop("00000.right.png") and pair == alone
+    refused = brokk("mode=render", "session.out=none", "studio.pair=false")
+    assert refused.code == 2 and "no pair to match" in refused.err
 
 
 def test_truth_and_masks_come_back_as_they_were_written(rig: Rig, tmp_path: Path) -> None:

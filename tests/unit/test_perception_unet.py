@@ -42,9 +42,9 @@ def test_the_loss_of_a_worked_example_is_right() -> None:
     assert float(loss(logits, target)) == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_shipped_widths_make_less_than_three_megabytes() -> None:
-    network = UNet((16, 32, 64, 96, 128))
-    assert 0.3e6 < sum(value.numel() for value in network.parameters()) < 0.75e6
+def test_the_shipped_widths_make_less_than_two_megabytes() -> None:
+    network = UNet((16, 24, 48, 80, 96))
+    assert 0.3e6 < sum(value.numel() for value in network.parameters()) < 0.5e6
     assert network(torch.zeros(1, 3, 32, 48)).shape == (1, 2, 32, 48)
 
 
@@ -98,6 +98,25 @@ def test_an_interrupted_training_goes_on_exactly(brokk: Callable[..., Any], fram
     assert Path("whole/segmenter.safetensors").read_bytes() == Path("parts/segmenter.safetensors").read_bytes()
     refused = brokk(*command, "session.out=parts", "resume=parts", "training.rate=0.02")
     assert refused.code == 2 and "its settings differ" in refused.err
+
+
+def test_a_training_ends_in_time_with_its_rate_at_nothing(
+    brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rates, rate = [], training._Training._rate
+    monkeypatch.setattr(training._Training, "_rate", lambda self: rates.append(rate(self)) or rates[-1])
+    clock = iter(range(1000))
+    monkeypatch.setattr(training.time, "monotonic", lambda: float(next(clock)))  # a second an update
+    done = brokk(
+        "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=10000", "training.max_seconds=8",
+        "training.validate_every=3", "session.out=run",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    result = json.loads(Path("run/training.json").read_text())
+    assert (result["updates"], result["seconds"]) == (8, 8.0)
+    assert [entry["update"] for entry in result["curve"]] == [3, 6, 8]
+    # the rise, 20 of the part spent, is over after one second; then half a cosine from 1 to 0 over 8
+    assert rates[1:] == pytest.approx([0.005 * (1 + np.cos(np.pi * k / 8)) for k in range(1, 8)])
 
 
 def test_folders_without_masks_are_refused(brokk: Callable[..., Any], tmp_path: Path) -> None:
