@@ -15,6 +15,8 @@ from perception.ellipse_support import ANGLES, NUM_SAMPLES, Candidates
 
 NUM_SEEDS = 64
 """Points that stand for an arc in its first fit."""
+LEAST_ARC = 0.2
+"""Part of an ellipse from which the rest of it can be told."""
 ROUNDS_PX = (1.0, 0.5, 0.3, 0.2)
 """Rounds of refinement: the distance at which a point counts a quarter."""
 TAIL = 2.0
@@ -149,8 +151,10 @@ class ArcDetector:
         whole = set(map(tuple, spans.tolist()))
         parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int).reshape(-1, 2)
         groups = [arcs[group] for group in ellipse_groups.find(arcs, edges, (4, 3, 2))]
-        seeds = np.concatenate([_seeds(some) for some in (spans[:, None], parts[:, None], *groups)])
-        found = self._chosen(self.judge(self.refine(self.first(seeds, edges, limits), edges), edges, limits), edges)
+        kinds = (spans[:, None], parts[:, None], *groups)
+        seeds = np.concatenate([_seeds(some) for some in kinds])
+        lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
+        found = self._chosen(self.judge(self.refine(self.first(seeds, lengths, edges, limits), edges), edges, limits), edges)
         return sorted(found, key=lambda one: -one[3])
 
     def _chosen(self, judged: Judged, edges: Edges) -> list[tuple[np.ndarray, float, float, float]]:
@@ -169,14 +173,20 @@ class ArcDetector:
             found.append((one.ellipses[0], judged.rms_px[k], judged.coverage[k], judged.score[k]))
         return found
 
-    def first(self, seeds: np.ndarray, edges: Edges, limits: SizePrior) -> Candidates:
-        """Returns the candidates of seed points `(C, P)` that lie on an ellipse of a possible size, their gradients all one way."""
+    def first(self, seeds: np.ndarray, lengths: np.ndarray, edges: Edges, limits: SizePrior) -> Candidates:
+        """Returns the candidates of seed points `(C, P)` that lie on an ellipse of a possible size, their gradients all one way.
+
+        The arcs that the seeds stand for have `lengths`, `(C,)` points, which must be a good part of the circumference.
+        """
+        smallest = conic.perimeter(np.array(limits.lowest_px / 1.5), np.array(limits.lowest_px / 1.5 * self.settings.flattest))
+        seeds, lengths = (some[lengths >= LEAST_ARC * smallest] for some in (seeds, lengths))
         if not len(seeds):
             return Candidates(np.empty((0, 5)), np.empty(0))
         points = edges.points[seeds]
         ellipses = conic.fit(points, np.ones(seeds.shape))
         ellipses = ellipses.copy()
         possible = self._sized(ellipses, limits, 1.5)
+        possible &= lengths >= LEAST_ARC * np.nan_to_num(conic.perimeter(ellipses[:, 2], ellipses[:, 3]))
         ellipses, points, seeds = ellipses[possible], points[possible], seeds[possible]
         off = conic.distance(ellipses, points)
         outward = (conic.normals(ellipses, points) * edges.directions[seeds]).sum(-1)

@@ -20,12 +20,11 @@ from brokk_rl.sight import (
     Rejection,
     SegmenterSpec,
     Sighting,
-    SizePrior,
     Target,
 )  # fmt: skip
 from brokk_rl.signals import Borehole, Frame
 from brokk_rl.spec import spec
-from perception import explain
+from perception import explain, rim, search
 from perception.pose import gray_of
 
 
@@ -40,6 +39,8 @@ class Perception:
         filter: Makes one target of many frames.
         radius_m: Radius of the holes, for the size that their ellipses may have.
         size_slack: By how much that size may be off, as a part of it.
+        comfortable_px: Least semi-axis for which an ellipse is looked for in a coarser resolution.
+        rim_px: How far, in px of that resolution, the rim in the full one may lie from what was found in it.
         smallest_block: Least part of the picture that must be block.
         block_probability: From which a pixel is block.
         roi: Where ellipses are looked for: on the `mask` of the block, or in its bounding `box`.
@@ -52,6 +53,8 @@ class Perception:
     filter: FilterSpec
     radius_m: float
     size_slack: float
+    comfortable_px: float
+    rim_px: float
     smallest_block: float
     block_probability: float
     roi: str
@@ -108,8 +111,11 @@ class Finder:
         if share < s.smallest_block:
             return Sighting([], [Rejection("segment", "part of the picture that is block", share, s.smallest_block)], [], masks, ms)
         with _timed(ms, "ellipse"):
-            prior = self._prior(frame, roi)
-            ellipses = self._detector.detect(gray_of(frame), self._region(roi, prior), prior)
+            gray = gray_of(frame)
+            levels = search.levels(frame, roi, s.radius_m, s.size_slack, s.comfortable_px)
+            levels = search.box(roi, levels) if s.roi == "box" else levels
+            ellipses = [rim.refined(gray, one, s.rim_px * level.shrink) if level.shrink > 1 else one
+                        for level in levels for one in level.detect(self._detector, gray)]  # fmt: skip
         with _timed(ms, "pose"):
             judged = [(ellipse, self._pose.estimate(frame, masks, ellipse)) for ellipse in ellipses]
             found = [(e, pose) for e, pose in judged if isinstance(pose, HolePose)]
@@ -131,35 +137,6 @@ class Finder:
     def explain(self, rejection: Rejection) -> str:
         """Returns in words what was refused, why, and what could be done."""
         return explain.words(rejection)
-
-    def _region(self, roi: np.ndarray, prior: SizePrior | None) -> np.ndarray:
-        """Returns where ellipses are looked for: the mask and as much around it as a hole is wide, or its bounding box.
-
-        A hole is a gap of the mask where the segmenter does not count it to the block, and lies at its border where something
-        stands before half of it.
-        """
-        region = np.zeros(roi.shape, bool)
-        if self.settings.roi == "box":
-            rows, columns = np.flatnonzero(roi.any(1)), np.flatnonzero(roi.any(0))
-            region[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
-            return region
-        step = 4
-        small = np.ascontiguousarray(roi[::step, ::step]).astype(np.uint8)
-        width = prior.highest_px / step if prior else 0.03 * small.shape[1]
-        size = 2 * max(1, round(width)) + 1
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-        return cv2.resize(cv2.dilate(small, kernel), roi.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-
-    def _prior(self, frame: Frame, roi: np.ndarray) -> SizePrior | None:
-        """Returns the size that a hole's ellipse may have at the depths of the block; `None` where no depth is known."""
-        depth = frame.depth_m[::4, ::4][roi[::4, ::4]]
-        depth = depth[np.isfinite(depth)]
-        if len(depth) < 50:
-            return None
-        near, far = np.percentile(depth, (2.0, 98.0))
-        size = float(np.sqrt(frame.camera_matrix[0, 0] * frame.camera_matrix[1, 1])) * self.settings.radius_m
-        slack = 1.0 + self.settings.size_slack
-        return SizePrior(float(size / far / slack), float(size / near * slack))
 
     def _single(self, found: Sequence[tuple[Ellipse, HolePose]]) -> tuple[list[tuple[Ellipse, HolePose]], list[Rejection]]:
         """Returns each hole once, the best first: of rims within each other the outer one, which is the near one."""

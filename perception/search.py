@@ -1,0 +1,112 @@
+"""Where holes are looked for, how large they look there, and in which resolution that is best seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from brokk_rl.sight import Ellipse, EllipseDetector, SizePrior
+from brokk_rl.signals import Frame
+
+STEP = 8
+"""Pixels to one of the grid on which regions are put together."""
+OCTAVES = 5
+"""Resolutions: the full one, half of it, and so on."""
+LEAST = 20
+"""Pixels of that grid below which a region is an accident of depth."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """A part of the picture in which holes look alike large.
+
+    Attributes:
+        shrink: Pixels of the picture to one of this level.
+        roi: Where to look, `(h, w)` bool, the whole picture.
+        prior: How large a hole may look there, px of the picture; `None` for any size.
+    """
+
+    shrink: int
+    roi: np.ndarray
+    prior: SizePrior | None
+
+    def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
+        """Returns the ellipses of this level, in px of the picture `(h, w)`."""
+        if self.shrink == 1:
+            return detector.detect(gray, self.roi, self.prior)
+        rows, columns = (np.flatnonzero(self.roi.any(k)) for k in (1, 0))
+        top, left = (int(places[0]) // self.shrink * self.shrink for places in (rows, columns))
+        height, width = ((int(places[-1]) + 1 - start) // self.shrink for places, start in ((rows, top), (columns, left)))
+        if min(height, width) < 1:
+            return []
+        part = np.s_[top : top + height * self.shrink, left : left + width * self.shrink]
+        small = cv2.resize(gray[part], (width, height), interpolation=cv2.INTER_AREA)
+        roi = np.ascontiguousarray(self.roi[part][self.shrink // 2 :: self.shrink, self.shrink // 2 :: self.shrink])
+        prior = self.prior and SizePrior(self.prior.lowest_px / self.shrink, self.prior.highest_px / self.shrink)
+        return [_enlarged(one, self.shrink, left, top) for one in detector.detect(small, roi, prior)]
+
+
+def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfortable_px: float) -> list[Level]:
+    """Returns where to look: each part of the block in the coarsest resolution in which a hole there has a good size.
+
+    A circle's major semi-axis is focal length times radius over depth, however it is tilted. What is looked at reaches as far
+    beyond the mask as a hole is wide: one is a gap of the mask where the segmenter does not count it to the block, and lies at its
+    border where something stands before half of it.
+
+    Args:
+        frame: For depth and camera.
+        mask: The block, `(h, w)` bool.
+        radius_m: Of the holes.
+        slack: By how much the size may be off, as a part of it.
+        comfortable_px: Least semi-axis in the chosen resolution.
+    """
+    focal_px = float(np.sqrt(frame.camera_matrix[0, 0] * frame.camera_matrix[1, 1]))
+    depth = frame.depth_m[STEP // 2 :: STEP, STEP // 2 :: STEP]
+    inside = mask[STEP // 2 :: STEP, STEP // 2 :: STEP]
+    known = inside & np.isfinite(depth)
+    if np.count_nonzero(known) < LEAST:
+        return [Level(1, _full(_dilated(inside, 0.03 * inside.shape[1]), mask.shape), None)]
+    size_px = np.divide(focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=known)
+    octave = np.floor(np.log2(np.maximum(size_px, 1e-3) / comfortable_px)).clip(0, OCTAVES - 1)
+    found = []
+    for number in range(OCTAVES):
+        here = known & (octave == number)
+        if np.count_nonzero(here) < LEAST:
+            continue
+        reach = float(np.percentile(size_px[here], 98.0)) * (1.0 + slack) / STEP
+        count, pieces = cv2.connectedComponents(_dilated(here, reach))
+        for piece in range(1, count):
+            part = pieces == piece
+            sizes_px = size_px[part & here]
+            if len(sizes_px) >= LEAST:
+                low, high = np.percentile(sizes_px, (2.0, 98.0))
+                prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
+                found.append(Level(2**number, _full(part.astype(np.uint8), mask.shape), prior))
+    return found
+
+
+def box(mask: np.ndarray, whole: Sequence[Level]) -> list[Level]:
+    """Returns one level instead, in full resolution: the bounding box of the mask, as large as a hole may be anywhere."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    roi = np.zeros(mask.shape, bool)
+    roi[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
+    priors = [level.prior for level in whole if level.prior]
+    prior = SizePrior(min(p.lowest_px for p in priors), max(p.highest_px for p in priors)) if priors else None
+    return [Level(1, roi, prior)]
+
+
+def _dilated(small: np.ndarray, reach: float) -> np.ndarray:
+    size = 2 * max(1, round(reach)) + 1
+    return cv2.dilate(small.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+
+
+def _full(small: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return cv2.resize(small, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _enlarged(one: Ellipse, factor: int, left: int, top: int) -> Ellipse:
+    x, y = ((place + 0.5) * factor - 0.5 + start for place, start in ((one.x, left), (one.y, top)))
+    return replace(one, x=x, y=y, a=one.a * factor, b=one.b * factor, rms_px=one.rms_px * factor)
