@@ -31,6 +31,8 @@ NOT_COMPARED = ("session", "mode", "hydra", "ablation", "preset")
 PROGRESS_COLUMNS = ("seconds", "env_steps", SUCCESS)
 MOST_ROWS = 250
 """Rows of a learning curve that `learning.csv` keeps: as many as a picture shows."""
+FILE_WIDTH = 120
+"""Characters of a table's line that goes into a file."""
 EVALUATED_ON = "evaluated on"
 """Column of the actuator on which policies of other runs were evaluated."""
 
@@ -65,7 +67,8 @@ class Compare:
         write_text(folder / "comparison.csv", as_csv(columns, results))
         draw(groups).savefig(folder / "comparison.png", dpi=150)
         self._learning(runs, columns)
-        Console().print(as_table(columns, groups))
+        console = Console()
+        console.print(as_table(columns, groups), width=None if console.is_terminal else FILE_WIDTH)
         log.info("%d runs compared in %s", len(runs), folder)
 
     def _learning(self, runs: Sequence[Run], columns: Sequence[str]) -> None:
