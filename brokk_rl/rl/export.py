@@ -25,6 +25,9 @@ from brokk_rl.session import write_json
 TOLERANCE = 1e-3
 """Largest difference of a command (of 2 full strokes) between torch and onnxruntime over recorded observations."""
 
+GOLDEN, NUM_GOLDEN = "golden.json", 16
+"""Observations and the network's own answers: whoever runs the file elsewhere compares with them first."""
+
 
 class _Plain(torch.nn.Module):
     """A copy of an actor on the CPU that takes a plain dictionary of groups: ONNX does not know the TensorDict."""
@@ -42,7 +45,7 @@ class _Plain(torch.nn.Module):
 
 
 def export_onnx(folder: Path, actor: MLPModel, task: TaskProcess, contract: dict[str, Any], observations: torch.Tensor) -> float:
-    """Writes `policy.onnx`: from the observation vector to masked commands, with the contract as metadata.
+    """Writes `policy.onnx`: from the observation vector to masked commands, with the contract as metadata; and `golden.json`.
 
     Args:
         folder: Where to; the contract there is completed by the parity figures.
@@ -87,6 +90,14 @@ def export_onnx(folder: Path, actor: MLPModel, task: TaskProcess, contract: dict
         )
     part.replace(folder / ONNX)
     largest = float(difference[~off].max())
+    golden = np.flatnonzero(~off)[:: max(1, len(off) // NUM_GOLDEN)][:NUM_GOLDEN]
+    write_json(
+        folder / GOLDEN,
+        {
+            "observation": observations[golden].cpu().numpy().astype(float).tolist(),
+            "command": expected[golden].astype(float).tolist(),
+        },
+    )
     parity = {
         "observations": len(off),
         "largest_difference": largest,

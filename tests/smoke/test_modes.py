@@ -59,8 +59,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_training_leaves_all_that_is_needed_to_judge_and_use_the_policy(run: Path) -> None:
     names = {path.name for path in run.iterdir()}
     assert names == {
-        "evaluation.json", "learning_curves.png", "model_2.pt", "model_3.pt", "policy.json", "policy.onnx", "policy.safetensors",
-        "progress.csv", "resolved.yaml", "session.json", "tensorboard",
+        "evaluation.json", "golden.json", "learning_curves.png", "model_2.pt", "model_3.pt", "policy.json", "policy.onnx",
+        "policy.safetensors", "progress.csv", "resolved.yaml", "session.json", "tensorboard",
     }  # fmt: skip
     assert (run / "learning_curves.png").read_bytes().startswith(b"\x89PNG")
     onnx.checker.check_model(onnx.load(run / "policy.onnx"))
@@ -116,7 +116,7 @@ def test_exporting_a_checkpoint_makes_the_same_policy(run: Path) -> None:
     command(run.parent, "mode=export", f"checkpoint={run}", "session.out=export", "actuator=lag", "num_checked=8")
     made = run.parent / "export"
     assert {path.name for path in made.iterdir()} == {
-        "policy.json", "policy.onnx", "policy.safetensors", "resolved.yaml", "session.json",
+        "golden.json", "policy.json", "policy.onnx", "policy.safetensors", "resolved.yaml", "session.json",
     }  # fmt: skip
     assert (made / "policy.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
     assert read(made / "policy.json")["observation"] == read(run / "policy.json")["observation"]

@@ -1,0 +1,179 @@
+"""The bus description: one DBC that says what is sent, how, how often and by whom.
+
+Signals are found by their names, whatever message they travel in, so that a DBC of another gateway takes the place of the example
+as long as it names them alike: `Command_<joint>`, `CommandMode`, `Position_<joint>`, `Valid_<joint>`, `Flow_<joint>`,
+`Lever_<left|right>_<theta|psi>`, `ButtonRight`, `DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`; optional are `Stamp`,
+`OilTemperature` and all others, which are recorded. Protected messages have a `Counter`, a `Crc` of one whole byte and the
+attribute `E2EDataId`. Cycle times are the DBC's (`GenMsgCycleTime`): no rate is written down twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import cantools
+from cantools.database import Database
+from cantools.database.can import Message
+
+from brokk_rl.errors import ConfigError, choices
+from brokk_rl.machine import Machine
+from deploy.bus.protection import Fault, crc8
+
+COUNTER, CRC = "Counter", "Crc"
+PC, GATEWAY, REMOTE = "PC", "GATEWAY", "REMOTE"
+LEVER_AXES = ("left_theta", "left_psi", "right_theta", "right_psi")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One message of the bus.
+
+    Attributes:
+        name: Its name.
+        frame_id: Its identifier.
+        extended: Whether that has 29 bits.
+        length: Number of data bytes.
+        period_s: Nominal time between two of them; 0: not sent by the clock.
+        sender: The node that sends it.
+        data_id: Goes into the CRC; `None`: not protected.
+        crc_byte: Where the CRC stands.
+        modulus: The counter counts 0 … modulus - 1.
+    """
+
+    name: str
+    frame_id: int
+    extended: bool
+    length: int
+    period_s: float
+    sender: str
+    data_id: int | None
+    crc_byte: int
+    modulus: int
+
+
+class Description:
+    """A DBC, checked against a machine.
+
+    Args:
+        name: Path of the DBC, or `package:path` for one that ships with a package.
+        machine: Gives the joints.
+
+    Attributes:
+        layouts: Messages by name.
+        by_id: The same by identifier.
+
+    Raises:
+        ConfigError: there is no such file, it is no DBC, or it lacks a signal.
+    """
+
+    def __init__(self, name: str, machine: Machine) -> None:
+        self.name = name
+        self._database = _load(name)
+        self._messages: dict[str, Message] = {message.name: message for message in self._database.messages}
+        self.layouts = {message.name: _layout(message, name) for message in self._database.messages}
+        self.by_id = {layout.frame_id: layout for layout in self.layouts.values()}
+        self._home = {signal.name: message.name for message in self._database.messages for signal in message.signals}
+        required = [f"{what}_{joint}" for what in ("Command", "Position", "Valid", "Flow") for joint in machine.joint_names]
+        required += [f"Lever_{axis}" for axis in LEVER_AXES]
+        required += ["CommandMode", "ButtonRight", "DeadMan", "RemoteOn", "EStop", "ExclusiveSelected"]
+        for signal in required:
+            if signal not in self._home:
+                raise ConfigError(f"bus: {name} has no signal '{signal}', which machine '{machine.name}' needs")
+        self.command = self.layouts[self.message_of(f"Command_{machine.joint_names[0]}")]
+        """The message with the valve commands."""
+
+    def message_of(self, signal: str) -> str:
+        """Returns the message in which `signal` travels.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        if signal not in self._home:
+            raise ConfigError(f"bus: {self.name} has no signal '{signal}'; {choices(signal, self._home)}")
+        return self._home[signal]
+
+    def signals(self, message: str) -> list[str]:
+        """Returns the names of the signals of `message`, without counter and CRC."""
+        return [signal.name for signal in self._messages[message].signals if signal.name not in (COUNTER, CRC)]
+
+    def unit(self, message: str, signal: str) -> str:
+        """Returns the unit of a signal, '' for none."""
+        return self._messages[message].get_signal_by_name(signal).unit or ""
+
+    def sent_by(self, node: str) -> list[Layout]:
+        """Returns what `node` sends."""
+        return [layout for layout in self.layouts.values() if layout.sender == node]
+
+    def encode(self, name: str, values: Mapping[str, float], counter: int) -> bytes:
+        """Returns the data of message `name`; signals that `values` leaves out are 0. Counter and CRC are put in here."""
+        layout, message = self.layouts[name], self._messages[name]
+        data = {signal.name: values.get(signal.name, 0) for signal in message.signals}
+        if layout.data_id is None:
+            return message.encode(data)
+        encoded = bytearray(message.encode(data | {COUNTER: counter % layout.modulus, CRC: 0}))
+        encoded[layout.crc_byte] = crc8(encoded, layout.data_id)
+        return bytes(encoded)
+
+    def decode(self, layout: Layout, data: bytes) -> dict[str, float] | Fault:
+        """Returns the signals of a message, its counter among them, or what is wrong with it."""
+        if len(data) != layout.length:
+            return Fault.LENGTH
+        if layout.data_id is not None:
+            plain = bytearray(data)
+            plain[layout.crc_byte] = 0
+            if crc8(plain, layout.data_id) != data[layout.crc_byte]:
+                return Fault.CRC
+        decoded = self._messages[layout.name].decode(data, decode_choices=False)
+        assert isinstance(decoded, dict)
+        return {name: float(value) for name, value in decoded.items()}  # type: ignore[arg-type]
+
+
+def located(name: str) -> Path:
+    """Returns the path of a file: a path, or `package:path` within an installed package."""
+    package, colon, inside = name.partition(":")
+    if not colon or Path(name).exists():
+        return Path(name)
+    try:
+        return Path(str(resources.files(package))) / inside
+    except (ModuleNotFoundError, ValueError, TypeError) as error:
+        raise ConfigError(f"{name}: there is no package '{package}' ({error}); give a path, or package:path") from error
+
+
+def _load(name: str) -> Database:
+    path = located(name)
+    try:
+        database = cantools.database.load_file(path)
+    except OSError as error:
+        raise ConfigError(f"bus.dbc={name}: cannot be read ({error.strerror or error})") from error
+    except (cantools.database.Error, ValueError) as error:
+        raise ConfigError(f"bus.dbc={name}: no valid DBC ({error})") from error
+    if not isinstance(database, Database):
+        raise ConfigError(f"bus.dbc={name}: no CAN database")
+    return database
+
+
+def _layout(message: Message, dbc: str) -> Layout:
+    signals = {signal.name: signal for signal in message.signals}
+    attribute = message.dbc.attributes.get("E2EDataId") if message.dbc else None
+    data_id, crc_byte, modulus = None, 0, 1
+    if attribute is not None:
+        counter, crc = signals.get(COUNTER), signals.get(CRC)
+        if counter is None or crc is None or crc.length != 8 or crc.start % 8 or crc.byte_order != "little_endian":
+            raise ConfigError(
+                f"bus: message {message.name} of {dbc} has E2EDataId; it needs {COUNTER}, and {CRC} of one whole byte"
+            )
+        data_id, crc_byte, modulus = int(attribute.value), crc.start // 8, 1 << counter.length
+    return Layout(
+        name=message.name,
+        frame_id=message.frame_id,
+        extended=message.is_extended_frame,
+        length=message.length,
+        period_s=(message.cycle_time or 0) / 1e3,
+        sender=message.senders[0] if message.senders else "",
+        data_id=data_id,
+        crc_byte=crc_byte,
+        modulus=modulus,
+    )

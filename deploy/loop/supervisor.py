@@ -1,0 +1,198 @@
+"""The parent of the loop: starts bus, policy and log, watches over them, shows what the outlet says, reports on timing.
+
+A child that dies is not started again in secret: bus or policy end the run with an error, a dead log is an alarm beside which
+guidance goes on. Whoever dies, the gateway goes to zero flow by itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+
+from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session, write_json
+from brokk_rl.spec import spec
+from deploy.bus.description import Description
+from deploy.bus.wire import Wire
+from deploy.guard import Limits
+from deploy.guidance import Guidance, LeverMap
+from deploy.loop.outlet import view
+from deploy.loop.process import Child
+from deploy.loop.records import Exchange
+from deploy.loop.station import Setting
+from deploy.loop.target import Target, TargetSource
+from deploy.loop.terminal import table
+from deploy.policy.adviser import Counsel
+from deploy.policy.bundle import Bundle
+from deploy.recorder.capture import Capture
+
+log = logging.getLogger(__name__)
+
+PROCESSES, TIMING = "processes.json", "timing.json"
+WATCH_S = 0.05
+PATIENCE_S = 3.0
+BUS_PRIORITY, POLICY_PRIORITY = 55, 50
+
+
+@spec
+class Loop:
+    """The loop on the machine: listens, advises, records; commands valves only where `commands` says so.
+
+    Attributes:
+        wire: The bus.
+        dbc: Its description.
+        limits: Of the guard.
+        guidance: How advice is shown.
+        policy: Policy bundle.
+        target: Where the borehole is.
+        target_s: Age of the borehole from which there is no advice.
+        pitch_rad: Wanted pitch of the tool, for policies that ask for one; else `null`.
+        commands: Whether the policy's advice is sent to the valves. `false`: nothing is ever sent.
+        armed: Whether sending is armed from the beginning; the dead-man must be held all the same.
+        record: Whether everything is recorded.
+        realtime: Whether to ask for real-time priority.
+        seconds: When to stop; `null`: when told to.
+        show: Whether to show levers and state in the terminal.
+    """
+
+    wire: Wire
+    dbc: str
+    limits: Limits
+    guidance: Guidance
+    policy: str
+    target: TargetSource
+    target_s: float
+    pitch_rad: float | None
+    commands: bool
+    armed: bool
+    record: bool
+    realtime: bool
+    seconds: float | None
+    show: bool
+
+    def check(self) -> None:
+        if self.armed and not self.commands:
+            raise ConfigError("deploy.armed: nothing is ever sent in this mode; deploy=auto sends the policy's commands")
+        if self.seconds is not None and self.seconds <= 0:
+            raise ConfigError(f"deploy.seconds: expected more than 0, or null, got {self.seconds}")
+
+    def run(self, machine: Machine, session: Session, companions: Sequence[Companion]) -> None:
+        """Runs until the time is over or a person stops it; leaves `processes.json` and `timing.json`.
+
+        Args:
+            machine: The machine.
+            session: Where to write.
+            companions: Further processes: the twin and a simulated operator of a bench.
+
+        Raises:
+            CheckpointError: the policy cannot be used on this machine.
+            ConfigError: bus description or levers do not fit the machine.
+            LinkError: bus or policy process died.
+        """
+        Description(self.dbc, machine)  # refused here, before anything runs
+        full_rad = float(LeverMap(self.guidance.levers or machine.levers, machine).full_rad.max())
+        Bundle(self.policy, machine)
+        exchange = Exchange.new(machine.num_joints, self.commands)
+        children = _Children(exchange)
+        try:
+            for companion in companions:
+                children.start(companion.name, companion.target, companion.arguments, None)
+            self._start(children, machine, session)
+            write_json(session.folder / PROCESSES, children.pids)
+            self._watch(children, exchange, full_rad)
+        except KeyboardInterrupt:
+            log.info("stopping")
+        finally:
+            children.end()
+            _report(exchange, session)
+            exchange.close()
+
+    def _start(self, children: _Children, machine: Machine, session: Session) -> None:
+        setting = Setting(self.wire, self.dbc, machine, self.limits)
+        counsel = Counsel(machine, self.policy, self.guidance, self.limits.joints_s, self.target_s, self.pitch_rad)
+        children.start("bus", "deploy.loop.station:run", (setting,), BUS_PRIORITY if self.realtime else None)
+        children.start("policy", "deploy.policy.adviser:run", (counsel,), POLICY_PRIORITY if self.realtime else None)
+        if self.record:
+            facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
+            children.start("log", "deploy.recorder.capture:run", (Capture(session.folder, self.dbc, machine, facts),), None)
+
+    def _watch(self, children: _Children, exchange: Exchange, full_rad: float) -> None:
+        """Shows, refreshes the borehole and looks after the children until it is time to stop."""
+        target, end_s = self.target.build(), None if self.seconds is None else time.monotonic() + self.seconds
+        with contextlib.ExitStack() as stack:
+            live = stack.enter_context(Live(console=Console(stderr=True), refresh_per_second=10)) if self.show else None
+            while end_s is None or time.monotonic() < end_s:
+                self._refresh(target, exchange)
+                controls = exchange.controls.new()
+                controls["t_s"], controls["armed"] = time.monotonic(), self.armed
+                exchange.controls.write(controls)
+                children.check()
+                if live is not None:
+                    live.update(table(view(exchange), full_rad))
+                time.sleep(WATCH_S)
+
+    def _refresh(self, target: Target, exchange: Exchange) -> None:
+        """Takes over news of the borehole; a file that makes no sense costs an alarm, not the run."""
+        try:
+            target.refresh(exchange.target)
+        except ConfigError as error:
+            log.error("%s", error)
+
+
+@dataclass(frozen=True)
+class Companion:
+    """A further process of a bench: `module:function`, called as `function(stop, *arguments, exchange)`."""
+
+    name: str
+    target: str
+    arguments: tuple[Any, ...]
+
+
+@dataclass
+class _Children:
+    exchange: Exchange
+    running: list[Child] = field(default_factory=list)
+
+    @property
+    def pids(self) -> dict[str, int]:
+        return {child.name: child.pid for child in self.running}
+
+    def start(self, name: str, target: str, arguments: tuple[Any, ...], realtime: int | None) -> None:
+        self.running.append(Child(name, target, (*arguments, self.exchange), self.exchange.files, realtime))
+
+    def check(self) -> None:
+        for child in list(self.running):
+            if child.code is None:
+                continue
+            self.running.remove(child)
+            if child.name == "log":
+                log.error("ALARM: the log has died (exit code %s); nothing is recorded any more", child.code)
+            else:
+                raise LinkError(f"the {child.name} process has died (exit code {child.code}); what it said stands above")
+
+    def end(self) -> None:
+        """Ends policy before bus before log, so that each can say goodbye to the next; companions last."""
+        order = {"policy": 0, "bus": 1, "log": 2}
+        for child in sorted(self.running, key=lambda child: order.get(child.name, 3)):
+            child.end(PATIENCE_S)
+
+
+def _report(exchange: Exchange, session: Session) -> None:
+    """Writes `timing.json`, how each process kept its time, and says it in a line each."""
+    reports = [json.loads(text) for text in exchange.reports.take()]
+    for one in reports:
+        log.info(
+            "%s: %d cycles of %.0f ms, %d missed, late by %.1f ms (99 %%), %.1f ms at most",
+            one["process"], one["cycles"], 1e3 * one["period_s"], one["missed"], 1e3 * one["late_p99_s"], 1e3 * one["late_max_s"],
+        )  # fmt: skip
+    dropped = exchange.bus_log.dropped + exchange.policy_log.dropped
+    write_json(session.folder / TIMING, {"processes": reports, "log_dropped": dropped, "last": view(exchange).plain()})

@@ -1,0 +1,135 @@
+"""A policy bundle, as a trainer leaves it: `policy.onnx`, `policy.json` (the contract) and `golden.json` (what it must answer).
+
+The file holds everything from the observation vector to the masked command. It is refused when it was made for another machine,
+joint order, history or rate, when contract and file do not belong together, or when it answers otherwise here than where it was
+made.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+from brokk_rl.errors import CheckpointError
+from brokk_rl.machine import Machine
+from brokk_rl.observation import Encoder, Scaling
+from deploy.bus.description import located
+
+CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
+SCHEMA = 1
+TOLERANCE = 1e-3
+"""Largest difference of a command (of full) to the golden answers; that of the export."""
+
+
+class Bundle:
+    """A policy ready to act.
+
+    Args:
+        folder: Folder of the bundle, or `package:path`.
+        machine: The machine it is to act on.
+
+    Attributes:
+        encoder: The training's own observation code, with the bundle's scaling.
+        contract: What `policy.json` says.
+
+    Raises:
+        CheckpointError: see the module; the message says what differs.
+    """
+
+    def __init__(self, folder: str, machine: Machine) -> None:
+        place = located(folder)
+        self.contract = _read(place / CONTRACT, folder)
+        _check_contract(self.contract, machine, folder)
+        observation = self.contract["observation"]
+        pitch = observation.get("pitch")
+        scaling = Scaling(
+            target_mean_m=observation["target"]["mean_m"],
+            target_std_m=observation["target"]["std_m"],
+            pitch_rad=(pitch["mean_rad"], pitch["std_rad"]) if pitch else None,
+        )
+        self.encoder = Encoder(machine, scaling, with_proposals=any("proposals" in part for part in observation["order"]))
+        expected = self.encoder.describe()
+        for key, value in expected.items():
+            if key != "size" and _differs(value, observation.get(key)):
+                raise CheckpointError(
+                    f"{folder}: the policy was told its observations otherwise ('{key}': {observation.get(key)}, here {value}); "
+                    "train or export it again for this machine and version"
+                )
+        self._session = _session(place / ONNX, folder, self.contract)
+        wanted = self._session.get_inputs()[0].shape[-1]
+        if not expected["size"] == observation["size"] == wanted:
+            raise CheckpointError(
+                f"{folder}: an observation has {expected['size']} numbers here, {observation['size']} in the contract and {wanted} "
+                f"in {ONNX}; history or joints differ"
+            )
+        self._check_golden(_read(place / GOLDEN, folder), folder)
+
+    def command(self, observation: np.ndarray) -> np.ndarray:
+        """Returns masked commands, `(B, J)`, for observation vectors, `(B, O)`."""
+        return np.asarray(self._session.run(None, {"observation": observation.astype(np.float32)})[0])
+
+    def _check_golden(self, golden: dict[str, Any], folder: str) -> None:
+        observations, expected = np.array(golden["observation"], np.float32), np.array(golden["command"], np.float32)
+        for one, answer in zip(observations, expected, strict=True):
+            found = self.command(one[None])[0]
+            if found.shape != answer.shape or not np.abs(found - answer).max() <= TOLERANCE:
+                raise CheckpointError(
+                    f"{folder}: the policy answers {found.round(4)} where {answer.round(4)} is expected ({GOLDEN}); the bundle is "
+                    "mixed or damaged: export it again (mode=export)"
+                )
+
+
+def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> None:
+    if contract.get("schema") != SCHEMA:
+        raise CheckpointError(f"{folder}: the contract has schema {contract.get('schema')}, expected {SCHEMA}")
+    machine.check_fingerprint(contract.get("fingerprint", {}), f"the policy in {folder}")
+    facts = {
+        "joints": list(machine.joint_names), "exclusive": list(machine.exclusive), "rate_hz": 1 / machine.period_s,
+        "dead_time_s": machine.dead_time_s,
+    }  # fmt: skip
+    for name, here in facts.items():
+        if _differs(here, contract.get(name)):
+            raise CheckpointError(f"{folder}: the policy's {name} is {contract.get(name)}, that of machine '{machine.name}' {here}")
+    if contract.get("command", {}).get("order") != list(machine.joint_names) or not contract["command"].get("masked"):
+        raise CheckpointError(f"{folder}: expected masked commands in the order {', '.join(machine.joint_names)}")
+
+
+def _differs(mine: Any, other: Any) -> bool:
+    """Says whether two pieces of plain data differ by more than rounding."""
+    if isinstance(mine, dict):
+        return not isinstance(other, dict) or mine.keys() != other.keys() or any(_differs(mine[k], other[k]) for k in mine)
+    if isinstance(mine, (list, tuple)):
+        return not isinstance(other, list) or len(mine) != len(other) or any(map(_differs, mine, other))
+    if isinstance(mine, (int, float)) and isinstance(other, (int, float)):
+        return abs(mine - other) > 1e-6
+    return mine != other
+
+
+def _read(path: Path, folder: str) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        hint = "export it again (mode=export)" if path.parent.is_dir() else "give the folder of a trained policy"
+        raise CheckpointError(f"policy {folder}: {path.name} is missing; {hint}") from None
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"policy {folder}: {path.name} cannot be read ({error}); export it again (mode=export)") from error
+
+
+def _session(path: Path, folder: str, contract: dict[str, Any]) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # a pool of threads would only wake up late
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+    except FileNotFoundError:
+        raise CheckpointError(f"policy {folder}: {ONNX} is missing; export it (mode=export)") from None
+    except Exception as error:  # onnxruntime's errors have no base of their own
+        raise CheckpointError(f"policy {folder}: {ONNX} is damaged or truncated ({str(error).splitlines()[0]})") from error
+    said = session.get_modelmeta().custom_metadata_map.get("brokk.fingerprint")
+    if said is None or json.loads(said) != contract["fingerprint"]:
+        raise CheckpointError(f"policy {folder}: {CONTRACT} and {ONNX} do not belong together; export it again (mode=export)")
+    return session

@@ -1,0 +1,186 @@
+"""The log process: writes what bus and policy hand over, and puts it safely on the disk twice a second.
+
+MCAP holds every decoded message as a JSON topic of its name, and `advice`, `guard`, `fault`, `bus`, `timing`; BLF holds the frames
+as they were, for any tool that reads it. Times are monotonic ones plus one constant, so that a step of the wall clock shows
+nowhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+from can.io.blf import BLFWriter
+from mcap.writer import CompressionType, Writer
+
+from brokk_rl.errors import StorageError
+from brokk_rl.machine import Machine
+from deploy.bus.description import Description, Layout, located
+from deploy.bus.protection import Fault
+from deploy.loop.process import Stop
+from deploy.loop.records import Exchange, wall_offset_ns
+from deploy.loop.station import FRAME, FRAMES
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.05
+FLUSH_S = 0.5
+"""What even a power failure costs at most."""
+MCAP, BLF = "capture.mcap", "frames.blf"
+FACTS = "brokk"
+"""Name of the metadata record."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What a log process is to do.
+
+    Attributes:
+        folder: Where to.
+        dbc: The bus description.
+        machine: The machine.
+        facts: Further metadata: `source`, `policy`, …
+    """
+
+    folder: Path
+    dbc: str
+    machine: Machine
+    facts: dict[str, str]
+
+
+def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
+    """Runs until it is asked to stop, then takes what is left.
+
+    Raises:
+        StorageError: the disk is full, or the files cannot be written; what was written stays readable.
+    """
+    try:
+        with Log(capture) as target:
+            while not (stop() and not exchange.bus_log.waiting and not exchange.policy_log.waiting):
+                for pipe in (exchange.bus_log, exchange.policy_log):
+                    for data in pipe.take():
+                        target.add(data)
+                target.flush_when_due()
+                time.sleep(POLL_S)
+    except OSError as error:
+        raise StorageError(f"log: {error.strerror or error} ({capture.folder}); nothing more is recorded") from error
+
+
+class DurableBlf(BLFWriter):
+    """A BLF whose header is true at any time, not only after it was closed."""
+
+    def flush(self) -> None:
+        """Writes what is buffered, and the header."""
+        self._flush()
+        end = self.file.tell()
+        self.file.seek(0)
+        self._write_header(end)
+        self.file.seek(end)
+        self.file.flush()
+
+
+class Log:
+    """Both files; a context manager."""
+
+    def __init__(self, capture: Capture) -> None:
+        self._description = Description(capture.dbc, capture.machine)
+        self._offset_ns = wall_offset_ns()
+        capture.folder.mkdir(parents=True, exist_ok=True)
+        self._mcap_file = (capture.folder / MCAP).open("wb")
+        self._mcap = Writer(self._mcap_file, compression=CompressionType.ZSTD)
+        self._mcap.start(profile="brokk", library="brokk-rl")
+        machine = capture.machine
+        facts = {
+            "schema": "1", "machine": machine.name, "fingerprint": json.dumps(machine.fingerprint()), "dbc": capture.dbc,
+            "started_ns": str(time.time_ns()),
+        }  # fmt: skip
+        self._mcap.add_metadata(FACTS, facts | capture.facts)
+        now_ns = time.time_ns()
+        self._mcap.add_attachment(now_ns, now_ns, Path(capture.dbc).name, "text/plain", located(capture.dbc).read_bytes())
+        self._blf = DurableBlf(capture.folder / BLF)
+        self._channels: dict[str, int] = {}
+        self._sequence: dict[str, int] = {}
+        self._flushed_s = time.monotonic()
+
+    def add(self, data: bytes) -> None:
+        """Takes one record of a pipe."""
+        if data[:1] == FRAMES:
+            for t_s, frame_id, sent, payload in _frames(data[1:]):
+                self._add_frame(t_s, frame_id, sent, payload)
+        else:
+            values = json.loads(data[1:])
+            self._write(values.pop("topic"), values.pop("t_s"), values)
+
+    def flush_when_due(self) -> None:
+        """Puts everything on the disk, twice a second."""
+        now_s = time.monotonic()
+        if now_s - self._flushed_s >= FLUSH_S:
+            self._flushed_s = now_s
+            self.flush()
+
+    def flush(self) -> None:
+        """Puts everything on the disk."""
+        self._mcap.flush()
+        self._blf.flush()
+        os.fsync(self._mcap_file.fileno())
+        os.fsync(self._blf.file.fileno())
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        with contextlib.suppress(OSError):  # the disk may be full; what was flushed is whole
+            self._mcap.finish()
+            self._blf.stop()
+        with contextlib.suppress(OSError):
+            self._mcap_file.close()
+
+    def _add_frame(self, t_s: float, frame_id: int, sent: bool, payload: bytes) -> None:
+        wall_s = (int(t_s * 1e9) + self._offset_ns) / 1e9
+        layout = self._description.by_id.get(frame_id)
+        extended = layout.extended if layout else frame_id > 0x7FF
+        self._blf.on_message_received(
+            can.Message(
+                timestamp=wall_s, arbitration_id=frame_id, data=payload, is_extended_id=extended, is_rx=not sent, check=False
+            )
+        )
+        if layout is None:
+            return
+        values = self._description.decode(layout, payload)
+        if isinstance(values, Fault):
+            self._write("refused", t_s, {"message": layout.name, "fault": values.value, "data": payload.hex()})
+        else:
+            self._write(layout.name, t_s, values | {"sent": sent}, layout)
+
+    def _write(self, topic: str, t_s: float, values: dict[str, Any], layout: Layout | None = None) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = self._mcap.register_channel(topic, "json", self._schema(topic, layout))
+            self._sequence[topic] = 0
+        self._sequence[topic] += 1
+        wall_ns = int(t_s * 1e9) + self._offset_ns
+        text = json.dumps({"t_s": t_s, **values}).encode()
+        self._mcap.add_message(self._channels[topic], wall_ns, text, wall_ns, self._sequence[topic])
+
+    def _schema(self, topic: str, layout: Layout | None) -> int:
+        properties: dict[str, Any] = {"t_s": {"type": "number", "description": "monotonic time in s"}}
+        for signal in self._description.signals(layout.name) if layout else ():
+            properties[signal] = {"type": "number", "description": self._description.unit(layout.name, signal) if layout else ""}
+        schema = {"title": topic, "type": "object", "properties": properties}
+        return self._mcap.register_schema(topic, "jsonschema", json.dumps(schema).encode())
+
+
+def _frames(data: bytes) -> Iterator[tuple[float, int, bool, bytes]]:
+    at = 0
+    while at < len(data):
+        t_s, frame_id, sent, length = FRAME.unpack_from(data, at)
+        at += FRAME.size
+        yield t_s, frame_id, bool(sent), data[at : at + length]
+        at += length

@@ -1,0 +1,167 @@
+"""What a study of two periods says about guidance: effect, interval, tests, and what practice did beside it.
+
+Each person has one figure in each period. `first - second` holds plus or minus the effect of guidance (by who was guided first) and
+the same effect of the period in both sequences, so that half the difference of the sequences' means is guidance and half their sum
+the period (Hills and Armitage, Br. J. Clin. Pharmacol. 8 (1979) 7-20).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize, stats
+
+from brokk_rl.intervals import CONFIDENCE
+from deploy.study import exact
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Guidance against no guidance in one measure; differences are guided minus unguided, `None` where too few persons have both.
+
+    Attributes:
+        num_persons: Persons with both conditions.
+        num_guided_first: Of those, who were guided in the first period.
+        guided: Mean with guidance.
+        unguided: Mean without.
+        difference: Mean difference, paired; what practice did is in it where sequences are unequal.
+        paired_ci95: Student's interval of it.
+        paired_dz: Mean difference over its standard deviation.
+        paired_dz_ci95: Interval from the noncentral t distribution.
+        hodges_lehmann: Median of the means of all pairs of differences.
+        hodges_lehmann_ci95: Exact interval that belongs to the signed-rank test; `None` where there is none of 95 %.
+        paired_p: Exact paired permutation test.
+        wilcoxon_p: Exact signed-rank test.
+        adjusted: Difference with the period in the model.
+        adjusted_ci95: Student's interval of it.
+        dz: The adjusted difference over the standard deviation within sequences.
+        dz_ci95: Interval from the noncentral t distribution.
+        p: Exact test over sequences: the one that counts. `None` where all had the same sequence.
+        period: What the second period is above the first, by practice or fatigue.
+        period_p: Student's test of it.
+        carry_over_p: Student's test of unequal sums of the sequences: what the first period left behind differs. It sees little at
+            such sizes and decides nothing here (Freeman, Stat. Med. 8 (1989) 1421-1432).
+    """
+
+    num_persons: int
+    num_guided_first: int
+    guided: float | None = None
+    unguided: float | None = None
+    difference: float | None = None
+    paired_ci95: Interval | None = None
+    paired_dz: float | None = None
+    paired_dz_ci95: Interval | None = None
+    hodges_lehmann: float | None = None
+    hodges_lehmann_ci95: Interval | None = None
+    paired_p: float | None = None
+    wilcoxon_p: float | None = None
+    adjusted: float | None = None
+    adjusted_ci95: Interval | None = None
+    dz: float | None = None
+    dz_ci95: Interval | None = None
+    p: float | None = None
+    period: float | None = None
+    period_p: float | None = None
+    carry_over_p: float | None = None
+
+
+def effect(guided: np.ndarray, unguided: np.ndarray, guided_first: np.ndarray) -> Effect:
+    """Returns what one measure says.
+
+    Args:
+        guided: One figure a person, `(P,)`; NaN where there is none.
+        unguided: Likewise.
+        guided_first: Who was guided in the first period, `(P,)` bool.
+    """
+    both = ~(np.isnan(guided) | np.isnan(unguided))
+    guided, unguided, first = guided[both], unguided[both], np.asarray(guided_first, bool)[both]
+    num, num_first = len(guided), int(first.sum())
+    facts: dict = {}
+    if num:
+        facts |= {"guided": float(guided.mean()), "unguided": float(unguided.mean())}
+    if num >= 2:
+        facts |= _paired(guided - unguided)
+    if min(num_first, num - num_first) >= 2:
+        facts |= _adjusted(np.where(first, guided - unguided, unguided - guided), guided + unguided, first)
+    return Effect(num_persons=num, num_guided_first=num_first, **facts)
+
+
+def _paired(difference: np.ndarray) -> dict:
+    num, mean, std = len(difference), float(difference.mean()), float(difference.std(ddof=1))
+    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, num - 1)) * std / math.sqrt(num)
+    facts = {
+        "difference": mean,
+        "paired_ci95": (mean - half, mean + half),
+        "paired_p": float(exact.paired_p(difference)),
+        "wilcoxon_p": float(exact.wilcoxon_p(difference)),
+        "hodges_lehmann": hodges_lehmann(difference)[0],
+        "hodges_lehmann_ci95": hodges_lehmann(difference)[1],
+    }
+    if std > 0:
+        facts |= {"paired_dz": mean / std, "paired_dz_ci95": dz_interval(mean / std, math.sqrt(num), num - 1)}
+    return facts
+
+
+def _adjusted(period_difference: np.ndarray, total: np.ndarray, first: np.ndarray) -> dict:
+    before, after = period_difference[first], period_difference[~first]
+    shape = math.sqrt(1 / len(before) + 1 / len(after))
+    free = len(first) - 2
+    std = math.sqrt((before.var(ddof=1) * (len(before) - 1) + after.var(ddof=1) * (len(after) - 1)) / free)
+    guidance, period = (before.mean() - after.mean()) / 2, -(before.mean() + after.mean()) / 2
+    error = std * shape / 2
+    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, free)) * error
+    facts = {
+        "adjusted": float(guidance),
+        "adjusted_ci95": (float(guidance - half), float(guidance + half)),
+        "p": float(exact.sequence_p(period_difference, first)),
+        "period": float(period),
+    }
+    if std > 0:
+        facts |= {
+            "dz": float(guidance / std),
+            "dz_ci95": dz_interval(float(guidance / std), 2 / shape, free),
+            "period_p": float(2 * stats.t.sf(abs(period / error), free)),
+        }
+    if total[first].var() + total[~first].var() > 0:
+        facts["carry_over_p"] = float(stats.ttest_ind(total[first], total[~first]).pvalue)
+    return facts
+
+
+def dz_interval(dz: float, scale: float, free: int) -> Interval:
+    """Returns the 95 % interval of a standardised mean difference.
+
+    The noncentralities under which t is just as far out as it may be (Cumming and Finch, Educ. Psychol. Meas. 61 (2001) 532-574).
+
+    Args:
+        dz: Mean over standard deviation.
+        scale: t over dz: the root of the number of persons, for a paired difference.
+        free: Degrees of freedom.
+    """
+    t = dz * scale
+
+    def bound(level: float) -> float:
+        low, high = t - 10.0 - abs(t), t + 10.0 + abs(t)
+        return float(optimize.brentq(lambda shift: stats.nct.cdf(t, free, shift) - level, low, high)) / scale  # type: ignore[arg-type]
+
+    return bound(0.5 + CONFIDENCE / 2), bound(0.5 - CONFIDENCE / 2)
+
+
+def hodges_lehmann(difference: np.ndarray) -> tuple[float, Interval | None]:
+    """Returns the median of the means of all pairs, and its exact 95 % interval, `None` where so few persons allow none.
+
+    Source: Hollander, Wolfe and Chicken, Nonparametric Statistical Methods, 2014, sections 3.2 and 3.3.
+    """
+    num = len(difference)
+    rows, columns = np.triu_indices(num)
+    means = np.sort((difference[rows] + difference[columns]) / 2)
+    ways = np.ones(1)  # in how many ways ranks 1 … n add up to each sum
+    for rank in range(1, num + 1):
+        ways = np.concatenate((ways, np.zeros(rank))) + np.concatenate((np.zeros(rank), ways))
+    below = np.cumsum(ways) / 2.0**num
+    cut = int(np.searchsorted(below, (1 - CONFIDENCE) / 2 + 1e-12, side="right"))  # sums so small occur in less than 2.5 %
+    interval = (float(means[cut - 1]), float(means[len(means) - cut])) if cut else None
+    return float(np.median(means)), interval

@@ -1,0 +1,190 @@
+"""Who does what when: sequences drawn by lot, holes and starts in Latin squares, practice before.
+
+A participant does a few trials in each of two periods, one with guidance and one without. Which comes first is drawn, in pairs
+of participants, so that at no time one sequence is two ahead. Within a period every hole and every start occurs once, and over
+participants each stands at every place of the period equally often: neither a hard hole nor practice favours a condition.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+CONDITIONS = ("guided", "unguided")
+PERIODS = (1, 2)
+
+
+@spec
+class Hole:
+    """A borehole of the study, measured in the machine's base frame.
+
+    Attributes:
+        center_in_base_m: Centre of its rim.
+        radius_m: Its radius.
+    """
+
+    center_in_base_m: tuple[float, float, float]
+    radius_m: float
+
+
+@spec
+class Success:
+    """When the chisel counts as inserted, as in the project's strict criterion.
+
+    Attributes:
+        depth_m: Depth of the tip below the rim.
+        clearance_m: Distance from the hole's axis within which the tip is inside: radius of the hole less that of the chisel.
+    """
+
+    depth_m: float
+    clearance_m: float
+
+
+@spec
+class Design:
+    """What a study is planned with.
+
+    Attributes:
+        num_participants: Participants to invite.
+        order: `counterbalanced`, or `fixed` with guidance first for all, as in the paper; then order and guidance cannot
+            be told apart.
+        holes: Boreholes by name, one trial each in each period.
+        starts: Joint positions from which trials begin, by name, as many as holes; rad or m.
+        practice_trials: Trials before the first period that do not count, half of them with guidance, until two in a row succeed.
+        practice_minutes: Time for it.
+        limit_s: Time after which a trial ends; a trial without insertion counts with this time.
+        success: When the tool is in.
+        primary: The one measure that decides, named beforehand.
+        alpha: Level of the tests.
+    """
+
+    num_participants: int
+    order: Literal["counterbalanced", "fixed"]
+    holes: dict[str, Hole]
+    starts: dict[str, tuple[float, ...]]
+    practice_trials: int
+    practice_minutes: float
+    limit_s: float
+    success: Success
+    primary: str
+    alpha: float
+
+    def check(self) -> None:
+        if self.num_participants < 2:
+            raise ConfigError(f"study.design.num_participants: expected 2 or more, got {self.num_participants}")
+        if len(self.holes) != len(self.starts) or len(self.holes) < 2:
+            raise ConfigError(
+                "study.design: expected as many starts as holes, 2 or more, "
+                f"got {len(self.holes)} holes and {len(self.starts)} starts"
+            )
+        if not 0 < self.alpha < 1:
+            raise ConfigError(f"study.design.alpha: expected a level between 0 and 1, got {self.alpha}")
+
+    def check_machine(self, machine: Machine) -> None:
+        """Raises a `ConfigError` that names the start which the machine cannot take."""
+        for name, q in self.starts.items():
+            if len(q) != machine.num_joints:
+                raise ConfigError(f"study.design.starts.{name}: expected {machine.num_joints} positions, got {len(q)}")
+            for joint, value in zip(machine.joints, q, strict=True):
+                if not joint.lower.value <= value <= joint.upper.value:
+                    raise ConfigError(
+                        f"study.design.starts.{name}: {joint.name} = {value} lies outside "
+                        f"[{joint.lower.value}, {joint.upper.value}]"
+                    )
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial to be done.
+
+    Attributes:
+        participant: Pseudonym.
+        period: 1 or 2; 0 for practice.
+        condition: `guided` or `unguided`.
+        number: Within the period, from 1.
+        hole: Name of the hole.
+        start: Name of the start.
+    """
+
+    participant: str
+    period: int
+    condition: str
+    number: int
+    hole: str
+    start: str
+
+    @property
+    def name(self) -> str:
+        """Name of its files."""
+        return f"{self.participant}_{self.period}_{self.number:02d}"
+
+
+def pseudonyms(count: int) -> list[str]:
+    """Returns `P01`, `P02`, …: the only names that a study knows."""
+    width = max(2, len(str(count)))
+    return [f"P{number:0{width}d}" for number in range(1, count + 1)]
+
+
+def sequences(design: Design, generator: np.random.Generator) -> dict[str, tuple[str, str]]:
+    """Returns the two conditions of each participant in order, drawn in blocks of two."""
+    drawn: list[tuple[str, str]] = []
+    for _ in range(math.ceil(design.num_participants / 2)):
+        guided_first = bool(generator.integers(2)) or design.order == "fixed"
+        second_first = guided_first if design.order == "fixed" else not guided_first
+        drawn += [CONDITIONS if first else CONDITIONS[::-1] for first in (guided_first, second_first)]
+    return dict(zip(pseudonyms(design.num_participants), drawn, strict=False))
+
+
+def squares(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns two Latin squares, `(K, K)` each: row `i` is an order of holes and one of starts.
+
+    In each, every entry stands once in every row and column. For odd `K` without divisor 3, and 3 itself, they are orthogonal
+    (every pair of hole and start occurs once over the rows); for even `K` they cannot be made so by shifts, and pairs repeat.
+    """
+    row, place = np.mgrid[:size, :size]
+    factor = next((m for m in range(2, size) if math.gcd(m, size) == math.gcd(m - 1, size) == 1), size - 1)
+    return (row + place) % size, (row + factor * place) % size
+
+
+def trials(design: Design, generator: np.random.Generator) -> list[Trial]:
+    """Returns every trial in the order in which it is to be done, practice first."""
+    holes, starts = list(design.holes), list(design.starts)
+    hole_square, start_square = squares(len(holes))
+    shuffle = [generator.permutation(len(holes)) for _ in range(2)]  # which name stands for which letter of the squares
+    found = []
+    for index, (participant, conditions) in enumerate(sequences(design, generator).items()):
+        for number in range(design.practice_trials):
+            condition = CONDITIONS[number % 2]
+            place = (index + number) % len(holes)
+            found.append(Trial(participant, 0, condition, number + 1, holes[place], starts[(place + 1) % len(starts)]))
+        for period, condition in zip(PERIODS, conditions, strict=True):
+            # both of a pair have the same rows, one with each sequence; the second period has another row than the first
+            row = (index // 2 + (period - 1) * (len(holes) // 2)) % len(holes)
+            for place in range(len(holes)):
+                hole, start = shuffle[0][hole_square[row, place]], shuffle[1][start_square[row, place]]
+                found.append(Trial(participant, period, condition, place + 1, holes[hole], starts[start]))
+    return found
+
+
+def as_json(design: Design, machine: Machine, seed: int, planned: list[Trial]) -> dict[str, Any]:
+    """Returns the plan as it stands in `plan.json`."""
+    conditions = {trial.participant: {} for trial in planned}
+    for trial in planned:
+        if trial.period:
+            conditions[trial.participant][trial.period] = trial.condition
+    return {
+        "schema": 1,
+        "machine": machine.name,
+        "fingerprint": machine.fingerprint(),
+        "seed": seed,
+        "design": asdict(design),
+        "participants": {name: [found[period] for period in PERIODS] for name, found in conditions.items()},
+        "trials": [asdict(trial) for trial in planned],
+    }

@@ -1,0 +1,139 @@
+"""The plan as a page to print: what the numbers can show, the rules, the order of trials of each participant with room for notes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from brokk_rl.report import Cell, Page
+from deploy.study import sample_size
+from deploy.study.design import Design, Trial
+
+RULES = (
+    "Names are pseudonyms (P01, …). Who is who is written on paper, kept apart, and destroyed after the study; "
+    "study.do=erase deletes a participant on request.",
+    "The primary measure is fixed before the first trial; everything else is secondary and corrected for looking at many (Holm).",
+    "A trial ends at insertion, at the time limit, or when the participant or the experimenter stops it; "
+    "nothing is repeated without a note.",
+    "A participant may stop at any time without a reason. What was done until then is kept unless they ask for it to be erased.",
+    "The questionnaire is filled in after each period, before the other begins.",
+)
+
+
+def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: dict[str, Any]) -> Page:
+    """Returns the page.
+
+    Args:
+        design: What was planned with.
+        machine: Name of the machine.
+        seed: Seed of the draw.
+        planned: All trials.
+        errors: How often simulated studies of this plan err; see `deploy.study.study`.
+    """
+    num = design.num_participants
+    can = sample_size.size(num, design.alpha)
+    paired_least, sequence_least = sample_size.least(design.alpha)
+    wanted = sample_size.enough(design.alpha)
+    if design.order == "fixed":
+        summary, tone = "With guidance first for all, order and guidance cannot be told apart, whatever the numbers say.", "bad"
+    elif can.smallest_p > design.alpha:
+        summary, tone = (
+            f"{num} participants cannot reach p < {design.alpha:g}: the smallest possible p is {can.smallest_p:.3f}. It takes "
+            f"{sequence_least} to be able to, and {wanted} to find a large effect (dz 0.8) in four of five studies.",
+            "bad",
+        )
+    else:
+        summary = f"{num} participants find an effect of dz 0.8 in {100 * can.power[1]:.0f} of 100 studies."
+        tone = "good" if can.power[1] >= 0.8 else "warn"
+        summary += "" if tone == "good" else f" {wanted} would find it in four of five."
+    found = Page(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
+    found.facts(
+        {
+            "participants": num,
+            "trials each": f"{len(design.holes)} with guidance, {len(design.holes)} without, {design.practice_trials} of practice before",
+            "order": design.order,
+            "primary measure": design.primary,
+            "time limit of a trial": f"{design.limit_s:g} s",
+            "inserted": f"{design.success.depth_m:g} m below the rim, within {1000 * design.success.clearance_m:.0f} mm of the axis",
+            "seed of the draw": seed,
+        }
+    )
+    _numbers(found, design, paired_least, sequence_least)
+    _errors(found, errors)
+    found.heading("Rules")
+    found.items(RULES)
+    found.heading("Places")
+    found.table(
+        ["hole", "x, m", "y, m", "rim z, m", "radius, m"], [[n, *h.center_in_base_m, h.radius_m] for n, h in design.holes.items()]
+    )
+    found.table(
+        ["start", *(f"joint {i + 1}" for i in range(len(next(iter(design.starts.values())))))],
+        [[n, *q] for n, q in design.starts.items()],
+    )
+    found.heading("Order of trials")
+    found.text("A hole and a start a trial, in this order; tick what is done, write down what went otherwise.")
+    _sheets(found, planned)
+    return found
+
+
+def _numbers(found: Page, design: Design, paired_least: int, sequence_least: int) -> None:
+    found.heading("How many participants")
+    found.text(
+        f"An exact paired test cannot go below p = 0.0625 with five participants: such a study "
+        f"can never be significant at 0.05. It takes {paired_least} for that, and {sequence_least} for the test that keeps practice apart from "
+        f"guidance. Power is the share of {sample_size.STUDIES} simulated studies that find the effect; dz is the mean difference in "
+        "standard deviations of it."
+    )
+    columns = [
+        "participants",
+        "smallest p, paired",
+        "smallest p, period in the model",
+        *(f"power at dz {dz:g}" for dz in sample_size.EFFECTS_DZ),
+    ]
+    sizes = sorted({*sample_size.SIZES, design.num_participants})
+    rows = []
+    for size in (sample_size.size(num, design.alpha) for num in sizes):
+        here = size.num_participants == design.num_participants
+        name = Cell(str(size.num_participants), note="this plan" if here else "")
+        rows.append([name, f"{size.smallest_paired_p:.2g}", f"{size.smallest_p:.2g}", *(f"{power:.2f}" for power in size.power)])
+    found.table(columns, rows)
+
+
+def _errors(found: Page, errors: dict[str, Any]) -> None:
+    found.heading("How such a study errs")
+    found.text(
+        "Studies drawn from a fast model of people at work (skill, practice by the power law, holes, chance; no machine), "
+        "analysed as this one will be."
+    )
+    rows = []
+    for entry in errors["studies"]:
+        low, high = entry["ci95"]
+        rows.append(
+            [
+                entry["what"],
+                str(entry["num_participants"]),
+                f"{entry['planted_dz']:g}",
+                Cell(f"{entry['share']:.3f}", f"{low:.3f} to {high:.3f}"),
+            ]
+        )
+    found.table(
+        ["study", "participants", "true dz", "called significant"],
+        rows,
+        f"{errors['studies'][0]['studies']} studies each; below: 95 % interval",
+    )
+
+
+def _sheets(found: Page, planned: list[Trial]) -> None:
+    for participant in dict.fromkeys(trial.participant for trial in planned):
+        mine = [trial for trial in planned if trial.participant == participant]
+        found.heading(participant, 3)
+        columns = ["", *(str(number) for number in range(1, max(trial.number for trial in mine) + 1))]
+        rows = []
+        for period in sorted({trial.period for trial in mine}):
+            here = [trial for trial in mine if trial.period == period]
+            title = "practice" if not period else f"period {period}: {here[0].condition}"
+            cells: list[str | Cell] = [f"{trial.hole} from {trial.start}" for trial in here]
+            if not period:
+                cells = [Cell(f"{trial.hole} from {trial.start}", trial.condition) for trial in here]
+            rows.append([title, *cells, *[""] * (len(columns) - 1 - len(here))])
+            rows.append(["notes", *[""] * (len(columns) - 1)])
+        found.table(columns, rows)

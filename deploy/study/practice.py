@@ -1,0 +1,128 @@
+"""A fast model of people at work: how long a trial takes, with skill, practice, holes, guidance, chance; no machine is simulated.
+
+    log T = log base + skill + hole - learning * log(trial number) + guidance + chance
+
+Practice follows the power law (Newell and Rosenbloom 1981); a trial longer than the limit counts with the limit. Thousands of
+studies can be drawn in a second, so that a plan can say how often it would find what is not there, and miss what is.
+Axes: `S` studies, `P` persons, `K` trials in a period.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import optimize
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.intervals import wilson
+from brokk_rl.spec import spec
+from deploy.study import exact
+
+LARGE = 20_000
+"""Persons from whose times the size of an effect is worked out."""
+
+
+@spec
+class Practice:
+    """How long simulated persons take for a trial; standard deviations are of the logarithm.
+
+    Attributes:
+        base_s: Typical time of the very first trial.
+        skill_sd: Differences between persons.
+        hole_sd: Differences between holes.
+        learning: Exponent of practice: twice as many trials make a trial 2**-learning as long.
+        learning_sd: Differences between persons in it.
+        guidance_sd: Differences between persons in what guidance does.
+        chance_sd: From trial to trial.
+    """
+
+    base_s: float
+    skill_sd: float
+    hole_sd: float
+    learning: float
+    learning_sd: float
+    guidance_sd: float
+    chance_sd: float
+
+    def check(self) -> None:
+        if self.base_s <= 0 or self.chance_sd <= 0:
+            raise ConfigError(f"study.practice: expected base_s and chance_sd above 0, got {self.base_s} and {self.chance_sd}")
+
+    def draw(
+        self, guided_first: np.ndarray, num_trials: int, practised: int, limit_s: float, effect: float, seed: int, studies: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns mean times with and without guidance, `(S, P)` each, s.
+
+        Args:
+            guided_first: Who has guidance in the first period, `(P,)` bool.
+            num_trials: Trials in a period, `K`.
+            practised: Trials before the first period.
+            limit_s: Time after which a trial ends.
+            effect: What guidance adds to the logarithm of the time; below 0 it helps.
+            seed: The same seed gives the same persons whatever the effect.
+            studies: Number of studies.
+        """
+        generator = np.random.default_rng(seed)
+        persons = (studies, len(guided_first), 1, 1)
+        skill = self.skill_sd * generator.standard_normal(persons)
+        learning = self.learning + self.learning_sd * generator.standard_normal(persons)
+        gain = effect + self.guidance_sd * generator.standard_normal(persons)
+        hole = self.hole_sd * generator.standard_normal((studies, 1, 1, num_trials))  # each occurs once in each period
+        chance = self.chance_sd * generator.standard_normal((*persons[:2], 2, num_trials))
+        number = practised + 1 + np.arange(2 * num_trials).reshape(2, num_trials)
+        guided = np.stack((guided_first, ~guided_first), 1)[None, :, :, None]
+        time_s = self.base_s * np.exp(skill + hole + chance - learning * np.log(number) + gain * guided)
+        period = np.minimum(time_s, limit_s).mean(3)
+        first = np.where(guided_first, period[..., 0], period[..., 1])
+        return first, np.where(guided_first, period[..., 1], period[..., 0])
+
+    def effect_of(self, dz: float, num_trials: int, practised: int, limit_s: float) -> float:
+        """Returns the effect with which guidance shortens times by `dz` standard deviations of a person's difference.
+
+        The standard deviation is that within sequences, without what practice does to all.
+        """
+        first = np.arange(LARGE) % 2 == 0
+
+        def found(effect: float) -> float:
+            guided, unguided = self.draw(first, num_trials, practised, limit_s, effect, seed=1)
+            saved = (unguided - guided)[0]
+            spread = np.sqrt((saved[first].var() + saved[~first].var()) / 2)
+            return float((saved[first].mean() + saved[~first].mean()) / 2 / spread) - dz
+
+        return float(optimize.brentq(found, -5.0, 1.0, xtol=1e-4))  # type: ignore[arg-type]
+
+
+def share_significant(
+    practice: Practice,
+    num_persons: int,
+    num_trials: int,
+    practised: int,
+    limit_s: float,
+    dz: float,
+    alpha: float,
+    studies: int,
+    seed: int,
+    fixed: bool = False,
+) -> dict[str, float | list[float]]:
+    """Returns in how many of many studies guidance would be called a help or a harm, with its 95 % interval.
+
+    Args:
+        practice: How persons work.
+        num_persons: Participants of each study.
+        num_trials: Trials in a period.
+        practised: Trials before.
+        limit_s: Time after which a trial ends.
+        dz: What guidance really does; 0: nothing, and every finding is false.
+        alpha: Level of the test.
+        studies: Number of studies.
+        seed: Of the draws.
+        fixed: Guidance first for all, and the paired test, as there is no other; else counterbalanced, period in the model.
+    """
+    first = np.ones(num_persons, bool) if fixed else np.arange(num_persons) < (num_persons + 1) // 2
+    effect = practice.effect_of(dz, num_trials, practised, limit_s) if dz else 0.0
+    guided, unguided = practice.draw(first, num_trials, practised, limit_s, effect, seed, studies)
+    if fixed:
+        p = exact.paired_p(guided - unguided)
+    else:
+        p = exact.sequence_p(np.where(first, guided - unguided, unguided - guided), first)
+    hits = int((p <= alpha).sum())
+    return {"share": hits / studies, "ci95": list(wilson(hits, studies)), "studies": studies}

@@ -1,0 +1,104 @@
+"""The steps of a study, each one command: plan, simulate, report, erase."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any, Literal
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session, write_json
+from brokk_rl.spec import spec
+from deploy.study import design as designs
+from deploy.study import folder as folders
+from deploy.study import plan_page
+from deploy.study.design import Design
+from deploy.study.practice import Practice, share_significant
+
+log = logging.getLogger(__name__)
+
+PLANTED_DZ = 0.8
+"""A large effect, which a plan should be able to find."""
+PAPER_PERSONS = 5
+
+
+@spec
+class Steps:
+    """A study of guidance against no guidance.
+
+    Attributes:
+        do: `plan`, `simulate`, `report` or `erase`.
+        folder: The study's folder; `null`: the run folder, where `plan` and `simulate` begin one.
+        participant: Whom to erase.
+        design: What is planned with.
+        practice: A fast model of people, from which the plan's errors are worked out.
+        num_studies: How many studies are drawn from it.
+    """
+
+    do: Literal["plan", "simulate", "report", "erase"]
+    folder: str | None
+    participant: str | None
+    design: Design
+    practice: Practice
+    num_studies: int
+
+    def run(self, machine: Machine, session: Session, ground: Any) -> None:
+        """Does the step `do`; see `brokk_rl.modes.study.Steps`."""
+        getattr(self, f"_{self.do}")(machine, session, ground)
+
+    def _plan(self, machine: Machine, session: Session, ground: Any) -> None:
+        plan = plan_study(self.design, machine, session)
+        folder = self._home(session)
+        if (folder / folders.PLAN).exists():
+            raise ConfigError(f"{folder} already holds a study; plan another one with study.folder=<folder>")
+        errors = study_errors(self.design, self.practice, self.num_studies, session.stream("study errors"))
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / folders.PLAN, designs.as_json(self.design, machine, session.seed, plan))
+        write_json(folder / "plan_errors.json", errors)
+        page = plan_page.page(self.design, machine.name, session.seed, plan, errors)
+        page.write(folder / "plan.html")
+        for entry in errors["studies"]:
+            log.info(
+                "%s, %d participants, true dz %g: significant in %.3f",
+                entry["what"],
+                entry["num_participants"],
+                entry["planted_dz"],
+                entry["share"],
+            )
+        log.info("planned: %s", folder / "plan.html")
+
+    def _erase(self, machine: Machine, session: Session, ground: Any) -> None:
+        if not self.participant:
+            raise ConfigError("study.do=erase needs study.participant=<pseudonym> and study.folder=<folder>")
+        gone, reports = folders.erase(self._home(session), self.participant)
+        log.info("%s erased: %d files deleted", self.participant, len(gone))
+        for report in reports:
+            log.warning("%s was made with this participant's data: delete it, and make it again with study.do=report", report)
+
+    def _home(self, session: Session) -> Path:
+        return Path(self.folder) if self.folder else session.folder
+
+
+def plan_study(design: Design, machine: Machine, session: Session) -> list[designs.Trial]:
+    """Returns all trials of a new study."""
+    design.check_machine(machine)
+    return designs.trials(design, session.generator("study plan"))
+
+
+def study_errors(design: Design, practice: Practice, num_studies: int, seed: int) -> dict[str, Any]:
+    """Returns how often studies like this one find what is not there and miss what is, beside those with a fixed order."""
+    num, trials = design.num_participants, len(design.holes)
+    cases = [
+        ("no effect, counterbalanced, period in the model", num, 0.0, False),
+        ("large effect, counterbalanced, period in the model", num, PLANTED_DZ, False),
+        ("no effect, guidance first for all, paired test", num, 0.0, True),
+        ("no effect, guidance first for all, paired test: the paper's number", PAPER_PERSONS, 0.0, True),
+    ]
+    found = []
+    for what, persons, dz, fixed in cases:
+        share = share_significant(
+            practice, persons, trials, design.practice_trials, design.limit_s, dz, design.alpha, num_studies, seed, fixed
+        )
+        found.append({"what": what, "num_participants": persons, "planted_dz": dz, "fixed_order": fixed, **share})
+    return {"schema": 1, "alpha": design.alpha, "seed": seed, "studies": found}

@@ -1,0 +1,44 @@
+"""A desk instead of a machine: the twin, and an operator at its remote who follows the advice as the configured person does."""
+
+from __future__ import annotations
+
+from brokk_rl.contracts import Connection, Follower
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from deploy.guidance import Guidance, LeverMap
+from deploy.loop.supervisor import Companion
+from deploy.twin.twin import Twin
+
+
+@spec
+class Bench:
+    """What stands in for machine and operator.
+
+    Attributes:
+        twin: The twin.
+        plant: The simulated machine behind it.
+        operator: Who moves the levers as they are shown; `null`: nobody, the levers stay in neutral.
+        guidance: How the levers are shown.
+    """
+
+    twin: Twin
+    plant: Connection
+    operator: Follower | None
+    guidance: Guidance
+
+    def check(self) -> None:
+        if self.twin.remote == (self.operator is not None):
+            raise ConfigError(
+                "bench: the remote is played by the twin (twin.remote=true) or by an operator, not by both or neither"
+            )
+
+    def companions(self, machine: Machine, session: Session) -> list[Companion]:
+        """Returns the processes to run beside the loop."""
+        found = [Companion("twin", "deploy.twin.twin:run", (self.twin, machine, self.plant, session))]
+        if self.operator is not None:
+            levers = LeverMap(self.guidance.levers or machine.levers, machine)
+            wire, dbc, seed = self.twin.wire, self.twin.dbc, session.stream("operator")
+            found.append(Companion("operator", "deploy.twin.remote:operate", (wire, dbc, machine, self.operator, levers, seed)))
+        return found

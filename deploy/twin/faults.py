@@ -1,0 +1,165 @@
+"""Faults on request: what can go wrong with messages and machine, switched on over a local port. Off unless a port is configured.
+
+A request is one JSON datagram: `{"fault": "drop", "message": "JointPos1", "seconds": 0.2}`. `message` names one message, or is left
+out for all; without `seconds` a fault stays until `{"fault": "none"}`.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+import time
+from dataclasses import dataclass, field
+
+from brokk_rl.errors import ConfigError, choices
+from deploy.bus.description import Layout
+from deploy.bus.wire import Wired
+
+FRAME_FAULTS = (
+    "drop",
+    "drop_some",
+    "duplicate",
+    "reorder",
+    "delay",
+    "corrupt",
+    "short",
+    "wrong_id",
+    "freeze_counter",
+    "masquerade",
+)
+"""Faults of messages on their way: not sent, one in ten not sent, sent twice, swapped with the next, sent 0.2 s late, one bit
+wrong, cut short, under another identifier, with a counter that stands still, with the CRC of another message."""
+SIGNAL_FAULTS = ("stuck", "jump", "drift", "out_of_range", "sign", "invalid")
+"""Faults of the measured position of the first joint: stands still, one jump, drifts, beyond its limits, wrong sign, called
+invalid."""
+MACHINE_FAULTS = ("estop", "deadman_released", "remote_off", "lever", "second_sender", "flood", "silent")
+"""Faults of the machine: emergency stop, dead-man or remote let go, a lever moved, another node that sends commands, a babbling
+node, nothing sent at all."""
+KNOWN = ("none", *FRAME_FAULTS, *SIGNAL_FAULTS, *MACHINE_FAULTS)
+
+
+@dataclass
+class Faults:
+    """The faults that are on.
+
+    Attributes:
+        until_s: By fault and message ('' for all), when it ends.
+    """
+
+    until_s: dict[tuple[str, str], float] = field(default_factory=dict)
+    _held: dict[str, Wired] = field(default_factory=dict)
+    _late: list[tuple[float, Wired]] = field(default_factory=list)
+    _chance: random.Random = field(default_factory=lambda: random.Random(0))
+    _since_s: dict[str, float] = field(default_factory=dict)
+
+    def request(self, text: bytes, now_s: float) -> None:
+        """Takes a request; see the module.
+
+        Raises:
+            ConfigError: it is none.
+        """
+        try:
+            asked = json.loads(text)
+            fault, message, seconds = asked["fault"], asked.get("message", ""), float(asked.get("seconds", 1e9))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ConfigError(f"fault: expected JSON with 'fault', got {text[:80]!r} ({error})") from error
+        if fault not in KNOWN:
+            raise ConfigError(f"fault: there is no '{fault}'; {choices(str(fault), KNOWN)}")
+        if fault == "none":
+            self.until_s.clear()
+        else:
+            self.until_s[fault, message] = now_s + seconds
+            self._since_s[fault] = now_s
+
+    def on(self, fault: str, message: str, now_s: float) -> bool:
+        """Says whether a fault is on for a message."""
+        return any(self.until_s.get((fault, name), -1.0) > now_s for name in (message, ""))
+
+    def since_s(self, fault: str, now_s: float) -> float:
+        """Returns how long ago a fault was asked for."""
+        return now_s - self._since_s.get(fault, now_s)
+
+    def counter(self, message: str, counter: int, now_s: float) -> int:
+        """Returns the counter to send."""
+        return 7 if self.on("freeze_counter", message, now_s) else counter
+
+    def pass_on(self, layout: Layout, frame: Wired, now_s: float) -> list[Wired]:
+        """Returns what is to be sent now in place of `frame`."""
+        name = layout.name
+
+        def on(fault: str) -> bool:
+            return self.on(fault, name, now_s)
+
+        data = bytearray(frame.data)
+        if on("silent") or on("drop") or (on("drop_some") and self._chance.random() < 0.1):
+            return []
+        if on("corrupt"):
+            data[self._chance.randrange(len(data))] ^= 1 << self._chance.randrange(8)
+        if on("masquerade"):
+            data[layout.crc_byte] ^= 0x5A
+        if on("short"):
+            del data[-1]
+        frame = Wired(frame.frame_id ^ (0x10 if on("wrong_id") else 0), bytes(data), frame.extended)
+        if on("delay"):
+            self._late.append((now_s + 0.2, frame))
+            return []
+        if on("reorder"):
+            held = self._held.pop(name, None)
+            if held is None:
+                self._held[name] = frame
+                return []
+            return [frame, held]
+        return [frame, frame] if on("duplicate") else [frame]
+
+    def due(self, now_s: float) -> list[Wired]:
+        """Returns the frames that were held up until now."""
+        ripe = [frame for at_s, frame in self._late if at_s <= now_s]
+        self._late = [(at_s, frame) for at_s, frame in self._late if at_s > now_s]
+        return ripe
+
+
+class FaultPort:
+    """Where requests come in: a datagram socket of this computer only; a context manager.
+
+    Args:
+        port: Its number; `None`: there is none, and no fault.
+    """
+
+    def __init__(self, port: int | None) -> None:
+        self._socket: socket.socket | None = None
+        if port is not None:
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._socket.bind(("127.0.0.1", port))
+            self._socket.setblocking(False)
+
+    def poll(self, faults: Faults) -> str | None:
+        """Takes a request that has come in, if any, and answers it; returns its text."""
+        if self._socket is None:
+            return None
+        try:
+            text, sender = self._socket.recvfrom(1024)
+        except BlockingIOError:
+            return None
+        try:
+            faults.request(text, time.monotonic())
+            answer = f"ok {time.monotonic()!r}"
+        except ConfigError as error:
+            answer = str(error)
+        self._socket.sendto(answer.encode(), sender)
+        return text.decode(errors="replace")
+
+    def __enter__(self) -> FaultPort:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._socket is not None:
+            self._socket.close()
+
+
+def ask(port: int, request: dict[str, object], timeout_s: float = 1.0) -> str:
+    """Sends a request to a twin on this computer and returns its answer."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        asking.settimeout(timeout_s)
+        asking.sendto(json.dumps(request).encode(), ("127.0.0.1", port))
+        return asking.recv(1024).decode()

@@ -1,0 +1,122 @@
+"""What the gateway of a machine must do, as an executable reference: who gets the valves, and when they get nothing.
+
+    levers moved at a remote that is on   the operator has the valves, whatever else is sent
+    valid commands, dead-man held         the PC has them, after three frames with mode idle
+    otherwise                             zero flow
+
+Commands that stay away for `TIMEOUT_S`, whose counter stands still or whose CRC is wrong count as missing; the PC then begins again
+with idle frames. Zero flow at an emergency stop, and when the remote is lost.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+
+from brokk_rl.machine import Machine
+from deploy.bus.description import COUNTER, LEVER_AXES, Description
+from deploy.bus.protection import Channel, Fault, Trust
+from deploy.bus.wire import Wired
+from deploy.guidance import AXES, LeverMap
+
+TIMEOUT_S = 0.07
+"""Age of the last valid command from which there is none; three cycles and a half, within the 100 ms that are promised."""
+REMOTE_S = 0.15
+IDLE_FRAMES = 3
+NEUTRAL = 0.03
+NOBODY, LEVERS, PC = 0, 1, 2
+"""Values of `FlowSource`."""
+
+
+class GatewayState(Enum):
+    """What the gateway says of itself (`GatewayState`)."""
+
+    IDLE = 0
+    LEVERS = 1
+    PC = 2
+    TIMEOUT = 3
+    STOPPED = 4
+
+
+class Gateway:
+    """See the module; pure, the caller brings frames and time.
+
+    Args:
+        description: The bus.
+        machine: The machine.
+
+    Attributes:
+        estop: Whether the emergency stop is pressed.
+    """
+
+    def __init__(self, description: Description, machine: Machine) -> None:
+        self._description, self._machine = description, machine
+        self._command = description.command
+        self._remote = description.layouts[description.message_of("DeadMan")]
+        self._channels = {one.name: Channel(one.modulus) for one in (self._command, self._remote)}
+        self._map = LeverMap(machine.levers, machine)
+        self._axis_full_rad = axis_full_rad(machine)
+        self._u, self._u_s, self._mode, self._idle = np.zeros(machine.num_joints), -np.inf, 0, 0
+        self._lever, self._remote_s = np.zeros(len(AXES)), -np.inf
+        self._button = self._deadman = self._on = False
+        self.estop = False
+
+    def take(self, frame: Wired, now_s: float) -> None:
+        """Takes in a frame of PC or remote."""
+        layout = self._description.by_id.get(frame.frame_id)
+        if layout is None or layout.name not in self._channels:
+            return
+        channel, values = self._channels[layout.name], self._description.decode(layout, frame.data)
+        if isinstance(values, Fault):
+            channel.refuse(values)
+            return
+        if channel.take(int(values[COUNTER])) is not None or channel.trust is not Trust.VALID:
+            return
+        if layout is self._remote:
+            self._lever = np.array([values[f"Lever_{axis}"] for axis in LEVER_AXES])
+            self._button, self._deadman = values["ButtonRight"] == 1.0, values["DeadMan"] == 1.0
+            self._on, self._remote_s = values["RemoteOn"] == 1.0, now_s
+            return
+        if now_s - self._u_s > TIMEOUT_S:
+            self._idle = 0
+        self._mode = int(values["CommandMode"])
+        self._idle = min(IDLE_FRAMES, self._idle + 1) if self._mode == 0 else self._idle
+        self._u = np.array([values[f"Command_{joint}"] for joint in self._machine.joint_names])
+        self._u_s = now_s
+
+    def flow(self, now_s: float) -> tuple[np.ndarray, int, GatewayState]:
+        """Returns what the valves get, `(J,)`, from whom, and the gateway's state."""
+        nothing = np.zeros(self._machine.num_joints)
+        remote = self._on and now_s - self._remote_s <= REMOTE_S and self._trusts(self._remote.name)
+        if self.estop or not remote:
+            self._idle = 0  # whoever commands begins again
+            return nothing, NOBODY, GatewayState.STOPPED
+        if np.abs(self._lever).max() > NEUTRAL:
+            self._idle = 0
+            return self._map.command(self._lever * self._axis_full_rad, self._button), LEVERS, GatewayState.LEVERS
+        if now_s - self._u_s > TIMEOUT_S or not self._trusts(self._command.name):
+            self._idle = 0
+            return nothing, NOBODY, GatewayState.TIMEOUT
+        if not self._deadman or self._mode != 1 or self._idle < IDLE_FRAMES:
+            return nothing, NOBODY, GatewayState.IDLE
+        moved = self._u != 0
+        if moved[self._machine.is_exclusive].any() and moved.sum() > 1:
+            return nothing, NOBODY, GatewayState.IDLE
+        return self._u, PC, GatewayState.PC
+
+    @property
+    def exclusive_selected(self) -> bool:
+        """Whether the exclusive joint is selected at the remote."""
+        return self._button
+
+    def _trusts(self, name: str) -> bool:
+        return self._channels[name].trust is not Trust.INVALID
+
+
+def axis_full_rad(machine: Machine) -> np.ndarray:
+    """Returns the angle of each of the four axes at full deflection, `(4,)`; 1 where no joint hangs on it."""
+    full = np.ones(len(AXES))
+    for lever in machine.levers:
+        full[AXES.index((lever.side, lever.axis))] = lever.max_angle_rad
+    return full

@@ -1,0 +1,88 @@
+"""The radio remote as a node of its own, and a simulated operator who holds it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.contracts import Follower
+from brokk_rl.machine import Machine
+from deploy.bus.description import LEVER_AXES, Description
+from deploy.bus.wire import Wire, Wired
+from deploy.guidance import AXES, LeverMap
+from deploy.loop.process import Pace, Stop
+from deploy.loop.records import Exchange
+from deploy.twin.gateway import axis_full_rad
+
+
+class Remote:
+    """Makes the remote's messages.
+
+    Args:
+        description: The bus.
+
+    Attributes:
+        levers: Deflections of the four axes, of full.
+        button_right: Whether the right button is held.
+        deadman: Whether the dead-man is held.
+        on: Whether it is switched on.
+    """
+
+    def __init__(self, description: Description) -> None:
+        self._description = description
+        self._layout = description.layouts[description.message_of("DeadMan")]
+        self.period_s = self._layout.period_s
+        self.levers: Sequence[float] = (0.0,) * len(AXES)
+        self.button_right = self.deadman = False
+        self.on = True
+        self._counter = 0
+
+    def frame(self) -> Wired:
+        """Returns the next message."""
+        values: dict[str, float] = {f"Lever_{axis}": value for axis, value in zip(LEVER_AXES, self.levers, strict=True)}
+        values |= {"ButtonRight": self.button_right, "DeadMan": self.deadman, "RemoteOn": self.on}
+        self._counter += 1
+        return Wired(
+            self._layout.frame_id, self._description.encode(self._layout.name, values, self._counter), self._layout.extended
+        )
+
+
+def operate(
+    stop: Stop, wire: Wire, dbc: str, machine: Machine, follower: Follower, levers: LeverMap, seed: int, exchange: Exchange
+) -> None:
+    """Runs a simulated operator: reads the outlet as a person reads the page, and moves the levers as `follower` says.
+
+    He lets go of the levers where the advice is stale or none.
+    """
+    import torch
+
+    torch.manual_seed(seed)
+    description = Description(dbc, machine)
+    remote, hands = Remote(description), follower.build(machine, 1, torch.device("cpu"))
+    per_period = round(machine.period_s / remote.period_s)
+    full_rad, pace, cycle = axis_full_rad(machine), Pace(remote.period_s), 0
+    remote.deadman = True
+    own = LeverMap(machine.levers, machine)  # what he moves is the machine's remote, whatever pattern is shown
+    with wire.open([]) as bus:
+        while not stop():
+            pace.wait()
+            pace.begin()
+            if cycle % per_period == 0:
+                with torch.inference_mode():
+                    proposed = torch.as_tensor(_proposed(exchange, levers), dtype=torch.float32)[None]
+                    given = hands.step(proposed)[0].numpy().astype(float)
+                angles_rad, remote.button_right = own.levers(given)
+                remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
+            cycle += 1
+            bus.send(remote.frame())
+
+
+def _proposed(exchange: Exchange, levers: LeverMap) -> np.ndarray:
+    """Returns the commands that the shown lever positions stand for."""
+    advice: Any = exchange.advice.read()
+    if advice is None or time.monotonic() - float(advice["t_s"]) > 0.5:
+        return np.zeros(len(levers.full_rad))
+    return levers.command(np.array(advice["lever_rad"]), bool(advice["button_right"]))

@@ -1,0 +1,180 @@
+"""The twin at work: gateway, remote and a simulated machine, in real time, on a bus.
+
+The machine is simulated at the control rate: what the valves get at the beginning of a period moves it through that period, and its
+positions are sent in between as a faster sensor would see them. Without an operator of its own the twin also plays the remote,
+levers in neutral.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.contracts import Connection, Link
+from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.signals import Command
+from brokk_rl.spec import spec
+from deploy.bus.description import GATEWAY, Description
+from deploy.bus.wire import OpenWire, Wire, Wired
+from deploy.loop.process import Pace, Stop
+from deploy.twin.faults import FaultPort, Faults
+from deploy.twin.gateway import Gateway
+from deploy.twin.remote import Remote
+
+log = logging.getLogger(__name__)
+
+CYCLE_S = 0.01
+FLOOD = 30
+"""Frames a cycle of a babbling node."""
+
+
+@spec
+class Twin:
+    """A simulated machine behind the bus.
+
+    Attributes:
+        wire: The bus.
+        dbc: Its description.
+        remote: Whether the twin plays the remote too; `false` where an operator is a node of its own.
+        deadman: Whether that remote's dead-man is held.
+        fault_port: Local port for faults on request; `null`: none.
+        seconds: When to stop; `null`: when told to.
+    """
+
+    wire: Wire
+    dbc: str
+    remote: bool
+    deadman: bool
+    fault_port: int | None
+    seconds: float | None
+
+    def check(self) -> None:
+        if self.fault_port is not None and not 0 < self.fault_port < 65536:
+            raise ConfigError(f"twin.fault_port: expected 1 to 65535, or null, got {self.fault_port}")
+
+    def run(self, stop: Stop, machine: Machine, plant: Connection, session: Session) -> None:
+        """Runs until told to stop, or the time is over.
+
+        Raises:
+            LinkError: the bus cannot be opened.
+        """
+        with plant.build(machine, 1, session) as link, self.wire.open() as bus, FaultPort(self.fault_port) as port:
+            _Running(self, machine, link, bus, port).run(stop)
+
+
+def run(stop: Stop, twin: Twin, machine: Machine, plant: Connection, session: Session, exchange: Any = None) -> None:
+    """Runs a twin as a child process."""
+    twin.run(stop, machine, plant, session)
+
+
+class _Running:
+    def __init__(self, twin: Twin, machine: Machine, link: Link, bus: OpenWire, port: FaultPort) -> None:
+        self._twin, self._machine, self._link, self._bus, self._port = twin, machine, link, bus, port
+        self._description = Description(twin.dbc, machine)
+        self._gateway, self._remote = Gateway(self._description, machine), Remote(self._description)
+        self._faults, self._pace = Faults(), Pace(CYCLE_S)
+        self._counters: dict[str, int] = {}
+        self._due_s: dict[str, float] = {}
+        self._q = self._before = np.asarray(link.read().q, dtype=float)
+        self._period_began_s = -np.inf
+        self._stuck: np.ndarray | None = None
+
+    def run(self, stop: Stop) -> None:
+        end_s = np.inf if self._twin.seconds is None else time.monotonic() + self._twin.seconds
+        while not stop() and time.monotonic() < end_s:
+            try:
+                while (left_s := self._pace.next_s - time.monotonic()) > 0:
+                    frame = self._bus.recv(left_s)
+                    if frame is not None:
+                        self._gateway.take(frame, time.monotonic())
+                self._pace.begin()
+                self._cycle(time.monotonic())
+            except LinkError as error:
+                log.warning("%s", error)
+                self._pace.wait()
+
+    def _cycle(self, now_s: float) -> None:
+        if (asked := self._port.poll(self._faults)) is not None:
+            log.info("fault: %s", asked)
+        faults, gateway = self._faults, self._gateway
+        gateway.estop = faults.on("estop", "", now_s)
+        if self._twin.remote:
+            self._play_remote(now_s)
+        flow, source, state = gateway.flow(now_s)
+        if now_s - self._period_began_s >= self._machine.period_s - CYCLE_S / 2:
+            late = now_s - self._period_began_s > 1.5 * self._machine.period_s
+            self._period_began_s = now_s if late else self._period_began_s + self._machine.period_s
+            self._before = self._q
+            self._link.send(Command(flow))
+            self._q = np.asarray(self._link.read().q, dtype=float)
+        values = self._positions(now_s) | {f"Flow_{name}": u for name, u in zip(self._machine.joint_names, flow, strict=True)}
+        values |= {"FlowSource": source, "EStop": gateway.estop, "ExclusiveSelected": gateway.exclusive_selected}
+        values |= {"GatewayState": state.value, "OilTemperature": self._oil_c(), "Stamp": round(now_s % 65.5, 3)}
+        for layout in self._description.sent_by(GATEWAY):
+            self._send(layout.name, values, now_s)
+        for frame in faults.due(now_s):
+            self._bus.send(frame)
+        if faults.on("second_sender", "", now_s):
+            command = self._description.command
+            self._bus.send(Wired(command.frame_id, self._description.encode(command.name, {}, self._counters.get("JointPos1", 0))))
+        if faults.on("flood", "", now_s):
+            for _ in range(FLOOD):
+                self._bus.send(Wired(0x1FFF0000, bytes(8)))
+
+    def _play_remote(self, now_s: float) -> None:
+        faults, remote = self._faults, self._remote
+        layout = self._description.layouts[self._description.message_of("DeadMan")]
+        if now_s < self._due_s.get(layout.name, now_s):
+            return
+        self._due_s[layout.name] = max(self._due_s.get(layout.name, now_s), now_s - layout.period_s) + layout.period_s
+        remote.deadman = self._twin.deadman and not faults.on("deadman_released", "", now_s)
+        remote.on = not faults.on("remote_off", "", now_s)
+        remote.levers = (0.5 if faults.on("lever", "", now_s) else 0.0, 0.0, 0.0, 0.0)
+        frame = remote.frame()
+        self._gateway.take(frame, now_s)
+        for one in faults.pass_on(layout, frame, now_s):
+            self._bus.send(one)
+
+    def _send(self, name: str, values: dict[str, float], now_s: float) -> None:
+        layout = self._description.layouts[name]
+        due_s = self._due_s.get(name, now_s)
+        if now_s < due_s - CYCLE_S / 2:
+            return
+        self._due_s[name] = max(due_s, now_s - layout.period_s) + layout.period_s
+        counter = self._counters[name] = self._counters.get(name, -1) + 1
+        data = self._description.encode(name, values, self._faults.counter(name, counter, now_s))
+        for one in self._faults.pass_on(layout, Wired(layout.frame_id, data, layout.extended), now_s):
+            self._bus.send(one)
+
+    def _positions(self, now_s: float) -> dict[str, float]:
+        """Returns positions and validities as the sensors say them."""
+        faults, machine = self._faults, self._machine
+        part = min(1.0, max(0.0, (now_s - self._period_began_s) / machine.period_s))
+        q = self._before + part * (self._q - self._before)
+        if faults.on("stuck", "", now_s):
+            self._stuck = q if self._stuck is None else self._stuck
+            q = self._stuck
+        else:
+            self._stuck = None
+        q = q.copy()
+        if faults.on("jump", "", now_s):
+            q[0] += 0.5
+        if faults.on("drift", "", now_s):
+            q[0] += 0.05 * faults.since_s("drift", now_s)
+        if faults.on("out_of_range", "", now_s):
+            q[0] = 3.1
+        if faults.on("sign", "", now_s):
+            q[:] = -q
+        valid = 0.0 if faults.on("invalid", "", now_s) else 1.0
+        names = machine.joint_names
+        values = {f"Position_{name}": float(np.clip(value, -3.2, 3.2)) for name, value in zip(names, q, strict=True)}
+        return values | {f"Valid_{name}": valid for name in names}
+
+    def _oil_c(self) -> float:
+        extra = getattr(self._link, "extra", dict)()
+        return float(np.clip(np.round(np.asarray(extra["oil_c"]).mean()), -40, 215)) if "oil_c" in extra else 20.0
