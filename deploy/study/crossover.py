@@ -97,7 +97,7 @@ def _paired(difference: np.ndarray) -> dict:
         "difference": mean,
         "paired_ci95": (mean - half, mean + half),
         "paired_p": float(exact.paired_p(difference)),
-        "wilcoxon_p": float(exact.wilcoxon_p(difference)),
+        "wilcoxon_p": exact.wilcoxon_p(difference),
         "hodges_lehmann": hodges_lehmann(difference)[0],
         "hodges_lehmann_ci95": hodges_lehmann(difference)[1],
     }
@@ -127,7 +127,7 @@ def _adjusted(period_difference: np.ndarray, total: np.ndarray, first: np.ndarra
             "period_p": float(2 * stats.t.sf(abs(period / error), free)),
         }
     if total[first].var() + total[~first].var() > 0:
-        facts["carry_over_p"] = float(stats.ttest_ind(total[first], total[~first]).pvalue)
+        facts["carry_over_p"] = float(stats.ttest_ind(total[first], total[~first])[1])  # type: ignore[arg-type]
     return facts
 
 
@@ -143,9 +143,13 @@ def dz_interval(dz: float, scale: float, free: int) -> Interval:
     """
     t = dz * scale
 
+    def below(shift: float) -> float:
+        share = float(stats.nct.cdf(t, free, shift))
+        return share if math.isfinite(share) else float(shift < t)  # far out scipy gives NaN
+
     def bound(level: float) -> float:
         low, high = t - 10.0 - abs(t), t + 10.0 + abs(t)
-        return float(optimize.brentq(lambda shift: stats.nct.cdf(t, free, shift) - level, low, high)) / scale  # type: ignore[arg-type]
+        return float(optimize.brentq(lambda shift: below(shift) - level, low, high)) / scale  # type: ignore[arg-type]
 
     return bound(0.5 + CONFIDENCE / 2), bound(0.5 - CONFIDENCE / 2)
 

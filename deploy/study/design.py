@@ -138,7 +138,7 @@ def sequences(design: Design, generator: np.random.Generator) -> dict[str, tuple
     for _ in range(math.ceil(design.num_participants / 2)):
         guided_first = bool(generator.integers(2)) or design.order == "fixed"
         second_first = guided_first if design.order == "fixed" else not guided_first
-        drawn += [CONDITIONS if first else CONDITIONS[::-1] for first in (guided_first, second_first)]
+        drawn += [CONDITIONS if first else (CONDITIONS[1], CONDITIONS[0]) for first in (guided_first, second_first)]
     return dict(zip(pseudonyms(design.num_participants), drawn, strict=False))
 
 

@@ -54,7 +54,7 @@ def paired_p(difference: np.ndarray) -> np.ndarray:
     return _two_sided(difference, _flips(difference.shape[-1]))
 
 
-def wilcoxon_p(difference: np.ndarray) -> np.ndarray:
+def wilcoxon_p(difference: np.ndarray) -> float:
     """Returns the two-sided exact p of Wilcoxon's signed-rank test, for `(P,)` differences; zeros are left out, ties share a rank.
 
     Exact also with ties, where tables and most packages are not.
@@ -62,8 +62,8 @@ def wilcoxon_p(difference: np.ndarray) -> np.ndarray:
     difference = np.asarray(difference, float)
     difference = difference[difference != 0]
     if not len(difference):
-        return np.float64(1.0)
-    return paired_p(np.sign(difference) * stats.rankdata(np.abs(difference)))
+        return 1.0
+    return float(paired_p(np.sign(difference) * stats.rankdata(np.abs(difference))))
 
 
 def sequence_p(period_difference: np.ndarray, guided_first: np.ndarray) -> np.ndarray:

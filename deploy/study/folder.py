@@ -207,7 +207,7 @@ def _read_trials(data: StudyData) -> None:
 
 def _read_questionnaires(data: StudyData) -> None:
     for name, entry in _entries(data.folder / QUESTIONNAIRES, data):
-        who, period = entry.get("participant"), entry.get("period")
+        who, period = str(entry.get("participant")), entry.get("period")
         if who not in data.plan["participants"] or period not in PERIODS:
             data.remarks.append(
                 Remark(name, f"a questionnaire of '{who}', period {period}, whom the plan does not know; not counted")

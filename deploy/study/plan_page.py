@@ -1,4 +1,4 @@
-"""The plan as a page to print: what the numbers can show, the rules, the order of trials of each participant with room for notes."""
+"""The plan as a page to print: what the numbers can show, the rules, everybody's order of trials with room for notes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: 
         planned: All trials.
         errors: How often simulated studies of this plan err; see `deploy.study.study`.
     """
-    num = design.num_participants
+    num, num_trials, inside = design.num_participants, len(design.holes), design.success
     can = sample_size.size(num, design.alpha)
     paired_least, sequence_least = sample_size.least(design.alpha)
     wanted = sample_size.enough(design.alpha)
@@ -49,11 +49,11 @@ def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: 
     found.facts(
         {
             "participants": num,
-            "trials each": f"{len(design.holes)} with guidance, {len(design.holes)} without, {design.practice_trials} of practice before",
+            "trials each": f"{num_trials} with guidance, {num_trials} without, {design.practice_trials} of practice before",
             "order": design.order,
             "primary measure": design.primary,
             "time limit of a trial": f"{design.limit_s:g} s",
-            "inserted": f"{design.success.depth_m:g} m below the rim, within {1000 * design.success.clearance_m:.0f} mm of the axis",
+            "inserted": f"{inside.depth_m:g} m below the rim, within {1000 * inside.clearance_m:.0f} mm of the axis",
             "seed of the draw": seed,
         }
     )
@@ -78,9 +78,9 @@ def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: 
 def _numbers(found: Page, design: Design, paired_least: int, sequence_least: int) -> None:
     found.heading("How many participants")
     found.text(
-        f"An exact paired test cannot go below p = 0.0625 with five participants: such a study "
-        f"can never be significant at 0.05. It takes {paired_least} for that, and {sequence_least} for the test that keeps practice apart from "
-        f"guidance. Power is the share of {sample_size.STUDIES} simulated studies that find the effect; dz is the mean difference in "
+        "An exact paired test cannot go below p = 0.0625 with five participants: such a study can never be significant at 0.05. "
+        f"It takes {paired_least} for that, and {sequence_least} for the test that keeps practice apart from guidance. "
+        f"Power is the share of {sample_size.STUDIES} simulated studies that find the effect; dz is the mean difference in "
         "standard deviations of it."
     )
     columns = [
