@@ -10,7 +10,7 @@ import numpy as np
 from perception import conic
 from perception.plane import Plane
 
-INSIDE, RING = 0.8, (1.15, 1.6)
+INSIDE, RING = 0.8, (1.15, 1.8)
 """Radii: the inside without the rim's blur, and the ring around that shows how bright the face is."""
 
 CLEARLY_M = 0.03
@@ -72,5 +72,21 @@ def interior(
         deeper = float(np.mean(behind[inside & known] > clearly)) if (inside & known).any() else 0.0
         into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
         along = (place[inside][:, :2] - (x, y)) @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
+        drift = _gradient(part, place, ring, ellipse) * min(darkness, 1.0)  # of dust, which lies over hole and face alike
+        values = values - (place[inside][:, :2] - (x, y)) @ drift
         slope = float(np.polyfit(along, values, 1)[0]) / max(face * (1.0 - darkness), 1.0)
     return Interior(darkness, slope, deeper, unknown)
+
+
+def _gradient(part: np.ndarray, place: np.ndarray, ring: np.ndarray, ellipse: np.ndarray) -> np.ndarray:
+    """Returns the mean slope of brightness over a ring, `(2,)` grey levels a pixel; what departs much from it does not count."""
+    away = np.column_stack([place[ring][:, :2] - ellipse[:2], np.ones(int(ring.sum()))])
+    values = part[ring].astype(float)
+    weight = np.ones(len(values))
+    fitted = np.zeros(3)
+    for _ in range(3):
+        heavy = away * weight[:, None]
+        fitted = np.linalg.lstsq(heavy.T @ away, heavy.T @ values, rcond=None)[0]
+        off = np.abs(values - away @ fitted)
+        weight = 1.0 / (1.0 + (off / max(1.5 * float(np.median(off)), 0.3)) ** 2)
+    return fitted[:2]

@@ -16,13 +16,14 @@ WORDS = {
     "depth noise on the face, 1/m": ("the face around it is no plane", "Is it on the block's edge, or is the depth that noisy?"),
     "tilt of the face, rad": ("the camera sees the face at too flat an angle", "Another place for the camera would see it better."),
     "axis ratio on the face": ("on the face it is no circle", "A shadow, a stain, or an edge."),
+    "part of a circle on the face with a rim": ("too little of a rim is seen", "What hides it? Another place would see it better."),
     "radius, m": (
         "on the face it does not have the size of a hole",
         "Look at perception.pose.radius_m if the holes are of another size.",
     ),
     "brightness inside over outside": ("it is not dark inside", "A ring, a filled hole, or a lamp in it."),
     "mouth probability inside": ("the network does not take it for the mouth of a hole", "A flat dark disc looks like this."),
-    "slope of brightness inside": ("it is evenly dark, and as deep as the face", "A flat dark disc looks like this."),
+    "evidence of depth inside": ("it is evenly dark, and as deep as the face", "A flat dark disc looks like this."),
     "distance to a larger rim, m": ("it lies within a larger rim", "The far rim or the floor of a hole."),
     "known depth at the centre": (
         "the depth at its centre is unknown",

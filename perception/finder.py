@@ -24,7 +24,7 @@ from brokk_rl.sight import (
 )  # fmt: skip
 from brokk_rl.signals import Borehole, Frame
 from brokk_rl.spec import spec
-from perception import explain, rim, search
+from perception import explain, search
 from perception.pose import gray_of
 
 
@@ -40,7 +40,6 @@ class Perception:
         radius_m: Radius of the holes, for the size that their ellipses may have.
         size_slack: By how much that size may be off, as a part of it.
         comfortable_px: Least semi-axis for which an ellipse is looked for in a coarser resolution.
-        rim_px: How far, in px of that resolution, the rim in the full one may lie from what was found in it.
         smallest_block: Least part of the picture that must be block.
         block_probability: From which a pixel is block.
         roi: Where ellipses are looked for: on the `mask` of the block, or in its bounding `box`.
@@ -54,7 +53,6 @@ class Perception:
     radius_m: float
     size_slack: float
     comfortable_px: float
-    rim_px: float
     smallest_block: float
     block_probability: float
     roi: str
@@ -114,8 +112,7 @@ class Finder:
             gray = gray_of(frame)
             levels = search.levels(frame, roi, s.radius_m, s.size_slack, s.comfortable_px)
             levels = search.box(roi, levels) if s.roi == "box" else levels
-            ellipses = [rim.refined(gray, one, s.rim_px * level.shrink) if level.shrink > 1 else one
-                        for level in levels for one in level.detect(self._detector, gray)]  # fmt: skip
+            ellipses = [one for level in levels for one in level.detect(self._detector, gray)]
         with _timed(ms, "pose"):
             judged = [(ellipse, self._pose.estimate(frame, masks, ellipse)) for ellipse in ellipses]
             found = [(e, pose) for e, pose in judged if isinstance(pose, HolePose)]
@@ -165,7 +162,7 @@ def rectified(frame: Frame) -> Frame:
     )
     color = cv2.remap(frame.color, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     depth = cv2.remap(frame.depth_m, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
-    return replace(frame, color=np.asarray(color, np.uint8), depth_m=np.asarray(depth, np.float32), distortion=None)
+    return replace(frame, color=np.asarray(color, np.uint8), depth_m=np.asarray(depth, np.float32), distortion=None, right=None)
 
 
 @contextmanager

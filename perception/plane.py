@@ -18,6 +18,8 @@ TUKEY = 4.685
 
 GROWING = 3.0
 """The same while the plane is grown: beyond an edge of the block another face begins at the same depth."""
+NEARNESS, LEAN = 0.3, 0.4
+"""How far inverse depth may be off what a circle's size says, as a part of it; its slope, off what its shape says."""
 LEAST = 60
 """Points in which a plane is looked for."""
 
@@ -65,12 +67,14 @@ class Support:
         inverse: Inverse depth, `(P,)` 1/m.
         radii: Distance from the ellipse's centre in its own radii, `(P,)`.
         cell: Number of the square of the picture in which a pixel lies, `(P,)`; noise is alike within one.
+        known: Part of the surroundings whose depth is known, whatever it is.
     """
 
     rays: np.ndarray
     inverse: np.ndarray
     radii: np.ndarray
     cell: np.ndarray
+    known: float
 
 
 def support(
@@ -78,19 +82,26 @@ def support(
     allowed: np.ndarray,
     camera_matrix: np.ndarray,
     ellipse: np.ndarray,
+    radius_m: float,
     inner: float,
+    certain: float,
     outer: float,
     most: int,
     cell_px: int,
 ) -> Support:
     """Returns the pixels with known depth between `inner` and `outer` radii of an ellipse `(5,)`.
 
+    A circle of a known radius says itself about how far away it is and how its plane leans: what is much nearer is something that
+    stands before it, what is much farther lies behind the block.
+
     Args:
         depth_m: `(h, w)`.
         allowed: Pixels of the face, `(h, w)` bool.
         camera_matrix: `(3, 3)`.
         ellipse: Centre, semi-axes, direction.
+        radius_m: Of the circle that it would be.
         inner: In radii of the ellipse; keeps the rim's bleeding out.
+        certain: In radii; up to here the face goes on around a hole, whatever `allowed` says.
         outer: In radii.
         most: Pixels beyond so many are left out on a regular grid.
         cell_px: Side of the squares in which noise is alike.
@@ -105,11 +116,18 @@ def support(
     depth = depth_m[top:bottom:step, left:right:step]
     value = np.einsum("...i,ij,...j->...", *_homogeneous(columns, rows, conic.form(ellipse)))
     radii = np.sqrt(np.maximum(value + 1.0, 0.0))
-    good = allowed[top:bottom:step, left:right:step] & np.isfinite(depth) & (depth > 0) & (radii > inner) & (radii < outer)
+    good = (allowed[top:bottom:step, left:right:step] | (radii < certain)) & np.isfinite(depth) & (depth > 0)
+    size = ellipse[2] / float(np.sqrt(camera_matrix[0, 0] * camera_matrix[1, 1]))
+    lean = np.sqrt(max((ellipse[2] / ellipse[3]) ** 2 - 1.0, 0.0)) + LEAN
+    with np.errstate(divide="ignore", invalid="ignore"):
+        good &= np.abs(radius_m / (size * depth) - 1.0) < NEARNESS + radii * size * lean
+    ring = (radii > inner) & (radii < certain)
+    known = float(np.isfinite(depth[ring]).mean()) if ring.any() else 0.0
+    good &= (radii > inner) & (radii < outer)
     u, v = columns[good].astype(float), rows[good].astype(float)
     rays = np.column_stack([u, v, np.ones_like(u)]) @ np.linalg.inv(camera_matrix).T
     cell = (v // cell_px).astype(np.int64) * (width // cell_px + 1) + (u // cell_px).astype(np.int64)
-    return Support(rays, 1.0 / depth[good].astype(float), radii[good], cell)
+    return Support(rays, 1.0 / depth[good].astype(float), radii[good], cell, known)
 
 
 def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.random.Generator) -> Plane | None:
@@ -145,7 +163,7 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
         first = sigma if ring == rings[0] else first
         extent = ring
     residual = points.inverse - points.rays @ m
-    return Plane(m, _covariance(points, weight, residual), sigma, int((weight > 0).sum()), extent)
+    return Plane(m, sandwich(points.rays, weight, residual, points.cell), sigma, int((weight > 0).sum()), extent)
 
 
 def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40) -> np.ndarray:
@@ -163,11 +181,18 @@ def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator
     return best
 
 
-def _covariance(points: Support, weight: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Returns the covariance of the plane, `(3, 3)`: the sandwich estimate over cells, within which noise may do as it likes."""
-    heavy = points.rays * weight[:, None]
-    bread = np.linalg.inv(heavy.T @ points.rays)
-    _, cell = np.unique(points.cell, return_inverse=True)
+def sandwich(slopes: np.ndarray, weight: np.ndarray, residual: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Returns the covariance of a fit of three numbers, `(3, 3)`: the sandwich estimate over cells, in which noise may be alike.
+
+    Args:
+        slopes: Of the residuals for each number, `(P, 3)`.
+        weight: `(P,)`.
+        residual: `(P,)`.
+        cell: Number of each point's cell, `(P,)`.
+    """
+    heavy = slopes * weight[:, None]
+    bread = np.linalg.inv(heavy.T @ slopes)
+    _, cell = np.unique(cell, return_inverse=True)
     push = heavy * residual[:, None]
     sums = np.column_stack([np.bincount(cell, push[:, k]) for k in range(3)])
     num = max(int(cell.max()) + 1, 4)

@@ -11,9 +11,10 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.sight import Ellipse, HolePose, Masks, PoseEstimator, PoseSpec, Rejection
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception import appearance, conic, plane
+from perception import alignment, appearance, conic, plane, rim
 from perception.appearance import Interior
 from perception.plane import Plane
+from perception.rim import Circle
 
 
 @spec
@@ -24,8 +25,10 @@ class Looks:
         darkness: Largest brightness of the darkest quarter inside over that of the face.
         mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives one.
         sure_mouth: From which the mouth channel needs no other witness.
-        slope: Largest slope of brightness inside, see `Interior`; asked where depth inside says nothing.
-        deeper: Part of the depth inside that lies behind the face from which depth says that it is a hole.
+        slope: Slope of brightness inside, see `Interior`, that alone would show a hole; less is as much less evidence, and adds up.
+        deeper: Part of the depth inside that lies behind the face, likewise.
+        parallax: Difference of left and right picture inside over that on the face, likewise; 1 is none.
+        parts: Radii of an ellipse: its inside for the parallax, and the ring of face around it.
     """
 
     darkness: float
@@ -33,6 +36,8 @@ class Looks:
     sure_mouth: float
     slope: float
     deeper: float
+    parallax: float
+    parts: tuple[float, tuple[float, float]]
 
 
 @spec
@@ -43,6 +48,7 @@ class PlaneConic:
         radius_m: Radius of the holes that are looked for.
         radius_tolerance: How far the measured radius may be off, as a part of it.
         axis_ratio: Least ratio of the semi-axes on the plane; 1 is a circle.
+        coverage: Least part of the circle on the face whose rim is seen.
         tilt_rad: Largest angle between the face's normal and the line of sight.
         inner: Inner limit of the face's support in radii of the ellipse; keeps the rim's bleeding out.
         rings: Outer limits in radii: the ring in which the plane is found, and those across which it is grown.
@@ -51,15 +57,19 @@ class PlaneConic:
         noise_floor_per_m: Least standard deviation of inverse depth, 1/m.
         noise_limit_per_m: Largest standard deviation of inverse depth on the face, 1/m.
         alike: By how much the covariance of the plane is larger than its residuals say: a matcher errs alike over wide stretches.
+        matcher_bias_per_m: Standard deviation of inverse depth by which a matcher is off all over a face, 1/m; with a right picture
+            the face is aligned anew.
         bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual shows, 1/m.
         center_px: Standard deviation of an ellipse's centre that no residual shows, px.
         looks: What it must look like.
         without_depth: What is tried where the face has no depth; `null` for nothing.
+        blind: Part of the face around a hole with known depth below which it has none.
     """
 
     radius_m: float
     radius_tolerance: float
     axis_ratio: float
+    coverage: float
     tilt_rad: float
     inner: float
     rings: tuple[float, ...]
@@ -68,10 +78,12 @@ class PlaneConic:
     noise_floor_per_m: float
     noise_limit_per_m: float
     alike: float
+    matcher_bias_per_m: float
     bias_per_m: float
     center_px: float
     looks: Looks
     without_depth: PoseSpec | None
+    blind: float
 
     def check(self) -> None:
         if not 0 < self.radius_tolerance < 1 or self.radius_m <= 0:
@@ -101,10 +113,11 @@ class PlaneConicEstimator:
         allowed = masks.block > 0.5
         if masks.mouth is not None:
             allowed &= masks.mouth < 0.5
-        points = plane.support(frame.depth_m, allowed, frame.camera_matrix, row, s.inner, s.rings[-1], s.max_pixels, s.cell_px)
+        reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
+        points = plane.support(frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px)
         face = plane.fit(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
         if face is None:
-            if self._without_depth is not None and frame.base_from_camera is not None:
+            if self._without_depth is not None and frame.base_from_camera is not None and points.known < s.blind:
                 return self._without_depth.estimate(frame, masks, ellipse)
             return Rejection("pose", "pixels of the face with depth", float(len(points.inverse)), float(plane.LEAST), ellipse)
         if face.sigma > s.noise_limit_per_m:
@@ -112,18 +125,30 @@ class PlaneConicEstimator:
         shape = self._shape(face, row, frame, ellipse)
         if isinstance(shape, Rejection):
             return shape
-        center, radius = shape
-        face = replace(face, cov=face.cov * s.alike)
         gray = gray_of(frame)
+        both = alignment.pair(frame, gray, face.m, row, face.extent)
+        if both is not None:
+            face = alignment.aligned(both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m)
+            shape = self._shape(face, row, frame, ellipse)
+            if isinstance(shape, Rejection):
+                return shape
+        circle = rim.circle(gray, row, frame.camera_matrix, face.m, s.radius_m, s.radius_tolerance)
+        if circle is None or circle.coverage < s.coverage:
+            return Rejection(
+                "pose", "part of a circle on the face with a rim", circle.coverage if circle else 0.0, s.coverage, ellipse
+            )
+        row = circle.ellipse
+        face = replace(face, cov=face.cov * s.alike)
         inside = appearance.interior(gray, frame.depth_m, row, frame.camera_matrix, face)
-        refused = self._looks(inside, masks, row, ellipse)
+        parallax = alignment.disagreement(both, face, frame.depth_m, row, *s.looks.parts) if both else float("nan")
+        refused = self._looks(inside, parallax, masks, row, ellipse)
         if refused:
             return refused
         return HolePose(
-            center_m=center,
+            center_m=circle.center_m,
             axis=face.normal,
-            radius_m=radius,
-            cov_m2=covariance(face, center, ellipse, frame.camera_matrix, s.center_px, s.bias_per_m),
+            radius_m=circle.radius_m,
+            cov_m2=covariance(face, circle, frame.camera_matrix, s.center_px, s.bias_per_m),
             axis_cov_rad2=face.normal_cov_rad2(),
             frame="camera",
             score=float(ellipse.score),
@@ -150,7 +175,7 @@ class PlaneConicEstimator:
             return Rejection("pose", "axis ratio on the face", ratio, s.axis_ratio, ellipse)
         return center, radius
 
-    def _looks(self, inside: Interior, masks: Masks, row: np.ndarray, ellipse: Ellipse) -> Rejection | None:
+    def _looks(self, inside: Interior, parallax: float, masks: Masks, row: np.ndarray, ellipse: Ellipse) -> Rejection | None:
         looks = self.settings.looks
         if not inside.darkness <= looks.darkness:
             return Rejection("pose", "brightness inside over outside", inside.darkness, looks.darkness, ellipse)
@@ -160,25 +185,19 @@ class PlaneConicEstimator:
                 return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
             if mouth >= looks.sure_mouth:
                 return None
-        if not inside.deeper >= looks.deeper and not inside.slope <= looks.slope:
-            return Rejection("pose", "slope of brightness inside", inside.slope, looks.slope, ellipse)
-        return None
+        witnesses = (inside.slope / looks.slope, inside.deeper / looks.deeper, (parallax - 1.0) / (looks.parallax - 1.0))
+        evidence = sum(max(one, 0.0) for one in witnesses if np.isfinite(one))
+        return None if evidence >= 1.0 else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
 
 
-def covariance(
-    face: Plane, center: np.ndarray, ellipse: Ellipse, camera_matrix: np.ndarray, center_px: float, bias_per_m: float
-) -> np.ndarray:
-    """Returns the covariance of a centre on a plane, `(3, 3)` m²: along the ray by the plane's, across it by the ellipse's.
-
-    The points of an ellipse are alike over about two pixels, and one that is seen in part has its centre less surely.
-    """
+def covariance(face: Plane, circle: Circle, camera_matrix: np.ndarray, center_px: float, bias_per_m: float) -> np.ndarray:
+    """Returns the covariance of a centre, `(3, 3)` m²: along the ray by the plane's, on the plane by the circle's."""
+    center = circle.center_m
     ray = center / center[2]
     depth_var = center[2] ** 4 * (float(ray @ face.cov @ ray) + bias_per_m**2)
-    number = max(float(conic.perimeter(np.array(ellipse.a), np.array(ellipse.b))) * ellipse.coverage / 2, 4.0)
-    std_px = np.hypot(center_px, 2 * ellipse.rms_px / np.sqrt(number) / ellipse.coverage**2)
-    across = np.linalg.inv(camera_matrix)[:, :2] * (std_px * center[2])
+    across = np.linalg.inv(camera_matrix)[:, :2] * (center_px * center[2])
     slip = np.eye(3) - np.outer(ray, face.m) / float(face.m @ ray)  # across the ray, the centre stays on the plane
-    return np.outer(ray, ray) * depth_var + slip @ across @ across.T @ slip.T
+    return np.outer(ray, ray) * depth_var + circle.cov_m2 + slip @ across @ across.T @ slip.T
 
 
 def vector(ellipse: Ellipse) -> np.ndarray:

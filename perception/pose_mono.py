@@ -7,8 +7,8 @@ import numpy as np
 from brokk_rl.sight import Ellipse, HolePose, Masks, Rejection
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception import conic
-from perception.pose import vector
+from perception import appearance, conic
+from perception.pose import gray_of, vector
 
 
 @spec
@@ -20,12 +20,14 @@ class MonoCircle:
         normal_in_base: Where the face looks in the base frame; also tells the two solutions apart.
         normal_rad: Largest angle to it.
         ellipse_px: Least standard deviation of the ellipse's axes, px; decides the covariance.
+        darkness: Largest brightness of the darkest quarter inside over that of the face; nothing else speaks for a hole here.
     """
 
     radius_m: float
     normal_in_base: tuple[float, float, float]
     normal_rad: float
     ellipse_px: float
+    darkness: float
 
     def build(self) -> MonoCircleEstimator:
         """Returns an estimator."""
@@ -49,6 +51,9 @@ class MonoCircleEstimator:
         angle = float(np.arccos(np.clip(normal @ expected, -1, 1)))
         if angle > s.normal_rad:
             return Rejection("pose", "angle to the expected normal, rad", angle, s.normal_rad, ellipse)
+        dark = appearance.interior(gray_of(frame), frame.depth_m, row, frame.camera_matrix, None).darkness
+        if not dark <= s.darkness:
+            return Rejection("pose", "brightness inside over outside", dark, s.darkness, ellipse)
         std = np.array([1, 1, 1, 1, 0]) * max(ellipse.rms_px, s.ellipse_px) / np.sqrt(max(ellipse.coverage, 0.1))
         std[4] = std[2] / max(ellipse.a - ellipse.b, std[2])
         moves, turns = [], []

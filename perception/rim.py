@@ -1,85 +1,204 @@
-"""The rim of a hole in full resolution: where brightness rises most steeply across an ellipse that is known roughly."""
+"""The rim of a hole as a circle on the face's plane, placed where brightness rises most steeply across it.
+
+With the plane known, three numbers are left, which a third of a rim determines well; an ellipse free in the picture has five,
+and closes the gap where an arm hides the rest of the rim with the arm's edge.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from brokk_rl.sight import Ellipse
 from perception import conic
 
-SIGMA_PX = 1.0
-"""Blur along a profile before its slope is taken."""
-STEP_PX = 0.5
-"""Between the samples of a profile."""
-ROUNDS_PX = (1.5, 0.6, 0.35)
-"""Rounds of the fit: the distance from the ellipse at which a point counts a quarter."""
-INLIER_PX = 1.0
-"""What lies farther from the final ellipse is no part of the rim."""
-STRAY = 0.35
-"""Slope of the edge against the ellipse from which it is another's."""
-LEAST_SHARE = 0.6
-"""Of the coverage that the rough ellipse had: with less, the rough one stays."""
+SIGMA_PX, SIGMA_Y, STEP_PX = 0.5, 2.0, 0.5
+"""Blur along a profile before its slope is taken, across profiles (in profiles), and what lies between the samples of one."""
+PEAKS = 3
+"""Steepest places of a profile that are looked at: a rim, its far end, and the edge of what stands before it."""
+FAINT = 0.25
+"""Part of the usual steepness below which a place is no edge."""
+TRIPLES = 200
+NEAR_PX, INLIER_PX = 0.7, 1.0
+"""A profile speaks for a circle that has an edge so near to it; of the final one."""
+NARROW_PX = 2.0
+"""Reach of the profiles across a circle that is known already."""
+ALIKE_PX = 2.0
+"""Points of a rim are alike over this length."""
+LEAST = 12
 
 
-def refined(gray: np.ndarray, rough: Ellipse, reach_px: float) -> Ellipse:
-    """Returns the ellipse through the steepest places of profiles across a rough one; the rough one where they do not agree.
+@dataclass(frozen=True)
+class Circle:
+    """A circle on a plane.
+
+    Attributes:
+        center_m: In camera coordinates, `(3,)`.
+        radius_m: Radius.
+        cov_m2: Covariance of the centre on the plane, `(3, 3)`, singular along its normal.
+        rms_px: Root mean square distance of its edge points.
+        coverage: Part of it that has any.
+        ellipse: What it is in the picture, `(5,)`.
+    """
+
+    center_m: np.ndarray
+    radius_m: float
+    cov_m2: np.ndarray
+    rms_px: float
+    coverage: float
+    ellipse: np.ndarray
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Coordinates on a plane, m: the place `origin + x first + y second` for each `(x, y)`."""
+
+    origin: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    m: np.ndarray
+    camera_matrix: np.ndarray
+
+    def flat(self, pixels: np.ndarray) -> np.ndarray:
+        """Returns the coordinates of what is seen at pixels, `(…, 2)`."""
+        rays = np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1) @ np.linalg.inv(self.camera_matrix).T
+        away = rays / (rays @ self.m)[..., None] - self.origin
+        return np.stack([away @ self.first, away @ self.second], -1)
+
+    def seen(self, circle: np.ndarray) -> np.ndarray:
+        """Returns the ellipse `(5,)` that a circle `(x, y, radius)` is in the picture."""
+        x, y, radius = circle
+        back = np.linalg.inv(self.camera_matrix @ np.column_stack([self.first, self.second, self.origin]))
+        return conic.ellipse_of((back.T @ conic.form(np.array([x, y, radius, radius, 0.0])) @ back)[None])[0]
+
+
+def circle(
+    gray: np.ndarray, ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray, radius_m: float, tolerance: float
+) -> Circle | None:
+    """Returns the circle on the plane `m · P = 1` whose rim has the most edges of dark to bright; `None` where nothing agrees.
 
     Args:
         gray: Picture, `(h, w)` uint8.
-        rough: Dark inside.
-        reach_px: How far from the rough ellipse its rim may lie.
+        ellipse: About where it is, `(5,)`.
+        camera_matrix: `(3, 3)`.
+        m: The plane, `(3,)`.
+        radius_m: About how large it is.
+        tolerance: By how much it may be larger or smaller, as a part of that.
     """
-    row = np.array([[rough.x, rough.y, rough.a, rough.b, rough.theta_rad]])
-    number = int(np.clip(2 * conic.perimeter(row[0, 2], row[0, 3]), 64, 256))
-    angles = np.arange(number) * (2 * np.pi / number)
-    points, outward, length = (value[0] for value in conic.sample(row, angles))
+    ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
+    normal = m / np.linalg.norm(m)
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    chart = Chart(ray / (m @ ray), first, np.cross(normal, first), m, camera_matrix)
+    size = float(np.sqrt(ellipse[2] * ellipse[3]))
+    profiles = _edges(gray, ellipse, max(NARROW_PX, 0.25 * size), chart)
+    if profiles is None:
+        return None
+    found = _agreed(*profiles, radius_m, tolerance)
+    for _ in range(2):
+        if found is None:
+            return None
+        seen = chart.seen(found)
+        profiles = _edges(gray, seen, NARROW_PX, chart) if np.isfinite(seen).all() else None
+        if profiles is None:
+            return None
+        found, cov, rms_px, coverage = _fitted(found, *profiles)
+        if found is not None and abs(found[2] - radius_m) > 1.5 * tolerance * radius_m:
+            return None
+    if found is None:
+        return None
+    axes = np.column_stack([chart.first, chart.second])
+    return Circle(chart.origin + axes @ found[:2], float(found[2]), axes @ cov @ axes.T, rms_px, coverage, chart.seen(found))
+
+
+def _edges(gray: np.ndarray, ellipse: np.ndarray, reach_px: float, chart: Chart) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns the steepest places of profiles across an ellipse on the plane, and how long a pixel is there.
+
+    Returns:
+        Places `(P, PEAKS, 2)` m, NaN where there are fewer, and the length on the plane of a pixel along each profile `(P,)`.
+    """
+    number = int(np.clip(2 * conic.perimeter(ellipse[2], ellipse[3]), 48, 200))
+    points, outward, _ = (value[0] for value in conic.sample(ellipse[None], np.arange(number) * (2 * np.pi / number)))
     offset = np.arange(-reach_px - 2.0, reach_px + 2.0 + 1e-9, STEP_PX)
     place = points[:, None] + offset[None, :, None] * outward[:, None]
     height, width = gray.shape
-    if place[..., 0].min() < 1 or place[..., 1].min() < 1 or place[..., 0].max() > width - 2 or place[..., 1].max() > height - 2:
-        return rough
-    profile = cv2.remap(gray, place[..., 0].astype(np.float32), place[..., 1].astype(np.float32), cv2.INTER_LINEAR).astype(
-        np.float32
-    )
-    slope = np.gradient(cv2.GaussianBlur(profile, (0, 0), SIGMA_PX / STEP_PX, sigmaY=0.8), axis=1)
-    peak = 1 + np.argmax(slope[:, 1:-1], 1)
-    rows = np.arange(number)
-    before, here, after = (slope[rows, peak + shift] for shift in (-1, 0, 1))
+    x, y = place[..., 0], place[..., 1]
+    left, top = int(np.floor(x.min())) - 2, int(np.floor(y.min())) - 2
+    part = gray[max(top, 0) : int(y.max()) + 4, max(left, 0) : int(x.max()) + 4]
+    if min(part.shape) < 4:
+        return None
+    map_x, map_y = ((some - max(corner, 0)).astype(np.float32) for some, corner in ((x, left), (y, top)))
+    profile = cv2.remap(part, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+    smooth = cv2.GaussianBlur(profile, (0, 0), SIGMA_PX / STEP_PX, sigmaY=SIGMA_Y)
+    slope = np.gradient(smooth, axis=1)
+    inner = slope[:, 1:-1]
+    peak = (inner >= slope[:, :-2]) & (inner > slope[:, 2:]) & (np.abs(offset[1:-1]) <= reach_px)
+    peak &= ((x > 1) & (y > 1) & (x < width - 2) & (y < height - 2))[:, 1:-1]
+    strength = np.where(peak, inner, 0.0)
+    steepest = strength.max(1)
+    usual = float(np.median(steepest[steepest > 0])) if (steepest > 0).any() else 0.0
+    chosen = np.argsort(-strength, 1)[:, :PEAKS]
+    rows = np.arange(number)[:, None]
+    good = strength[rows, chosen] > FAINT * usual
+    at = chosen + 1
+    before, here, after = (slope[rows, at + shift] for shift in (-1, 0, 1))
     bend = before - 2 * here + after
     shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0).clip(-0.5, 0.5)
-    at = offset[peak] + STEP_PX * shift
-    steep = here > 0.3 * np.median(here)
-    good = steep & (peak > 1) & (peak < slope.shape[1] - 2) & _follows(at, length * (2 * np.pi / number))
-    edge = points + at[:, None] * outward
-    found = row
-    for scale_px in ROUNDS_PX:
-        weight = good / (1.0 + (conic.distance(found, edge[None])[0] / scale_px) ** 2) ** 2
-        size = float(np.sqrt(found[0, 2] * found[0, 3]))
-        even = weight / np.maximum(conic.slopes(found, edge[None])[0] * size, 1e-3) ** 2
-        found = conic.fit(edge[None], even[None])
-        if not np.isfinite(found).all():
-            return rough
-    off = conic.distance(found, edge[None])[0]
-    on = good & (np.abs(off) < INLIER_PX)
-    coverage = float(length[on].sum() / length.sum())
-    moved = np.abs(found[0, :4] - row[0, :4]).max()
-    if coverage < LEAST_SHARE * rough.coverage or moved > reach_px + 1.0:
-        return rough
-    x, y, a, b, theta = map(float, found[0])
-    rms_px = float(np.sqrt(np.mean(off[on] ** 2)))
-    return replace(rough, x=x, y=y, a=a, b=b, theta_rad=theta, rms_px=rms_px, coverage=coverage)
+    way = offset[at] + STEP_PX * shift
+    edges = chart.flat(points[:, None] + way[..., None] * outward[:, None])
+    edges[~good] = np.nan
+    pixel_m = np.linalg.norm(chart.flat(points + 0.5 * outward) - chart.flat(points - 0.5 * outward), axis=1)
+    return edges, pixel_m
 
 
-def _follows(at: np.ndarray, step_px: np.ndarray) -> np.ndarray:
-    """Says where the edge runs along the ellipse, not across it as that of something before it does, `(P,)` bool.
+def _agreed(edges: np.ndarray, pixel_m: np.ndarray, radius_m: float, tolerance: float) -> np.ndarray | None:
+    """Returns the circle `(x, y, radius)` through three edges that most profiles speak for."""
+    places, owner = edges.reshape(-1, 2), np.repeat(np.arange(len(edges)), edges.shape[1])
+    known = np.isfinite(places[:, 0])
+    places, owner = places[known], owner[known]
+    if len(places) < LEAST:
+        return None
+    triples = places[np.random.default_rng(0).integers(len(places), size=(TRIPLES, 3))]
+    with np.errstate(all="ignore"):
+        one, two = triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0]
+        double = 2 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+        square_one, square_two = (one**2).sum(1), (two**2).sum(1)
+        x = (two[:, 1] * square_one - one[:, 1] * square_two) / double
+        y = (one[:, 0] * square_two - two[:, 0] * square_one) / double
+        radius = np.hypot(x, y)
+        circles = np.column_stack([triples[:, 0, 0] + x, triples[:, 0, 1] + y, radius])
+    circles = circles[np.isfinite(circles).all(1) & (np.abs(radius - radius_m) < tolerance * radius_m)]
+    if not len(circles):
+        return None
+    off = np.abs(np.linalg.norm(edges[None] - circles[:, None, None, :2], axis=-1) - circles[:, 2, None, None]) / pixel_m[:, None]
+    near = np.min(np.where(np.isfinite(off), off, np.inf), 2)
+    return circles[np.argmax(np.maximum(1 - (near / NEAR_PX) ** 2, 0.0).sum(1))]
 
-    Args:
-        at: Distance of the edge from the ellipse at each place around it, `(P,)` px.
-        step_px: From each place to the next, `(P,)`.
-    """
-    reach = max(2, round(2.0 / float(step_px.mean())))
-    rise = np.abs(np.roll(at, -reach) - np.roll(at, reach)) / (2 * reach * step_px)
-    return rise < STRAY
+
+def _fitted(start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, float, float]:
+    """Returns the circle that fits the edges nearest to one, the covariance of its centre, its residual in px and its coverage."""
+    found = start
+    for scale_px in (NARROW_PX, INLIER_PX, 0.6 * INLIER_PX):
+        away = edges - found[:2]
+        distance = np.linalg.norm(away, axis=-1)
+        off = (distance - found[2]) / pixel_m[:, None]
+        best = np.argmin(np.where(np.isfinite(off), np.abs(off), np.inf), 1)
+        rows = np.arange(len(edges))
+        off, away, distance = off[rows, best], away[rows, best], distance[rows, best]
+        off = np.where(np.isfinite(off), off, np.inf)
+        weight = np.maximum(1 - (off / scale_px) ** 2, 0.0) ** 2
+        on = weight > 0
+        if on.sum() < LEAST:
+            return None, np.zeros((2, 2)), 0.0, 0.0
+        slope = np.column_stack([-away / distance[:, None], -np.ones(len(rows))]) / pixel_m[:, None]
+        heavy = slope[on] * weight[on, None]
+        normal = heavy.T @ slope[on]
+        if np.linalg.cond(normal) > 1e8:
+            return None, np.zeros((2, 2)), 0.0, 0.0
+        found = found - np.linalg.solve(normal, heavy.T @ off[on])
+    rms_px = float(np.sqrt(np.average(off[on] ** 2, weights=weight[on])))
+    spacing_px = float(2 * np.pi * found[2] / len(rows) / np.median(pixel_m))
+    alike = max(ALIKE_PX / spacing_px, 1.0)
+    cov = np.linalg.inv(normal)[:2, :2] * rms_px**2 * alike
+    return found, cov, rms_px, float(np.mean(on))

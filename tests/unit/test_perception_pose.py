@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from composed import option
-from drawn import AXIS, CENTER, drawn
+from drawn import AXIS, CENTER, RAYS, K, drawn
 
 from brokk_rl.sight import HolePose, Rejection
-from perception import plane
+from perception import alignment, plane
+from perception.pose import gray_of
+from perception.pose import vector as pose_row
 
 
 @pytest.fixture(scope="module")
@@ -21,13 +24,55 @@ def estimator():
 def test_a_hole_is_where_it_was_drawn(estimator) -> None:
     pose = estimator.estimate(*drawn())
     assert isinstance(pose, HolePose)
-    assert pose.center_m == pytest.approx(CENTER, abs=2e-4)
+    assert pose.center_m == pytest.approx(CENTER, abs=8e-4)  # 0.3 px: the lit wall beyond the far rim blurs into it
     assert pose.axis == pytest.approx(AXIS, abs=1e-3)
-    assert pose.radius_m == pytest.approx(0.05, abs=1e-4)
+    assert pose.radius_m == pytest.approx(0.05, abs=6e-4)
+
+
+def test_a_third_of_a_rim_that_is_hidden_is_not_missed(estimator) -> None:
+    frame, masks, ellipse = drawn()
+    color, depth_m = frame.color.copy(), frame.depth_m.copy()
+    edge = int(ellipse.x + 0.35 * ellipse.a)
+    color[:, edge:], depth_m[:, edge:] = 210, 0.5
+    hidden = replace(ellipse, x=ellipse.x - 1.5, a=ellipse.a - 1.5)  # an ellipse that takes the arm's edge for the rim
+    pose = estimator.estimate(replace(frame, color=color, depth_m=depth_m), masks, hidden)
+    assert isinstance(pose, HolePose)
+    assert pose.center_m == pytest.approx(CENTER, abs=1.5e-3)
+    assert float(pose.axis @ AXIS) > np.cos(np.radians(0.2))
+
+
+def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() -> None:
+    generator = np.random.default_rng(3)
+    frame, masks, ellipse = drawn()
+    m, row = AXIS / (AXIS @ CENTER), pose_row(ellipse)
+    grain = cv2.GaussianBlur(generator.normal(0, 1, (480, 900)).astype(np.float32), (0, 0), 1.2)
+    left = np.clip(120 + 60 * grain[:, 200:840], 0, 255)
+    pull_px = K[0, 0] * 0.12
+    u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    # the right camera sees at column x what the left one has at u = x + pull (m . ray(u)), solved for u
+    x = u - pull_px * (m[0] * (u - K[0, 2]) / K[0, 0] + m[1] * (v - K[1, 2]) / K[1, 1] + m[2])
+    back = (u - x[:, :1]) / (1 - pull_px * m[0] / K[0, 0])
+    right = cv2.remap(grain, (back + 200).astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC)
+    right = np.clip(0.9 * (120 + 60 * right) + 8, 0, 255)
+    color, partner = (np.repeat(np.rint(one).astype(np.uint8)[..., None], 3, 2) for one in (left, right))
+    off = 0.1 / pull_px  # a tenth of a pixel
+    depth = (1.0 / (RAYS @ m + off + generator.normal(0, 0.3, (480, 640)) / pull_px)).astype(np.float32)
+    frame = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
+    allowed = masks.block > 0.5
+    points = plane.support(depth, allowed, K, row, 0.05, 1.25, 2.6, 7.0, 8000, 24)
+    face = plane.fit(points, (2.6, 7.0), 2e-4, generator)
+    assert face is not None
+    both = alignment.pair(frame, gray_of(frame), face.m, row, face.extent)
+    assert both is not None
+    mended = alignment.aligned(both, face, frame, allowed, row, 1.25, 24, 1e-3)
+    ray = CENTER / CENTER[2]
+    assert (face.m - m) @ ray == pytest.approx(off, rel=0.2)
+    assert abs((mended.m - m) @ ray) < 0.2 * off
+    assert float(mended.normal @ AXIS) > np.cos(np.radians(0.3))
 
 
 @pytest.mark.parametrize(
-    ("hole", "reason"), [({"radius_m": 0.035}, "radius"), ({"radius_m": 0.07}, "radius"), ({"depth_m": 0.0}, "slope of brightness")]
+    ("hole", "reason"), [({"radius_m": 0.035}, "radius"), ({"radius_m": 0.07}, "radius"), ({"depth_m": 0.0}, "evidence of depth")]
 )
 def test_what_is_no_hole_of_this_kind_is_refused(hole: dict[str, float], reason: str, estimator) -> None:
     refused = estimator.estimate(*drawn(**hole))
@@ -76,7 +121,7 @@ def test_the_covariance_of_a_plane_is_that_of_its_repetitions() -> None:
     cell = np.arange(2000) // 4
     fits = []
     for _ in range(60):
-        support = plane.Support(rays, rays @ m + generator.normal(0, sigma, 2000), np.full(2000, 2.0), cell)
+        support = plane.Support(rays, rays @ m + generator.normal(0, sigma, 2000), np.full(2000, 2.0), cell, 1.0)
         found = plane.fit(support, (3.0,), 1e-5, generator)
         assert found is not None
         fits.append(found)
@@ -90,6 +135,6 @@ def test_a_plane_ignores_another_face() -> None:
     m = np.array([0.0, 0.4, 0.7])
     inverse = np.where(rays[:, 0] < 0.15, rays @ m, rays @ np.array([1.5, 0.4, 0.475])) + generator.normal(0, 0.002, 4000)
     radii = 1.25 + 30 * np.linalg.norm(rays[:, :2], axis=1)
-    found = plane.fit(plane.Support(rays, inverse, radii, np.arange(4000) // 10), (2.6, 4.0, 7.0, 12.0), 2e-4, generator)
+    found = plane.fit(plane.Support(rays, inverse, radii, np.arange(4000) // 10, 1.0), (2.6, 4.0, 7.0, 12.0), 2e-4, generator)
     assert found is not None
     assert found.m == pytest.approx(m, abs=2e-3)

@@ -1,0 +1,214 @@
+"""The face's plane from both pictures at once: the one by which the right picture, brought onto the left, agrees with it best.
+
+A matcher answers for each pixel, by its neighbourhood, with whatever its sub-pixel step gets wrong; where all of a face is known to
+be one plane, three numbers are left to be found from all of its pixels, each of which counts as much as the picture is steep there
+(Lucas and Kanade 1981, with the plane's homography as the warp). What does not agree by that warp, inside a rim, lies deeper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from brokk_rl.signals import Frame
+from perception import conic
+from perception.plane import Plane, sandwich
+
+SMOOTH_PX = 1.0
+"""Blur of both pictures: noise would shrink the slope."""
+WINDOW_PX = 31
+"""Of which the mean is taken off."""
+MOST = 50_000
+"""Pixels that are compared; of more, whole rows are left out."""
+WIDE_PX = 1000
+"""A part of the picture that is wider than this is looked at in a coarser resolution."""
+ROUNDS = 3
+TUKEY = 4.685
+LEAST, LEAST_INSIDE = 200, 24
+"""Pixels in which a plane is aligned, and in which an inside is compared."""
+LARGEST_PX = 1.0
+"""Shift of the whole face beyond which the pictures agree on something else."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A part of both pictures, smooth, in a resolution in which it is small.
+
+    Attributes:
+        left: `(h, w)` float32.
+        right: `(h, W)` float32, of the same rows.
+        shrink: Pixels of the picture to one of these.
+        corner: Column and row of the picture at which `left` begins, `(2,)`.
+        right_column: Column at which `right` begins.
+        camera_matrix: `(3, 3)` of the whole picture.
+        pull_px: Focal length times baseline, px m: disparity for inverse depth.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    shrink: int
+    corner: tuple[int, int]
+    right_column: int
+    camera_matrix: np.ndarray
+    pull_px: float
+
+    def seen(self, u: np.ndarray, row: np.ndarray, rays: np.ndarray, m: np.ndarray, picture: np.ndarray) -> np.ndarray:
+        """Returns what the right one shows of the points of a plane on `rays`, `(h, w, 3)`, of columns `u` of the picture."""
+        x = (u - self.pull_px * (rays @ m) - self.right_column + 0.5) / self.shrink - 0.5
+        return cv2.remap(picture, x.astype(np.float32), row.astype(np.float32), cv2.INTER_CUBIC)
+
+    def pixel(self, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns column and row in the picture of places in `left`."""
+        return ((column + 0.5) * self.shrink - 0.5 + self.corner[0], (row + 0.5) * self.shrink - 0.5 + self.corner[1])
+
+    def column(self, u: float) -> float:
+        """Returns the column of `left` of a column of the picture."""
+        return (u - self.corner[0] + 0.5) / self.shrink - 0.5
+
+    def row(self, v: float) -> float:
+        """Returns the row of `left` of a row of the picture."""
+        return (v - self.corner[1] + 0.5) / self.shrink - 0.5
+
+    def inside(self, u: np.ndarray, rays: np.ndarray, m: np.ndarray) -> np.ndarray:
+        """Says which of these points the right one shows too, with room for the slope."""
+        x = (u - self.pull_px * (rays @ m) - self.right_column) / self.shrink
+        return (x > 3) & (x < self.right.shape[1] - 4)
+
+
+def pair(frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, outer: float) -> Pair | None:
+    """Returns the surroundings of an ellipse `(5,)`, up to `outer` of its radii, in both pictures; `None` without a right one."""
+    if frame.right is None or frame.baseline_m is None or frame.right.shape != frame.color.shape:
+        return None
+    height, width = gray.shape
+    x, y, reach = ellipse[0], ellipse[1], ellipse[2] * outer
+    left, right = max(0, int(x - reach)), min(width, int(x + reach) + 2)
+    top, bottom = max(0, int(y - reach)), min(height, int(y + reach) + 2)
+    if right - left < 16 or bottom - top < 16:
+        return None
+    shrink = max(1, -(-(right - left) // WIDE_PX))
+    pull_px = float(frame.camera_matrix[0, 0]) * frame.baseline_m
+    corners = _rays(np.array([left, right, left, right]), np.array([top, top, bottom, bottom]), frame.camera_matrix)
+    shift = pull_px * (corners @ m)
+    first = max(0, int(left - shift.max()) - 8 * shrink)
+    last = min(width, int(right - shift.min()) + 8 * shrink)
+    rows, columns = (bottom - top) // shrink, (right - left) // shrink
+    others = (last - first) // shrink
+    if others < 16:
+        return None
+    partner = cv2.cvtColor(
+        np.ascontiguousarray(frame.right[top : top + rows * shrink, first : first + others * shrink]), cv2.COLOR_RGB2GRAY
+    )
+    mine = gray[top : top + rows * shrink, left : left + columns * shrink]
+    small = [cv2.resize(picture, (size, rows), interpolation=cv2.INTER_AREA) if shrink > 1 else picture
+             for picture, size in ((mine, columns), (partner, others))]  # fmt: skip
+    one, other = (cv2.GaussianBlur(picture.astype(np.float32), (0, 0), SMOOTH_PX) for picture in small)
+    return Pair(one, other, shrink, (left, top), first, frame.camera_matrix, pull_px)
+
+
+def aligned(
+    both: Pair, face: Plane, frame: Frame, allowed: np.ndarray, ellipse: np.ndarray, inner: float, cell_px: int, bias_per_m: float
+) -> Plane:
+    """Returns the plane by which the two pictures agree best on the face; `face` itself where they do not.
+
+    What dust, exposure and vignetting add to one of them varies slowly, so only what departs from the mean of a window counts.
+
+    Args:
+        both: The face in both pictures.
+        face: Where to begin.
+        frame: For depth.
+        allowed: Pixels of the face, `(h, w)` bool.
+        ellipse: `(5,)`.
+        inner: In radii of it; nearer to it the rim is seen from two sides.
+        cell_px: Side of the squares within which errors may be alike.
+    """
+    height, width = both.left.shape
+    stride = max(1, round(height * width / MOST))
+    row, column = (np.ascontiguousarray(some, np.float64) for some in np.mgrid[0:height:stride, 0:width])
+    u, v = both.pixel(column, row)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(both.camera_matrix).T
+    pixel = np.rint(v).astype(int).clip(0, allowed.shape[0] - 1), np.rint(u).astype(int).clip(0, allowed.shape[1] - 1)
+    depth = frame.depth_m[pixel]
+    homogeneous = np.stack([u, v, np.ones_like(u)], -1)
+    radii = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", homogeneous, conic.form(ellipse), homogeneous) + 1.0, 0.0))
+    with np.errstate(invalid="ignore"):
+        on = allowed[pixel] & (np.abs(1.0 / depth - rays @ face.m) < 3.0 * face.sigma) & (radii > inner) & (radii < face.extent)
+    on &= both.inside(u, rays, face.m)
+    if on.sum() < LEAST:
+        return face
+    weight = on.astype(np.float32)
+    window = (WINDOW_PX, max(3, WINDOW_PX // stride | 1))
+    counted = np.maximum(cv2.boxFilter(weight, -1, window), 1e-3)
+
+    def departing(values: np.ndarray) -> np.ndarray:
+        return (values - cv2.boxFilter(values * weight, -1, window) / counted)[on].astype(float)
+
+    mine = departing(both.left[::stride])
+    slope = cv2.Sobel(both.right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    m, ray = face.m, rays[on]
+    for _ in range(ROUNDS):
+        seen, rise = (departing(both.seen(u, row, rays, m, picture)) for picture in (both.right, slope))
+        push = np.column_stack([ray * (-both.pull_px / both.shrink * rise)[:, None], -mine])
+        gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
+        off = seen - gain * mine
+        scale = 1.4826 * float(np.median(np.abs(off))) + 1e-6
+        trust = np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
+        heavy = push * trust[:, None]
+        m = m - np.linalg.lstsq(heavy.T @ push, heavy.T @ off, rcond=1e-12)[0][:3]
+    moved_px = both.pull_px * np.abs(ray @ (m - face.m)).max()
+    if not np.isfinite(m).all() or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px:
+        return face
+    cell = (v[on] // cell_px).astype(np.int64) * 10_000 + (u[on] // cell_px).astype(np.int64)
+    return merged(face, replace(face, m=m, cov=sandwich(push[:, :3], trust, off, cell)), bias_per_m)
+
+
+def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:
+    """Returns the plane between two, each weighted by what it knows best; the whole of the first may be off by a bias."""
+    doubt = first.cov + np.diag([0.0, 0.0, bias_per_m**2])
+    weights = [np.linalg.inv(cov) for cov in (doubt, second.cov)]
+    cov = np.linalg.inv(weights[0] + weights[1])
+    return replace(second, m=cov @ (weights[0] @ first.m + weights[1] @ second.m), cov=cov)
+
+
+def _rays(u: np.ndarray, v: np.ndarray, camera_matrix: np.ndarray) -> np.ndarray:
+    return np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera_matrix).T
+
+
+def disagreement(
+    both: Pair, face: Plane, depth_m: np.ndarray, ellipse: np.ndarray, inner: float, ring: tuple[float, float]
+) -> float:
+    """Returns how much the pictures differ inside an ellipse by the plane's warp, over how much they do on the face around it.
+
+    A flat disc looks the same from both cameras, the inside of a hole does not. NaN where too little of it can be seen.
+
+    Args:
+        both: The ellipse's surroundings in both pictures.
+        face: The plane of the face.
+        depth_m: `(h, w)`; what stands before the face is left out.
+        ellipse: `(5,)`.
+        inner: Radii within which it is the inside.
+        ring: Radii between which it is the face.
+    """
+    row, column = np.mgrid[0 : both.left.shape[0], 0 : both.left.shape[1]].astype(np.float64)
+    near = np.hypot(column - both.column(ellipse[0]), row - both.row(ellipse[1])) * both.shrink < ring[1] * ellipse[2]
+    if not near.any():
+        return float("nan")
+    rows, columns = (np.flatnonzero(near.any(k)) for k in (1, 0))
+    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    row = row[part]
+    u, v = both.pixel(column[part], row)
+    place = np.stack([u, v, np.ones_like(u)], -1)
+    rays = place @ np.linalg.inv(both.camera_matrix).T
+    radii = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", place, conic.form(ellipse), place) + 1.0, 0.0))
+    depth = depth_m[np.rint(v).astype(int).clip(0, len(depth_m) - 1), np.rint(u).astype(int).clip(0, depth_m.shape[1] - 1)]
+    with np.errstate(invalid="ignore"):
+        before = (1.0 / depth - rays @ face.m > 4 * face.sigma).astype(np.uint8)
+    shown = both.inside(u, rays, face.m) & (cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0)
+    within, around = shown & (radii < inner), shown & (radii > ring[0]) & (radii < ring[1])
+    if within.sum() < LEAST_INSIDE or around.sum() < LEAST_INSIDE:
+        return float("nan")
+    mine, seen = both.left[part], both.seen(u, row, rays, face.m, both.right)
+    off = mine - seen * (np.median(mine[around]) / max(float(np.median(seen[around])), 1.0))
+    usual = 1.4826 * float(np.median(np.abs(off[around] - np.median(off[around]))))
+    return float(np.std(off[within])) / max(usual, 0.1)
