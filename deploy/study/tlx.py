@@ -1,0 +1,90 @@
+"""NASA-TLX: six scales of workload, raw and weighted.
+
+Each scale goes from 0 to 100 in steps of 5; that of performance from good (0) to poor (100), so that more is more load on all six.
+The raw score is their mean; the weighted one weighs each by how often it was chosen in the 15 pairs (Hart and Staveland 1988; Hart
+2006). An answer that is missing makes the score missing: a mean over the rest would be another questionnaire.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from brokk_rl.errors import choices
+
+SCALES = {
+    "mental": "Mental demand",
+    "physical": "Physical demand",
+    "temporal": "Temporal demand",
+    "performance": "Performance (0 good, 100 poor)",
+    "effort": "Effort",
+    "frustration": "Frustration",
+}
+STEP = 5
+PAIRS = tuple(combinations(SCALES, 2))
+
+
+def pairs(generator: np.random.Generator) -> list[tuple[str, str]]:
+    """Returns the 15 pairs in random order, each in random order, as they are to be shown."""
+    shuffled = [PAIRS[index] for index in generator.permutation(len(PAIRS))]
+    return [pair if generator.integers(2) else pair[::-1] for pair in shuffled]
+
+
+def check(answers: Mapping) -> list[str]:
+    """Returns what is missing or wrong in a questionnaire, in words; empty where it is whole."""
+    found = []
+    ratings, chosen = answers.get("ratings") or {}, answers.get("pairs") or []
+    lacking = [scale for scale in SCALES if ratings.get(scale) is None]
+    if lacking:
+        found.append(f"{', '.join(lacking)} not answered: no raw score")
+    for scale, value in ratings.items():
+        if scale not in SCALES:
+            found.append(f"unknown scale '{scale}'; {choices(scale, SCALES)}")
+        elif value is not None and not (isinstance(value, (int, float)) and 0 <= value <= 100):
+            found.append(f"{scale} is {value!r}, expected 0 to 100: not counted")
+    if chosen and _weights(chosen) is None:
+        found.append(f"{len(chosen)} of 15 pairs answered as they should be: no weighted score")
+    return found
+
+
+def ratings(answers: Mapping) -> dict[str, float]:
+    """Returns the rating of each scale, NaN where there is none that makes sense."""
+    given = answers.get("ratings") or {}
+    values = {scale: given.get(scale) for scale in SCALES}
+    return {
+        scale: float(value) if isinstance(value, (int, float)) and 0 <= value <= 100 else math.nan
+        for scale, value in values.items()
+    }
+
+
+def raw(answers: Mapping) -> float:
+    """Returns the mean of the six scales, NaN where one is missing."""
+    return float(np.mean(list(ratings(answers).values())))
+
+
+def weighted(answers: Mapping) -> float:
+    """Returns the sum of ratings times weights over 15, NaN where a pair, or a scale that was ever chosen, is missing."""
+    weights = _weights(answers.get("pairs") or [])
+    if weights is None:
+        return math.nan
+    given = ratings(answers)
+    return sum(weights[scale] * given[scale] for scale in SCALES if weights[scale]) / len(PAIRS)
+
+
+def _weights(chosen: Sequence[Mapping]) -> dict[str, int] | None:
+    """Returns how often each scale was chosen; `None` unless each of the 15 pairs was answered once.
+
+    Each answer is `{"pair": [a, b], "chosen": a}`.
+    """
+    seen: dict[frozenset, str] = {}
+    for answer in chosen:
+        pair = frozenset(answer.get("pair", ()))
+        if answer.get("chosen") not in pair or pair in seen:
+            return None
+        seen[pair] = answer["chosen"]
+    if set(seen) != {frozenset(pair) for pair in PAIRS}:
+        return None
+    return {scale: list(seen.values()).count(scale) for scale in SCALES}
