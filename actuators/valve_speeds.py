@@ -22,8 +22,10 @@ PLAYS = np.array([0.0, 0.01, 0.02, 0.035, 0.05, 0.08, 0.12])
 """Widths for which the play is computed; between them its output is interpolated."""
 STIFFNESS = 4.0
 """Prior: slope of a flow curve changes by so much per root of stroke."""
-POSE = 0.3
+POSE = 0.03
 """Prior: relative change of speed per feature of the pose."""
+TOGETHER = 15.0
+"""Increments whose errors hang together: a speed that wanders for some seconds is no evidence for a bend of the curve or a pose."""
 
 
 @dataclass
@@ -124,7 +126,7 @@ class Speeds:
                 left = self.way[j] - level - slopes @ found.pose[j].ravel()
                 typical = 1.4826 * np.median(np.abs(left[np.abs(self.way[j]) > 0.1 * np.sqrt(self.scale[j])]))
                 free[j] = self._free[j] * np.minimum(1.0, 4.0 * typical / np.maximum(np.abs(left), 1e-9))
-                noise[j] = max(typical**2, 1e-6 * self.scale[j])
+                noise[j] = TOGETHER * max(typical**2, 1e-6 * self.scale[j])
                 flow.append(plain)
             full = np.maximum(np.abs(found.curve[:, [half - 1, 2 * half - 1]]), 1e-3)
             unit = self.machine.max_speed * self._period_s

@@ -18,7 +18,7 @@ from brokk_rl.diagnosis.candidates import Candidates
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.noise import LONGEST, Noise, increments
 
-GRID = (0.1, 0.25, 0.45, 0.7, 1.0, 1.4, 1.9, 2.5)
+GRID = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
 """Sizes, over the typical one, at which an effect is simulated; in between its doing is interpolated."""
 
 GAIN, FAULT_S, FAULT = 0.01, 0.004, 0.01
@@ -84,12 +84,16 @@ class Evidence:
         noise: Of each joint; `None` while it is still to be found.
         claims: Whether each window says something about each joint, `(W, J)`.
         mean: What effects of chance change on average, which are known already, `(W, K, J)`.
+        bias: Increments that the simulator misses already on the reference, `(W, I, J)`; see `discrepancy`.
+        widths: How large faults of the simulator's own numbers are, over the usual, `(P,)`; see `discrepancy`.
     """
 
     candidates: Candidates
     noise: Sequence[Noise] | None
     claims: np.ndarray
     mean: np.ndarray | None = None
+    bias: np.ndarray | None = None
+    widths: np.ndarray | None = None
 
     @cached_property
     def base(self) -> np.ndarray:
@@ -115,6 +119,7 @@ class Evidence:
         """Returns measured less simulated increments, `(…, W, I, J)`, of free runs `(…, W, K, J)`."""
         still = np.zeros_like(self.start)
         known = 0.0 if self.mean is None else increments(self.mean, still)
+        known = known if self.bias is None else known + self.bias
         return increments(self.candidates.cut.measured, self.start) - increments(paths, self.start) - known
 
     @cached_property
@@ -183,7 +188,8 @@ class Evidence:
             by = FAULT_S if name.endswith("_s") else FAULT
             moved = increments(candidates.paths([], 1, {name: value.numpy() + by})[0], self.start) - self.way
             found.append(self.whitened(moved[None]))
-        return np.concatenate(found, 1)
+        lines = np.concatenate(found, 1)
+        return lines if self.widths is None else lines * self.widths[:, None]
 
     def response(self, ray: Ray) -> np.ndarray:
         """Returns what an effect on all joints changes at each size of the ray, over the noise, `(J, C, E)`."""

@@ -49,13 +49,17 @@ def add(shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray]
     return [replace(ray, shape=shape) for ray in ways]
 
 
-def plain_joints(evidence: Evidence, scatter: np.ndarray | None = None) -> list[Plain]:
-    """Returns the errors of each joint with small faults of the simulator, in units of `scatter` times the noise."""
+def plain_joints(evidence: Evidence, scatter: np.ndarray | None = None, z: np.ndarray | None = None) -> list[Plain]:
+    """Returns the errors of each joint with small faults of the simulator, in units of `scatter` times the noise.
+
+    Args:
+        evidence: Errors over the noise.
+        scatter: Mean square error over what the noise says, `(J,)`.
+        z: Errors to explain in place of those of the evidence, `(J, E)`.
+    """
     by = np.ones(len(evidence.z)) if scatter is None else 1.0 / np.sqrt(scatter)
-    joints = []
-    for j, z in enumerate(evidence.z):
-        joints.append(plain(z * by[j], evidence.faults[j] * by[j], evidence.fold))
-    return joints
+    z = evidence.z if z is None else z
+    return [plain(one * part, lines * part) for one, lines, part in zip(z, evidence.faults, by, strict=True)]
 
 
 def _all(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ import torch
 
 from brokk_rl import open_loop
 from brokk_rl.contracts import Actuator, ActuatorFit
-from brokk_rl.diagnosis import noise, tuning
+from brokk_rl.diagnosis import discrepancy, noise, tuning
 from brokk_rl.diagnosis.candidates import Candidates
 from brokk_rl.diagnosis.case import HORIZON_S, Case, parts, running_s
 from brokk_rl.diagnosis.evidence import Evidence
@@ -25,7 +25,7 @@ from brokk_rl.record import Recording
 
 log = logging.getLogger(__name__)
 
-FOLDS = 3
+FOLDS = 4
 """Times that a part of the reference is left out."""
 TOGETHER = 3
 """Windows in a row on which the noise is fitted."""
@@ -114,7 +114,7 @@ def fitted(case: Case, fit: ActuatorFit, folder: Path, seed: int, device: torch.
             "judged on recordings it was not fitted to needs several minutes"
         )
     begun = _begun(reference)
-    fold = np.arange(len(reference)) * FOLDS // len(reference) if len(reference) >= FOLDS else np.arange(len(reference))
+    fold = np.arange(len(reference)) % FOLDS  # in turns: what is left out is of the same making as what is fitted to
     refit: Any = getattr(fit, "refit", None)
     nulls = []
     if refit:
@@ -135,9 +135,19 @@ def fitted(case: Case, fit: ActuatorFit, folder: Path, seed: int, device: torch.
         actuator = tuning.changed(actuator, changes, machine)
         nulls = _noised([one.with_base(tuning.changed(one.evidence.candidates.base, changes, machine)) for one in nulls], machine)
         field = field.with_base(actuator)
-    noises = nulls[0].evidence.noise
-    claims = _known(case, field)
-    return Base(actuator, replace(field, evidence=replace(field.evidence, noise=noises, claims=claims)), nulls)
+    field = replace(field, evidence=replace(field.evidence, claims=_known(case, field)))
+    return learned(Base(actuator, field, nulls), machine)
+
+
+def learned(base: Base, machine: Machine) -> Base:
+    """Returns the same simulator, with what it gets wrong on the reference taken off, and the noise of what is left."""
+    biases, of_field = discrepancy.learned([one.evidence for one in base.nulls], base.field.evidence)
+    nulls = [replace(one, evidence=replace(one.evidence, bias=bias)) for one, bias in zip(base.nulls, biases, strict=True)]
+    nulls = _noised(nulls, machine)
+    widths = discrepancy.widths([one.evidence for one in nulls])
+    nulls = [replace(one, evidence=replace(one.evidence, widths=widths)) for one in nulls]
+    field = replace(base.field.evidence, noise=nulls[0].evidence.noise, bias=of_field, widths=widths)
+    return replace(base, field=replace(base.field, evidence=field), nulls=nulls)
 
 
 def given(case: Case, actuator: Actuator, seed: int) -> Base:

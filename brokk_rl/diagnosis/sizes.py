@@ -1,4 +1,7 @@
-"""Which sizes of some effects explain a joint's errors best, and how much that earns on recordings they were not fitted to.
+"""Which sizes of some effects explain a joint's errors best, and how much more likely that makes the recordings.
+
+What a set of effects earns is the logarithm of its Bayes factor against the simulator alone, by Laplace's approximation: the
+likelihood at the best sizes, less what large sizes and large faults of the simulator are unlikely, less the price of fitting them.
 
 What an effect does at a size is interpolated between the sizes at which it was simulated, and effects are added up: both are near
 enough for choosing, and what is chosen is simulated again.
@@ -14,7 +17,7 @@ import numpy as np
 
 from brokk_rl.diagnosis.noise import FREEDOM, loss, weight
 
-STEPS = 6
+STEPS = 10
 """Gauss-Newton steps at most."""
 ENOUGH = 0.02
 """Gain in log likelihood below which the steps end."""
@@ -83,12 +86,15 @@ def fitted(
     left = left_at(size)
     now, damping = total(left, size), 1e-3
     for _ in range(STEPS):
-        slope = np.concatenate([*(shape.at(one)[1][None] for shape, one in zip(shapes, size, strict=False)), lines])
+        slope = _slopes(shapes, lines, size)
         weighted = slope * (weight(left) * used)
         normal, gradient = weighted @ slope.T + np.diag(precision), weighted @ left - precision * size
+        free = ~((size <= low) & (gradient < 0.0) | (size >= high) & (gradient > 0.0))
         gain = 0.0
         for _ in range(3):
-            trial = np.clip(size + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), low, high)
+            damped = (normal + damping * np.diag(np.diag(normal)))[np.ix_(free, free)]
+            trial = size.copy()
+            trial[free] = np.clip(size[free] + np.linalg.solve(damped, gradient[free]), low[free], high[free])
             remains = left_at(trial)
             then = total(remains, trial)
             if then < now - 1e-9:
@@ -98,6 +104,10 @@ def fitted(
         if gain < ENOUGH:
             break
     return size
+
+
+def _slopes(shapes: Sequence[Shape], lines: np.ndarray, size: np.ndarray) -> np.ndarray:
+    return np.concatenate([*(shape.at(one)[1][None] for shape, one in zip(shapes, size, strict=False)), lines])
 
 
 def alone(z: np.ndarray, shape: Shape, used: np.ndarray | None = None) -> float:
@@ -116,44 +126,50 @@ class Plain:
 
     Attributes:
         z: Errors over the noise, `(E,)`.
-        fold: Half of the recordings of each entry.
         faults: What the simulator's own numbers change, `(P, E)`.
-        loss: Loss of each entry where faults were fitted to the other half.
+        loss: Loss of each entry.
+        price: Of the faults: how unlikely their sizes are, and of having fitted them.
     """
 
     z: np.ndarray
-    fold: np.ndarray
     faults: np.ndarray
     loss: np.ndarray
+    price: float
 
 
-def plain(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray, fold: np.ndarray) -> Plain:
-    """Returns a joint's errors with the simulator's faults, `(P, E)`, fitted crosswise."""
+def plain(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray) -> Plain:
+    """Returns a joint's errors with the simulator's faults, `(P, E)`, fitted."""
     lines = np.reshape(np.asarray(faults, dtype=float), (-1, len(z)))
-    return Plain(z, fold, lines, _each(z - _crossed(z, [], lines, fold, fitted(z, [], faults=lines))))
-
-
-def _crossed(z: np.ndarray, shapes: Sequence[Shape], faults: np.ndarray, fold: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Returns what shapes and faults change, `(E,)`, on each half with sizes fitted to the other."""
-    change = np.zeros(len(z))
-    for half in (0, 1):
-        other = fold == half
-        if other.any() and not other.all():
-            size = fitted(z, shapes, start, faults, np.where(other, 0.0, 1.0))
-            whole = size[len(shapes) :] @ faults + (predicted(shapes, size[: len(shapes)]) if shapes else 0.0)
-            change[other] = whole[other]
-    return change
+    whole = fitted(z, [], faults=lines)
+    left = z - whole @ lines
+    return Plain(z, lines, loss(left[:, None], axis=1), _price(left, [], lines, whole))
 
 
 def earned(joint: Plain, shapes: Sequence[Shape], start: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Returns by how much shapes fitted to one half of the entries lower the loss of the other, entry by entry `(E,)`.
+    """Returns by how much shapes make the errors more likely, entry by entry `(E,)`, and their best sizes.
 
-    Returns:
-        What each entry earns, and the sizes fitted to all.
+    Prices of sizes and faults are spread over the entries.
     """
     whole = fitted(joint.z, shapes, start, joint.faults)
-    return joint.loss - _each(joint.z - _crossed(joint.z, shapes, joint.faults, joint.fold, whole)), whole[: len(shapes)]
+    count = len(shapes)
+    left = joint.z - whole[count:] @ joint.faults - (predicted(shapes, whole[:count]) if shapes else 0.0)
+    saved = joint.price - _price(left, shapes, joint.faults, whole)
+    return joint.loss - loss(left[:, None], axis=1) + saved / len(left), whole[:count]
 
 
-def _each(z: np.ndarray) -> np.ndarray:
-    return loss(z[:, None], axis=1)
+def _price(left: np.ndarray, shapes: Sequence[Shape], lines: np.ndarray, size: np.ndarray) -> float:
+    """Returns the loss of sizes and faults under their priors, and Occam's factor: how much narrower the recordings make them."""
+    slope = _slopes(shapes, lines, size)
+    precision = np.concatenate([np.full(len(shapes), PRIOR**-2.0), np.ones(len(lines))])
+    told = (slope * weight(left)) @ slope.T / precision + np.eye(len(size))
+    return 0.5 * float(precision @ np.square(size)) + 0.5 * float(np.linalg.slogdet(told)[1])
+
+
+def crossed(z: np.ndarray, shapes: Sequence[Shape], fold: np.ndarray) -> np.ndarray:
+    """Returns what shapes change, `(E,)`, on each half `fold` with sizes fitted to the other."""
+    change = np.zeros(len(z))
+    for half in (0, 1):
+        other = fold == half
+        if shapes and other.any() and not other.all():
+            change[other] = predicted(shapes, fitted(z, shapes, used=np.where(other, 0.0, 1.0)))[other]
+    return change

@@ -42,7 +42,7 @@ def test_increments_add_up_to_the_way_since_the_start() -> None:
 
 def joint(z: np.ndarray, shapes: dict[str, list[Shape]], faults: list[np.ndarray] | None = None) -> Table:
     block = np.arange(len(z)) // 80
-    return Table(plain(z, faults or [], block % 2), shapes, block)
+    return Table(plain(z, faults or []), shapes, block)
 
 
 def line(column: np.ndarray) -> Shape:
@@ -64,12 +64,23 @@ def test_the_size_of_an_effect_is_found_though_it_does_not_grow_in_proportion() 
     assert fitted(z, [bend(column)])[0] == pytest.approx(1.2, abs=0.06)
 
 
-def test_what_earns_nothing_on_the_other_half_earns_nothing() -> None:
+def test_what_an_effect_earns_is_its_bayes_factor() -> None:
+    random = np.random.default_rng(3)
+    column = 0.3 * random.standard_normal(400)
+    for size in (0.0, 0.6):
+        z = size * column + random.standard_normal(400)
+        fine = np.linspace(-2.0, 2.0, 4001)
+        likely = -noise.loss(z[:, None] - fine * column[:, None], 0) + noise.loss(z)
+        whole = np.trapezoid(np.exp(likely - 0.5 * fine**2) / np.sqrt(2.0 * np.pi), fine)  # over the prior of the size
+        assert earned(plain(z, []), [line(column)])[0].sum() == pytest.approx(np.log(whole), abs=0.25)
+
+
+def test_an_effect_that_is_not_there_earns_less_than_nothing() -> None:
     random, gains = np.random.default_rng(3), []
     for _ in range(40):
         z, column = random.standard_normal(800), random.standard_normal(800)
-        gains.append(earned(plain(z, [], np.arange(800) // 80 % 2), [line(column)])[0].sum())
-    assert np.mean(gains) < 0.2 and np.max(gains) < 6.0
+        gains.append(earned(plain(z, []), [line(column)])[0].sum())
+    assert np.mean(gains) < -1.0 and np.max(gains) < 2.0
 
 
 def test_a_pair_is_found_of_which_neither_pays_alone() -> None:

@@ -69,7 +69,7 @@ def grown(errors: Errors, worth: Worth) -> dict[str, float]:
 
 def held_out(errors: Errors, names: frozenset[str]) -> float:
     """Returns the gain in log likelihood on the half that was not fitted to."""
-    return float(sizes.earned(sizes.plain(errors.z, [], errors.fold), errors.rays(names))[0].sum())
+    return float(loss(errors.z) - loss(errors.z - sizes.crossed(errors.z, errors.rays(names), errors.fold)))
 
 
 def bic(errors: Errors, names: frozenset[str]) -> float:
