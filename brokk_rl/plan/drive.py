@@ -11,7 +11,9 @@ from brokk_rl.contracts import Link
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.plan.runner import Runner
+from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
+from brokk_rl.spec import spec
 
 DUE = 0.9
 """Part of a control period after which a new state counts as due: states that come at the machine's own rate jitter."""
@@ -81,25 +83,40 @@ def _next(link: Link, due_s: float) -> JointState:
     return state
 
 
-class Nominal:
-    """A machine as its file has it: dead time, full speed times command, stops; `N` of them, from home."""
+@spec
+class NominalMachine:
+    """A machine as its file has it: dead time and full speed times command. Needs neither simulator nor torch."""
 
-    def __init__(self, machine: Machine, num_runs: int) -> None:
-        self._machine, self._t_s = machine, 0.0
+    @property
+    def source(self) -> str:
+        """That it is none."""
+        return "nominal machine"
+
+    def build(self, machine: Machine, num_runs: int, session: Session) -> Link:
+        """Returns a link to `num_runs` of them."""
+        return Nominal(machine, num_runs, alone=num_runs == 1)
+
+
+class Nominal:
+    """A machine as its file has it: dead time, full speed times command, stops; `N` of them, or one alone without that axis."""
+
+    def __init__(self, machine: Machine, num_runs: int, alone: bool = False) -> None:
+        self._machine, self._t_s, self._form = machine, 0.0, (machine.num_joints,) if alone else (num_runs, machine.num_joints)
         self._q = np.tile(machine.home, (num_runs, 1))
         self._in_flight = np.zeros((round(machine.dead_time_s / machine.period_s) + 1, *self._q.shape))
 
     def read(self) -> JointState:
         """Returns the true positions."""
-        return JointState(self._t_s, self._q)
+        return JointState(self._t_s, self._q.reshape(self._form))
 
     def send(self, command: Command) -> Command:
         """Moves on by one control period."""
         machine = self._machine
-        self._in_flight = np.concatenate([self._in_flight[1:], np.asarray(command.u)[None]])
+        u = np.nan_to_num(np.asarray(command.u, dtype=float), nan=0.0, posinf=0.0, neginf=0.0).clip(-1.0, 1.0)
+        self._in_flight = np.concatenate([self._in_flight[1:], u.reshape(1, *self._q.shape)])
         self._q = (self._q + self._in_flight[0] * machine.max_speed * machine.period_s).clip(machine.lower, machine.upper)
         self._t_s += machine.period_s
-        return command
+        return Command(u)
 
     def __enter__(self) -> Self:
         return self

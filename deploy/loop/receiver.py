@@ -12,9 +12,10 @@ from brokk_rl.machine import Machine
 from deploy.bus.description import COUNTER, GATEWAY, LEVER_AXES, REMOTE, Description, Layout
 from deploy.bus.protection import Channel, Fault, Trust
 from deploy.bus.wire import Wired
-from deploy.guard import Limits, Plausibility, Seen, body_of
+from deploy.guard import Limits, Seen, body_of
+from deploy.plausibility import Plausibility
 
-OWN = 64
+OWN = 8
 """Commands last sent that are known again: on some buses a node hears itself."""
 STAMP_MODULUS_S = 65.536
 """The gateway's clock of the example wraps here."""

@@ -83,6 +83,9 @@ class _Running:
         self._q = self._before = np.asarray(link.read().q, dtype=float)
         self._period_began_s = -np.inf
         self._stuck: np.ndarray | None = None
+        remote = self._description.layouts[self._description.message_of("DeadMan")]
+        # on some buses a node hears itself; its own remote has been taken in already
+        self._own = {remote.frame_id} if twin.remote else set()
 
     def run(self, stop: Stop) -> None:
         end_s = np.inf if self._twin.seconds is None else time.monotonic() + self._twin.seconds
@@ -90,7 +93,7 @@ class _Running:
             try:
                 while (left_s := self._pace.next_s - time.monotonic()) > 0:
                     frame = self._bus.recv(left_s)
-                    if frame is not None:
+                    if frame is not None and frame.frame_id not in self._own:
                         self._gateway.take(frame, time.monotonic())
                 self._pace.begin()
                 self._cycle(time.monotonic())

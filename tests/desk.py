@@ -1,0 +1,169 @@
+"""A desk with real processes: twin, bus process, and a commander in place of the policy, on a multicast bus of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import time
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from brokk_rl.machine import Machine
+from brokk_rl.plan.drive import NominalMachine
+from brokk_rl.session import Session
+from deploy.bus.description import Description
+from deploy.bus.protection import Fault
+from deploy.bus.wire import Wire
+from deploy.guard import Limits
+from deploy.loop.outlet import view
+from deploy.loop.process import Child, Stop
+from deploy.loop.records import Exchange
+from deploy.loop.station import Setting
+from deploy.twin.faults import ask
+from deploy.twin.twin import Twin
+
+DBC = "deploy:dbc/example_gateway.dbc"
+COMMAND = (0.3, 0.0, -0.3, 0.0, 0.2)
+"""What the commander asks for."""
+
+
+def command(stop: Stop, exchange: Exchange) -> None:
+    """Asks for the same motion twenty times a second, as a policy would."""
+    assert exchange.request is not None
+    while not stop():
+        request = exchange.request.new()
+        request["t_s"], request["u"] = time.monotonic(), COMMAND
+        exchange.request.write(request)
+        time.sleep(0.05)
+
+
+def free_port() -> int:
+    """Returns a port that nobody uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def wire() -> Wire:
+    """Returns a bus that nobody else uses."""
+    return Wire(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=free_port())
+
+
+class Desk:
+    """The processes; a context manager.
+
+    Args:
+        machine: The machine.
+        limits: Of the guard.
+        folder: Where a session may write.
+        commands: Whether the bus process may send at all.
+    """
+
+    def __init__(self, machine: Machine, limits: Limits, folder: Path, commands: bool = True) -> None:
+        self.machine, self.wire, self.port = machine, wire(), free_port()
+        self.exchange = Exchange.new(machine.num_joints, commands)
+        self._description = Description(DBC, machine)
+        self._setting = Setting(self.wire, DBC, machine, limits)
+        twin = Twin(wire=self.wire, dbc=DBC, remote=True, deadman=True, fault_port=self.port, seconds=None)
+        session = Session(out=str(folder), seed=0, device="cpu")
+        self._twin_arguments = (twin, machine, NominalMachine(), session, None)
+        self.children: dict[str, Child] = {}
+        self.bus = self.wire.open()
+
+    def start(self, name: str) -> None:
+        """Starts `twin`, `bus` or `commander`."""
+        what: dict[str, tuple[str, tuple[Any, ...], int | None]] = {
+            "twin": ("deploy.twin.twin:run", self._twin_arguments, 60),
+            "bus": ("deploy.loop.station:run", (self._setting, self.exchange), 55),
+            "commander": ("desk:command", (self.exchange,), 50),
+        }
+        target, arguments, priority = what[name]
+        self.children[name] = Child(name, target, arguments, self.exchange.files, priority)
+
+    def fault(self, fault: str, message: str = "", seconds: float = 1e9) -> float:
+        """Switches a fault on; returns when (monotonic)."""
+        answer = ask(self.port, {"fault": fault, "message": message, "seconds": seconds}, timeout_s=5.0)
+        assert answer.startswith("ok "), answer
+        return float(answer.removeprefix("ok "))
+
+    def arm(self, armed: bool = True) -> None:
+        """Arms or disarms."""
+        controls = self.exchange.controls.new()
+        controls["t_s"], controls["armed"] = time.monotonic(), armed
+        self.exchange.controls.write(controls)
+
+    def heard(self, message: str, seconds: float) -> list[tuple[float, dict[str, float]]]:
+        """Returns what was said on the bus from now on, with when."""
+        self._drain()
+        layout, end_s, found = self._description.layouts[message], time.monotonic() + seconds, []
+        while (left_s := end_s - time.monotonic()) > 0:
+            frame = self.bus.recv(left_s)
+            if frame is not None and frame.frame_id == layout.frame_id:
+                values = self._description.decode(layout, frame.data)
+                if not isinstance(values, Fault):
+                    found.append((time.monotonic(), values))
+        return found
+
+    def moves(self) -> bool:
+        """Says whether the valves get anything now."""
+        return any(abs(values["Flow_q1"]) > 0 for _, values in self.heard("ValveFeedback", 0.06))
+
+    def set_moving(self, patience_s: float = 20.0) -> None:
+        """Goes the operator's way until the machine moves as the commander asks."""
+        end_s = time.monotonic() + patience_s
+        self.fault("none")
+        self.arm()
+        while time.monotonic() < end_s:
+            self.fault("deadman_released", seconds=0.15)
+            time.sleep(0.4)
+            if all(abs(values["Flow_q1"] - COMMAND[0]) < 0.01 for _, values in self.heard("ValveFeedback", 0.05)):
+                return
+        raise AssertionError(f"the machine does not move: {view(self.exchange).plain()}")
+
+    def still_after(self, since_s: float, seconds: float = 1.0) -> float:
+        """Returns how long after `since_s` the valves got nothing any more, up to the end of `seconds`."""
+        layout, end_s, last_s = self._description.layouts["ValveFeedback"], since_s + seconds, since_s
+        while (left_s := end_s - time.monotonic()) > 0:
+            frame = self.bus.recv(left_s)
+            if frame is None or frame.frame_id != layout.frame_id:
+                continue
+            values = self._description.decode(layout, frame.data)
+            if not isinstance(values, Fault) and any(values[f"Flow_{name}"] for name in self.machine.joint_names):
+                last_s = max(last_s, time.monotonic())
+        assert last_s < end_s - 0.1, f"still moving after {seconds} s"
+        return last_s - since_s + layout.period_s  # the next message would have said zero
+
+    def signal(self, name: str, number: int) -> float:
+        """Sends a signal to a process; returns when."""
+        now_s = time.monotonic()
+        os.kill(self.children[name].pid, number)
+        return now_s
+
+    def wait_for_state(self, patience_s: float = 20.0) -> None:
+        """Waits until positions come."""
+        end_s = time.monotonic() + patience_s
+        while time.monotonic() < end_s:
+            state = self.exchange.state.read()
+            if state is not None and float(state["q_t_s"]) > 0 and np.isfinite(state["q"]).all():
+                return
+            time.sleep(0.02)
+        raise AssertionError("nothing comes from the twin")
+
+    def _drain(self) -> None:
+        while self.bus.recv(0.0) is not None:
+            pass
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for child in self.children.values():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(child.pid, signal.SIGCONT)
+            child.end(2.0)
+        self.bus.close()
+        self.exchange.close()

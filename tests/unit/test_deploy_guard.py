@@ -1,0 +1,332 @@
+"""The guard: who may send what, and when nothing is sent."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from composed import option
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brokk_rl.errors import ConfigError
+from deploy.guard import Decision, Guard, Limits, Request, Seen, State, Trip, body_of
+from deploy.plausibility import Plausibility
+
+BODY = body_of([-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [False, True, False])
+LIMITS = Limits(
+    max_command=0.8, max_rate_1_s=5.0, overrun=0.001, neutral=0.05, stop_margin=0.1, joints_s=0.15, levers_s=0.16, status_s=0.17,
+    request_s=0.18, gap_s=0.2, jump_margin=3.0, jump_slack=0.01, range_slack=0.2, num_jumps=3,
+)  # fmt: skip
+WELL = Seen(
+    q=(0.0, 0.0, 1.0), joints_age_s=0.01, joints_plausible=True, trusted=True, levers_age_s=0.01, lever=0.0, deadman=True,
+    status_age_s=0.01, estop=False, bus_up=True, alone=True,
+)  # fmt: skip
+RELEASED = replace(WELL, deadman=False)
+STILL = (0.0, 0.0, 0.0)
+DT = 0.02
+
+
+class Hand:
+    """A guard whose clock goes on by `DT` with each decision."""
+
+    def __init__(self, limits: Limits = LIMITS) -> None:
+        self.guard, self.now_s = Guard(limits, BODY), 100.0
+
+    def decide(self, seen: Seen = WELL, u: tuple[float, ...] | None = STILL, armed: bool = True, **change: Any) -> Decision:
+        self.now_s += change.pop("dt", DT)
+        age_s = change.pop("age_s", 0.0)
+        request = None if u is None else Request(u, age_s)
+        return self.guard.decide(self.now_s, armed, replace(seen, **change), request)
+
+    def active(self) -> Hand:
+        """Goes the way an operator goes: arm, release, press."""
+        self.decide(RELEASED, dt=0.01)
+        assert self.decide(RELEASED).state is State.READY
+        assert self.decide(WELL).state is State.ACTIVE
+        return self
+
+
+def test_nothing_is_sent_until_somebody_arms_it_on_purpose() -> None:
+    hand = Hand()
+    for seen in (WELL, RELEASED, WELL):
+        decision = hand.decide(seen, (0.5, 0.0, 0.5), armed=False)
+        assert decision.state is State.SILENT and not decision.sends and decision.u == STILL
+    assert decision.trip is Trip.NOT_ARMED
+
+
+def test_what_is_wrong_is_said_in_silence_too() -> None:
+    hand = Hand()
+    hand.decide(armed=False)
+    assert hand.decide(armed=False, estop=True).trip is Trip.ESTOP
+
+
+def test_arming_alone_moves_nothing_and_neither_does_a_dead_man_held_from_the_start() -> None:
+    hand = Hand()
+    hand.decide(WELL)
+    decision = hand.decide(WELL, (0.5, 0.0, 0.0))
+    assert decision.state is State.LATCHED and decision.sends and decision.u == STILL and decision.trip is Trip.NOT_ARMED
+
+
+def test_the_way_to_the_valves_is_release_then_press() -> None:
+    hand = Hand().active()
+    decision = hand.decide(u=(0.05, 0.0, -0.05))
+    assert decision == Decision(State.ACTIVE, (0.05, 0.0, -0.05), Trip.NONE, Trip.NONE)
+
+
+def test_the_first_cycle_with_the_dead_man_pressed_still_sends_zero() -> None:
+    hand = Hand()
+    hand.decide(RELEASED)
+    hand.decide(RELEASED)
+    decision = hand.decide(WELL, (0.5, 0.0, 0.0))
+    assert decision.state is State.ACTIVE and decision.u == STILL
+
+
+def test_a_released_dead_man_is_zero_in_the_same_cycle_and_may_be_pressed_again() -> None:
+    hand = Hand().active()
+    hand.decide(u=(0.1, 0.0, 0.0))
+    decision = hand.decide(RELEASED, (0.1, 0.0, 0.0))
+    assert decision.state is State.READY and decision.u == STILL and decision.trip is Trip.DEADMAN
+    assert hand.decide(u=(0.1, 0.0, 0.0)).state is State.ACTIVE
+    assert hand.decide(u=(0.05, 0.0, 0.0)).u == (0.05, 0.0, 0.0)
+
+
+WRONG = [
+    ({"bus_up": False}, Trip.BUS_DOWN),
+    ({"dt": LIMITS.gap_s + 0.001}, Trip.TIME_GAP),
+    ({"dt": -0.001}, Trip.TIME_GAP),
+    ({"estop": True}, Trip.ESTOP),
+    ({"trusted": False}, Trip.CHANNEL_INVALID),
+    ({"status_age_s": LIMITS.status_s + 0.001}, Trip.STATUS_STALE),
+    ({"status_age_s": math.inf}, Trip.STATUS_STALE),
+    ({"levers_age_s": LIMITS.levers_s + 0.001}, Trip.LEVERS_STALE),
+    ({"joints_age_s": LIMITS.joints_s + 0.001}, Trip.JOINTS_STALE),
+    ({"joints_age_s": math.nan}, Trip.JOINTS_STALE),
+    ({"joints_plausible": False}, Trip.JOINTS_INVALID),
+    ({"q": (0.0, math.nan, 0.0)}, Trip.JOINTS_INVALID),
+    ({"q": (0.0, 0.0, math.inf)}, Trip.JOINTS_INVALID),
+    ({"alone": False}, Trip.SECOND_SENDER),
+    ({"lever": LIMITS.neutral + 0.001}, Trip.LEVER),
+    ({"lever": math.nan}, Trip.LEVER),
+]
+ASKED = [
+    (None, 0.0, Trip.REQUEST_STALE),
+    ((0.1, 0.0, 0.0), LIMITS.request_s + 0.001, Trip.REQUEST_STALE),
+    ((0.1, 0.0, 0.0), math.nan, Trip.REQUEST_STALE),
+    ((math.nan, 0.0, 0.0), 0.0, Trip.REQUEST_INVALID),
+    ((0.0, 0.0, math.inf), 0.0, Trip.REQUEST_INVALID),
+    ((1.002, 0.0, 0.0), 0.0, Trip.REQUEST_INVALID),
+    ((0.0, 0.0, -1.002), 0.0, Trip.REQUEST_INVALID),
+    ((0.1, 0.0), 0.0, Trip.REQUEST_INVALID),
+    ((0.1, 0.1, 0.0), 0.0, Trip.REQUEST_EXCLUSIVE),
+    ((0.0, -0.1, 1e-9), 0.0, Trip.REQUEST_EXCLUSIVE),
+]
+
+
+@pytest.mark.parametrize(("change", "trip"), WRONG, ids=str)
+def test_anything_wrong_is_zero_in_the_same_cycle_and_latches_until_release_and_press(change: dict[str, Any], trip: Trip) -> None:
+    hand = Hand().active()
+    hand.decide(u=(0.1, 0.0, 0.1))
+    decision = hand.decide(u=(0.1, 0.0, 0.1), **change)
+    assert decision.state is State.LATCHED and decision.u == STILL and decision.trip is trip and decision.cause is trip
+    again = hand.decide(u=(0.1, 0.0, 0.1))
+    assert again.state is State.LATCHED and again.u == STILL and again.trip is trip
+    assert hand.decide(RELEASED).state is State.READY
+    pressed = hand.decide(WELL)
+    assert pressed.state is State.ACTIVE and pressed.cause is Trip.NONE
+
+
+@pytest.mark.parametrize(("change", "trip"), WRONG, ids=str)
+def test_nobody_is_let_out_of_the_latch_while_something_is_wrong(change: dict[str, Any], trip: Trip) -> None:
+    hand = Hand()
+    hand.decide(RELEASED)
+    hand.decide(RELEASED)
+    assert hand.decide(RELEASED, **change).state is State.LATCHED
+    assert hand.decide(RELEASED, **change).state is State.LATCHED
+    assert hand.decide(WELL).trip is trip
+
+
+@pytest.mark.parametrize(("u", "age_s", "trip"), ASKED, ids=str)
+def test_a_request_that_makes_no_sense_is_refused_before_use(u: tuple[float, ...] | None, age_s: float, trip: Trip) -> None:
+    hand = Hand().active()
+    hand.decide(u=(0.1, 0.0, 0.1))
+    decision = hand.decide(u=u, age_s=age_s)
+    assert decision.state is State.LATCHED and decision.u == STILL and decision.trip is trip
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"dt": LIMITS.gap_s - 1e-9}, {"dt": 0.0}, {"status_age_s": LIMITS.status_s}, {"levers_age_s": LIMITS.levers_s},
+        {"joints_age_s": LIMITS.joints_s}, {"lever": LIMITS.neutral}, {"age_s": LIMITS.request_s}, {"u": (1.001, 0.0, -1.001)},
+        {"u": (0.0, -0.1, 0.0)},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_lies_on_a_limit_is_allowed(change: dict[str, Any]) -> None:
+    hand = Hand().active()
+    assert hand.decide(**change).state is State.ACTIVE
+
+
+def test_a_request_is_not_judged_before_it_can_have_an_effect() -> None:
+    hand = Hand().active()
+    assert hand.decide(RELEASED, u=None).state is State.READY
+
+
+def test_disarming_is_silence_at_once() -> None:
+    hand = Hand().active()
+    hand.decide(u=(0.1, 0.0, 0.0))
+    decision = hand.decide(u=(0.1, 0.0, 0.0), armed=False)
+    assert decision.state is State.SILENT and decision.u == STILL and decision.cause is Trip.NONE
+    assert hand.decide().state is State.LATCHED
+
+
+def test_commands_grow_by_the_rate_and_end_at_the_limit() -> None:
+    hand = Hand().active()
+    found = [hand.decide(u=(1.0, 0.0, -1.0)).u for _ in range(10)]
+    assert [round(u[0], 6) for u in found] == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.8, 0.8]
+    assert [round(u[2], 6) for u in found] == [-0.1, -0.2, -0.3, -0.4, -0.5, -0.6, -0.7, -0.8, -0.8, -0.8]
+
+
+def test_growth_goes_by_time_not_by_cycles() -> None:
+    hand = Hand().active()
+    assert hand.decide(u=(1.0, 0.0, 0.0), dt=0.1).u[0] == pytest.approx(0.5)
+    assert hand.decide(u=(1.0, 0.0, 0.0), dt=0.001).u[0] == pytest.approx(0.505)
+
+
+def test_towards_zero_a_command_may_fall_at_once_and_a_reversal_begins_at_zero() -> None:
+    hand = Hand().active()
+    for _ in range(5):
+        hand.decide(u=(0.5, 0.0, 0.5))
+    decision = hand.decide(u=(0.2, 0.0, -0.5))
+    assert decision.u == (0.2, 0.0, pytest.approx(-0.1))
+    assert hand.decide(u=(0.0, 0.0, 0.0)).u == STILL
+    assert hand.decide(u=(1.0, 0.0, 0.0)).u[0] == pytest.approx(0.1)
+
+
+def test_after_a_trip_commands_begin_at_zero_again() -> None:
+    hand = Hand().active()
+    for _ in range(5):
+        hand.decide(u=(0.5, 0.0, 0.0))
+    hand.decide(estop=True)
+    hand.decide(RELEASED)
+    hand.decide(WELL)
+    assert hand.decide(u=(0.5, 0.0, 0.0)).u[0] == pytest.approx(0.1)
+
+
+def test_nothing_moves_further_out_at_a_stop_but_everything_back() -> None:
+    hand = Hand().active()
+    q = (0.9, 0.0, 0.1)
+    assert hand.decide(u=(0.05, 0.0, -0.05), q=q).u == STILL
+    assert hand.decide(u=(-0.05, 0.0, 0.05), q=q).u == (-0.05, 0.0, 0.05)
+    assert hand.decide(u=(0.05, 0.0, -0.05), q=(0.899, 0.0, 0.101)).u == (0.05, 0.0, -0.05)
+
+
+def test_the_exclusive_joint_moves_alone() -> None:
+    hand = Hand().active()
+    assert hand.decide(u=(0.0, 0.05, 0.0)).u == (0.0, 0.05, 0.0)
+    assert hand.decide(u=(0.05, 0.0, 0.05)).u == (0.05, 0.0, 0.05)
+
+
+numbers = st.one_of(st.floats(-1.5, 1.5), st.sampled_from([0.0, math.nan, math.inf, -math.inf]))
+ages = st.one_of(st.floats(0.0, 0.3), st.just(math.inf))
+cycles = st.fixed_dictionaries(
+    {
+        "dt": st.floats(0.0, 0.25),
+        "armed": st.sampled_from([True] * 9 + [False]),
+        "u": st.one_of(st.none(), st.tuples(numbers, st.sampled_from([0.0, 0.0, 0.5]), numbers)),
+        "age_s": st.floats(0.0, 0.2),
+        "deadman": st.booleans(),
+        "estop": st.sampled_from([False] * 9 + [True]),
+        "lever": st.sampled_from([0.0] * 9 + [0.3]),
+        "joints_age_s": st.floats(0.0, 0.16),
+        "q": st.tuples(st.floats(-1.2, 1.2), st.floats(-2, 2), st.floats(-0.2, 3.2)),
+    }
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(cycles, max_size=40))
+def test_whatever_happens_the_guard_keeps_its_promises(story: list[dict[str, Any]]) -> None:
+    hand, before, state, pressed = Hand(), STILL, State.SILENT, False
+    for cycle in story:
+        dt = cycle["dt"]
+        decision = hand.decide(WELL, **cycle)
+        moved = [value != 0 for value in decision.u]
+        assert all(abs(value) <= LIMITS.max_command for value in decision.u)
+        assert not (moved[1] and (moved[0] or moved[2]))
+        for j, (value, last) in enumerate(zip(decision.u, before, strict=True)):
+            grown = abs(value) - (abs(last) if value * last > 0 else 0.0)
+            assert grown <= LIMITS.max_rate_1_s * dt + 1e-9
+            at, lower, upper = cycle["q"][j], BODY.lower[j] + LIMITS.stop_margin, BODY.upper[j] - LIMITS.stop_margin
+            assert not (value > 0 and at >= upper) and not (value < 0 and at <= lower)
+        if any(moved):
+            assert decision.state is State.ACTIVE and state is State.ACTIVE
+            assert cycle["armed"] and cycle["deadman"] and not cycle["estop"] and cycle["lever"] == 0 and pressed
+            assert cycle["u"] is not None and all(map(math.isfinite, cycle["u"])) and cycle["age_s"] <= LIMITS.request_s
+            assert dt <= LIMITS.gap_s and cycle["joints_age_s"] <= LIMITS.joints_s
+        if decision.state is State.ACTIVE and state is not State.ACTIVE:
+            assert state is State.READY and cycle["deadman"] and not any(moved)
+        if decision.state is State.READY:
+            assert not cycle["deadman"]
+        assert decision.sends == cycle["armed"]
+        before, state, pressed = decision.u, decision.state, cycle["deadman"]
+
+
+def test_a_joint_that_jumps_is_refused_and_three_in_a_row_make_all_implausible() -> None:
+    watch = Plausibility(LIMITS, BODY)
+    assert watch.accept(0, 1.00, 0.0)
+    assert watch.accept(0, 1.01, 0.0249)  # 0.01 + 3 * 0.5 rad/s * 0.01 s
+    for number in (1, 2, 3):
+        assert watch.plausible
+        assert not watch.accept(0, 1.01 + 0.01 * number, 0.9)
+    assert not watch.plausible
+    assert watch.accept(0, 1.05, 0.03) and watch.plausible
+
+
+def test_a_joint_that_stays_at_its_new_place_is_believed_once_it_could_have_got_there() -> None:
+    watch = Plausibility(LIMITS, BODY)
+    watch.accept(2, 0.0, 1.0)
+    found = [watch.accept(2, 0.01 * step, 1.5) for step in range(1, 40)]
+    assert not any(found[:32]) and all(found[32:])  # (0.5 - 0.01) / 1.5 rad/s = 0.327 s
+
+
+@pytest.mark.parametrize(("position", "good"), [(1.2, True), (1.2001, False), (-1.2, True), (-1.2001, False), (math.nan, False)])
+def test_a_position_beyond_the_limits_is_refused(position: float, good: bool) -> None:
+    assert Plausibility(LIMITS, BODY).accept(0, 0.0, position) is good
+
+
+def test_time_that_runs_backwards_gives_no_room_for_a_jump() -> None:
+    watch = Plausibility(LIMITS, BODY)
+    watch.accept(0, 1.0, 0.0)
+    assert not watch.accept(0, 0.0, 0.02) and watch.accept(0, 0.0, -0.0099)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"max_command": 0.0}, {"max_command": 1.01}, {"max_rate_1_s": 0.0}, {"gap_s": math.inf}, {"joints_s": 0.0},
+        {"levers_s": 0.0}, {"status_s": 0.0}, {"request_s": -1.0}, {"jump_slack": 0.0}, {"range_slack": 0.0},
+        {"overrun": -0.1}, {"stop_margin": -0.1},
+        {"neutral": 0.0}, {"neutral": 1.0}, {"jump_margin": 0.9}, {"num_jumps": 0},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_limits_that_make_no_sense_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="guard"):
+        replace(LIMITS, **change)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"max_command": 1.0}, {"overrun": 0.0}, {"stop_margin": 0.0}, {"jump_margin": 1.0}, {"num_jumps": 1}, {"neutral": 0.999}],
+    ids=str,
+)
+def test_limits_at_their_ends_are_allowed(change: dict[str, Any]) -> None:
+    replace(LIMITS, **change)
+
+
+def test_the_shipped_limits_are_limits() -> None:
+    assert option("guard", "default").max_command <= 1.0

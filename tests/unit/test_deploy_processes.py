@@ -1,0 +1,128 @@
+"""Reaction times, with real processes on a multicast bus: a few trials each; benchmarks/reactions.py makes sixty."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from composed import option
+from desk import COMMAND, Desk
+
+from brokk_rl.machine import Machine
+from deploy.loop.outlet import view
+
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
+SLACK = 3.0 if os.environ.get("CI") or os.cpu_count() == 2 else 1.0
+"""On shared cores a process without real-time priority may be late itself; the figures proper are the benchmark's."""
+
+
+@pytest.fixture(scope="module")
+def desk(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+        with Desk(machine, option("guard", "default"), tmp_path_factory.mktemp("desk")) as made:
+            for name in ("twin", "bus", "commander"):
+                made.start(name)
+            made.wait_for_state()
+            yield made
+
+
+def test_nothing_moves_before_it_is_armed_and_the_dead_man_pressed(desk: Desk) -> None:
+    desk.fault("none")
+    desk.arm(False)
+    time.sleep(0.1)
+    assert not desk.moves() and not desk.heard("ValveCmd", 0.2)
+    desk.arm()
+    time.sleep(0.3)
+    assert not desk.moves() and desk.heard("ValveCmd", 0.2)
+
+
+FAULTS = [  # the whole catalogue; the normal suite tries those without a mark
+    ("estop", "", 0.02),
+    ("deadman_released", "", 0.02),
+    pytest.param("remote_off", "", 0.02, marks=pytest.mark.slow),
+    ("drop", "JointPos1", 0.15),
+    pytest.param("drop", "LeverState", 0.15, marks=pytest.mark.slow),
+    pytest.param("drop", "MachineStatus", 0.15, marks=pytest.mark.slow),
+    ("corrupt", "JointPos2", 0.1),
+    pytest.param("freeze_counter", "JointPos1", 0.1, marks=pytest.mark.slow),
+    pytest.param("masquerade", "MachineStatus", 0.1, marks=pytest.mark.slow),
+    pytest.param("short", "LeverState", 0.1, marks=pytest.mark.slow),
+    pytest.param("wrong_id", "JointPos1", 0.15, marks=pytest.mark.slow),
+    ("delay", "JointPos2", 0.15),
+    ("jump", "", 0.03),
+    pytest.param("out_of_range", "", 0.03, marks=pytest.mark.slow),
+    pytest.param("invalid", "", 0.03, marks=pytest.mark.slow),
+    ("second_sender", "", 0.03),
+    pytest.param("silent", "", 0.2, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("fault", "message", "limit_s"), FAULTS)
+def test_a_fault_stops_the_machine_in_time(desk: Desk, fault: str, message: str, limit_s: float) -> None:
+    desk.set_moving()
+    since_s = desk.fault(fault, message)
+    found_s = _stopped(desk, fault, since_s)
+    desk.fault("none")
+    assert found_s <= limit_s + 0.03 * SLACK  # the twin's own cycles: 10 ms to take up the fault, 20 ms between messages
+    safety = view(desk.exchange).safety
+    assert safety is not None and safety.state in ("LATCHED", "READY")
+
+
+def _stopped(desk: Desk, fault: str, since_s: float) -> float:
+    if fault == "silent":  # the gateway says nothing either: what the guard sends decides
+        while time.monotonic() < since_s + 1.0:
+            safety = view(desk.exchange).safety
+            if safety is not None and not any(safety.sent):
+                return time.monotonic() - since_s
+            time.sleep(0.001)
+    return desk.still_after(since_s, 0.6)
+
+
+def test_the_operators_lever_always_wins(desk: Desk) -> None:
+    desk.set_moving()
+    desk.fault("lever")
+    time.sleep(0.1)
+    heard = desk.heard("ValveFeedback", 0.1)
+    desk.fault("none")
+    assert heard and all(values["FlowSource"] == 1 and values["Flow_q1"] == 0 and values["Flow_q4"] > 0.4 for _, values in heard)
+    state = desk.exchange.state.read()
+    assert state is not None and not state["sent"].any()
+
+
+@pytest.mark.parametrize("fault", ["drop_some", "duplicate"])
+def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero_but_is_never_used(desk: Desk, fault: str) -> None:
+    desk.set_moving()
+    desk.fault(fault, "JointPos1", 0.5)
+    time.sleep(0.5)
+    state = desk.exchange.state.read()
+    assert state is not None and (state["lost"] > 0 or state["refused"] > 0)
+    assert bool(state["q_plausible"])
+
+
+@pytest.mark.parametrize(("name", "number"), [("commander", signal.SIGKILL), ("commander", signal.SIGSTOP), ("bus", signal.SIGSTOP),
+                                              ("bus", signal.SIGKILL)])  # fmt: skip
+def test_a_process_that_dies_or_hangs_stops_the_machine(desk: Desk, name: str, number: int) -> None:
+    desk.set_moving()
+    since_s = desk.signal(name, number)
+    found_s = desk.still_after(since_s)
+    if number == signal.SIGSTOP:
+        desk.signal(name, signal.SIGCONT)
+        time.sleep(0.2)
+        assert not desk.moves()  # what wakes up late begins anew
+    else:
+        desk.children[name].end(1.0)
+        desk.start(name)
+        desk.wait_for_state()
+    assert found_s <= 0.2 + 0.03 * SLACK
+
+
+def test_what_is_shown_says_who_has_the_valves(desk: Desk) -> None:
+    desk.set_moving()
+    safety = view(desk.exchange).safety
+    assert safety is not None and safety.state == "ACTIVE" and safety.commands
+    assert [round(u, 3) for u in safety.sent] == [round(u, 3) for u in COMMAND]
