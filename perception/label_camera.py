@@ -40,6 +40,18 @@ class CameraTracker(Protocol):
         ...
 
 
+class BoardTracker(CameraTracker, Protocol):
+    """A tracker that finds a board, and says where its corners are."""
+
+    def corners(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the corners that are seen, `(n, 3)` m in the board's frame, and where, `(n, 2)` px.
+
+        Raises:
+            FrameError: there are too few.
+        """
+        ...
+
+
 @spec
 class Charuco:
     """The camera's pose from a ChArUco board beside the block.
@@ -67,7 +79,7 @@ class Charuco:
         if not 0 < self.marker_m < self.square_m:
             raise ConfigError(f"board: expected 0 < marker_m < square_m, got {self.marker_m} and {self.square_m}")
 
-    def build(self) -> CameraTracker:
+    def build(self) -> BoardTracker:
         """Returns a tracker."""
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, markers)
@@ -104,7 +116,7 @@ class TagGrid:
     def check(self) -> None:
         _check(self.dictionary, self.min_corners)
 
-    def build(self) -> CameraTracker:
+    def build(self) -> BoardTracker:
         """Returns a tracker."""
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         board = cv2.aruco.GridBoard((self.columns, self.rows), self.marker_m, self.gap_m, markers)
@@ -150,19 +162,23 @@ class _BoardTracker:
     def __init__(self, board: Any, corners: Any, min_corners: int, max_error_px: float) -> None:
         self._board, self._corners, self._min_corners, self._max_error_px = board, corners, min_corners, max_error_px
 
-    def locate(self, frame: Frame) -> CameraPose:
+    def corners(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         found, numbers = self._corners(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))
         count = 0 if numbers is None else sum(len(np.reshape(one, (-1, 2))) for one in found)
         if count < self._min_corners:
             raise FrameError(f"{frame.name}: {count} corners of the board are seen, {self._min_corners} are needed")
         there, seen = self._board.matchImagePoints(found, numbers)
+        return there.reshape(-1, 3).astype(float), seen.reshape(-1, 2).astype(float)
+
+    def locate(self, frame: Frame) -> CameraPose:
+        there, seen = self.corners(frame)
         matrix = np.asarray(frame.camera_matrix, float)
         done, turn, shift = cv2.solvePnP(there, seen, matrix, frame.distortion, flags=cv2.SOLVEPNP_SQPNP)
         if not done:
             raise FrameError(f"{frame.name}: the board's corners fit no pose of the camera")
         turn, shift = cv2.solvePnPRefineLM(there, seen, matrix, frame.distortion, turn, shift)
         again, _ = cv2.projectPoints(there, turn, shift, matrix, frame.distortion)
-        error_px = float(np.sqrt(((again - seen) ** 2).sum(-1).mean()))
+        error_px = float(np.sqrt(((again[:, 0] - seen) ** 2).sum(-1).mean()))
         if error_px > self._max_error_px:
             raise FrameError(f"{frame.name}: the board's corners miss by {error_px:.1f} px, {self._max_error_px:g} are allowed")
         rotation = np.asarray(cv2.Rodrigues(turn)[0])

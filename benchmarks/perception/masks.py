@@ -50,7 +50,7 @@ def built(name: str, overrides: list[str], folder: str) -> tuple[Segmenter, Fram
         cfg = hydra.compose(
             "config",
             ["~mode", f"+perception/segmenter@segmenter={name}", "+perception/source@source=folder", f"source.folder={folder}",
-             "source.pictures_only=true", *overrides],
+             "source.needs=camera", *overrides],
         )  # fmt: skip
     segmenter, source = (instantiate(cfg[key], _convert_="all").build() for key in ("segmenter", "source"))
     return segmenter, source

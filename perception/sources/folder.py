@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
+from perception.calibration.extrinsics import Place, place_of
 from perception.sources import soundness
 from perception.stereo import Stereo
 
@@ -29,15 +30,18 @@ class Folder:
         folder: Where they lie.
         rate_hz: How fast they followed each other; gives frame `k` the time k / rate_hz.
         least_known: Part of the picture whose depth must be known.
-        pictures_only: Photographs without depth are welcome, grey ones and those without `camera.yaml` too: enough to look for
-            ellipses in the picture.
+        needs: What a frame must have. `depth`: all of it. `camera`: `camera.yaml`; depth may be missing, which is enough for a
+            board or a network. `nothing`: photographs, grey ones too, are enough to look for ellipses in.
+        base_from_camera: Pose of the camera in the base frame: `calibration.yaml` of `mode=calibrate`, or `(4, 4)`; `null` takes
+            `T_base_cam` of `camera.yaml`.
         stereo: Makes the depth of a frame that has a right picture and no depth.
     """
 
     folder: str
     rate_hz: float
     least_known: float
-    pictures_only: bool
+    needs: Literal["depth", "camera", "nothing"]
+    base_from_camera: Place
     stereo: Stereo
 
     def check(self) -> None:
@@ -122,7 +126,10 @@ class FolderSource:
     def __enter__(self) -> FolderSource:
         self._stems, self._next = dataset.stems(self._place), 0
         path = self._place / dataset.CAMERA
-        self._camera = None if self._settings.pictures_only and not path.exists() else read_camera(path)
+        self._camera = None if self._settings.needs == "nothing" and not path.exists() else read_camera(path)
+        place = place_of(self._settings.base_from_camera, "source.base_from_camera")
+        if self._camera is not None and place is not None:
+            self._camera = replace(self._camera, base_from_camera=place)
         return self
 
     def __exit__(self, *exc: Any) -> None:
@@ -143,7 +150,7 @@ class FolderSource:
     def _read(self, stem: Path, t_s: float) -> Frame:
         paths = {ending: stem.with_name(stem.name + ending) for ending in (dataset.COLOR, dataset.RIGHT)}
         picture = read_picture(paths[dataset.COLOR])
-        if self._settings.pictures_only and picture.ndim == 2:
+        if self._settings.needs == "nothing" and picture.ndim == 2:
             picture = np.repeat(picture[..., None], 3, 2)
         color = soundness.color(picture, str(paths[dataset.COLOR]))
         height, width = color.shape[:2]
@@ -169,7 +176,7 @@ class FolderSource:
             found = soundness.depth(values, str(where), least)
             soundness.same_size(color, found, str(where), "depth")
             return found
-        if self._settings.pictures_only:
+        if self._settings.needs != "depth":
             return np.full(color.shape[:2], np.nan, np.float32)
         if right is None:
             raise FrameError(

@@ -10,6 +10,7 @@ import numpy as np
 
 from brokk_rl.errors import FrameError
 from brokk_rl.spec import spec
+from perception.calibration.extrinsics import Place, place_of
 from perception.sources import soundness
 from perception.sources.live import Capture, Freshness, Lens, LiveSource
 
@@ -23,7 +24,8 @@ class RealSense:
         width: Pixels.
         height: Pixels.
         rate_hz: Pictures a second.
-        base_from_camera: Pose of the colour camera in the base frame, `(4, 4)`, from `mode=calibrate`; `null` where unknown.
+        base_from_camera: Pose of the colour camera in the base frame: `calibration.yaml` of `mode=calibrate`,
+            or `(4, 4)`; `null` where unknown.
         fresh: Which frames are too old, and how long to wait.
     """
 
@@ -31,12 +33,12 @@ class RealSense:
     width: int
     height: int
     rate_hz: int
-    base_from_camera: tuple[tuple[float, ...], ...] | None
+    base_from_camera: Place
     fresh: Freshness
 
     def build(self) -> LiveSource:
         """Returns the source, not yet opened."""
-        pose = None if self.base_from_camera is None else soundness.pose(self.base_from_camera, "source.base_from_camera")
+        pose = place_of(self.base_from_camera, "source.base_from_camera")
         return LiveSource(RealSenseDevice(self), "RealSense camera", self.fresh, pose)
 
 

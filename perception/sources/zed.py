@@ -10,6 +10,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.spec import spec
+from perception.calibration.extrinsics import Place, place_of
 from perception.sources import soundness
 from perception.sources.live import Capture, Freshness, Lens, LiveSource
 
@@ -30,7 +31,8 @@ class Zed:
         confidence: Depth that the SDK trusts less than this, in percent of its own scale, is unknown.
         nearest_m: Range of depth.
         farthest_m: Range of depth.
-        base_from_camera: Pose of the left camera in the base frame, `(4, 4)`, from `mode=calibrate`; `null` where unknown.
+        base_from_camera: Pose of the left camera in the base frame: `calibration.yaml` of `mode=calibrate`,
+            or `(4, 4)`; `null` where unknown.
         fresh: Which frames are too old, and how long to wait.
     """
 
@@ -43,7 +45,7 @@ class Zed:
     confidence: int
     nearest_m: float
     farthest_m: float
-    base_from_camera: tuple[tuple[float, ...], ...] | None
+    base_from_camera: Place
     fresh: Freshness
 
     def check(self) -> None:
@@ -56,7 +58,7 @@ class Zed:
 
     def build(self) -> LiveSource:
         """Returns the source, not yet opened."""
-        pose = None if self.base_from_camera is None else soundness.pose(self.base_from_camera, "source.base_from_camera")
+        pose = place_of(self.base_from_camera, "source.base_from_camera")
         return LiveSource(ZedDevice(self), "ZED camera", self.fresh, pose)
 
 

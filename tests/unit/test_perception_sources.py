@@ -44,7 +44,10 @@ def frames(tmp_path: Path) -> Path:
 def folder(path: Path, **changes: Any) -> Folder:
     return Folder(
         folder=str(path),
-        **({"rate_hz": 10.0, "least_known": 0.01, "pictures_only": False, "stereo": option("stereo", "sgbm")} | changes),
+        **(
+            {"rate_hz": 10.0, "least_known": 0.01, "needs": "depth", "base_from_camera": None, "stereo": option("stereo", "sgbm")}
+            | changes
+        ),
     )
 
 
@@ -191,7 +194,7 @@ def test_a_camera_without_a_place_or_a_baseline_is_welcome(frames: Path) -> None
 
 def test_photographs_alone_will_do_for_ellipses(tmp_path: Path) -> None:
     save(tmp_path / "grey.color.png", np.full(SIZE, 90, np.uint8))
-    found = read(tmp_path, pictures_only=True)[0]
+    found = read(tmp_path, needs="nothing")[0]
     assert found.color.shape == (*SIZE, 3) and (found.color == 90).all() and np.isnan(found.depth_m).all()
 
 

@@ -1,0 +1,63 @@
+"""The stored place of a camera: a YAML file that sources of frames take as `base_from_camera`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from brokk_rl.errors import FrameError
+from perception.sources import soundness
+
+SCHEMA = 1
+Place = str | tuple[tuple[float, ...], ...] | None
+"""How a config says where a camera is: a file of `mode=calibrate`, a 4 x 4 transform, or not at all."""
+
+
+def place_of(given: Place, where: str) -> np.ndarray | None:
+    """Returns `base_from_camera`, `(4, 4)`, as a config gives it; `None` where it does not.
+
+    Raises:
+        FrameError: there is no such file, it is none of ours, or the transform is not rigid.
+    """
+    if given is None:
+        return None
+    if isinstance(given, str):
+        return soundness.pose(read(Path(given), where)["T_base_cam"], f"{where}={given}")
+    return soundness.pose(given, where)
+
+
+def read(path: Path, where: str) -> dict[str, Any]:
+    """Returns what stands in a file of `mode=calibrate`.
+
+    Raises:
+        FrameError: it cannot be read, or is none.
+    """
+    try:
+        told = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise FrameError(
+            f"{where}: {path} cannot be read ({error}); expected calibration.yaml of `brokk mode=calibrate`"
+        ) from error
+    if not isinstance(told, dict) or told.get("schema") != SCHEMA or "T_base_cam" not in told:
+        raise FrameError(f"{where}: {path} is no calibration of schema {SCHEMA}; `brokk mode=calibrate` writes one")
+    return told
+
+
+def point_std_m(cov: np.ndarray, distance_m: float) -> float:
+    """Returns how uncertain a point `distance_m` before the camera is in the base frame, by the calibration alone, m.
+
+    Args:
+        cov: Of a small motion of the camera in its own frame, `(6, 6)`.
+        distance_m: How far before the camera.
+    """
+    lever = np.concatenate([np.eye(3), distance_m * np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 0]])], 1)
+    return float(np.sqrt(np.trace(lever @ cov @ lever.T)))
+
+
+def plain(values: np.ndarray | Sequence[float], digits: int = 9) -> list[Any]:
+    """Returns an array as lists of rounded numbers, for YAML."""
+    return np.round(np.asarray(values, float), digits).tolist()
