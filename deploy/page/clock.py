@@ -1,0 +1,66 @@
+"""The clock of one page, as it shows in what the page says of each message: when it came, when it was drawn, when that was said."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+
+KEPT = 64
+"""Messages of which the sending time is remembered; a page has at most a few that it has not answered."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a page said of a message.
+
+    Attributes:
+        number: Of the message.
+        advice: Number of the advice that became visible with it; `None` where that had been visible before.
+        drawn_s: When, by this computer's monotonic clock.
+    """
+
+    number: int
+    advice: int | None
+    drawn_s: float
+
+
+class PageClock:
+    """Translates times of a page into those of this computer.
+
+    The difference of the clocks is that of the exchange with the shortest round trip so far (as in NTP): waiting in a queue on one
+    way only makes the round trip longer.
+
+    Attributes:
+        round_trip_s: The shortest one.
+    """
+
+    def __init__(self) -> None:
+        self.round_trip_s = math.inf
+        self._ahead_s = 0.0
+        self._sent: dict[int, tuple[float, int | None]] = {}
+        self._advice: int | None = None
+
+    def sent(self, number: int, advice: int | None, now_s: float) -> None:
+        """Notes that message `number` went out, with the advice of that number."""
+        self._sent[number] = (now_s, advice)
+        if len(self._sent) > KEPT:
+            del self._sent[next(iter(self._sent))]
+
+    def heard(self, text: str | bytes, now_s: float) -> Said | None:
+        """Returns what the page says in `text`: `[number, came_ms, drawn_ms, said_ms]` by its own clock; `None` for nonsense."""
+        try:
+            number, came_ms, drawn_ms, said_ms = json.loads(text)
+            came_s, drawn_s, said_s = (float(value) / 1000.0 for value in (came_ms, drawn_ms, said_ms))
+            sent_s, advice = self._sent.pop(number)
+        except (ValueError, TypeError, KeyError):
+            return None
+        if not all(map(math.isfinite, (came_s, drawn_s, said_s))) or not came_s <= said_s:
+            return None
+        round_trip_s = (now_s - sent_s) - (said_s - came_s)
+        if round_trip_s < self.round_trip_s:
+            self.round_trip_s = round_trip_s
+            self._ahead_s = ((came_s - sent_s) + (said_s - now_s)) / 2.0
+        new = advice is not None and advice != self._advice
+        self._advice = advice
+        return Said(number, advice if new else None, drawn_s - self._ahead_s)

@@ -1,0 +1,73 @@
+"""A frame on its way to the page: depth in whole millimetres, coded by differences along each row and zstd, and colour as JPEG.
+
+266 KiB for 640 x 360 px and 1.3 ms to code, where 32-bit points and colours take 3.2 MB; Draco takes 702 KiB and a second. The page
+makes points of it on the graphics card. A message is the length of a JSON header, 4 bytes little-endian, the header, the depth, and
+the JPEG, which also is the camera's picture.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+import zstandard
+
+from brokk_rl.errors import FrameError
+from brokk_rl.signals import Frame
+from deploy.picture import jpeg, shrunk
+
+LENGTH = struct.Struct("<I")
+M_PER_UNIT = 0.001
+FAR = 65_535
+"""Depths from here on, in units, are not known: 65 m is further than a stereo camera sees."""
+LEVEL = 1
+"""Of zstd: higher ones take ten times as long for a few percent."""
+
+
+def encode(frame: Frame, width: int, quality: int) -> bytes:
+    """Returns the message of a frame, shrunk to `width` px where it is wider.
+
+    Args:
+        frame: Depth and colour of one size.
+        width: Of what is sent, px.
+        quality: Of the JPEG, 1 to 100.
+
+    Raises:
+        FrameError: depth and colour differ in size.
+    """
+    if frame.depth_m.shape != frame.color.shape[:2]:
+        raise FrameError(f"depth is {frame.depth_m.shape}, colour {frame.color.shape}: expected one size")
+    full_height, full_width = frame.depth_m.shape
+    part = min(1.0, width / full_width)
+    size = round(part * full_width), round(part * full_height)
+    color, depth_m = frame.color, frame.depth_m
+    if part < 1.0:
+        color, depth_m = shrunk(color, *size), shrunk(depth_m, *size)
+    matrix = frame.camera_matrix.astype(float).copy()
+    matrix[:2] *= part  # the half pixel that the grid moves by is a millimetre at 4 m
+    pose = np.eye(4) if frame.base_from_camera is None else frame.base_from_camera
+    depth = zstandard.ZstdCompressor(level=LEVEL).compress(differences(depth_m).tobytes())
+    header = json.dumps(
+        {
+            "t_s": frame.t_s, "width": size[0], "height": size[1], "m_per_unit": M_PER_UNIT, "depth_bytes": len(depth),
+            "focal_px": [matrix[0, 0], matrix[1, 1]], "center_px": [matrix[0, 2], matrix[1, 2]],
+            "base_from_camera": pose.astype(float).ravel().tolist(), "placed": frame.base_from_camera is not None,
+        }
+    ).encode()  # fmt: skip
+    return b"".join((LENGTH.pack(len(header)), header, depth, jpeg(color, quality)))
+
+
+def differences(depth_m: np.ndarray) -> np.ndarray:
+    """Returns depths, `(h, w)` in m, as 16-bit millimetres (0: unknown), each less its left neighbour, modulo 2^16."""
+    units = np.nan_to_num(depth_m / M_PER_UNIT, nan=0.0, posinf=0.0, neginf=0.0).round()
+    units = np.where((units > 0) & (units < FAR), units, 0).astype("<u2")
+    units[:, 1:] -= units[:, :-1].copy()
+    return units
+
+
+def depth_m(data: bytes, width: int, height: int) -> np.ndarray:
+    """Returns the depths, `(h, w)` float32 in m and NaN where unknown, that `data` holds: as the page has them."""
+    rows = np.frombuffer(zstandard.ZstdDecompressor().decompress(data), "<u2").reshape(height, width)
+    units = rows.cumsum(1, dtype=np.uint16).astype(np.float32)
+    return np.where(units > 0, units * np.float32(M_PER_UNIT), np.float32(np.nan))

@@ -1,0 +1,172 @@
+"""A feed without a machine: a simulated state and camera, so that the page can be seen, tried and tested at a desk.
+
+What it shows is made up from the clock alone: the joint that is never moved with others goes its way with the button held, then the
+rest; the operator's levers follow the advice a little late. It claims nothing about a machine or a policy.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.signals import Frame
+from brokk_rl.spec import spec
+from deploy.page.chain import approach, points_in_base_m
+from deploy.page.demo_camera import Camera
+from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Wish
+
+EXCLUSIVE_S, OTHERS_S = 5.0, 9.0
+"""How long each part of the programme takes."""
+LEAD_IN_S = 1.5
+LIMITS_S = {"positions": 0.15, "levers": 0.15, "advice": 0.15, "camera": 1.0, "borehole": 600.0}
+ABOVE_M, BELOW_M = 0.3, 0.1
+BLOCK_M = ((1.9, -0.8, 0.0), (3.3, 0.8, 0.75))
+UP = (0.0, 0.0, 1.0)
+TARGETS = (
+    Target("1", (2.6, 0.0, 0.75), UP, 0.06, 0.002, 0.97, False),
+    Target("2", (2.25, 0.4, 0.75), UP, 0.06, 0.004, 0.86, False),
+    Target("3", (2.95, -0.4, 0.75), UP, 0.06, 0.011, 0.41, False),
+)
+
+
+@spec
+class Demo:
+    """A made-up machine at work: levers, joints, boreholes, camera and point cloud from the clock alone.
+
+    Attributes:
+        lag_s: How late the operator's levers follow.
+        amplitude: Of the commands, of full.
+        frames: Whether there are camera pictures and a point cloud.
+        width_px: Of the camera.
+        height_px: Of the camera.
+        rate_hz: Of the camera.
+    """
+
+    lag_s: float
+    amplitude: float
+    frames: bool
+    width_px: int
+    height_px: int
+    rate_hz: float
+
+    def check(self) -> None:
+        if self.lag_s < 0 or not 0 < self.amplitude <= 1 or self.rate_hz <= 0 or min(self.width_px, self.height_px) < 16:
+            raise ConfigError("feed: expected lag_s of 0 or more, amplitude in (0, 1], rate_hz of more than 0, 16 px or more")
+
+    def build(self, machine: Machine) -> DemoFeed:
+        """Returns it at work."""
+        return DemoFeed(self, machine, time.monotonic)
+
+
+class DemoFeed:
+    """See `deploy.page.shown.Feed`.
+
+    Args:
+        demo: What is shown.
+        machine: The machine.
+        clock: Monotonic time in s.
+    """
+
+    def __init__(self, demo: Demo, machine: Machine, clock: Callable[[], float]) -> None:
+        self._demo, self._machine, self._clock = demo, machine, clock
+        self._began_s = clock()
+        self._guiding, self._recorded_s = True, self._began_s
+        self._recording, self._chosen = False, TARGETS[0].name
+        self._camera = Camera(demo.width_px, demo.height_px, BLOCK_M, TARGETS) if demo.frames else None
+        self._exclusive = machine.is_exclusive
+
+    def shown(self) -> Shown:
+        """See `Feed`."""
+        now_s, machine = self._clock(), self._machine
+        t_s = now_s - self._began_s
+        number = int(t_s / machine.period_s)
+        levers, due_s = self._programme(number * machine.period_s)
+        own, _ = self._programme(max(0.0, t_s - self._demo.lag_s))
+        q = self._positions(t_s)
+        targets = tuple(replace(target, chosen=target.name == self._chosen) for target in TARGETS)
+        chosen = next(target for target in targets if target.chosen)
+        path = ()
+        if machine.has_bodies and self._guiding:
+            tip_m = points_in_base_m(machine, q)[-1]
+            path = approach(tip_m, np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base), ABOVE_M, BELOW_M)
+        age_s: dict[str, float | None] = {
+            "positions": t_s % 0.01,
+            "levers": t_s % 0.02,
+            "advice": t_s - number * machine.period_s,
+            "borehole": t_s,
+        }
+        age_s["camera"] = t_s % (1.0 / self._demo.rate_hz) if self._camera else None
+        return Shown(
+            t_s=now_s, alive=True, guiding=self._guiding, advice=Advice(True, "valid", number, levers, due_s), own=own,
+            q=tuple(q.tolist()), streams=tuple(Stream(name, age_s[name], limit_s) for name, limit_s in LIMITS_S.items()),
+            safety=Safety(False, "SILENT", "nothing", True, False, True),
+            recording=Recording(self._recording, now_s - self._recorded_s if self._recording else 0.0, 0),
+            targets=targets, path_in_base_m=path, block_in_base_m=BLOCK_M,
+        )  # fmt: skip
+
+    def frame(self, after_s: float) -> Frame | None:
+        """See `Feed`."""
+        number = int((self._clock() - self._began_s) * self._demo.rate_hz)
+        t_s = self._began_s + number / self._demo.rate_hz
+        return self._camera.frame(number, t_s) if self._camera and t_s > after_s else None
+
+    def wish(self, wish: Wish) -> bool:
+        """See `Feed`."""
+        if wish.kind == "target":
+            self._chosen = wish.value
+        elif wish.kind == "record":
+            self._recording, self._recorded_s = wish.value == "on", self._clock()
+        else:
+            self._guiding = wish.kind == "start"
+        return True
+
+    def drawn(self, drawn: Drawn) -> None:
+        """See `Feed`; nobody is interested."""
+
+    def _programme(self, t_s: float) -> tuple[Levers, float | None]:
+        """Returns lever positions at `t_s`, and the time until the button is due."""
+        u, cycle = np.zeros(self._machine.num_joints), EXCLUSIVE_S + OTHERS_S
+        at_s, number = t_s % cycle, int(t_s // cycle)
+        alone = at_s < EXCLUSIVE_S and bool(self._exclusive.any())
+        if alone:
+            u[self._exclusive] = self._demo.amplitude * np.sin(np.pi * at_s / EXCLUSIVE_S) * (1 if number % 2 == 0 else -1)
+        else:
+            phase = 2 * np.pi * (at_s - EXCLUSIVE_S) / OTHERS_S
+            joints = np.arange(self._machine.num_joints)
+            u = np.where(
+                self._exclusive, 0.0, self._demo.amplitude * np.sin(phase * (1 + joints % 2)) * (1 - 2 * (joints // 2 % 2))
+            )
+        left_s = cycle - at_s
+        due_s = 0.0 if alone else left_s if left_s <= LEAD_IN_S and self._exclusive.any() else None
+        return levers_of(self._machine, u, alone), due_s
+
+    def _positions(self, t_s: float) -> np.ndarray:
+        """Returns what these commands make of the joints, kept within their limits."""
+        machine, cycle = self._machine, EXCLUSIVE_S + OTHERS_S
+        at_s, number = t_s % cycle, int(t_s // cycle)
+        speed = 0.5 * self._demo.amplitude * machine.max_speed
+        done = min(at_s, EXCLUSIVE_S) / EXCLUSIVE_S
+        forth = (1 - np.cos(np.pi * done)) / np.pi * EXCLUSIVE_S
+        alone = speed * (forth if number % 2 == 0 else 2 * EXCLUSIVE_S / np.pi - forth)
+        phase = 2 * np.pi * max(0.0, at_s - EXCLUSIVE_S) / OTHERS_S
+        joints = np.arange(machine.num_joints)
+        times = 1 + joints % 2
+        others = speed * (1 - np.cos(phase * times)) / times * OTHERS_S / (2 * np.pi) * (1 - 2 * (joints // 2 % 2))
+        return np.clip(machine.home + np.where(self._exclusive, alone, others), machine.lower, machine.upper)
+
+
+def levers_of(machine: Machine, u: np.ndarray, button: bool) -> Levers:
+    """Returns the lever positions, of full, that stand for commands `(J,)` on the machine's own levers."""
+    axes = {(lever.side, lever.axis): 0.0 for lever in machine.levers}
+    for lever in machine.levers:
+        j = machine.joint_names.index(lever.joint)
+        if bool(machine.is_exclusive[j]) == button:
+            axes[lever.side, lever.axis] = float(u[j])
+    sides = [(side, axis) for side in ("left", "right") for axis in ("theta", "psi")]
+    left_theta, left_psi, right_theta, right_psi = (axes.get(one, 0.0) for one in sides)
+    return Levers(left_theta, left_psi, right_theta, right_psi, button)

@@ -1,0 +1,235 @@
+"""The page's server: one process, one port; files, and three WebSockets.
+
+`/state` sends the newest `Shown` as JSON, `/frames` the newest frame, `/control` takes wishes. A page says of every message when it
+has drawn it, and has at most a few that it has not drawn: whoever is slow, asleep or not reading gets fewer and always the newest,
+and costs neither memory nor the loop anything.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import time
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from http import HTTPStatus
+from typing import TYPE_CHECKING
+
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from brokk_rl.errors import LinkError
+from brokk_rl.machine import Machine
+from deploy.page import access, cloud
+from deploy.page.clock import PageClock
+from deploy.page.files import FILES, SECURITY, load
+from deploy.page.newest import Newest, Room
+from deploy.page.shown import Drawn, Feed, Shown
+
+if TYPE_CHECKING:
+    from deploy.page.settings import OperatorPage
+
+log = logging.getLogger(__name__)
+
+POLL_S, FRAME_POLL_S = 0.004, 0.02
+"""Between looks at the feed: what a new advice, or frame, waits for at most."""
+HEARTBEAT_S = 0.1
+"""Between messages when nothing changes, so that a page knows that it is connected."""
+UNDRAWN_STATES, UNDRAWN_FRAMES = 4, 2
+"""Messages that a page may not have drawn yet before it gets more."""
+WRONG_TOKEN_S = 0.5
+BUFFER_BYTES = 1 << 16
+STATE, FRAMES, CONTROL = "/state", "/frames", "/control"
+
+
+class Server:
+    """See the module.
+
+    Args:
+        page: How to serve.
+        machine: The machine.
+        feed: What to show.
+        token: What a browser must show to have something done.
+    """
+
+    def __init__(self, page: OperatorPage, machine: Machine, feed: Feed, token: str) -> None:
+        self._page, self._feed, self._token = page, feed, token
+        self._files = load(json.dumps(page.setup(machine)).encode())
+        self._names: frozenset[str] = frozenset()
+        self._state: Newest[tuple[Shown | None, str]] = Newest((None, ""))
+        self._frame = Newest(b"")
+        self._open, self._pages = 0, 0
+        self._guess = asyncio.Lock()
+
+    async def run(self, stop: Callable[[], bool], ready: Callable[[int], None]) -> None:
+        """Serves until `stop` says so; calls `ready` with the port once browsers can connect.
+
+        Raises:
+            LinkError: the address is taken or not this computer's.
+        """
+        page = self._page
+        try:
+            server = await serve(
+                self._connection, page.host, page.port, process_request=self._answer, compression=None, server_header=None,
+                max_size=4 * access.LONGEST, max_queue=4, write_limit=BUFFER_BYTES, ping_interval=5, ping_timeout=10,
+                close_timeout=1, open_timeout=5, logger=logging.getLogger("deploy.page.websockets"),
+            )  # fmt: skip
+        except OSError as error:
+            raise LinkError(f"page: cannot listen on {page.host}:{page.port} ({error.strerror}); choose page.port=…") from error
+        port = next(iter(server.sockets)).getsockname()[1]
+        self._names = access.names(page.host, port, page.names)
+        logging.getLogger("deploy.page.websockets").setLevel(logging.WARNING)
+        async with server, asyncio.TaskGroup() as group:
+            tasks = [group.create_task(self._watch()), group.create_task(self._watch_frames())]
+            ready(port)
+            while not stop():
+                await asyncio.sleep(0.05)
+            for task in tasks:
+                task.cancel()
+
+    async def _watch(self) -> None:
+        """Looks at the feed; what is new goes out at once, though no faster than the rate."""
+        sent_s, before = 0.0, None
+        while True:
+            shown, now_s = self._feed.shown(), time.monotonic()
+            since_s = now_s - sent_s
+            facts = (shown.advice, shown.own, shown.q, shown.safety, shown.alive, shown.guiding, shown.recording.on, shown.targets)
+            if since_s >= HEARTBEAT_S or (facts != before and since_s >= 1.0 / self._page.rate_hz):
+                sent_s, before = now_s, facts
+                text = json.dumps({"number": self._state.number + 1, "shown": shown.plain()}, separators=(",", ":"))
+                await self._state.put((shown, text))
+            await asyncio.sleep(POLL_S)
+
+    async def _watch_frames(self) -> None:
+        """Takes frames while somebody looks; they are coded in a thread, once for all pages."""
+        taken_s, due_s = -1.0, 0.0
+        while True:
+            await asyncio.sleep(FRAME_POLL_S)
+            frame = self._feed.frame(taken_s) if self._open and time.monotonic() >= due_s else None
+            if frame is not None:
+                taken_s, due_s = frame.t_s, time.monotonic() + 0.9 / self._page.frames_hz  # a camera's period is not exact
+                await self._frame.put(await asyncio.to_thread(cloud.encode, frame, self._page.picture_px, self._page.jpeg_quality))
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answers requests for files; `None` lets a WebSocket in."""
+        path, host = request.path.partition("?")[0], request.headers.get("Host")
+        if host not in self._names:
+            return _refused(HTTPStatus.MISDIRECTED_REQUEST, "unknown host name; see page.names")
+        if path not in (STATE, FRAMES, CONTROL):
+            found = self._files.get(path)
+            return _refused(HTTPStatus.NOT_FOUND, "no such page") if found is None else _response(HTTPStatus.OK, *found)
+        origin = request.headers.get("Origin")
+        if not access.same_origin(origin, host, self._names) or (path == CONTROL and origin is None):
+            log.warning("refused a connection from another origin")
+            return _refused(HTTPStatus.FORBIDDEN, "another origin")
+        if self._open >= 3 * self._page.clients:
+            return _refused(HTTPStatus.SERVICE_UNAVAILABLE, "too many pages; see page.clients")
+        return None
+
+    async def _connection(self, connection: ServerConnection) -> None:
+        assert connection.request is not None
+        talk = {STATE: self._states, FRAMES: self._frames, CONTROL: self._control}[connection.request.path.partition("?")[0]]
+        self._open += 1
+        try:
+            with suppress(ConnectionClosed):
+                await talk(connection)
+        finally:
+            self._open -= 1
+
+    async def _states(self, connection: ServerConnection) -> None:
+        self._pages += 1
+        clock, page = PageClock(), self._pages
+        room = Room(UNDRAWN_STATES)
+
+        async def listen() -> None:
+            async for text in connection:
+                if (said := clock.heard(text, time.monotonic())) is None:
+                    await connection.close(1008, "malformed")
+                    return
+                room.drawn(said.number)
+                if said.advice is not None:
+                    self._feed.drawn(Drawn(said.advice, said.drawn_s, clock.round_trip_s, page))
+
+        async def speak() -> None:
+            number = 0
+            while True:
+                await room.wait()
+                number, (shown, text) = await self._state.after(number)
+                advice = shown.advice if shown else None
+                clock.sent(number, advice.number if advice else None, time.monotonic())
+                room.sent(number)
+                await connection.send(text)
+
+        await _both(listen(), speak())
+
+    async def _frames(self, connection: ServerConnection) -> None:
+        room = Room(UNDRAWN_FRAMES)
+
+        async def listen() -> None:
+            async for text in connection:
+                if not str(text).isdecimal():
+                    await connection.close(1008, "malformed")
+                    return
+                room.drawn(int(text))
+
+        async def speak() -> None:
+            number = sent = 0
+            while True:
+                await room.wait()
+                number, message = await self._frame.after(number)
+                sent += 1
+                room.sent(sent)
+                await connection.send(message)
+
+        await _both(listen(), speak())
+
+    async def _control(self, connection: ServerConnection) -> None:
+        try:
+            given = json.loads(await asyncio.wait_for(connection.recv(), 5.0))
+        except (ValueError, TimeoutError):
+            given = None
+        if not access.token_fits(given.get("token") if isinstance(given, dict) else None, self._token):
+            async with self._guess:  # one guess at a time, whoever guesses
+                await asyncio.sleep(WRONG_TOKEN_S)
+            log.warning("refused a page with a wrong token")
+            await connection.close(1008, "token")
+            return
+        await connection.send(json.dumps({"ready": True}))
+        async for text in connection:
+            await connection.send(json.dumps(self._hand_on(text)))
+
+    def _hand_on(self, text: str | bytes) -> dict[str, str]:
+        """Checks a wish against what holds now, not against what the page showed; returns the answer."""
+        wish = access.read_wish(text)
+        if wish is None:
+            return {"refused": "malformed", "kind": ""}
+        reason = access.refusal(wish, self._feed.shown())
+        if reason is None and not self._feed.wish(wish):
+            reason = "busy"
+        log.info("%s %s: %s", wish.kind, wish.value, reason or "done")
+        return {"refused": reason, "kind": wish.kind} if reason else {"done": wish.kind, "kind": wish.kind}
+
+
+async def _both(listen: Coroutine[None, None, None], speak: Coroutine[None, None, None]) -> None:
+    """Runs both ways of a connection until one ends."""
+    tasks = [asyncio.create_task(listen), asyncio.create_task(speak)]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
+    headers = Headers({**SECURITY, "Content-Type": kind, "Content-Length": str(len(body)), "Connection": "close"})
+    return Response(status.value, status.phrase, headers, body)
+
+
+def _refused(status: HTTPStatus, why: str) -> Response:
+    return _response(status, FILES[".txt"], f"{why}\n".encode())

@@ -1,0 +1,232 @@
+// The operator's page: newest state in, drawn once a frame, and said back when it was drawn; wishes out.
+import { LeverView } from "./levers.js";
+import { Socket } from "./socket.js";
+import { LANGUAGES, preferred, words } from "./words.js";
+
+const $ = id => document.getElementById(id);
+const setup = await (await fetch("setup.json")).json();
+let language = preferred(setup.language);
+let say = words(language);
+const token = new URLSearchParams(location.hash.slice(1)).get("token") ?? sessionStorage.getItem("token");
+if (token) sessionStorage.setItem("token", token);
+history.replaceState(null, "", location.pathname + location.search);  // the key stays out of the history and of screenshots
+
+const views = { left: new LeverView($("left"), "left", setup), right: new LeverView($("right"), "right", setup) };
+const measured = window.measured = { drawn: 0, number: 0, fps: 0, points: 0, frames: 0, frame_ms: 0 };
+let newest = null, came = 0, asked = false, allowed = null;
+
+// ---- state in, drawn back
+const painted = new MessageChannel();
+painted.port1.onmessage = ({ data: [number, at] }) => {
+  const now = performance.now();
+  state.send(JSON.stringify([number, at, now, performance.now()]));
+};
+const state = new Socket("/state", {
+  heard: text => {
+    came = performance.now();
+    newest = JSON.parse(text);
+    if (!asked) { asked = true; requestAnimationFrame(frame); }
+  },
+});
+
+function frame() {
+  asked = false;
+  draw();
+  measured.drawn += 1;
+  measured.number = newest.number;
+  painted.port2.postMessage([newest.number, came]);  // runs once the frame is through layout and paint
+  scene?.postMessage({ state: newest.shown });
+}
+
+function put(node, text, kind) {
+  if (node.textContent !== text) node.textContent = text;
+  if (kind !== undefined) for (const one of ["good", "bad", "careful", "idle"]) node.classList.toggle(one, one === kind);
+}
+
+function fresh(shown, name, since_s) {
+  const stream = shown.streams.find(one => one.name === name);
+  return Boolean(stream && stream.age_s !== null && stream.age_s + since_s <= stream.limit_s);
+}
+
+function draw() {
+  const since_s = (performance.now() - came) / 1000;
+  const lost = newest === null || since_s > setup.stale_s;
+  document.body.classList.toggle("lost", lost);
+  if (lost) put($("connection"), say("lost"), "bad");
+  if (newest === null) return;
+  const shown = newest.shown;
+  if (!lost) put($("connection"), say(shown.alive ? "connected" : "dead"), shown.alive ? "good" : "bad");
+  const good = name => !lost && shown.alive && fresh(shown, name, since_s);
+  drawSafety(shown, lost, good("levers"));
+  drawLevers(shown, { own: good("levers"), advised: good("advice") && good("positions") && Boolean(shown.advice?.valid) });
+  drawStreams(shown, since_s);
+  $("camera").classList.toggle("stale", !good("camera"));
+  drawTargets(shown);
+  $("start").setAttribute("aria-pressed", shown.guiding);
+  $("record").setAttribute("aria-pressed", shown.recording.on);
+}
+
+function drawSafety(shown, lost, known) {
+  const { safety, recording } = shown;
+  const held = known && safety?.deadman && !safety.estop;
+  put($("deadman"), say(held ? "dead-man held" : "dead-man released"), held ? "good" : "careful");
+  if (safety) {
+    const state = safety.state === "SILENT" && !safety.commands ? "listens only" : safety.state;
+    const wrong = safety.estop ? "emergency stop" : safety.trip;
+    const calm = safety.commands ? wrong === "nothing" : !safety.estop && safety.bus_up;
+    const why = safety.commands || safety.estop || !safety.bus_up ? ` – ${say(safety.bus_up ? wrong : "bus down")}` : "";
+    const kind = lost || safety.estop || safety.state === "LATCHED" || !safety.bus_up ? "bad" : safety.state === "ACTIVE" ? "careful" : calm ? "good" : "careful";
+    put($("safety"), say(state) + why, kind);
+  } else put($("safety"), say("nothing from the bus"), "bad");
+  const minutes = `${Math.floor(recording.seconds / 60)}:${String(Math.floor(recording.seconds % 60)).padStart(2, "0")}`;
+  const gaps = recording.dropped ? `, ${recording.dropped} ${say("gaps")}` : "";
+  put($("recording"), recording.on ? `${say("recording")} ${minutes}${gaps}` : say("not recording"), recording.dropped ? "bad" : recording.on ? "good" : "idle");
+}
+
+function drawLevers(shown, sure) {
+  const advice = shown.guiding ? shown.advice : null;
+  const button = Boolean(advice?.levers.button_right);
+  for (const view of Object.values(views)) view.draw(shown.own, advice?.levers ?? null, sure, button);
+  put($("advice"), !shown.guiding ? say("stopped") : shown.advice?.valid ? say("guiding") : say(shown.advice?.reason ?? "nothing from the bus"));
+  $("advice").classList.toggle("none", shown.guiding && !shown.advice?.valid);
+  const due = advice && sure.advised ? advice.button_due_s : null;
+  const now = sure.advised && button, soon = !now && due !== null && due > 0;
+  const box = $("button").classList;
+  box.toggle("now", now); box.toggle("due", soon); box.toggle("stale", !sure.advised && Boolean(advice)); box.toggle("held", sure.own && Boolean(shown.own?.button_right));
+  const joint = setup.exclusive.join(" ");
+  put($("button").lastElementChild, now ? `${joint}: ${say("button now")}` : soon ? `${joint}: ${say("button due")} ${due.toFixed(1)} s` : `${joint}: ${say("button off")}`);
+  if (soon) $("button").querySelector(".left").setAttribute("stroke-dasharray", `${Math.min(1, due / 1.5).toFixed(3)} 1`);
+}
+
+function drawStreams(shown, since_s) {
+  const list = $("streams");
+  while (list.children.length < shown.streams.length) list.append(document.createElement("li"));
+  while (list.children.length > shown.streams.length) list.lastChild.remove();
+  shown.streams.forEach((stream, index) => {
+    const age_s = stream.age_s === null ? null : stream.age_s + since_s, item = list.children[index];
+    const text = age_s === null ? say("never") : age_s < 1 ? `${Math.ceil(age_s * 20) * 50} ms` : age_s < 100 ? `${age_s.toFixed(0)} s` : `${(age_s / 60).toFixed(0)} min`;
+    put(item, `${say(stream.name)} ${age_s !== null && age_s < stream.limit_s && age_s < 0.1 ? "✓" : text}`);
+    item.dataset.stream = stream.name;
+    item.classList.toggle("stale", age_s === null || age_s > stream.limit_s);
+  });
+}
+
+let listed = "";
+function drawTargets(shown) {
+  const key = JSON.stringify([shown.targets, language]);
+  if (key === listed) return;
+  listed = key;
+  const focused = document.activeElement?.dataset?.target;
+  $("targets").replaceChildren(...shown.targets.map((target, index) => {
+    const button = document.createElement("button"), sure = document.createElement("small"), spread = document.createElement("small");
+    button.type = "button";
+    button.dataset.target = target.name;
+    button.setAttribute("role", "radio");
+    button.setAttribute("aria-checked", target.chosen);
+    button.setAttribute("aria-keyshortcuts", index + 1);
+    sure.textContent = target.confidence === null ? say("unsure") : `${Math.round(100 * target.confidence)} %`;
+    spread.textContent = target.std_m === null ? "" : `± ${(1000 * target.std_m).toFixed(0)} mm`;
+    button.append(target.name, sure, spread);
+    button.onclick = () => wish("target", target.name);
+    return button;
+  }));
+  if (focused) [...$("targets").children].find(one => one.dataset.target === focused)?.focus();
+  put($("boreholes"), say(shown.targets.length ? "boreholes" : "no borehole"));
+}
+
+// ---- wishes out
+const control = token ? new Socket("/control", {
+  opened: socket => socket.send(JSON.stringify({ token })),
+  heard: text => answered(JSON.parse(text)),
+  closed: event => {
+    if (event.reason === "token") { allowed = false; control.end(); answer("refused token"); } else allowed = null;
+  },
+}) : null;
+
+function answered(said) {
+  if (said.ready) { allowed = true; answer(""); } else answer(said.refused ? `refused ${said.refused}` : "");
+}
+
+let answerKey = "";
+function answer(key) { answerKey = key; put($("answer"), key ? say(key) : ""); }
+
+function wish(kind, value = "") {
+  if (!control || allowed === false) answer("refused token");
+  else if (!allowed || !control.ready) answer("refused lost");
+  else control.send(JSON.stringify({ kind, value }));
+}
+
+$("start").onclick = () => wish("start");
+$("stop").onclick = () => wish("stop");
+$("record").onclick = () => wish("record", newest?.shown.recording.on ? "off" : "on");
+$("language").onclick = () => {
+  language = LANGUAGES[(LANGUAGES.indexOf(language) + 1) % LANGUAGES.length];
+  sessionStorage.setItem("language", language);
+  speak();
+};
+addEventListener("keydown", event => {
+  if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
+  const act = { Escape: () => wish("stop"), g: () => $("start").click(), r: () => $("record").click(), l: () => $("language").click() }[event.key];
+  if (act) act();
+  else if (/^[1-9]$/.test(event.key)) $("targets").children[event.key - 1]?.click();
+});
+
+function speak() {
+  say = words(language);
+  document.documentElement.lang = language;
+  document.title = `${setup.machine} – ${say("title")}`;
+  for (const id of ["start", "stop", "record"]) put($(id).querySelector("b"), say(id));
+  put($("language"), language === "en" ? "DE" : "EN");
+  $("language").setAttribute("aria-label", language === "en" ? "Deutsch" : "English");
+  put($("camera").querySelector("figcaption"), say("camera"));
+  for (const side of ["left", "right"]) $(side).setAttribute("aria-label", say(side));
+  $("scene").setAttribute("aria-label", say("scene"));
+  const [advised, own] = $("legend").querySelectorAll("span");
+  put(advised, say("advised")); put(own, say("own")); put($("noscene"), say("no 3D"));
+  answer(answerKey);
+  draw();
+}
+
+// ---- 3D scene and camera, in a thread of their own: levers never wait for them
+let scene = null;
+function startScene() {
+  const canvas = $("scene"), picture = $("picture").getContext("bitmaprenderer");
+  const worker = new Worker("scene.js", { type: "module" });
+  const size = () => ({ size: [canvas.clientWidth, canvas.clientHeight] });
+  const surface = canvas.transferControlToOffscreen();
+  worker.postMessage({ start: { canvas: surface, geometry: setup.geometry, points: setup.points, ...size() } }, [surface]);
+  worker.onmessage = ({ data }) => {
+    if (data.failed) { $("noscene").hidden = false; return; }
+    if (data.picture) picture.transferFromImageBitmap(data.picture);
+    if (data.measured) Object.assign(measured, data.measured);
+  };
+  new ResizeObserver(() => worker.postMessage(size())).observe(canvas);
+  const held = new Map();
+  let apart = 0;
+  canvas.onpointerdown = event => { canvas.setPointerCapture(event.pointerId); held.set(event.pointerId, event); apart = 0; };
+  canvas.onpointerup = canvas.onpointercancel = event => { held.delete(event.pointerId); apart = 0; };
+  canvas.onpointermove = event => {
+    const before = held.get(event.pointerId);
+    if (!before) return;
+    held.set(event.pointerId, event);
+    if (held.size === 1) worker.postMessage({ turn: [event.clientX - before.clientX, event.clientY - before.clientY] });
+    else {
+      const [a, b] = held.values(), now = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
+      if (apart) worker.postMessage({ zoom: apart / now });
+      apart = now;
+    }
+  };
+  canvas.addEventListener("wheel", event => { event.preventDefault(); worker.postMessage({ zoom: Math.exp(event.deltaY / 600) }); }, { passive: false });
+  canvas.addEventListener("keydown", event => {
+    const turn = { ArrowLeft: [-24, 0], ArrowRight: [24, 0], ArrowUp: [0, -24], ArrowDown: [0, 24] }[event.key];
+    const zoom = { "+": 0.87, "-": 1.15 }[event.key];
+    if (turn) { event.preventDefault(); worker.postMessage({ turn }); }
+    if (zoom) worker.postMessage({ zoom });
+  });
+  return worker;
+}
+
+speak();
+if (!token) answer("refused token");
+setInterval(draw, 100);  // ages grow even when nothing comes
+scene = startScene();

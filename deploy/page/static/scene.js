@@ -1,0 +1,83 @@
+// The 3D scene, in a worker with a canvas and a WebSocket of its own: machine, block, boreholes, path, and the point cloud.
+import { decompress } from "./fzstd.js";
+import { lookAt, multiply, perspective } from "./matrices.js";
+import { Painter } from "./painter.js";
+import { Shapes, block, boreholes, ground, machine, path } from "./shapes.js";
+import { Socket } from "./socket.js";
+
+const FOV = 0.7, NEAR = 0.1, FAR = 40, REPORT_MS = 1000;
+const view = { at: [1.7, 0, 0.7], distance: 6.2, azimuth: -1.05, height: 0.42 };
+const floor = new Shapes();
+ground(floor);
+let painter = null, setup = null, state = null, changed = true, drawn = 0, since = performance.now();
+let frames = 0, undrawn = null;
+
+function start({ canvas, geometry, points, size }) {
+  setup = { canvas, geometry, points };
+  resize(size);
+  try { painter = new Painter(canvas); } catch { postMessage({ failed: true }); return; }
+  new Socket("/frames", { binary: true, opened: () => { frames = 0; }, heard: take });
+  requestAnimationFrame(tick);
+}
+
+function resize([width, height]) {
+  setup.canvas.width = Math.max(1, width);
+  setup.canvas.height = Math.max(1, height);
+  changed = true;
+}
+
+// A frame: depth to the graphics card as it is, colour to the card and to the page.
+async function take(data, socket) {
+  const began = performance.now(), number = ++frames;
+  const length = new DataView(data).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  const { width, height, depth_bytes } = header;
+  const depth = new Uint16Array(decompress(new Uint8Array(data, 4 + length, depth_bytes), new Uint8Array(2 * width * height)).buffer);
+  for (let row = 0; row < depth.length; row += width) for (let i = row + 1; i < row + width; i++) depth[i] += depth[i - 1];  // modulo 2^16
+  const jpeg = new Blob([new Uint8Array(data, 4 + length + depth_bytes)], { type: "image/jpeg" });
+  const picture = await createImageBitmap(jpeg);
+  painter.cloud(header, depth, picture, setup.points);
+  postMessage({ picture }, [picture]);
+  undrawn = { number, socket, began };
+  changed = true;
+}
+
+function tick() {
+  requestAnimationFrame(tick);
+  if (!changed) return;
+  changed = false;
+  const shapes = new Shapes();
+  if (state) {
+    if (setup.geometry && state.q) machine(shapes, setup.geometry, state.q);
+    if (state.block_in_base_m) block(shapes, state.block_in_base_m);
+    boreholes(shapes, state.targets);
+    path(shapes, state.path_in_base_m);
+  }
+  const { at, distance, azimuth, height } = view, { width, height: tall } = setup.canvas;
+  const eye = [at[0] + distance * Math.cos(height) * Math.cos(azimuth), at[1] + distance * Math.cos(height) * Math.sin(azimuth), at[2] + distance * Math.sin(height)];
+  painter.draw(multiply(perspective(FOV, width / tall, NEAR, FAR), lookAt(eye, at)), floor, shapes);
+  drawn += 1;
+  if (undrawn) {
+    undrawn.socket.send(String(undrawn.number));
+    postMessage({ measured: { frames: undrawn.number, frame_ms: performance.now() - undrawn.began, points: painter.points } });
+    undrawn = null;
+  }
+  const now = performance.now();
+  if (now - since >= REPORT_MS) {
+    postMessage({ measured: { fps: 1000 * drawn / (now - since) } });
+    [drawn, since] = [0, now];
+  }
+}
+
+const acts = {
+  start,
+  size: resize,
+  state: shown => { state = shown; changed = true; },
+  turn: ([x, y]) => {
+    view.azimuth -= x * 0.006;
+    view.height = Math.min(1.5, Math.max(-0.1, view.height + y * 0.006));
+    changed = true;
+  },
+  zoom: factor => { view.distance = Math.min(15, Math.max(0.8, view.distance * factor)); changed = true; },
+};
+onmessage = ({ data }) => { for (const [name, value] of Object.entries(data)) acts[name]?.(value); };

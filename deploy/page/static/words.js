@@ -1,0 +1,46 @@
+// All that the page says, in English and German. What the loop says comes as English words and is looked up here too.
+export const LANGUAGES = ["en", "de"];
+
+const DE = {
+  connected: "Verbunden", lost: "KEINE VERBINDUNG", dead: "Steuerrechner still", title: "Bedienseite",
+  "listens only": "Hört nur zu", SILENT: "Sendet nicht", LATCHED: "VERRIEGELT", READY: "Bereit", ACTIVE: "STEUERT VENTILE",
+  "dead-man held": "Totmann gehalten", "dead-man released": "Totmann los", "recording": "Aufnahme", "not recording": "Keine Aufnahme", gaps: "Lücken",
+  start: "Führung ein", stop: "STOPP", record: "Aufnahme", boreholes: "Bohrloch wählen", camera: "Kamera", positions: "Stellung", levers: "Hebel",
+  advice: "Vorschlag", borehole: "Bohrloch", never: "fehlt", advised: "Vorschlag", own: "Eigener Hebel", left: "Linker Hebel", right: "Rechter Hebel",
+  "button off": "Taste loslassen", "button due": "Taste in", "button now": "Taste HALTEN", guiding: "Hebel auf Grün führen", stopped: "Führung aus",
+  "no 3D": "Kein 3D: dieser Browser bietet kein WebGL 2", unsure: "unbekannt", "no borehole": "Kein Bohrloch bekannt", scene: "3D-Ansicht: ziehen dreht",
+  "refused token": "Kein Zugriff: Seite über den Link mit Schlüssel öffnen", "refused deadman": "Abgelehnt: Totmann halten",
+  "refused target": "Abgelehnt: dieses Bohrloch gibt es nicht mehr", "refused busy": "Abgelehnt: die Steuerung nimmt es nicht an",
+  "refused malformed": "Abgelehnt: nicht verstanden", "refused lost": "Keine Verbindung zur Steuerung",
+  nothing: "alles in Ordnung", "bus down": "Bus gestört", "time stood still": "Zeit stand still", "emergency stop": "NOT-HALT",
+  "machine status missing": "Maschinenzustand fehlt", "remote missing": "Fernbedienung fehlt", "joint positions missing": "Gelenkstellungen fehlen",
+  "joint positions not plausible": "Gelenkstellungen unglaubwürdig", "messages corrupted": "Nachrichten verfälscht",
+  "somebody else sends commands": "Ein anderer sendet Befehle", "operator moves a lever": "Bediener bewegt Hebel", "no fresh command": "Kein frischer Befehl",
+  "command is no number, or beyond full": "Befehl ungültig", "exclusive joint together with others": "Gelenk darf nur allein fahren", "not armed": "nicht scharf",
+  "nothing from the bus": "Nichts vom Bus", "positions are stale": "Gelenkstellungen veraltet", "positions are not plausible": "Gelenkstellungen unglaubwürdig",
+  "history is filling": "Sammelt Messwerte", "no borehole is known": "Kein Bohrloch bekannt",
+  "the borehole was found too long ago": "Bohrloch zu lange nicht gesehen", "the policy's answer makes no sense": "Vorschlag unbrauchbar",
+};
+const EN = {
+  connected: "Connected", lost: "NO CONNECTION", dead: "Control computer silent", title: "operator's page",
+  "listens only": "Listens only", SILENT: "Sends nothing", LATCHED: "LATCHED", READY: "Ready", ACTIVE: "COMMANDS VALVES",
+  "dead-man held": "Dead-man held", "dead-man released": "Dead-man released", "recording": "Recording", "not recording": "Not recording", gaps: "gaps",
+  start: "Guide me", stop: "STOP", record: "Record", boreholes: "Choose the borehole", camera: "Camera", positions: "Positions", levers: "Levers",
+  advice: "Advice", borehole: "Borehole", never: "missing", advised: "Advice", own: "Your lever", left: "Left lever", right: "Right lever",
+  "button off": "Release button", "button due": "Button in", "button now": "HOLD button", guiding: "Bring your levers to green", stopped: "Guidance is off",
+  "no 3D": "No 3D: this browser offers no WebGL 2", unsure: "unknown", "no borehole": "No borehole is known", scene: "3D view: drag to turn",
+  "refused token": "No access: open the page by the link with the key", "refused deadman": "Refused: hold the dead-man",
+  "refused target": "Refused: that borehole is gone", "refused busy": "Refused: the loop does not take it", "refused malformed": "Refused: not understood",
+  "refused lost": "No connection to the loop", nothing: "all is well", "emergency stop": "EMERGENCY STOP",
+};
+
+export function words(language) {
+  const known = language === "de" ? DE : EN;
+  return key => known[key] ?? key;
+}
+
+export function preferred(setup) {
+  const asked = new URLSearchParams(location.search).get("lang") ?? sessionStorage.getItem("language");
+  const wanted = asked ?? (setup === "auto" ? navigator.language.slice(0, 2) : setup);
+  return LANGUAGES.includes(wanted) ? wanted : "en";
+}
