@@ -26,8 +26,8 @@ class DeadBand(EffectSpec):
     retract: Value
     side = "command"
     numbers: ClassVar = {
-        "extend": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.6)),
-        "retract": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.6)),
+        "extend": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.85)),  # servo-driven rotary valves reach 0.75
+        "retract": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.85)),
     }
 
     def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:

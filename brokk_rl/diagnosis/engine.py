@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from brokk_rl.diagnosis import frames, remainder, sensors, tool
+from brokk_rl.diagnosis import around, frames, remainder, sensors, tool
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.evidence import Evidence, Ray, rays
 from brokk_rl.diagnosis.found import Found
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.noise import increments
 from brokk_rl.diagnosis.repair import Repair, repair
-from brokk_rl.diagnosis.search import Chosen, Price, Table, choose
+from brokk_rl.diagnosis.search import MOST, Chosen, Price, Table, choose
 from brokk_rl.diagnosis.shapes import SMALL, Nulls, add, plain_joints
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.sizes import Shape
@@ -30,6 +30,8 @@ SCATTERED = 1.3
 """Mean square error over that of the reference from which what effects earn is taken down."""
 CUT = 25.0
 """Squares of errors over the noise count no more than this in what scatters."""
+TURNS = 2
+"""Times that effects are simulated around what was found, where adding up is far off."""
 Tell = Callable[[str, float], None]
 """Is told what is being done and how much of the whole is done."""
 
@@ -132,6 +134,14 @@ class Search:
 
         scatter = np.ones(self.case.machine.num_joints)
         tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)
+        wide = None
+        if (
+            repaired
+            and np.abs(repaired.sizes).max() > around.LARGE
+            and around.is_needed(evidence, repaired, _promised(tables, chosen))
+        ):
+            wide, tables, chosen, repaired = self._around(evidence, grown, chosen, repaired, price)
+            grown = wide[1]
         self.tell("frames", 0.8)
         after = repaired.after if repaired else evidence.base
         late = frames.search(evidence, evidence.error_of(after), nulls, self.kinds, prices.joint, prices.name)
@@ -141,7 +151,9 @@ class Search:
                 steady = [*evidence.candidates.fixed, *(repaired.effects() if repaired else [])]
                 mean = frames.mean_change(replace(evidence.candidates, fixed=steady), late)
                 evidence = replace(evidence, mean=mean)
-            tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)
+                wide = around.simulated(evidence, grown, repaired) if wide and repaired else None
+            z, grown, shapes = wide or (None, grown, shapes)
+            tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter, z)
         self.tell("what is left", 0.92)
         others = [*on_sensors, *on_tool.found, *([late] if late else [])]
         left, left_null = self._left(evidence, repaired, scatter)
@@ -169,21 +181,57 @@ class Search:
         shapes: Sequence[Mapping[str, list[Shape]]],
         price: Price,
         scatter: np.ndarray,
+        z: np.ndarray | None = None,
     ) -> tuple[list[Table], Chosen, Repair | None]:
-        """Searches sets where errors scatter more than the noise says: they are worth less by as much."""
-        tables, flat = [], dict.fromkeys(grown, self.prices.joint)
-        for j, (mine, joint) in enumerate(zip(shapes, plain_joints(evidence, scatter), strict=True)):
-            self.tell(f"trying sets on joint {j + 1}", 0.55 + 0.1 * j / len(shapes))
-            by = 1.0 / np.sqrt(scatter[j])
-            scaled = {name: [Shape(shape.sizes, shape.change * by) for shape in own] for name, own in mine.items()}
-            tables.append(Table(joint, scaled, evidence.block))
-            tables[-1].explore(flat, 3)
+        """Searches sets where errors scatter more than the noise says: they are worth less by as much; `z`: errors to explain."""
+        tables = self._tables(evidence, grown, shapes, scatter, z)
         self.tell("the same on the reference", 0.7)
         prices = self.prices
         shared = frozenset(kind.name for kind in self.kinds if getattr(kind.target, "shared", False))
         chosen = choose(tables, price, prices.name, prices.share, shared, prices.partial, prices.joint)
         start = [table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)]
         return tables, chosen, repair(evidence, chosen.subsets, grown, start) if chosen.names else None
+
+    def _tables(
+        self,
+        evidence: Evidence,
+        grown: Mapping[str, list[Ray]],
+        shapes: Sequence[Mapping[str, list[Shape]]],
+        scatter: np.ndarray,
+        z: np.ndarray | None,
+    ) -> list[Table]:
+        """Returns what sets earn on each joint."""
+        tables, flat = [], dict.fromkeys(grown, self.prices.joint)
+        for j, (mine, joint) in enumerate(zip(shapes, plain_joints(evidence, scatter, z), strict=True)):
+            self.tell(f"trying sets on joint {j + 1}", 0.55 + 0.1 * j / len(shapes))
+            by = 1.0 / np.sqrt(scatter[j])
+            scaled = {name: [Shape(shape.sizes, shape.change * by) for shape in own] for name, own in mine.items()}
+            tables.append(Table(joint, scaled, evidence.block))
+            tables[-1].explore(flat, 3 if z is None else MOST)
+        return tables
+
+    def _around(
+        self, evidence: Evidence, grown: Mapping[str, list[Ray]], chosen: Chosen, repaired: Repair, price: Price
+    ) -> tuple[around.Around, list[Table], Chosen, Repair | None]:
+        """Goes on from a set whose effects do not add up: simulates all others in its company, fits sizes together."""
+        tried, scatter = [repaired], np.ones(self.case.machine.num_joints)
+        wide = around.simulated(evidence, grown, repaired)
+        for turn in range(TURNS):
+            self.tell("simulating around what was found", 0.72 + 0.04 * turn)
+            before = chosen
+            tables, chosen, now = self._round(evidence, *wide[1:], price, scatter, wide[0])
+            tried += [now] if now else []
+            more = now and around.grown(evidence, wide[1], tables, chosen, now, self.prices.joint)
+            tried += [more] if more else []
+            if now is None or (more is None and chosen.subsets == before.subsets):
+                break
+            wide = around.simulated(evidence, grown, more or now)
+        best = around.best(evidence, wide[1], tried, price)
+        wide = around.simulated(evidence, grown, best)
+        tables, subsets = self._tables(evidence, *wide[1:], scatter, wide[0]), around.subsets_of(best)
+        worth = sum(table.score(s).total - price(j, s) for j, (table, s) in enumerate(zip(tables, subsets, strict=True)) if s)
+        chosen = Chosen(subsets, worth - self.prices.name * len(frozenset().union(*subsets)))
+        return wide, tables, chosen, best if chosen.names else None
 
     def _scatter(self, evidence: Evidence, repaired: Repair | None) -> np.ndarray:
         """Returns the mean square of errors over the noise over that of the reference, outliers cut, `(J,)`."""
@@ -199,6 +247,10 @@ class Search:
             earned = remainder.predictable(one.evidence, one.evidence.z).sum(1)
             of_nulls.append(earned * entries / one.evidence.z.shape[1])
         return remainder.predictable(evidence, z).sum(1), np.max(of_nulls, 0)
+
+
+def _promised(tables: Sequence[Table], chosen: Chosen) -> float:
+    return sum(table.score(subset).total for table, subset in zip(tables, chosen.subsets, strict=True))
 
 
 def _adjusted(evidence: Evidence, found: Sequence[Found]) -> Evidence:

@@ -19,6 +19,8 @@ FREEDOM = 5.0
 """Degrees of freedom of the t distribution that whitened errors are taken to have."""
 LONGEST = 80
 """Increments in a block."""
+STILL = 0.1
+"""Smallest typical error, over the root of the mean square."""
 
 
 def increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -70,7 +72,8 @@ class Noise:
 
 def fit(error: np.ndarray, way: np.ndarray) -> Noise:
     """Returns the noise of one joint: maximum likelihood on errors and simulated increments, `(W, I)`, with outliers cut."""
-    typical = 1.4826 * np.median(np.abs(error)) + 1e-9
+    # a joint that stands still most of the time, read by a coarse sensor, has a median error of 0
+    typical = max(1.4826 * np.median(np.abs(error)), STILL * np.sqrt(np.mean(error**2))) + 1e-9
     size = np.sqrt(np.mean(way**2)) + 1e-9
     error = np.clip(error, -12.0 * typical - 0.3 * np.abs(way), 12.0 * typical + 0.3 * np.abs(way))
 

@@ -16,9 +16,22 @@ from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.noise import loss, weight
 from brokk_rl.diagnosis.sizes import PRIOR
 
-STEPS = 4
+STEPS = 6
+"""Steps of a fit at most."""
 STEP = 0.05
 """Finite difference, of the typical size."""
+STARTS = (1.0, 0.5, 1.6)
+"""Multiples of the first guess at which a fit may begin: what adding up the effects said is far off where they are large."""
+DAMPING = (0.03, 1.0, 30.0)
+"""Factors on the damping that are tried at each step."""
+WITHIN = (1e-4, 1e4)
+"""Damping, over the diagonal of the normal matrix."""
+ENOUGH = 0.02
+"""Gain in log likelihood below which a fit ends."""
+DRAWN, FOLLOWED, SPREAD = 40, 3, 0.5
+"""Starts of a search, those of a joint that are followed, and how far they scatter (of the logarithm)."""
+BEYOND = 2.5
+"""Sizes may grow to so many times the largest that was simulated before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +89,16 @@ def repair(
     start: Sequence[Mapping[str, np.ndarray]],
     steps: int = STEPS,
 ) -> Repair:
-    """Fits a set of effects by simulation.
+    """Fits a set of effects by simulation, all sizes of a joint at once.
+
+    The fit to all entries begins at the best of several multiples of `start`; those to all but one half begin where it ended.
 
     Args:
         evidence: Errors of the simulator without them.
         subsets: Effects of each joint.
         rays: Ways in which each effect can grow.
         start: Sizes of each effect along its rays, by joint and name.
-        steps: Simulations of all sizes and their neighbourhood.
+        steps: Steps of each fit at most.
     """
     chosen = [(ray, place) for name in sorted(frozenset().union(*subsets)) for place, ray in enumerate(rays[name])]
     mask = np.array([[ray.kind.name in subset for subset in subsets] for ray, _ in chosen])
@@ -94,32 +109,91 @@ def repair(
         ]
     )
     found = [ray for ray, _ in chosen]
-    low, high = (np.array([ray.sizes[end] for ray in found])[:, None] for end in (0, -1))
-    low, high = np.where(low < 0, 2.0 * low, low), 2.0 * high  # beyond what was simulated before, within the bounds of the number
-    used = np.stack([np.ones(len(evidence.fold)), evidence.fold != 0, evidence.fold != 1])  # (3, E)
-    now = np.repeat(sizes[None], 3, 0)
-    best, best_loss = now.copy(), np.full((3, sizes.shape[1]), np.inf)
-    slopes = z = np.zeros(0)
-    for _ in range(steps):
-        z, slopes, paths = _linear(evidence, found, now)
-        totals = np.einsum("fje,fe->fj", np.log1p(z**2 / 5.0) * 3.0, used) + 0.5 * (now**2).sum(1) / PRIOR**2
-        better = totals < best_loss - 1e-6
-        best, best_loss = np.where(better[:, None], now, best), np.minimum(totals, best_loss)
-        step = np.zeros_like(now)
-        for f in range(3):
-            for j in np.flatnonzero(mask.any(0)):
-                rows = mask[:, j]
-                weighted = slopes[f, j][rows] * (weight(z[f, j]) * used[f])
-                normal = weighted @ slopes[f, j][rows].T + np.eye(rows.sum()) / PRIOR**2
-                step[f, rows, j] = np.linalg.solve(1.001 * normal, weighted @ z[f, j] - now[f, rows, j] / PRIOR**2)
-        origin = np.where(better[:, None], now, best)
-        now = np.clip(np.where(better[:, None], now + step, 0.5 * (origin + now)), low, high)
-    z, slopes, paths = _linear(evidence, found, best)
+    every, halves = np.ones((1, len(evidence.fold))), np.stack([evidence.fold != 0, evidence.fold != 1]).astype(float)
+    fit = _Fit(evidence, found, mask)
+    whole = fit.descended(fit.nearest(sizes)[None], every, steps)
+    apart = fit.descended(np.repeat(whole, 2, 0), halves, max(1, steps // 2))
+    z, slopes, _ = _linear(evidence, found, whole)
+    z_apart, paths = fit.simulated(apart)
     half = evidence.fold.reshape(len(evidence.way), -1)[:, 0]
-    after = np.where((half == 0)[:, None, None], paths[1], paths[2]) + (0.0 if evidence.mean is None else evidence.mean)
-    held = np.where(evidence.fold == 0, z[1], z[2])
-    deviation = _deviation(z[0], slopes[0], mask, evidence.block)
-    return Repair(found, mask, best[0], best[1:], after, held, deviation)
+    after = np.where((half == 0)[:, None, None], paths[0], paths[1]) + (0.0 if evidence.mean is None else evidence.mean)
+    held = np.where(evidence.fold == 0, z_apart[0], z_apart[1])
+    return Repair(found, mask, whole[0], apart, after, held, _deviation(z[0], slopes[0], evidence, mask))
+
+
+def searched(
+    evidence: Evidence, rays: Sequence[Ray], mask: np.ndarray, known: np.ndarray, generator: np.random.Generator
+) -> np.ndarray:
+    """Returns sizes `(R, J)` fitted from many starts about those `known`; where these are 0, about the typical one."""
+    drawn = np.exp(SPREAD * generator.standard_normal((DRAWN, *known.shape)))
+    starts = np.where(known == 0.0, drawn**2, known * drawn) * mask
+    fit = _Fit(evidence, rays, mask)
+    starts = np.clip(starts, *fit.bounds)
+    order = _totals(fit.simulated(starts)[0], starts, 1.0).argsort(0)[:FOLLOWED]  # (F, J)
+    best = np.take_along_axis(starts, order[:, None], 0)
+    found = fit.descended(best, np.ones((FOLLOWED, len(evidence.fold))), STEPS)
+    last = _totals(fit.simulated(found)[0], found, 1.0).argmin(0)
+    return np.take_along_axis(found, last[None, None], 0)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Levenberg and Marquardt's descent of the sizes of all joints at once, `F` fits side by side."""
+
+    evidence: Evidence
+    rays: Sequence[Ray]
+    mask: np.ndarray
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest sizes, `(R, 1)`: beyond what was simulated before, within the bounds of the numbers."""
+        low, high = (np.array([ray.sizes[end] for ray in self.rays])[:, None] for end in (0, -1))
+        return np.where(low < 0, BEYOND * low, low), BEYOND * high
+
+    def simulated(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns errors over the noise `(F, J, E)` and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
+        paths = simulate(self.evidence.candidates, self.rays, sizes)
+        return self.evidence.whitened(self.evidence.error_of(paths)).swapaxes(0, 1), paths
+
+    def nearest(self, sizes: np.ndarray) -> np.ndarray:
+        """Returns, joint by joint, the best of several multiples of sizes `(R, J)`."""
+        trials = np.clip(np.stack([sizes * by for by in STARTS]), *self.bounds)
+        best = _totals(self.simulated(trials)[0], trials, 1.0).argmin(0)
+        return np.where(self.mask, np.take_along_axis(trials, best[None, None], 0)[0], 0.0)
+
+    def descended(self, now: np.ndarray, used: np.ndarray, steps: int) -> np.ndarray:
+        """Returns the best sizes from `now` `(F, R, J)` on, with entries weighed by `used` `(F, E)`."""
+        damping, weights = np.full((len(now), now.shape[2]), 1e-2), used[:, None]
+        for _ in range(steps):
+            z, slopes, _ = _linear(self.evidence, self.rays, now)
+            least = _totals(z, now, weights)
+            trials = np.clip(np.stack([now + self._step(z, slopes, now, used, by * damping) for by in DAMPING]), *self.bounds)
+            tried = self.simulated(trials.reshape(-1, *now.shape[1:]))[0].reshape(len(DAMPING), *z.shape)
+            totals = np.stack([_totals(one, sizes, weights) for one, sizes in zip(tried, trials, strict=True)])  # (D, F, J)
+            best = totals.argmin(0)
+            gained = least - totals.min(0)
+            better = gained > 0.0
+            damping = np.clip(damping * np.where(better, np.array(DAMPING)[best], DAMPING[-1] ** 2), *WITHIN)
+            now = np.where(better[:, None], np.take_along_axis(trials, best[None, :, None], 0)[0], now)
+            if gained.max() < ENOUGH:
+                break
+        return now
+
+    def _step(self, z: np.ndarray, slopes: np.ndarray, now: np.ndarray, used: np.ndarray, damping: np.ndarray) -> np.ndarray:
+        """Returns how far sizes should change, `(F, R, J)`."""
+        step = np.zeros_like(now)
+        for f, j in np.ndindex(damping.shape):
+            rows = self.mask[:, j]
+            weighted = slopes[f, j][rows] * (weight(z[f, j]) * used[f])
+            normal = weighted @ slopes[f, j][rows].T + np.eye(rows.sum()) / PRIOR**2
+            damped = normal + damping[f, j] * np.diag(np.diag(normal))
+            step[f, rows, j] = np.linalg.solve(damped, weighted @ z[f, j] - now[f, rows, j] / PRIOR**2)
+        return step
+
+
+def _totals(z: np.ndarray, sizes: np.ndarray, used: np.ndarray | float) -> np.ndarray:
+    """Returns the loss of errors `(F, J, E)` and sizes `(F, R, J)`, `(F, J)`."""
+    return (loss(z[..., None], -1) * used).sum(-1) + 0.5 * np.square(sizes / PRIOR).sum(1)
 
 
 def _linear(evidence: Evidence, rays: Sequence[Ray], sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -137,17 +211,22 @@ def _linear(evidence: Evidence, rays: Sequence[Ray], sizes: np.ndarray) -> tuple
     return z[:, :, 0].swapaxes(0, 1), slopes.swapaxes(0, 1), paths.reshape(fits, count + 1, *paths.shape[1:])[:, 0]
 
 
-def _deviation(z: np.ndarray, slopes: np.ndarray, mask: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """Returns standard errors of the sizes, `(R, J)`: the larger of what the likelihood says and the spread between blocks."""
+def _deviation(z: np.ndarray, slopes: np.ndarray, evidence: Evidence, mask: np.ndarray) -> np.ndarray:
+    """Returns standard errors of the sizes, `(R, J)`.
+
+    The larger of what the likelihood says and the spread between blocks, and what small faults of the simulator would make of them:
+    a constant fault shows in no spread.
+    """
     found = np.zeros(mask.shape)
     for j in np.flatnonzero(mask.any(0)):
         rows = mask[:, j]
         weighted = slopes[j][rows] * weight(z[j])
         inverse = np.linalg.inv(weighted @ slopes[j][rows].T + np.eye(rows.sum()) / PRIOR**2)
-        scores = np.stack([(weighted * z[j])[:, block == one].sum(1) for one in np.unique(block)])
+        scores = np.stack([(weighted * z[j])[:, evidence.block == one].sum(1) for one in np.unique(evidence.block)])
         factor = len(scores) / max(1, len(scores) - 1)
         spread = inverse @ (factor * scores.T @ scores) @ inverse
-        found[rows, j] = np.sqrt(np.maximum(np.diag(spread), np.diag(inverse)))
+        of_faults = np.square(inverse @ weighted @ evidence.faults[j].T).sum(1)
+        found[rows, j] = np.sqrt(np.maximum(np.diag(spread), np.diag(inverse)) + of_faults)
     return found
 
 

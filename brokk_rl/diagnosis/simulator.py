@@ -65,12 +65,15 @@ class Base:
     Attributes:
         actuator: Fitted to the whole reference, or given.
         field: Against the field.
-        nulls: Fits that left out a part of the reference, each against that part; empty without reference.
+        nulls: Fits that left out a part of the reference, each against that part; without a reference flexible models that left out
+            a part of the field; empty where there are too few recordings for either.
+        is_flexible: `nulls` are flexible models of the field.
     """
 
     actuator: Actuator
     field: Held
     nulls: Sequence[Held]
+    is_flexible: bool = False
 
 
 Begun = Sequence[tuple[Recording, float]]
@@ -113,24 +116,8 @@ def fitted(case: Case, fit: ActuatorFit, folder: Path, seed: int, device: torch.
             f"too little data: the reference lasts {sum(r.duration_s for r in case.reference):.0f} s; a simulator that is "
             "judged on recordings it was not fitted to needs several minutes"
         )
-    begun = _begun(reference)
-    fold = np.arange(len(reference)) % FOLDS  # in turns: what is left out is of the same making as what is fitted to
-    refit: Any = getattr(fit, "refit", None)
-    nulls = []
-    if refit:
-        actuator = fit.fit(machine, case.reference, [], folder, seed, device)
-        for part in np.unique(fold):
-            rest = [r for r, f in zip(reference, fold, strict=True) if f != part]
-            left = [one for one, f in zip(begun, fold, strict=True) if f == part]
-            nulls.append(held(refit(actuator, machine, rest), left, machine, seed))
-    else:
-        last = fold == fold.max()
-        rest = [r for r, out in zip(reference, last, strict=True) if not out]
-        actuator = fit.fit(machine, rest[: max(1, len(rest) - 1)], rest[-1:], folder, seed, device)
-        left = [one for one, out in zip(begun, last, strict=True) if out]
-        nulls.append(held(actuator, left, machine, seed))
+    actuator, nulls = _crosswise(case.reference, reference, fit, machine, folder, seed, device)
     field = held(actuator, _begun(case.field), machine, seed)
-    nulls = _noised(nulls, machine)
     if changes := tuning.changes([one.evidence for one in nulls]):
         actuator = tuning.changed(actuator, changes, machine)
         nulls = _noised([one.with_base(tuning.changed(one.evidence.candidates.base, changes, machine)) for one in nulls], machine)
@@ -150,10 +137,51 @@ def learned(base: Base, machine: Machine) -> Base:
     return replace(base, field=replace(base.field, evidence=field), nulls=nulls)
 
 
-def given(case: Case, actuator: Actuator, seed: int) -> Base:
-    """Returns a configured simulator held against the field; without reference its noise is that of the field's own errors."""
-    field = held(actuator, _begun(case.field), case.machine, seed)
-    return Base(actuator, replace(field, evidence=replace(field.evidence, noise=noises([field], case.machine))), [])
+def given(case: Case, actuator: Actuator, fit: ActuatorFit, folder: Path, seed: int, device: torch.device) -> Base:
+    """Returns a configured simulator held against the field, and flexible models of the field that leave a part of it out.
+
+    There is no reference that would tell how a machine errs that lacks nothing: what `fit` does not explain of recordings that it
+    was not fitted to takes its place, as noise, price and floor. Where it cannot be fitted the noise is that of the simulator.
+    """
+    machine = case.machine
+    field = held(actuator, _begun(case.field), machine, seed)
+    pieces, nulls = parts(case.field), []
+    try:
+        if len(pieces) > 1:
+            nulls = _crosswise(case.field, pieces, fit, machine, folder, seed, device)[1]
+    except RecordingError as error:
+        log.warning("no floor: a flexible model cannot be fitted to the field (%s)", error)
+    known = nulls[0].evidence.noise if nulls else noises([field], machine)
+    return Base(actuator, replace(field, evidence=replace(field.evidence, noise=known)), nulls, is_flexible=bool(nulls))
+
+
+def _crosswise(
+    recordings: Sequence[Recording],
+    pieces: Sequence[Recording],
+    fit: ActuatorFit,
+    machine: Machine,
+    folder: Path,
+    seed: int,
+    device: torch.device,
+) -> tuple[Actuator, list[Held]]:
+    """Returns a fit, and fits that left out a part of the recordings' `pieces`, each held against that part, their noise known."""
+    begun = _begun(pieces)
+    fold = np.arange(len(pieces)) % FOLDS  # in turns: what is left out is of the same making as what is fitted to
+    refit: Any = getattr(fit, "refit", None)
+    nulls = []
+    if refit:
+        actuator = fit.fit(machine, recordings, [], folder, seed, device)
+        for part in np.unique(fold):
+            rest = [r for r, f in zip(pieces, fold, strict=True) if f != part]
+            left = [one for one, f in zip(begun, fold, strict=True) if f == part]
+            nulls.append(held(refit(actuator, machine, rest), left, machine, seed))
+    else:
+        last = fold == fold.max()
+        rest = [r for r, out in zip(pieces, last, strict=True) if not out]
+        actuator = fit.fit(machine, rest[: max(1, len(rest) - 1)], rest[-1:], folder, seed, device)
+        left = [one for one, out in zip(begun, last, strict=True) if out]
+        nulls.append(held(actuator, left, machine, seed))
+    return actuator, _noised(nulls, machine)
 
 
 def _noised(nulls: Sequence[Held], machine: Machine) -> list[Held]:

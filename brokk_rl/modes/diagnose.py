@@ -57,7 +57,7 @@ class Diagnose:
     Attributes:
         session: Folder, seed, device.
         machine: The machine that was recorded.
-        fit: How the simulator is made from `reference/`.
+        fit: How the simulator is made from `reference/`; without one, the flexible model that tells what could be explained at all.
         actuator: The simulator that `diagnosis.field` is held against.
         thresholds: When a stretch of a recording is worth telling.
         excitation: Experiments that could follow, by name.
@@ -106,11 +106,11 @@ class Diagnose:
         return Case(self.machine, [], record.read_all(subject.field, self.machine))
 
     def _base(self, given: Case) -> Base:
-        seed, device = self.session.stream("base"), self.session.torch_device()
+        seed, device, folder = self.session.stream("base"), self.session.torch_device(), self.session.folder
         if given.reference:
-            return simulator.fitted(given, self.fit, self.session.folder / "base", seed, device)
+            return simulator.fitted(given, self.fit, folder / "base", seed, device)
         assert self.actuator is not None, "there is one where there is no reference"
-        return simulator.given(given, self.actuator, seed)
+        return simulator.given(given, self.actuator, self.fit, folder / "flexible", seed, device)
 
 
 def _show(found: Answer, folder: Path) -> None:
