@@ -21,6 +21,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import Encoder, Scaling
 from tasks.advice import Advice
 from tasks.deployable import Deployable, features
+from tasks.measured import Measured
 from tasks.reward import Term
 from tasks.state import ToolState
 from tasks.tool_pose import Action, Noise, Switch
@@ -53,7 +54,7 @@ class Options:
     depth_m: float
     memory: int
     advice: Advice | None
-    noise: Noise
+    noise: Noise | Measured
     switch: Switch
     action: Action
     scaling: Scaling
@@ -120,7 +121,8 @@ class ToolPoseProcess:
         uniform = torch.rand(len(mask), 5, device=mask.device)
         turn, lift = uniform[:, 0] * (2 * math.pi), uniform[:, 1] * 2 - 1
         flat = torch.sqrt(1 - lift.square())
-        bias = torch.stack((flat * turn.cos(), flat * turn.sin(), lift), 1) * uniform[:, 2:3] * noise.target_bias_m
+        bias = torch.stack((flat * turn.cos(), flat * turn.sin(), lift), 1) * uniform[:, 2:3]
+        bias = bias * noise.bias_m(start["target_m"])
         fresh = {f"start.{key}": value for key, value in start.items()}
         fresh |= {
             "bias_m": bias,
@@ -254,7 +256,7 @@ class ToolPoseProcess:
         """Writes what the policy is told: estimate, guidance, phase and the observation groups."""
         noise, state = self.options.noise, self.state
         true_m = state["start.target_m"]
-        error = (2 * torch.rand_like(true_m) - 1) * noise.target_sample_m
+        error = (2 * torch.rand_like(true_m) - 1) * noise.sample_m(true_m)
         if noise.target_relative:
             error = error + (2 * torch.rand_like(true_m) - 1) * noise.target_relative * true_m
         sample = true_m + state["bias_m"] + error

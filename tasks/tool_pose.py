@@ -35,6 +35,14 @@ class Noise:
     q_scale: float
     u_scale: float
 
+    def bias_m(self, target_m: torch.Tensor) -> torch.Tensor | float:
+        """Returns the longest constant error of targets, `(N, 3)` in the base frame: the same for all."""
+        return self.target_bias_m
+
+    def sample_m(self, target_m: torch.Tensor) -> torch.Tensor | float:
+        """Returns the half width of the error of each sample and axis: the same for all."""
+        return self.target_sample_m
+
 
 @spec
 class Switch:

@@ -11,6 +11,7 @@ from brokk_rl.observation import Scaling
 from brokk_rl.sim import scene
 from brokk_rl.spec import spec
 from tasks.advice import Advice
+from tasks.measured import Measured
 from tasks.process import Options, ToolPoseProcess
 from tasks.reward import Term
 from tasks.starts import Arms, Targets, Uniform, random_starts
@@ -90,7 +91,7 @@ class BoreholeInsertion:
     success: Success
     memory: int
     advice: Advice | None
-    noise: Noise
+    noise: Noise | Measured
     switch: Switch
     action: Action
     scaling: Scaling
