@@ -20,7 +20,7 @@ SMOOTH_PX = 1.0
 """Blur of both pictures: noise would shrink the slope."""
 WINDOW_PX = 31
 """Of which the mean is taken off."""
-MOST = 50_000
+MOST = 30_000
 """Pixels that are compared; of more, whole rows are left out."""
 WIDE_PX = 1000
 """A part of the picture that is wider than this is looked at in a coarser resolution."""
@@ -190,14 +190,16 @@ def disagreement(
         inner: Radii within which it is the inside.
         ring: Radii between which it is the face.
     """
-    row, column = np.mgrid[0 : both.left.shape[0], 0 : both.left.shape[1]].astype(np.float64)
-    near = np.hypot(column - both.column(ellipse[0]), row - both.row(ellipse[1])) * both.shrink < ring[1] * ellipse[2]
-    if not near.any():
+    reach = ring[1] * ellipse[2] / both.shrink
+    across, down = (
+        (max(0, int(middle - reach)), min(size, int(middle + reach) + 2))
+        for middle, size in zip((both.column(ellipse[0]), both.row(ellipse[1])), both.left.shape[::-1], strict=True)
+    )
+    part = np.s_[down[0] : down[1], across[0] : across[1]]
+    row, column = np.mgrid[part].astype(np.float64)
+    if not row.size:
         return float("nan")
-    rows, columns = (np.flatnonzero(near.any(k)) for k in (1, 0))
-    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    row = row[part]
-    u, v = both.pixel(column[part], row)
+    u, v = both.pixel(column, row)
     place = np.stack([u, v, np.ones_like(u)], -1)
     rays = place @ np.linalg.inv(both.camera_matrix).T
     radii = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", place, conic.form(ellipse), place) + 1.0, 0.0))

@@ -17,8 +17,8 @@ NUM_SEEDS = 64
 """Points that stand for an arc in its first fit."""
 LEAST_ARC = 0.2
 """Part of an ellipse from which the rest of it can be told."""
-ROUNDS_PX = (1.0, 0.5, 0.3, 0.2)
-"""Rounds of refinement: the distance at which a point counts a quarter."""
+ROUNDS_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.4)
+"""Rounds of refinement: the distance at which a point counts a quarter; the rougher ones where the size is known beforehand."""
 TAIL = 2.0
 """Of the limit of what is typical, which holds for the residuals of all the support."""
 TIGHT = 0.7
@@ -154,7 +154,14 @@ class ArcDetector:
         kinds = (spans[:, None], parts[:, None], *groups)
         seeds = np.concatenate([_seeds(some) for some in kinds])
         lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
-        found = self._chosen(self.judge(self.refine(self.first(seeds, lengths, edges, limits), edges), edges, limits), edges)
+        found = self._chosen(
+            self.judge(
+                self.refine(self.first(seeds, lengths, edges, limits), edges, ROUGH_PX if limits.lowest_px > 0 else ROUNDS_PX),
+                edges,
+                limits,
+            ),
+            edges,
+        )
         return sorted(found, key=lambda one: -one[3])
 
     def _chosen(self, judged: Judged, edges: Edges) -> list[tuple[np.ndarray, float, float, float]]:
@@ -195,13 +202,13 @@ class ArcDetector:
         keep = near & (np.abs(outward.mean(1)) > 0.5)
         return Candidates(ellipses[keep], np.sign(outward.mean(1))[keep])
 
-    def refine(self, candidates: Candidates, edges: Edges) -> Candidates:
+    def refine(self, candidates: Candidates, edges: Edges, rounds_px: tuple[float, ...]) -> Candidates:
         """Returns the candidates fitted again to the edge points that support them.
 
         Points are weighted so that distances count, not form values, and so that those beside the ellipse, where the edge of
         something else meets it, count less from round to round.
         """
-        for scale_px in ROUNDS_PX:
+        for scale_px in rounds_px:
             if not len(candidates.ellipses):
                 break
             e = candidates.ellipses

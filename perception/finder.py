@@ -27,6 +27,9 @@ from brokk_rl.spec import spec
 from perception import explain, search
 from perception.pose import gray_of
 
+ALIKE = 0.15
+"""Part of its size by which an ellipse differs from another that is the same rim."""
+
 
 @spec
 class Perception:
@@ -112,7 +115,7 @@ class Finder:
             gray = gray_of(frame)
             levels = search.levels(frame, roi, s.radius_m, s.size_slack, s.comfortable_px)
             levels = search.box(roi, levels) if s.roi == "box" else levels
-            ellipses = [one for level in levels for one in level.detect(self._detector, gray)]
+            ellipses = _distinct([one for level in levels for one in level.detect(self._detector, gray)])
         with _timed(ms, "pose"):
             judged = [(ellipse, self._pose.estimate(frame, masks, ellipse)) for ellipse in ellipses]
             found = [(e, pose) for e, pose in judged if isinstance(pose, HolePose)]
@@ -163,6 +166,19 @@ def rectified(frame: Frame) -> Frame:
     color = cv2.remap(frame.color, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     depth = cv2.remap(frame.depth_m, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
     return replace(frame, color=np.asarray(color, np.uint8), depth_m=np.asarray(depth, np.float32), distortion=None, right=None)
+
+
+def _distinct(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
+    """Returns the ellipses, the best first, without those that are nearly the same as a better one."""
+    kept: list[Ellipse] = []
+    for one in sorted(ellipses, key=lambda one: -one.score):
+        size = (one.a * one.b) ** 0.5
+        if not any(
+            np.hypot(one.x - other.x, one.y - other.y) < ALIKE * size and abs((other.a * other.b) ** 0.5 / size - 1) < ALIKE
+            for other in kept
+        ):
+            kept.append(one)
+    return kept
 
 
 @contextmanager

@@ -56,7 +56,10 @@ class PlaneConic:
         cell_px: Side of the squares within which depth noise is taken to be alike.
         noise_floor_per_m: Least standard deviation of inverse depth, 1/m.
         noise_limit_per_m: Largest standard deviation of inverse depth on the face, 1/m.
-        alike: By how much the covariance of the plane is larger than its residuals say: a matcher errs alike over wide stretches.
+        matcher_alike: By how much the covariance of the plane from depth alone is larger than its residuals say: what a matcher
+            gets wrong is alike over wide stretches.
+        depth_alike: The same of the plane's depth, in the end.
+        tilt_alike: The same of its normal.
         matcher_bias_per_m: Standard deviation of inverse depth by which a matcher is off all over a face, 1/m; with a right picture
             the face is aligned anew.
         bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual shows, 1/m.
@@ -77,7 +80,9 @@ class PlaneConic:
     cell_px: int
     noise_floor_per_m: float
     noise_limit_per_m: float
-    alike: float
+    matcher_alike: float
+    depth_alike: float
+    tilt_alike: float
     matcher_bias_per_m: float
     bias_per_m: float
     center_px: float
@@ -105,14 +110,13 @@ class PlaneConicEstimator:
     def __init__(self, settings: PlaneConic) -> None:
         self.settings = settings
         self._without_depth: PoseEstimator | None = settings.without_depth.build() if settings.without_depth else None
+        self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Returns the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
         s = self.settings
         row = vector(ellipse)
-        allowed = masks.block > 0.5
-        if masks.mouth is not None:
-            allowed &= masks.mouth < 0.5
+        gray, allowed = self._pictures(frame, masks)
         reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
         points = plane.support(frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px)
         face = plane.fit(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
@@ -122,10 +126,10 @@ class PlaneConicEstimator:
             return Rejection("pose", "pixels of the face with depth", float(len(points.inverse)), float(plane.LEAST), ellipse)
         if face.sigma > s.noise_limit_per_m:
             return Rejection("pose", "depth noise on the face, 1/m", face.sigma, s.noise_limit_per_m, ellipse)
+        face = replace(face, cov=face.cov * s.matcher_alike)
         shape = self._shape(face, row, frame, ellipse)
         if isinstance(shape, Rejection):
             return shape
-        gray = gray_of(frame)
         both = alignment.pair(frame, gray, face.m, row, face.extent)
         if both is not None:
             face = alignment.aligned(both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m)
@@ -138,7 +142,6 @@ class PlaneConicEstimator:
                 "pose", "part of a circle on the face with a rim", circle.coverage if circle else 0.0, s.coverage, ellipse
             )
         row = circle.ellipse
-        face = replace(face, cov=face.cov * s.alike)
         inside = appearance.interior(gray, frame.depth_m, row, frame.camera_matrix, face)
         parallax = alignment.disagreement(both, face, frame.depth_m, row, *s.looks.parts) if both else float("nan")
         refused = self._looks(inside, parallax, masks, row, ellipse)
@@ -148,12 +151,21 @@ class PlaneConicEstimator:
             center_m=circle.center_m,
             axis=face.normal,
             radius_m=circle.radius_m,
-            cov_m2=covariance(face, circle, frame.camera_matrix, s.center_px, s.bias_per_m),
-            axis_cov_rad2=face.normal_cov_rad2(),
+            cov_m2=covariance(replace(face, cov=face.cov * s.depth_alike), circle, frame.camera_matrix, s.center_px, s.bias_per_m),
+            axis_cov_rad2=face.normal_cov_rad2() * s.tilt_alike,
             frame="camera",
             score=float(ellipse.score),
             t_s=frame.t_s,
         )
+
+    def _pictures(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the grey picture and the pixels of the face, which all ellipses of a frame share."""
+        if self._seen is None or self._seen[0] is not frame or self._seen[1] is not masks:
+            allowed = masks.block > 0.5
+            if masks.mouth is not None:
+                allowed &= masks.mouth < 0.5
+            self._seen = frame, masks, gray_of(frame), allowed
+        return self._seen[2:]
 
     def _shape(self, face: Plane, row: np.ndarray, frame: Frame, ellipse: Ellipse) -> tuple[np.ndarray, float] | Rejection:
         """Returns centre and radius on the face, or which gate of geometry is not passed."""

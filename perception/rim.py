@@ -19,7 +19,7 @@ PEAKS = 3
 """Steepest places of a profile that are looked at: a rim, its far end, and the edge of what stands before it."""
 FAINT = 0.25
 """Part of the usual steepness below which a place is no edge."""
-TRIPLES = 200
+TRIPLES = 120
 NEAR_PX, INLIER_PX = 0.7, 1.0
 """A profile speaks for a circle that has an edge so near to it; of the final one."""
 NARROW_PX = 2.0
@@ -118,7 +118,7 @@ def _edges(gray: np.ndarray, ellipse: np.ndarray, reach_px: float, chart: Chart)
     Returns:
         Places `(P, PEAKS, 2)` m, NaN where there are fewer, and the length on the plane of a pixel along each profile `(P,)`.
     """
-    number = int(np.clip(2 * conic.perimeter(ellipse[2], ellipse[3]), 48, 200))
+    number = int(np.clip(2 * conic.perimeter(ellipse[2], ellipse[3]), 48, 144))
     points, outward, _ = (value[0] for value in conic.sample(ellipse[None], np.arange(number) * (2 * np.pi / number)))
     offset = np.arange(-reach_px - 2.0, reach_px + 2.0 + 1e-9, STEP_PX)
     place = points[:, None] + offset[None, :, None] * outward[:, None]

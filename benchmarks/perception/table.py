@@ -14,6 +14,7 @@ import csv
 import functools
 import json
 import multiprocessing
+import signal
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -54,6 +55,7 @@ class Task:
     seed: int
     failures: Path
     pictures: int
+    shown: str
 
 
 def main() -> None:
@@ -67,7 +69,9 @@ def main() -> None:
     parser.add_argument("--distances", nargs="+", type=float, default=(1.0, 2.0, 3.0, 4.0))
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1, help="of the scenes; networks are trained on those of others")
-    parser.add_argument("--pictures", type=int, default=12, help="at most so many pictures of failures of each row")
+    parser.add_argument(
+        "--pictures", type=int, default=12, help="at most so many pictures of failures of each row of the first option"
+    )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     path = given.out / "frames.jsonl"
@@ -78,19 +82,39 @@ def main() -> None:
             for distance_m in given.distances:
                 left = tuple(option for option in given.options if (condition, distance_m, number, option) not in done)
                 if left:
-                    tasks.append(Task(condition, distance_m, number, left, given.seed, given.out / "failures", given.pictures))
+                    tasks.append(
+                        Task(
+                            condition,
+                            distance_m,
+                            number,
+                            left,
+                            given.seed,
+                            given.out / "failures",
+                            given.pictures,
+                            given.options[0],
+                        )
+                    )
     if tasks:
         work(tasks, path, given.processes)
     write(given.out, rows(path, given.options))
 
 
 def work(tasks: list[Task], path: Path, processes: int) -> None:
-    """Renders and looks, in as many processes; each line is written as it comes."""
+    """Renders and looks, in as many processes; each line is written as it comes, so an interruption loses nothing."""
     context = multiprocessing.get_context("spawn")
-    with context.Pool(min(processes, len(tasks)), cv2.setNumThreads, (1,)) as pool, path.open("a") as file, Progress() as progress:
-        for lines in progress.track(pool.imap_unordered(look, tasks), total=len(tasks), description="scenes"):
-            file.writelines(json.dumps(line) + "\n" for line in lines)
-            file.flush()
+    with context.Pool(min(processes, len(tasks)), ready) as pool, path.open("a") as file, Progress() as progress:
+        try:
+            for lines in progress.track(pool.imap_unordered(look, tasks), total=len(tasks), description="scenes"):
+                file.writelines(json.dumps(line) + "\n" for line in lines)
+                file.flush()
+        except KeyboardInterrupt:
+            Console().print("interrupted; the same command goes on from here")
+
+
+def ready() -> None:
+    """Prepares a process: one thread each, and it is the first one that is interrupted."""
+    cv2.setNumThreads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def look(task: Task) -> list[dict[str, Any]]:
@@ -108,7 +132,7 @@ def look(task: Task) -> list[dict[str, Any]]:
         tally, sighting = judge(seer, frame, shot.truth)
         place = {"condition": task.condition, "distance_m": task.distance_m, "number": task.number, "option": option}
         lines.append({**place, "tally": asdict(tally)})
-        if not tally.is_perfect:
+        if not tally.is_perfect and option == task.shown:
             name = f"{option.replace(' ', '_').replace('/', '-')}_{task.condition}_{task.distance_m:g}m"
             show_failure(task, name, frame, sighting, seer)
     return lines
