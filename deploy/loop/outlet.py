@@ -174,7 +174,7 @@ def view(exchange: Exchange) -> View:
         sent=tuple(state["sent"].tolist()),
         refused=int(state["refused"]),
         lost=int(state["lost"]),
-        log_dropped=exchange.bus_log.dropped + exchange.policy_log.dropped,
+        log_dropped=sum(pipe.dropped for pipe in exchange.logs),
     )
     return View(now_s, now_s - float(state["t_s"]) < ALIVE_S, proposed, machine, safety)
 

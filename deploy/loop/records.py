@@ -81,8 +81,8 @@ def request_fields(num_joints: int) -> np.dtype:
 TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,)), ("std_m", float)])
 """The borehole: when it was found, the centre of its rim, and the standard deviation of that."""
 
-CONTROLS = np.dtype([("t_s", float), ("armed", bool)])
-"""What the operator's side wants: commands to be sent at all."""
+CONTROLS = np.dtype([("t_s", float), ("armed", bool), ("recording", bool), ("recording_t_s", float)])
+"""What the operator's side wants: commands to be sent at all; and whether all this is recorded, since when."""
 
 
 @dataclass
@@ -97,6 +97,8 @@ class Exchange:
         controls: From the operator's side.
         bus_log: From the bus process to the log.
         policy_log: From the policy to the log.
+        page_log: From the operator's page to the log.
+        wishes: From the operator's page to the supervisor, a JSON text each.
         reports: What each process says of its timing when it ends; one after the other.
     """
 
@@ -107,6 +109,8 @@ class Exchange:
     controls: Slot
     bus_log: Pipe
     policy_log: Pipe
+    page_log: Pipe
+    wishes: Pipe
     reports: Pipe
 
     @classmethod
@@ -120,8 +124,15 @@ class Exchange:
             controls=Slot("controls", CONTROLS),
             bus_log=Pipe("bus_log", PIPE_BYTES),
             policy_log=Pipe("policy_log", PIPE_BYTES),
+            page_log=Pipe("page_log", PIPE_BYTES),
+            wishes=Pipe("wishes", 1 << 12),
             reports=Pipe("reports", 1 << 16),
         )
+
+    @property
+    def logs(self) -> tuple[Pipe, ...]:
+        """All that goes to the log."""
+        return self.bus_log, self.policy_log, self.page_log
 
     @property
     def files(self) -> list[int]:

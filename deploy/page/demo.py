@@ -16,15 +16,15 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from deploy.page.chain import approach, points_in_base_m
 from deploy.page.demo_camera import Camera
+from deploy.page.scene import approach
 from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Wish
+from deploy.study.chain import tool
 
 EXCLUSIVE_S, OTHERS_S = 5.0, 9.0
 """How long each part of the programme takes."""
 LEAD_IN_S = 1.5
 LIMITS_S = {"positions": 0.15, "levers": 0.15, "advice": 0.15, "camera": 1.0, "borehole": 600.0}
-ABOVE_M, BELOW_M = 0.3, 0.1
 BLOCK_M = ((1.9, -0.8, 0.0), (3.3, 0.8, 0.75))
 UP = (0.0, 0.0, 1.0)
 TARGETS = (
@@ -92,8 +92,7 @@ class DemoFeed:
         chosen = next(target for target in targets if target.chosen)
         path = ()
         if machine.has_bodies and self._guiding:
-            tip_m = points_in_base_m(machine, q)[-1]
-            path = approach(tip_m, np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base), ABOVE_M, BELOW_M)
+            path = approach(tool(machine, q).tip_in_base_m, np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base))
         age_s: dict[str, float | None] = {
             "positions": t_s % 0.01,
             "levers": t_s % 0.02,

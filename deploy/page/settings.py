@@ -14,7 +14,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.page.chain import geometry
+from deploy.page.scene import geometry
 from deploy.page.server import Server
 from deploy.page.shown import Feed
 
@@ -38,6 +38,7 @@ class OperatorPage:
         jpeg_quality: Of the picture, 1 to 100.
         points: Points to draw at most; every second pixel, third, … is drawn until that is kept.
         tolerance: Distance of own lever and advice, of full, up to which they count as together.
+        borehole_radius_m: Of boreholes of which only the centre is known.
         stale_s: Silence of the server from which the page greys everything.
         clients: Pages that can be open at once.
     """
@@ -53,6 +54,7 @@ class OperatorPage:
     jpeg_quality: int
     points: int
     tolerance: float
+    borehole_radius_m: float
     stale_s: float
     clients: int
 

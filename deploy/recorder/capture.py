@@ -64,8 +64,8 @@ def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
     """
     try:
         with Log(capture) as target:
-            while not (stop() and not exchange.bus_log.waiting and not exchange.policy_log.waiting):
-                for pipe in (exchange.bus_log, exchange.policy_log):
+            while not (stop() and not any(pipe.waiting for pipe in exchange.logs)):
+                for pipe in exchange.logs:
                     for data in pipe.take():
                         target.add(data)
                 target.flush_when_due()

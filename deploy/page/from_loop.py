@@ -1,0 +1,165 @@
+"""The page beside the loop: a process of its own that reads the outlet and hands wishes to the supervisor.
+
+The slots it reads are overwritten by their writers, who wait for nobody; what it writes are two pipes that count what they must
+drop. However slow a browser is, or if this process dies, the loop feels nothing of it.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.signals import Frame
+from deploy.guidance import AXES, Guidance
+from deploy.loop import outlet
+from deploy.loop.process import Stop
+from deploy.loop.records import Exchange
+from deploy.loop.station import TEXT
+from deploy.page.scene import approach
+from deploy.page.settings import OperatorPage
+from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Vector, Wish
+from deploy.study.chain import tool
+
+ADVICE_PERIODS = 3
+"""Control periods without a new advice from which the last one is stale."""
+UP: Vector = (0.0, 0.0, 1.0)
+NAME = "1"
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What a page process is to do.
+
+    Attributes:
+        page: How to serve.
+        machine: The machine.
+        guidance: How the levers are shown.
+        session: Where the link goes.
+        positions_s: Age from which positions are stale.
+        levers_s: Age from which the operator's levers are.
+        borehole_s: Age from which the borehole is.
+    """
+
+    page: OperatorPage
+    machine: Machine
+    guidance: Guidance
+    session: Session
+    positions_s: float
+    levers_s: float
+    borehole_s: float
+
+
+def run(stop: Stop, beside: Beside, exchange: Exchange) -> None:
+    """Serves the page until it is asked to stop.
+
+    Raises:
+        LinkError: the address is taken.
+    """
+    beside.page.serve(stop, beside.machine, LoopFeed(beside, exchange), beside.session, lambda link: None)
+
+
+class LoopFeed:
+    """See `deploy.page.shown.Feed`.
+
+    Args:
+        beside: What is shown, and how.
+        exchange: Where to read and write.
+        clock: Monotonic time in s.
+    """
+
+    def __init__(self, beside: Beside, exchange: Exchange, clock: Callable[[], float] = time.monotonic) -> None:
+        self._beside, self._exchange, self._clock = beside, exchange, clock
+        self._guiding, self._began_s = True, clock()
+        machine = beside.machine
+        self._advised_full = _full(machine, beside.guidance.levers or machine.levers)
+        self._exclusive = machine.is_exclusive
+
+    def shown(self) -> Shown:
+        """See `Feed`."""
+        seen, beside = outlet.view(self._exchange), self._beside
+        target, controls = self._exchange.target.read(), self._exchange.controls.read()
+        found = None if target is None else self._target(target)
+        machine, proposed, safety = seen.machine, seen.advice, seen.safety
+        recording = controls is not None and bool(controls["recording"])
+        ages_s = {
+            "positions": (machine and machine.q_age_s, beside.positions_s),
+            "levers": (machine and machine.levers_age_s, beside.levers_s),
+            "advice": (proposed and proposed.age_s, ADVICE_PERIODS * beside.machine.period_s),
+            "borehole": (None if target is None else seen.t_s - float(target["t_s"]), beside.borehole_s),
+        }
+        return Shown(
+            t_s=seen.t_s,
+            alive=seen.alive,
+            guiding=self._guiding,
+            advice=proposed and self._advice(proposed),
+            own=machine and Levers(**vars(machine.levers)),
+            q=machine and machine.q,
+            streams=tuple(Stream(name, *age) for name, age in ages_s.items()),
+            safety=safety and Safety(safety.commands, safety.state, safety.trip, safety.deadman, safety.estop, safety.bus_up),
+            recording=Recording(
+                recording,
+                seen.t_s - float(controls["recording_t_s"]) if recording and controls is not None else 0.0,
+                safety.log_dropped if safety else 0,
+            ),
+            targets=() if found is None else (found,),
+            path_in_base_m=() if found is None or machine is None else self._path(machine.q, found),
+            block_in_base_m=None,
+        )
+
+    def frame(self, after_s: float) -> Frame | None:
+        """See `Feed`; the loop has no camera of its own yet."""
+        return None
+
+    def wish(self, wish: Wish) -> bool:
+        """See `Feed`."""
+        if wish.kind == "target":
+            return wish.value == NAME  # there is one, and it is chosen
+        taken = self._exchange.wishes.put(json.dumps({"kind": wish.kind, "value": wish.value}).encode())
+        self._say("wish", {"kind": wish.kind, "value": wish.value, "taken": taken})
+        if wish.kind in ("start", "stop"):
+            self._guiding = wish.kind == "start"
+            return taken or wish.kind == "stop"
+        return taken
+
+    def drawn(self, drawn: Drawn) -> None:
+        """See `Feed`; goes into the recording as topic `drawn`."""
+        self._say("drawn", {"advice": drawn.number, "at_s": drawn.t_s, "round_trip_s": drawn.round_trip_s, "page": drawn.page})
+
+    def _say(self, topic: str, values: dict[str, Any]) -> None:
+        self._exchange.page_log.put(TEXT + json.dumps({"topic": topic, "t_s": self._clock(), **values}).encode())
+
+    def _advice(self, proposed: outlet.Advice) -> Advice:
+        angles = proposed.levers_rad
+        parts = {name: getattr(angles, name) / full for name, full in self._advised_full.items()}
+        due_s = 0.0 if angles.button_right else None
+        if not angles.button_right and proposed.valid and np.asarray(proposed.command)[self._exclusive].any():
+            # the policy wants it already; what is shown goes through neutral first, as fast as a hand can
+            most_rad = max(abs(getattr(angles, name)) for name in self._advised_full)
+            due_s = max(self._beside.machine.period_s, most_rad / self._beside.guidance.max_rate_rad_s)
+        return Advice(proposed.valid, proposed.reason, proposed.number, Levers(**parts, button_right=angles.button_right), due_s)
+
+    def _target(self, record: Any) -> Target:
+        x, y, z = (float(value) for value in record["center_in_base_m"])
+        std_m = float(record["std_m"])
+        return Target(NAME, (x, y, z), UP, self._beside.page.borehole_radius_m, std_m or None, None, True)
+
+    def _path(self, q: tuple[float, ...], target: Target) -> tuple[Vector, ...]:
+        if not self._guiding or not self._beside.machine.has_bodies:
+            return ()
+        tip_m = tool(self._beside.machine, np.array(q)).tip_in_base_m
+        return approach(tip_m, np.array(target.center_in_base_m), np.array(target.axis_in_base))
+
+
+def _full(machine: Machine, levers: tuple[Any, ...]) -> dict[str, float]:
+    """Returns the angle at full deflection of each axis by its name in `Levers`; 1 where no joint hangs on it."""
+    return {
+        f"{side}_{axis}": max((one.max_angle_rad for one in levers if (one.side, one.axis) == (side, axis)), default=1.0)
+        for side, axis in AXES
+    }
