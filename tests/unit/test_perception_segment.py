@@ -15,8 +15,10 @@ from hypothesis import strategies as st
 
 from brokk_rl.errors import CheckpointError, ConfigError, FrameError
 from brokk_rl.signals import Frame
-from perception import dataset, export
+from perception import dataset, export, segment_network
 from perception.dataset import Label
+from perception.render.drawing import compose
+from perception.render.studio import Studio
 from perception.segment_network import NetworkSegmenter
 from perception.segment_plane import onto_edges
 from perception.segment_window import Window, around, block_box, whole
@@ -159,6 +161,41 @@ def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path:
         found.append(segmenter.segment(view.frame))
     np.testing.assert_allclose(found[0].block, found[1].block, atol=1e-4)
     np.testing.assert_allclose(found[0].mouth, found[1].mouth, atol=1e-4)
+
+
+def test_a_network_that_ships_is_loaded_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    network = UNet((4, 8)).eval().requires_grad_(False)
+    header = export.header_of(network, (64, 32), {})
+    monkeypatch.setattr(segment_network, "SHIPPED", tmp_path)
+    with pytest.raises(CheckpointError, match=r"in the package \(none\)"):
+        option("perception/segmenter", "onnx").build()
+    export.write(tmp_path / export.TENSORS, network, header)
+    export.write_onnx(tmp_path / export.ONNX, network, header, torch.rand(1, 3, 32, 64))
+    frame = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90)).frame
+    one, other = (option("perception/segmenter", name).build().segment(frame) for name in ("onnx", "unet"))
+    np.testing.assert_allclose(one.block, other.block, atol=1e-4)
+
+
+@pytest.mark.skipif(not (segment_network.SHIPPED / export.ONNX).is_file(), reason="no network ships yet")
+def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -> None:
+    rig = option("rig", "zed_2i_720p")
+    segmenters = [option("perception/segmenter", name).build() for name in ("onnx", "unet")]
+    shared, either = np.zeros(2), np.zeros(2)
+    for seed in (101, 102, 103):
+        chance, kind = np.random.default_rng(seed), option("scene", "clean")
+        studio = Studio(rig=rig, scene=kind, stereo=option("stereo", "sgbm"), depth="none", pair=False)
+        shot = studio.shot(compose(kind, rig, chance), chance)
+        frame = Frame(color=shot.color, depth_m=shot.exact_depth_m, camera_matrix=rig.left.matrix, base_from_camera=None, t_s=0.0)
+        masks, again = (segmenter.segment(frame) for segmenter in segmenters)
+        np.testing.assert_allclose(masks.block, again.block, atol=0.01)
+        assert masks.mouth is not None
+        for k, (said, known) in enumerate(((masks.block > 0.5, shot.label.block), (masks.mouth > 0.5, shot.label.mouth))):
+            shared[k] += (said & known).sum()
+            either[k] += (said | known).sum()
+    assert (shared / either > [0.9, 0.6]).all()
+    for name in (export.ONNX, export.TENSORS):
+        assert (segment_network.SHIPPED / name).stat().st_size < 2_000_000
 
 
 def test_files_that_are_no_network_of_ours_are_refused(tmp_path: Path) -> None:
