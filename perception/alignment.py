@@ -26,6 +26,9 @@ WIDE_PX = 1000
 """A part of the picture that is wider than this is looked at in a coarser resolution."""
 ROUNDS = 3
 TUKEY = 4.685
+MARGIN_PX, BORDER_PX, SATURATED = 6, 4, 248.0
+"""Around what stands before the face, where a matcher bleeds; within its border, where blur mixes it with what lies behind; and
+the grey level from which a picture shows nothing."""
 LEAST, LEAST_INSIDE = 200, 24
 """Pixels in which a plane is aligned, and in which an inside is compared."""
 LARGEST_PX = 1.0
@@ -133,8 +136,14 @@ def aligned(
     homogeneous = np.stack([u, v, np.ones_like(u)], -1)
     radii = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", homogeneous, conic.form(ellipse), homogeneous) + 1.0, 0.0))
     with np.errstate(invalid="ignore"):
-        on = allowed[pixel] & (np.abs(1.0 / depth - rays @ face.m) < 3.0 * face.sigma) & (radii > inner) & (radii < face.extent)
-    on &= both.inside(u, rays, face.m)
+        off = np.abs(1.0 / depth - rays @ face.m)
+        on = allowed[pixel] & (off < 3.0 * face.sigma) & (radii > inner) & (radii < face.extent)
+        other = (off > 8.0 * face.sigma).astype(np.uint8)
+    other = cv2.morphologyEx(other, cv2.MORPH_OPEN, np.ones((1 if stride > 1 else 3, 3), np.uint8))
+    margin = np.ones((2 * round(MARGIN_PX / stride) + 1, 2 * MARGIN_PX + 1), np.uint8)
+    on &= (cv2.dilate(np.asarray(other), margin) == 0) & both.inside(u, rays, face.m) & (both.left[::stride] < SATURATED)
+    whole = cv2.morphologyEx(on.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 5), np.uint8))
+    on &= cv2.erode(whole, np.ones((2 * round(BORDER_PX / stride) + 1, 2 * BORDER_PX + 1), np.uint8)) > 0
     if on.sum() < LEAST:
         return face
     weight = on.astype(np.float32)

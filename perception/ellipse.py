@@ -17,7 +17,7 @@ NUM_SEEDS = 64
 """Points that stand for an arc in its first fit."""
 LEAST_ARC = 0.2
 """Part of an ellipse from which the rest of it can be told."""
-ROUNDS_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.4)
+ROUNDS_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
 """Rounds of refinement: the distance at which a point counts a quarter; the rougher ones where the size is known beforehand."""
 TAIL = 2.0
 """Of the limit of what is typical, which holds for the residuals of all the support."""
