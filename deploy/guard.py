@@ -17,14 +17,10 @@ has not seen in the same cycle.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
-
-Numbers = tuple[float, ...]
+from deploy.limits import Body, Limits, Numbers
 
 
 class State(Enum):
@@ -50,77 +46,12 @@ class Trip(Enum):
     CHANNEL_INVALID = "messages corrupted"
     SECOND_SENDER = "somebody else sends commands"
     LEVER = "operator moves a lever"
+    IGNORED = "the gateway does not follow"
     DEADMAN = "dead-man released"
     REQUEST_STALE = "no fresh command"
     REQUEST_INVALID = "command is no number, or beyond full"
     REQUEST_EXCLUSIVE = "exclusive joint together with others"
     NOT_ARMED = "not armed"
-
-
-@spec
-class Limits:
-    """What the guard allows.
-
-    Attributes:
-        max_command: Largest command, of full.
-        max_rate_1_s: Largest growth of a command per second.
-        overrun: Command beyond full that counts as rounding; more is refused.
-        neutral: Deflection of the operator's own levers, of full, below which they count as released.
-        stop_margin: Distance to the joint limits (rad or m) within which commands further outward are zero.
-        joints_s: Age of joint positions from which they are stale.
-        levers_s: Age of the remote's message from which it is stale.
-        status_s: Age of the machine's status from which it is stale.
-        request_s: Age of a command from which it is stale.
-        gap_s: Time between two cycles from which time is said to have stood still (a stopped process, a sleeping computer).
-        jump_margin: Speed over the machine's fastest, beyond which a joint has jumped.
-        jump_slack: Jump (rad or m) that noise alone may make.
-        range_slack: Distance beyond the joint limits (rad or m) at which a position is still believed.
-        num_jumps: Jumps in a row after which positions are not plausible.
-    """
-
-    max_command: float
-    max_rate_1_s: float
-    overrun: float
-    neutral: float
-    stop_margin: float
-    joints_s: float
-    levers_s: float
-    status_s: float
-    request_s: float
-    gap_s: float
-    jump_margin: float
-    jump_slack: float
-    range_slack: float
-    num_jumps: int
-
-    def check(self) -> None:
-        if not 0 < self.max_command <= 1:
-            raise ConfigError(f"guard.max_command: expected (0, 1], got {self.max_command}")
-        positive = ("max_rate_1_s", "joints_s", "levers_s", "status_s", "request_s", "gap_s", "jump_slack", "range_slack")
-        for name in positive:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"guard.{name}: expected more than 0, got {getattr(self, name)}")
-        if self.overrun < 0 or self.stop_margin < 0 or not 0 < self.neutral < 1 or self.jump_margin < 1 or self.num_jumps < 1:
-            raise ConfigError(
-                "guard: expected overrun and stop_margin of 0 or more, neutral in (0, 1), jump_margin and num_jumps of 1 or more"
-            )
-
-
-@dataclass(frozen=True)
-class Body:
-    """What the guard knows of the machine, each of length `J`.
-
-    Attributes:
-        lower: Lower joint limits, rad or m.
-        upper: Upper joint limits.
-        max_speed: Speeds at full command, rad/s or m/s.
-        exclusive: Joints that never move together with others.
-    """
-
-    lower: Numbers
-    upper: Numbers
-    max_speed: Numbers
-    exclusive: tuple[bool, ...]
 
 
 @dataclass(frozen=True)
@@ -139,6 +70,7 @@ class Seen:
         estop: Whether an emergency stop is on.
         bus_up: Whether the bus works.
         alone: Whether nobody else sends valve commands.
+        followed: Whether the gateway says that it goes by our commands.
     """
 
     q: Numbers
@@ -152,6 +84,7 @@ class Seen:
     estop: bool
     bus_up: bool
     alone: bool
+    followed: bool
 
 
 @dataclass(frozen=True)
@@ -202,6 +135,7 @@ class Guard:
         self._still = (0.0,) * len(body.lower)
         self._state, self._cause = State.SILENT, Trip.NONE
         self._sent, self._before_s = self._still, -math.inf
+        self._followed_s = -math.inf
 
     def decide(self, now_s: float, armed: bool, seen: Seen, request: Request | None) -> Decision:
         """Returns what to send in this cycle.
@@ -214,6 +148,10 @@ class Guard:
         """
         elapsed_s, self._before_s = now_s - self._before_s, now_s
         wrong = self._health(seen, elapsed_s)
+        if seen.followed or self._state is not State.ACTIVE:
+            self._followed_s = now_s
+        elif now_s - self._followed_s > self._limits.ignored_s and wrong is Trip.NONE:
+            wrong = Trip.IGNORED
         if not armed:
             self._state, self._cause = State.SILENT, Trip.NONE
             return self._say(self._still, wrong if wrong is not Trip.NONE else Trip.NOT_ARMED)
@@ -282,8 +220,3 @@ class Guard:
     def _say(self, u: Numbers, trip: Trip) -> Decision:
         self._sent = u
         return Decision(self._state, u, trip, self._cause)
-
-
-def body_of(lower: Sequence[float], upper: Sequence[float], max_speed: Sequence[float], exclusive: Sequence[bool]) -> Body:
-    """Returns the machine as the guard knows it, from arrays of length `J`."""
-    return Body(tuple(map(float, lower)), tuple(map(float, upper)), tuple(map(float, max_speed)), tuple(map(bool, exclusive)))

@@ -18,7 +18,8 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.spec import spec
 from deploy.bus.wire import Wire
-from deploy.guard import Limits, State
+from deploy.guard import State
+from deploy.limits import Limits
 from deploy.loop.outlet import view
 from deploy.loop.process import Child
 from deploy.loop.records import Exchange

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from deploy.guard import Body, Limits
+from deploy.limits import Body, Limits
 
 
 class Plausibility:

@@ -18,7 +18,7 @@ from brokk_rl.session import Session
 from deploy.bus.description import Description
 from deploy.bus.protection import Fault
 from deploy.bus.wire import Wire
-from deploy.guard import Limits
+from deploy.limits import Limits
 from deploy.loop.outlet import view
 from deploy.loop.process import Child, Stop
 from deploy.loop.records import Exchange

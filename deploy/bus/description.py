@@ -1,7 +1,7 @@
 """The bus description: one DBC that says what is sent, how, how often and by whom.
 
 Signals are found by their names, whatever message they travel in, so that a DBC of another gateway takes the place of the example
-as long as it names them alike: `Command_<joint>`, `CommandMode`, `Position_<joint>`, `Valid_<joint>`, `Flow_<joint>`,
+as long as it names them alike: `Command_<joint>`, `CommandMode`, `Position_<joint>`, `Valid_<joint>`, `Flow_<joint>`, `FlowSource`,
 `Lever_<left|right>_<theta|psi>`, `ButtonRight`, `DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`; optional are `Stamp`,
 `OilTemperature` and all others, which are recorded. Protected messages have a `Counter`, a `Crc` of one whole byte and the
 attribute `E2EDataId`. Cycle times are the DBC's (`GenMsgCycleTime`): no rate is written down twice.
@@ -78,7 +78,7 @@ class Description:
         self._home = {signal.name: message.name for message in self._database.messages for signal in message.signals}
         required = [f"{what}_{joint}" for what in ("Command", "Position", "Valid", "Flow") for joint in machine.joint_names]
         required += [f"Lever_{axis}" for axis in LEVER_AXES]
-        required += ["CommandMode", "ButtonRight", "DeadMan", "RemoteOn", "EStop", "ExclusiveSelected"]
+        required += ["CommandMode", "FlowSource", "ButtonRight", "DeadMan", "RemoteOn", "EStop", "ExclusiveSelected"]
         for signal in required:
             if signal not in self._home:
                 raise ConfigError(f"bus: {name} has no signal '{signal}', which machine '{machine.name}' needs")

@@ -12,11 +12,14 @@ from brokk_rl.machine import Machine
 from deploy.bus.description import COUNTER, GATEWAY, LEVER_AXES, REMOTE, Description, Layout
 from deploy.bus.protection import Channel, Fault, Trust
 from deploy.bus.wire import Wired
-from deploy.guard import Limits, Seen, body_of
+from deploy.guard import Seen
+from deploy.limits import Limits, body_of
 from deploy.plausibility import Plausibility
 
 OWN = 8
 """Commands last sent that are known again: on some buses a node hears itself."""
+FROM_PC = 2
+"""Value of `FlowSource`."""
 STAMP_MODULUS_S = 65.536
 """The gateway's clock of the example wraps here."""
 FORGET_S = 60.0
@@ -54,6 +57,7 @@ class Receiver:
         count = machine.num_joints
         self.q, self.q_t_s, self.q_valid = np.zeros(count), np.full(count, -math.inf), np.zeros(count, dtype=bool)
         self.flow, self.flow_sum, self.flow_number, self.flow_t_s = np.zeros(count), np.zeros(count), 0, -math.inf
+        self.followed = False
         self.lever, self.levers_t_s = np.zeros(4), -math.inf
         self.button_right = self.deadman = self.remote_on = False
         self.estop, self.exclusive_selected, self.oil_c, self.status_t_s = False, False, math.nan, -math.inf
@@ -104,6 +108,7 @@ class Receiver:
             status_age_s=now_s - self.status_t_s,
             estop=self.estop,
             bus_up=bus_up,
+            followed=self.followed,
             alone=now_s - self._stranger_s > 1.0,
         )
 
@@ -128,6 +133,7 @@ class Receiver:
                 if self.plausibility.accept(j, now_s, position) and self.q_valid[j]:
                     self.q[j], self.q_t_s[j] = position, now_s
         if f"Flow_{machine.joint_names[0]}" in values:
+            self.followed = values["FlowSource"] == FROM_PC
             self.flow = np.array([values[f"Flow_{joint}"] for joint in machine.joint_names])
             self.flow_sum, self.flow_number, self.flow_t_s = self.flow_sum + self.flow, self.flow_number + 1, now_s
         if "DeadMan" in values:

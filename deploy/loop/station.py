@@ -17,7 +17,8 @@ from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from deploy.bus.description import Description
 from deploy.bus.wire import OpenWire, Wire, Wired
-from deploy.guard import Decision, Guard, Limits, Request, State, Trip
+from deploy.guard import Decision, Guard, Request, State, Trip
+from deploy.limits import Limits
 from deploy.loop.process import Pace, Stop
 from deploy.loop.receiver import Receiver
 from deploy.loop.records import Exchange

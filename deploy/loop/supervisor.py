@@ -23,8 +23,8 @@ from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.bus.description import Description
 from deploy.bus.wire import Wire
-from deploy.guard import Limits
 from deploy.guidance import Guidance, LeverMap
+from deploy.limits import Limits
 from deploy.loop.outlet import view
 from deploy.loop.process import Child
 from deploy.loop.records import Exchange
@@ -105,7 +105,7 @@ class Loop:
         children = _Children(exchange)
         try:
             for companion in companions:
-                children.start(companion.name, companion.target, companion.arguments, None)
+                children.start(companion.name, companion.target, companion.arguments, companion.realtime if self.realtime else None)
             self._start(children, machine, session)
             write_json(session.folder / PROCESSES, children.pids)
             self._watch(children, exchange, full_rad)
@@ -150,11 +150,19 @@ class Loop:
 
 @dataclass(frozen=True)
 class Companion:
-    """A further process of a bench: `module:function`, called as `function(stop, *arguments, exchange)`."""
+    """A further process of a bench.
+
+    Attributes:
+        name: What it is.
+        target: `module:function`, called as `function(stop, *arguments, exchange)`.
+        arguments: Its arguments.
+        realtime: Real-time priority, where the loop asks for one: a machine is never late.
+    """
 
     name: str
     target: str
     arguments: tuple[Any, ...]
+    realtime: int
 
 
 @dataclass

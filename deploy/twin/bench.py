@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from brokk_rl.contracts import Connection, Follower
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -10,6 +12,9 @@ from brokk_rl.spec import spec
 from deploy.guidance import Guidance, LeverMap
 from deploy.loop.supervisor import Companion
 from deploy.twin.twin import Twin
+
+TWIN_PRIORITY = 45
+"""Below bus and policy: the loop must not look better or worse for the company it has on a desk."""
 
 
 @spec
@@ -21,12 +26,14 @@ class Bench:
         plant: The simulated machine behind it.
         operator: Who moves the levers as they are shown; `null`: nobody, the levers stay in neutral.
         guidance: How the levers are shown.
+        assumed: What policies for such an operator assume of them; `null` without one.
     """
 
     twin: Twin
     plant: Connection
     operator: Follower | None
     guidance: Guidance
+    assumed: dict[str, Any] | None
 
     def check(self) -> None:
         if self.twin.remote == (self.operator is not None):
@@ -36,9 +43,13 @@ class Bench:
 
     def companions(self, machine: Machine, session: Session) -> list[Companion]:
         """Returns the processes to run beside the loop."""
-        found = [Companion("twin", "deploy.twin.twin:run", (self.twin, machine, self.plant, session))]
+        found = [Companion("twin", "deploy.twin.twin:run", (self.twin, machine, self.plant, session), TWIN_PRIORITY)]
         if self.operator is not None:
             levers = LeverMap(self.guidance.levers or machine.levers, machine)
             wire, dbc, seed = self.twin.wire, self.twin.dbc, session.stream("operator")
-            found.append(Companion("operator", "deploy.twin.remote:operate", (wire, dbc, machine, self.operator, levers, seed)))
+            found.append(
+                Companion(
+                    "operator", "deploy.twin.remote:operate", (wire, dbc, machine, self.operator, levers, seed), TWIN_PRIORITY
+                )
+            )
         return found

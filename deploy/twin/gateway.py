@@ -22,7 +22,7 @@ from deploy.guidance import AXES, LeverMap
 
 TIMEOUT_S = 0.07
 """Age of the last valid command from which there is none; three cycles and a half, within the 100 ms that are promised."""
-REMOTE_S = 0.15
+REMOTE_S, FORGET_S = 0.15, 1.0
 IDLE_FRAMES = 3
 NEUTRAL = 0.03
 NOBODY, LEVERS, PC = 0, 1, 2
@@ -48,6 +48,7 @@ class Gateway:
 
     Attributes:
         estop: Whether the emergency stop is pressed.
+        heard_s: Since when the PC is heard.
     """
 
     def __init__(self, description: Description, machine: Machine) -> None:
@@ -60,7 +61,7 @@ class Gateway:
         self._u, self._u_s, self._mode, self._idle = np.zeros(machine.num_joints), -np.inf, 0, 0
         self._lever, self._remote_s = np.zeros(len(AXES)), -np.inf
         self._button = self._deadman = self._on = False
-        self.estop = False
+        self.estop, self.heard_s = False, np.inf
 
     def take(self, frame: Wired, now_s: float) -> None:
         """Takes in a frame of PC or remote."""
@@ -80,6 +81,8 @@ class Gateway:
             return
         if now_s - self._u_s > TIMEOUT_S:
             self._idle = 0
+        if now_s - self._u_s > FORGET_S:
+            self.heard_s = now_s
         self._mode = int(values["CommandMode"])
         self._idle = min(IDLE_FRAMES, self._idle + 1) if self._mode == 0 else self._idle
         self._u = np.array([values[f"Command_{joint}"] for joint in self._machine.joint_names])

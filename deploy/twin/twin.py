@@ -29,6 +29,7 @@ from deploy.twin.remote import Remote
 log = logging.getLogger(__name__)
 
 CYCLE_S = 0.01
+PRESS_S = 1.0
 FLOOD = 30
 """Frames a cycle of a babbling node."""
 
@@ -41,7 +42,7 @@ class Twin:
         wire: The bus.
         dbc: Its description.
         remote: Whether the twin plays the remote too; `false` where an operator is a node of its own.
-        deadman: Whether that remote's dead-man is held.
+        deadman: Whether an operator at that remote presses the dead-man, one second after the PC is first heard, and holds it.
         fault_port: Local port for faults on request; `null`: none.
         seconds: When to stop; `null`: when told to.
     """
@@ -135,7 +136,9 @@ class _Running:
         if now_s < self._due_s.get(layout.name, now_s):
             return
         self._due_s[layout.name] = max(self._due_s.get(layout.name, now_s), now_s - layout.period_s) + layout.period_s
-        remote.deadman = self._twin.deadman and not faults.on("deadman_released", "", now_s)
+        remote.deadman = (
+            self._twin.deadman and now_s - self._gateway.heard_s > PRESS_S and not faults.on("deadman_released", "", now_s)
+        )
         remote.on = not faults.on("remote_off", "", now_s)
         remote.levers = (0.5 if faults.on("lever", "", now_s) else 0.0, 0.0, 0.0, 0.0)
         frame = remote.frame()

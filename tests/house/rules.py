@@ -38,6 +38,7 @@ DOORS = {
 CLOSED = {
     "deploy": ("brokk_rl.sim", "brokk_rl.rl", "mujoco", "warp", "rsl_rl"),
     "deploy.guard": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
 }
 """What a package must not import, whatever its floor: the machine's own computer has neither simulator nor trainer."""

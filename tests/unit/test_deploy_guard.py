@@ -12,17 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brokk_rl.errors import ConfigError
-from deploy.guard import Decision, Guard, Limits, Request, Seen, State, Trip, body_of
+from deploy.guard import Decision, Guard, Request, Seen, State, Trip
+from deploy.limits import Limits, body_of
 from deploy.plausibility import Plausibility
 
 BODY = body_of([-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [False, True, False])
 LIMITS = Limits(
     max_command=0.8, max_rate_1_s=5.0, overrun=0.001, neutral=0.05, stop_margin=0.1, joints_s=0.15, levers_s=0.16, status_s=0.17,
-    request_s=0.18, gap_s=0.2, jump_margin=3.0, jump_slack=0.01, range_slack=0.2, num_jumps=3,
+    request_s=0.18, ignored_s=0.3, gap_s=0.2, jump_margin=3.0, jump_slack=0.01, range_slack=0.2, num_jumps=3,
 )  # fmt: skip
 WELL = Seen(
     q=(0.0, 0.0, 1.0), joints_age_s=0.01, joints_plausible=True, trusted=True, levers_age_s=0.01, lever=0.0, deadman=True,
-    status_age_s=0.01, estop=False, bus_up=True, alone=True,
+    status_age_s=0.01, estop=False, bus_up=True, alone=True, followed=True,
 )  # fmt: skip
 RELEASED = replace(WELL, deadman=False)
 STILL = (0.0, 0.0, 0.0)
@@ -308,7 +309,7 @@ def test_time_that_runs_backwards_gives_no_room_for_a_jump() -> None:
     "change",
     [
         {"max_command": 0.0}, {"max_command": 1.01}, {"max_rate_1_s": 0.0}, {"gap_s": math.inf}, {"joints_s": 0.0},
-        {"levers_s": 0.0}, {"status_s": 0.0}, {"request_s": -1.0}, {"jump_slack": 0.0}, {"range_slack": 0.0},
+        {"levers_s": 0.0}, {"status_s": 0.0}, {"request_s": -1.0}, {"ignored_s": 0.0}, {"jump_slack": 0.0}, {"range_slack": 0.0},
         {"overrun": -0.1}, {"stop_margin": -0.1},
         {"neutral": 0.0}, {"neutral": 1.0}, {"jump_margin": 0.9}, {"num_jumps": 0},
     ],
@@ -330,3 +331,28 @@ def test_limits_at_their_ends_are_allowed(change: dict[str, Any]) -> None:
 
 def test_the_shipped_limits_are_limits() -> None:
     assert option("guard", "default").max_command <= 1.0
+
+
+def test_a_gateway_that_does_not_follow_is_noticed() -> None:
+    hand = Hand().active()
+    for _ in range(3):
+        assert hand.decide(u=(0.05, 0.0, 0.0), dt=0.1 - 1e-9, followed=False).state is State.ACTIVE
+    assert hand.decide(u=(0.05, 0.0, 0.0), followed=True).u == (0.05, 0.0, 0.0)
+    for _ in range(3):
+        hand.decide(u=(0.05, 0.0, 0.0), dt=0.1, followed=False)
+    decision = hand.decide(u=(0.05, 0.0, 0.0), dt=0.01, followed=False)
+    assert decision.state is State.LATCHED and decision.u == STILL and decision.cause is Trip.IGNORED
+
+
+def test_nobody_needs_to_follow_what_is_not_commanded() -> None:
+    hand = Hand()
+    for _ in range(100):
+        assert hand.decide(RELEASED, followed=False).trip in (Trip.DEADMAN, Trip.TIME_GAP)
+    assert hand.decide(WELL, followed=False).state is State.ACTIVE
+    assert hand.decide(WELL, estop=True, dt=0.19, followed=False).trip is Trip.ESTOP
+    hand.decide(WELL, dt=0.19, followed=False)
+    assert hand.decide(RELEASED, followed=False).state is State.READY
+
+
+def test_the_states_have_the_numbers_that_travel_on_the_bus() -> None:
+    assert {state.name: state.value for state in State} == {"SILENT": 0, "LATCHED": 1, "READY": 2, "ACTIVE": 3}

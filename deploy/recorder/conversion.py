@@ -1,0 +1,144 @@
+"""From a capture to the recordings that identification and diagnosis read (`mode=convert import=capture`).
+
+At the machine's control rate: positions linearly between messages; commands as what the valves really got, averaged over the period
+that begins at each row, as the policy's history has it. A gap in either splits the log; pieces of one log share the metadata `run`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from brokk_rl import record
+from brokk_rl.errors import CheckpointError, RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.spec import spec
+from deploy.recorder import reading
+from deploy.recorder.reading import Contents
+
+Series = tuple[np.ndarray, np.ndarray]
+"""Times, s, and values."""
+
+
+@spec
+class CaptureLog:
+    """Reads captures of the loop, whole or cut off.
+
+    Attributes:
+        longest_gap_s: A longer time between two messages splits the log.
+        shortest_s: Shorter pieces are left out.
+    """
+
+    longest_gap_s: float
+    shortest_s: float
+
+    def read(self, path: Path, machine: Machine) -> list[Recording]:
+        """Returns the pieces of the capture at `path`; see `brokk_rl.modes.convert.LogReader`.
+
+        Raises:
+            RecordingError: it cannot be read, was made on another machine, or holds no piece that is long enough.
+        """
+        contents = reading.read(path)
+        try:
+            machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
+        except (CheckpointError, KeyError, ValueError) as error:
+            raise RecordingError(f"{path}: {error}") from error
+        names, found = machine.joint_names, []
+        q = {name: _series(contents, f"Position_{name}", path) for name in names}
+        flow = {name: _series(contents, f"Flow_{name}", path) for name in names}
+        for begin_s, end_s in _pieces([*q.values(), *flow.values()], self.longest_gap_s):
+            if end_s - begin_s >= max(self.shortest_s, 2 * machine.period_s):
+                found.append(self._piece(contents, q, flow, begin_s, end_s, path, machine))
+        if not found:
+            raise RecordingError(
+                f"{path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s in positions or "
+                "valve feedback"
+            )
+        return found
+
+    def _piece(
+        self,
+        contents: Contents,
+        q: dict[str, Series],
+        flow: dict[str, Series],
+        begin_s: float,
+        end_s: float,
+        path: Path,
+        machine: Machine,
+    ) -> Recording:
+        grid_s = begin_s + np.arange(int((end_s - begin_s) / machine.period_s + 1e-6)) * machine.period_s
+        first_s = next(iter(contents.messages.values()))[0][0]
+        created = datetime.fromtimestamp((contents.wall_ns / 1e9) + (begin_s - first_s), UTC)
+        return Recording(
+            machine=machine.name,
+            joints=machine.joint_names,
+            units=tuple(joint.unit for joint in machine.joints),
+            rate_hz=1.0 / machine.period_s,
+            t_s=grid_s - begin_s,
+            u=np.stack([_means(flow[name], grid_s, machine.period_s) for name in machine.joint_names], 1).astype(np.float32),
+            q=np.stack([np.interp(grid_s, q[name][0], q[name][1]) for name in machine.joint_names], 1).astype(np.float32),
+            extra=_extra(contents, grid_s, machine),
+            metadata={
+                "source": f"capture: {contents.facts.get('source', path.name)}", "fingerprint": record.stamp(machine),
+                "run": f"{path.resolve().parent.name}/{path.stem}", "created": created.isoformat(timespec="milliseconds"),
+            },
+            path=None,
+        )  # fmt: skip
+
+
+def _series(contents: Contents, signal: str, path: Path) -> Series:
+    """Returns times and values of a signal, whatever message it came in; of what was called invalid nothing."""
+    joint, positions = signal.partition("_")[2], signal.startswith("Position_")
+    for messages in contents.messages.values():
+        if signal in messages[0][1]:
+            kept = [(t_s, values[signal]) for t_s, values in messages if not positions or values.get(f"Valid_{joint}", 1.0) == 1.0]
+            if len(kept) > 1:
+                t_s, values = np.array(kept, dtype=float).T
+                forward = np.concatenate([[True], np.diff(t_s) > 0])
+                return t_s[forward], values[forward]
+    raise RecordingError(f"{path}: signal '{signal}' was never heard (topics: {', '.join(sorted(contents.messages)) or 'none'})")
+
+
+def _pieces(series: Sequence[Series], longest_gap_s: float) -> list[tuple[float, float]]:
+    """Returns the times, begin and end, in which none of the series has a gap."""
+    begin_s, end_s = max(t_s[0] for t_s, _ in series), min(t_s[-1] for t_s, _ in series)
+    gaps = sorted(
+        (float(t_s[row]), float(t_s[row + 1])) for t_s, _ in series for row in np.flatnonzero(np.diff(t_s) > longest_gap_s)
+    )
+    pieces, at_s = [], begin_s
+    for before_s, after_s in gaps:
+        if before_s > at_s:
+            pieces.append((at_s, min(before_s, end_s)))
+        at_s = max(at_s, after_s)
+    if at_s < end_s:
+        pieces.append((at_s, end_s))
+    return pieces
+
+
+def _means(series: Series, grid_s: np.ndarray, period_s: float) -> np.ndarray:
+    """Returns the means over the period after each grid time of a value that holds until its next message."""
+    t_s, values = series
+    # integral of the staircase up to any time, linear in between
+    integral = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(t_s))])
+    return np.diff(np.interp(np.append(grid_s, grid_s[-1] + period_s), t_s, integral)) / period_s
+
+
+def _extra(contents: Contents, grid_s: np.ndarray, machine: Machine) -> dict[str, np.ndarray]:
+    """Returns the oil's temperature and the advice shown, where there was any; NaN where not."""
+    extra: dict[str, np.ndarray] = {}
+    for messages in contents.messages.values():
+        if "OilTemperature" in messages[0][1]:
+            t_s, values = np.array([(t_s, values["OilTemperature"]) for t_s, values in messages], dtype=float).T
+            extra["oil_c"] = np.interp(grid_s, t_s, values).astype(np.float32)
+    if advised := contents.messages.get("advice"):
+        t_s = np.array([t_s for t_s, _ in advised])
+        shown = np.array([values["u"] if values["reason"] == "valid" else [np.nan] * machine.num_joints for _, values in advised])
+        rows = np.searchsorted(t_s, grid_s, side="right") - 1
+        for j, name in enumerate(machine.joint_names):
+            extra[f"advice_{name}"] = np.where(rows >= 0, shown[rows.clip(0), j], np.nan).astype(np.float32)
+    return extra

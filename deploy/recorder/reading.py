@@ -1,0 +1,148 @@
+"""Reading captures back, whole or cut off: what a crash left is read up to where it ends."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import can
+from can.io.blf import BLFReader
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+from brokk_rl.errors import RecordingError
+from deploy.recorder.capture import FACTS, DurableBlf
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Contents:
+    """What a capture holds.
+
+    Attributes:
+        facts: Metadata of the run: `machine`, `fingerprint`, `dbc`, `started_ns`, …
+        messages: By topic, in order: (t_s, values); `t_s` is monotonic time.
+        wall_ns: Wall-clock time of the first message.
+        whole: Whether the file was closed properly.
+    """
+
+    facts: dict[str, str] = field(default_factory=dict)
+    messages: dict[str, list[tuple[float, dict[str, Any]]]] = field(default_factory=dict)
+    wall_ns: int = 0
+    whole: bool = True
+
+
+def read(path: Path) -> Contents:
+    """Reads the capture at `path` as far as it goes.
+
+    Raises:
+        RecordingError: there is none, or not even its beginning can be read.
+    """
+    contents, topics = Contents(whole=is_whole(path)), {}
+    for record in _records(path):
+        if isinstance(record, Metadata) and record.name == FACTS:
+            contents.facts = dict(record.metadata)
+        elif isinstance(record, Channel):
+            topics[record.id] = record.topic
+        elif isinstance(record, Message):
+            values = json.loads(record.data)
+            contents.wall_ns = contents.wall_ns or record.log_time
+            contents.messages.setdefault(topics[record.channel_id], []).append((values.pop("t_s"), values))
+    if not contents.facts:
+        raise RecordingError(f"{path}: no capture of this framework, or cut off within its first second")
+    return contents
+
+
+def is_whole(path: Path) -> bool:
+    """Says whether the capture at `path` was closed properly."""
+    try:
+        with path.open("rb") as file:
+            return make_reader(file).get_summary() is not None
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path}: no such capture") from error
+    except (McapError, OSError, ValueError):
+        return False
+
+
+def recover_mcap(path: Path, out: Path) -> int:
+    """Writes what can be read of a cut-off capture as a whole one; returns the number of messages.
+
+    Raises:
+        RecordingError: nothing can be read.
+    """
+    count, schemas, channels = 0, {0: 0}, {}
+    part = out.with_name(f".{out.name}.part")
+    with part.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start(profile="brokk", library="brokk-rl")
+        for record in _records(path):
+            if isinstance(record, Schema):
+                schemas.setdefault(record.id, writer.register_schema(record.name, record.encoding, record.data))
+            elif isinstance(record, Channel) and record.id not in channels:
+                channels[record.id] = writer.register_channel(record.topic, record.message_encoding, schemas[record.schema_id])
+            elif isinstance(record, Message):
+                writer.add_message(channels[record.channel_id], record.log_time, record.data, record.publish_time, record.sequence)
+                count += 1
+            elif isinstance(record, Metadata):
+                writer.add_metadata(record.name, dict(record.metadata))
+            elif isinstance(record, Attachment):
+                writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+        writer.finish()
+    if not count:
+        part.unlink()
+        raise RecordingError(f"{path}: not a single message can be read")
+    part.replace(out)
+    return count
+
+
+def recover_blf(path: Path, out: Path) -> int:
+    """Writes what can be read of a cut-off BLF as a whole one; returns the number of frames."""
+    part, count = out.with_name(f".{out.name}.part"), 0
+    writer = DurableBlf(part)
+    try:
+        for message in frames(path):
+            writer.on_message_received(message)
+            count += 1
+    finally:
+        writer.stop()
+    part.replace(out)
+    return count
+
+
+def frames(path: Path) -> Iterator[can.Message]:
+    """Yields the frames of a BLF as far as it can be read."""
+    try:
+        with BLFReader(path) as reader:
+            yield from reader
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path}: no such log") from error
+    except Exception as error:  # a container that was cut off fails in zlib, struct or the parser
+        log.warning("%s: ends before its end (%s)", path, error)
+
+
+def _records(path: Path) -> Iterator[Any]:
+    """Yields records as far as the file can be read; chunks are opened."""
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
+    with file:
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True).records
+        while True:
+            try:
+                record = next(reader)
+                inner = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+            except StopIteration:
+                return
+            except Exception as error:  # a cut-off file fails wherever it was cut
+                log.warning("%s: ends before its end (%s: %s)", path, type(error).__name__, error)
+                return
+            yield from inner
