@@ -321,6 +321,64 @@ class Policy(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class TrialBatch:
+    """Trials of a study, to be done side by side in numpy.
+
+    Attributes:
+        q: Joint positions from which each begins, `(N, J)`.
+        rim_in_base_m: Centre of the rim of its hole, `(N, 3)`.
+        radius_m: Radius of its hole, `(N,)`.
+        guided: Whether advice is shown, `(N,)` bool.
+        limit_s: Time after which each ends at the latest.
+    """
+
+    q: np.ndarray
+    rim_in_base_m: np.ndarray
+    radius_m: np.ndarray
+    guided: np.ndarray
+    limit_s: float
+
+
+@dataclass(frozen=True)
+class OperatorView:
+    """What simulated operators can see at the start of a control period, numpy.
+
+    Attributes:
+        q: Joint positions, `(N, J)`.
+        rim_in_base_m: Centre of the hole's rim, `(N, 3)`; how well it is seen is the operator's matter.
+        advice: Commands that are advised, `(N, J)`; NaN where none is shown.
+    """
+
+    q: np.ndarray
+    rim_in_base_m: np.ndarray
+    advice: np.ndarray
+
+
+class OperatorModel(Protocol):
+    """Simulated operators at the levers of `N` machines, in numpy; one control period a call."""
+
+    def step(self, view: OperatorView) -> np.ndarray:
+        """Returns the commands given during the coming period, `(N, J)` in [-1, 1]; exclusive joints never together with others."""
+        ...
+
+
+class Operator(Protocol):
+    """A spec in `conf/operator`: a kind of simulated operator."""
+
+    def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
+        """Returns operators at work; `persons`, `(N,)`, numbers them: the same number and seed is the same person."""
+        ...
+
+
+class TrialGround(Protocol):
+    """A spec in `conf/ground`: where simulated operators do trials."""
+
+    def run(self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel) -> list[Recording]:
+        """Does the trials; returns a recording of each, in order, with advice where it was shown."""
+        ...
+
+
 class BoreholeFinder(Protocol):
     """Finds the borehole in a frame."""
 

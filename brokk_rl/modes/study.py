@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from brokk_rl.contracts import Operator, TrialGround
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
@@ -12,8 +13,10 @@ from brokk_rl.spec import spec
 class Steps(Protocol):
     """What a study is made of; the room of the machine's computer has it."""
 
-    def run(self, machine: Machine, session: Session, ground: Any) -> float | None:
-        """Does the step that was asked for; `ground` is where simulated operators work, `None` for nowhere."""
+    def run(
+        self, machine: Machine, session: Session, ground: TrialGround | None, guided: Operator | None, unguided: Operator | None
+    ) -> float | None:
+        """Does the step that was asked for; simulated operators work on `ground`, with advice shown and without."""
         ...
 
 
@@ -26,13 +29,17 @@ class Study:
         machine: The machine.
         study: Plan, measures, statistics.
         ground: Where simulated operators work; `null`: nowhere, as on the machine's own computer.
+        guided: Simulated operators with advice; `null`: none.
+        unguided: Simulated operators without; the same persons.
     """
 
     session: Session
     machine: Machine
     study: Steps
     ground: Any
+    guided: Any
+    unguided: Any
 
     def run(self) -> float | None:
         """Leaves `plan.{json,html}` or `report.html` with its pictures and tables in the run folder."""
-        return self.study.run(self.machine, self.session, self.ground)
+        return self.study.run(self.machine, self.session, self.ground, self.guided, self.unguided)

@@ -20,12 +20,14 @@ class Tool(NamedTuple):
         axis_in_base: Unit vector from the last joint to the tip, `(…, 3)`.
         jacobian: Motion of the tip for unit motion of each joint, `(…, 3, J)`, m/rad or m/m.
         turn: Motion of the axis likewise, `(…, 3, J)`, 1/rad.
+        joints_in_base_m: Origins of the joints, `(…, J, 3)`.
     """
 
     tip_in_base_m: np.ndarray
     axis_in_base: np.ndarray
     jacobian: np.ndarray
     turn: np.ndarray
+    joints_in_base_m: np.ndarray
 
 
 def tool(machine: Machine, q: np.ndarray) -> Tool:
@@ -50,7 +52,7 @@ def tool(machine: Machine, q: np.ndarray) -> Tool:
     hinge = np.array([joint.kind == "hinge" for joint in machine.joints])[:, None]
     jacobian = np.where(hinge, np.cross(axes, tip[..., None, :] - origins), axes)
     turn = np.where(hinge, np.cross(axes, axis[..., None, :]), 0.0)
-    return Tool(tip, axis, np.swapaxes(jacobian, -1, -2), np.swapaxes(turn, -1, -2))
+    return Tool(tip, axis, np.swapaxes(jacobian, -1, -2), np.swapaxes(turn, -1, -2), origins)
 
 
 def _turned(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

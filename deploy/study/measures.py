@@ -154,7 +154,7 @@ def tracking(u: np.ndarray, advice: np.ndarray, period_s: float) -> dict[str, fl
 
     Advice that is NaN was not shown.
     """
-    shown = ~np.isnan(advice).any(1)
+    shown = np.asarray(~np.isnan(advice).any(1))
     if not shown.any():
         return {"advice_error": math.nan, "advice_lag_s": math.nan}
     away = np.where(shown[:, None], u - np.nan_to_num(advice), 0.0)

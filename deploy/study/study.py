@@ -6,15 +6,20 @@ import logging
 from pathlib import Path
 from typing import Any, Literal
 
+from rich.progress import track
+
+from brokk_rl.contracts import Operator, TrialGround
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.study import design as designs
 from deploy.study import folder as folders
-from deploy.study import plan_page
+from deploy.study import plan_page, report
+from deploy.study.analysis import analyse
 from deploy.study.design import Design
 from deploy.study.practice import Practice, share_significant
+from deploy.study.simulation import simulate
 
 log = logging.getLogger(__name__)
 
@@ -43,11 +48,26 @@ class Steps:
     practice: Practice
     num_studies: int
 
-    def run(self, machine: Machine, session: Session, ground: Any) -> None:
+    def run(
+        self, machine: Machine, session: Session, ground: TrialGround | None, guided: Operator | None, unguided: Operator | None
+    ) -> None:
         """Does the step `do`; see `brokk_rl.modes.study.Steps`."""
-        getattr(self, f"_{self.do}")(machine, session, ground)
+        if self.do == "plan":
+            self._plan(machine, session)
+        elif self.do == "erase":
+            self._erase(session)
+        elif self.do == "simulate":
+            if ground is None or guided is None or unguided is None:
+                raise ConfigError(
+                    "study.do=simulate needs a ground and operators: ground=simulated, operator@guided=…, operator@unguided=…"
+                )
+            planned = self._plan(machine, session)
+            simulate(self._home(session), self.design, planned, machine, session, ground, guided, unguided)
+            self._report(machine, session)
+        else:
+            self._report(machine, session)
 
-    def _plan(self, machine: Machine, session: Session, ground: Any) -> None:
+    def _plan(self, machine: Machine, session: Session) -> list[designs.Trial]:
         plan = plan_study(self.design, machine, session)
         folder = self._home(session)
         if (folder / folders.PLAN).exists():
@@ -67,14 +87,26 @@ class Steps:
                 entry["share"],
             )
         log.info("planned: %s", folder / "plan.html")
+        return plan
 
-    def _erase(self, machine: Machine, session: Session, ground: Any) -> None:
+    def _report(self, machine: Machine, session: Session) -> None:
+        data = folders.read(self._home(session))
+        machine.check_fingerprint(data.plan["fingerprint"], f"the study in {data.folder}")
+        found = analyse(data, machine, lambda trials: track(trials, "measuring trials", transient=True))
+        path = report.write(session.folder, data, found)
+        folders.note_report(data.folder, session.folder)
+        for remark in found.remarks:
+            log.warning("%s: %s", remark.where, remark.text)
+        log.info("%s%s", "SIMULATED. " if data.is_simulated else "", report.verdict(found)[0])
+        log.info("report: %s", path)
+
+    def _erase(self, session: Session) -> None:
         if not self.participant:
             raise ConfigError("study.do=erase needs study.participant=<pseudonym> and study.folder=<folder>")
         gone, reports = folders.erase(self._home(session), self.participant)
         log.info("%s erased: %d files deleted", self.participant, len(gone))
-        for report in reports:
-            log.warning("%s was made with this participant's data: delete it, and make it again with study.do=report", report)
+        for place in reports:
+            log.warning("%s was made with this participant's data: delete it, and make it again with study.do=report", place)
 
     def _home(self, session: Session) -> Path:
         return Path(self.folder) if self.folder else session.folder

@@ -1,0 +1,190 @@
+"""From a study's folder to what it says: every trial measured, means of each person and condition, effects, and what to beware of.
+
+Axes: `P` participants in the order of the plan.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brokk_rl import record
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from deploy.study import exact, tlx
+from deploy.study.chain import tool
+from deploy.study.crossover import Effect, effect
+from deploy.study.design import CONDITIONS, PERIODS, Hole, Success
+from deploy.study.folder import Remark, StudyData
+from deploy.study.measures import GUIDED_ONLY, MEASURES, measure
+
+FEW_TRIALS = 2
+"""Trials of a condition below which a participant's mean is pointed out."""
+
+
+@dataclass(frozen=True)
+class MeasuredTrial:
+    """A trial with its numbers.
+
+    Attributes:
+        facts: What stands in its file.
+        values: By measure, NaN where the recording does not tell.
+        tip_in_base_m: Path of the tool until the trial ended, `(T, 3)`; empty where there is no recording.
+        counts: Whether it enters the means; practice and spare trials do not.
+    """
+
+    facts: dict[str, Any]
+    values: dict[str, float]
+    tip_in_base_m: np.ndarray
+    counts: bool
+
+
+@dataclass
+class Analysis:
+    """What a study says.
+
+    Attributes:
+        participants: Pseudonyms, `P` of them.
+        guided_first: Who was guided in the first period, `(P,)` bool.
+        trials: Every trial that is there.
+        means: By measure and condition, one mean a participant, `(P,)`, NaN where there is none.
+        loads: NASA-TLX by scale (and `raw`, `weighted`) and condition, `(P,)`.
+        effects: By measure; those of `loads` as `tlx_<scale>`.
+        holm: p adjusted within its family by the same names: secondary measures, and the six scales.
+        primary: Name of the measure that decides.
+        alpha: Level.
+        remarks: What a reader must know.
+    """
+
+    participants: list[str]
+    guided_first: np.ndarray
+    trials: list[MeasuredTrial]
+    means: dict[str, dict[str, np.ndarray]]
+    loads: dict[str, dict[str, np.ndarray]]
+    primary: str
+    alpha: float
+    effects: dict[str, Effect] = field(default_factory=dict)
+    holm: dict[str, float] = field(default_factory=dict)
+    remarks: list[Remark] = field(default_factory=list)
+
+
+def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] = iter) -> Analysis:
+    """Returns what the study says.
+
+    Args:
+        data: What is there.
+        machine: The machine of the plan.
+        progress: Wraps the list of trials while their recordings are read.
+    """
+    design, plan = data.plan["design"], data.plan["participants"]
+    erased = data.plan.get("erased", {})
+    names = [name for name in plan if name not in erased]
+    found = Analysis(
+        participants=names,
+        guided_first=np.array([plan[name][0] == "guided" for name in names], bool),
+        trials=[],
+        means={},
+        loads={},
+        primary=design["primary"],
+        alpha=design["alpha"],
+        remarks=list(data.remarks),
+    )
+    everything = [(trial, bool(trial["period"])) for trial in data.trials.values()] + [(trial, False) for trial in data.spare]
+    success = Success(**design["success"])
+    for trial, counts in progress(everything):
+        found.trials.append(_measured(data.folder, trial, counts, machine, success, found.remarks))
+    found.means = {each.name: {which: _means(found, each.name, which) for which in CONDITIONS} for each in MEASURES}
+    _note_few(found)
+    _loads(found, data)
+    for name, by_condition in (*found.means.items(), *((f"tlx_{scale}", value) for scale, value in found.loads.items())):
+        if name not in GUIDED_ONLY:
+            found.effects[name] = effect(by_condition["guided"], by_condition["unguided"], found.guided_first)
+    secondary = [each.name for each in MEASURES if each.name in found.effects and each.name != found.primary]
+    for family in (secondary, [f"tlx_{scale}" for scale in tlx.SCALES]):
+        p = [deciding_p(found.effects[name]) for name in family]
+        found.holm |= dict(
+            zip(family, exact.holm(np.array([math.nan if value is None else value for value in p])).tolist(), strict=True)
+        )
+    return found
+
+
+def deciding_p(found: Effect) -> float | None:
+    """Returns the p that counts: of the test with the period in the model; `None` where sequences do not allow it."""
+    return found.p
+
+
+def _measured(
+    folder: Path, trial: dict[str, Any], counts: bool, machine: Machine, success: Success, remarks: list[Remark]
+) -> MeasuredTrial:
+    name = f"{trial.get('participant')} {trial.get('period')}.{trial.get('number')}"
+    empty = MeasuredTrial(trial, dict.fromkeys((each.name for each in MEASURES), math.nan), np.zeros((0, 3)), counts)
+    where = trial.get("hole")
+    if not trial.get("recording") or not isinstance(where, dict):
+        remarks.append(Remark(name, "names no recording; only its outcome is known"))
+        return _outcome_only(empty)
+    try:
+        recording: Recording = record.read(folder / trial["recording"], machine)
+        hole = Hole(center_in_base_m=tuple(where["center_in_base_m"]), radius_m=float(where["radius_m"]))
+    except (RecordingError, KeyError, TypeError, ValueError) as error:
+        remarks.append(Remark(name, f"its recording cannot be used ({error}); only its outcome is known"))
+        return _outcome_only(empty)
+    values = measure(recording, machine, hole, success, float(trial["limit_s"]))
+    said = trial.get("outcome")
+    if said in ("inserted", "time limit") and (said == "inserted") != bool(values["success"]):
+        seen = "an insertion" if values["success"] else "none"
+        remarks.append(Remark(name, f"written down as '{said}', but the recording shows {seen}; the recording counts"))
+    num = int(np.searchsorted(recording.t_s - recording.t_s[0], values["time_s"], side="right"))
+    return MeasuredTrial(trial, values, tool(machine, recording.q[:num]).tip_in_base_m, counts)
+
+
+def _outcome_only(trial: MeasuredTrial) -> MeasuredTrial:
+    """Returns a trial without a recording as its outcome tells: inserted or not; not inserted counts with the limit."""
+    outcome = trial.facts.get("outcome")
+    if outcome not in ("inserted", "time limit", "stopped"):
+        return trial
+    known = {"success": float(outcome == "inserted")}
+    if outcome != "inserted":
+        known["time_s"] = float(trial.facts["limit_s"])
+    return MeasuredTrial(trial.facts, trial.values | known, trial.tip_in_base_m, trial.counts)
+
+
+def _means(found: Analysis, measure_name: str, condition: str) -> np.ndarray:
+    """Returns each participant's mean over the trials that tell, `(P,)`."""
+    means = np.full(len(found.participants), np.nan)
+    for index, name in enumerate(found.participants):
+        values = np.array([t.values[measure_name] for t in found.trials if _is_of(t, name, condition)])
+        values = values[~np.isnan(values)]
+        means[index] = values.mean() if len(values) else math.nan
+    return means
+
+
+def _is_of(trial: MeasuredTrial, participant: str, condition: str) -> bool:
+    return trial.counts and trial.facts["participant"] == participant and trial.facts["condition"] == condition
+
+
+def _note_few(found: Analysis) -> None:
+    for name in found.participants:
+        for condition in CONDITIONS:
+            num = sum(_is_of(trial, name, condition) for trial in found.trials)
+            if num < FEW_TRIALS:
+                what = "is in no comparison" if not num else "their mean rests on it"
+                found.remarks.append(Remark(name, f"{num} trials {condition}: {what}"))
+
+
+def _loads(found: Analysis, data: StudyData) -> None:
+    keys = (*tlx.SCALES, "raw", "weighted")
+    found.loads = {key: {which: np.full(len(found.participants), np.nan) for which in CONDITIONS} for key in keys}
+    for (name, period), answers in data.questionnaires.items():
+        if name not in found.participants:
+            continue
+        condition = data.plan["participants"][name][PERIODS.index(period)]
+        values = tlx.ratings(answers) | {"raw": tlx.raw(answers), "weighted": tlx.weighted(answers)}
+        for key, value in values.items():
+            found.loads[key][condition][found.participants.index(name)] = value
+        found.remarks += [Remark(f"{name} period {period}", f"questionnaire: {text}") for text in tlx.check(answers)]

@@ -1,0 +1,36 @@
+"""An operator who does what is advised, as well as hands can."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from brokk_rl.contracts import OperatorModel, OperatorView
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+from deploy.study.operators.hands import Hands, HandsModel
+
+
+@spec
+class Follower:
+    """Simulated: follows the advice shown, late and imprecisely, a few levers at once; without advice does nothing.
+
+    Attributes:
+        hands: How the levers are moved.
+    """
+
+    hands: Hands
+
+    def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
+        """See `brokk_rl.contracts.Operator`."""
+        return FollowerModel(self.hands.build(machine, persons, seed))
+
+
+class FollowerModel:
+    """Followers at work."""
+
+    def __init__(self, hands: HandsModel) -> None:
+        self._hands = hands
+
+    def step(self, view: OperatorView) -> np.ndarray:
+        """See `brokk_rl.contracts.OperatorModel`."""
+        return self._hands.step(np.nan_to_num(view.advice))

@@ -1,0 +1,241 @@
+"""The report of a study: one page, its pictures, and tables for other programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from brokk_rl.errors import StorageError
+from brokk_rl.report import Cell, Page
+from brokk_rl.session import write_json, write_text
+from deploy.study import pictures, tlx
+from deploy.study.analysis import Analysis
+from deploy.study.crossover import Effect
+from deploy.study.exact import smallest_paired_p, smallest_sequence_p
+from deploy.study.folder import StudyData
+from deploy.study.measures import GUIDED_ONLY, MEASURES
+from deploy.study.simulation import NOTICE
+
+COMPARED = tuple(each.name for each in MEASURES if each.name not in GUIDED_ONLY)
+LOADS = tuple(f"tlx_{scale}" for scale in (*tlx.SCALES, "raw", "weighted"))
+SHOWN = ("time_s", "path_m", "efficiency", "several_joints", "joint_switches", "smoothness")
+"""Measures of which each participant's line is drawn."""
+
+
+def write(folder: Path, data: StudyData, found: Analysis) -> Path:
+    """Writes `report.html`, four pictures, `trials.csv`, `means.csv`, `effects.csv` and `report.json`; returns the page's path.
+
+    Raises:
+        StorageError: a file could not be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(folder / "trials.csv", _trials(found))
+        write_text(folder / "means.csv", _means(found))
+        write_text(folder / "effects.csv", _effects(found))
+        effects = {name: asdict(effect) for name, effect in found.effects.items()}
+        remarks = [asdict(remark) for remark in found.remarks]
+        facts = {"primary": found.primary, "alpha": found.alpha, "simulated": data.is_simulated, "participants": found.participants}
+        write_json(
+            folder / "report.json", _plain({"schema": 1, **facts, "effects": effects, "holm": found.holm, "remarks": remarks})
+        )
+        drawn = {
+            "paths": pictures.paths(found),
+            "tlx": pictures.radar(found),
+            "pairs": pictures.pairs(found, (*SHOWN, "tlx_raw", "tlx_weighted")),
+            "effects": pictures.effects(found, (*COMPARED, *LOADS)),
+        }
+        for name, figure in drawn.items():
+            if data.is_simulated:
+                figure.suptitle("SIMULATED OPERATORS", fontsize=9, color="#b3261e", x=0.02, ha="left")
+            figure.savefig(folder / f"{name}.png", dpi=150)
+    except OSError as error:
+        raise StorageError(f"cannot write the report into {folder}: {error.strerror or error}") from error
+    path = folder / "report.html"
+    _page(folder, data, found).write(path)
+    return path
+
+
+def verdict(found: Analysis) -> tuple[str, str]:
+    """Returns what the primary measure says, in words, and whether that is good, bad or no news."""
+    effect, title = found.effects[found.primary], pictures.title_of(found.primary)
+    better = next(each.better for each in MEASURES if each.name == found.primary)
+    if effect.adjusted is None or effect.p is None or effect.adjusted_ci95 is None:
+        why = (
+            "all had the same order, so guidance and order cannot be told apart"
+            if effect.num_persons >= 4
+            else "too few participants"
+        )
+        return f"Nothing can be said about guidance: {why}.", "bad"
+    low, high = effect.adjusted_ci95
+    size = f"{title}: {effect.adjusted:+.3g} with guidance (95 % {low:+.3g} to {high:+.3g}), exact p = {effect.p:.3g}"
+    if effect.p > found.alpha:
+        return f"No effect of guidance is shown on the primary measure. {size}; {effect.num_persons} participants.", "warn"
+    helps = effect.adjusted * better > 0
+    return f"Guidance {'helps' if helps else 'harms'}. {size}; {effect.num_persons} participants.", "good" if helps else "bad"
+
+
+def _page(folder: Path, data: StudyData, found: Analysis) -> Page:
+    summary, tone = verdict(found)
+    page = Page("Does guidance help?", summary, tone)  # type: ignore[arg-type]
+    if data.is_simulated:
+        page.text(f"Simulated: {NOTICE}.", "warn")
+    num, num_first = len(found.participants), int(found.guided_first.sum())
+    least = max(smallest_paired_p(num), smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0)
+    if least > found.alpha:
+        page.text(
+            f"With {num} participants no test here can reach p = {found.alpha:g}: the smallest possible is {least:.3g}.", "bad"
+        )
+    counted = [trial for trial in found.trials if trial.counts]
+    page.facts(
+        {
+            "participants": f"{num}, {num_first} of them guided first",
+            "trials that count": f"{len(counted)}, {sum(trial.values['success'] > 0 for trial in counted)} inserted",
+            "trials kept that do not count": len(found.trials) - len(counted),
+            "primary measure": pictures.title_of(found.primary),
+            "level": found.alpha,
+        }
+    )
+    page.heading("What guidance does")
+    page.text(
+        "Guided minus unguided, with the period in the model: what practice does between the first and the second period is not "
+        "counted as guidance. p is exact, over all ways in which the order could have been drawn. The primary measure decides; the "
+        "others are corrected for looking at many (Holm, within the measures and within the six scales). dz is in standard "
+        "deviations of a person's difference. Means of a participant are over trials; a trial without insertion has the limit as "
+        "its time and no efficiency."
+    )
+    page.table(*_table(found, COMPARED), "of recordings; below each figure its 95 % interval")
+    page.picture(folder / "effects.png", "Effect of guidance on every measure, with 95 % intervals")
+    page.picture(folder / "pairs.png", "Every participant, and means with 95 % intervals")
+    page.heading("Tool paths")
+    page.picture(folder / "paths.png", "Paths of the tool, guided solid and unguided dotted; stars: starts, spheres: holes")
+    page.heading("Workload (NASA-TLX)")
+    page.table(*_table(found, LOADS), "0 to 100, more is more load; below each figure its 95 % interval")
+    page.picture(folder / "tlx.png", "Means of the six scales with 95 % intervals")
+    page.heading("Without the period in the model")
+    page.text(
+        "The usual paired tests, for comparison; practice is part of the differences here, though not of their mean where as many "
+        "had one order as the other."
+    )
+    page.table(*_paired_table(found), "guided minus unguided")
+    page.heading("How the advice was followed")
+    page.table(["measure", "mean, guided"], [[pictures.title_of(name), _mean(found, name)] for name in GUIDED_ONLY])
+    page.heading("What to beware of")
+    if found.remarks:
+        page.table(["where", "what"], [[remark.where, remark.text] for remark in found.remarks])
+    else:
+        page.text("Nothing is missing, doubled or half filled.")
+    return page
+
+
+def _table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list[list[str | Cell]]]:
+    columns = ["measure", "people", "guided", "unguided", "difference", "dz", "p", "p, Holm", "period", "p of it"]
+    rows: list[list[str | Cell]] = []
+    for name in names:
+        e, note = found.effects[name], "primary" if name == found.primary else ""
+        people = [Cell(pictures.title_of(name), note), str(e.num_persons), _number(e.guided), _number(e.unguided)]
+        size = [Cell(_number(e.adjusted), _interval(e.adjusted_ci95)), Cell(_number(e.dz), _interval(e.dz_ci95))]
+        tests = [_p(e.p), "decides" if note else _p(found.holm.get(name)), _number(e.period), _p(e.period_p)]
+        rows.append([*people, *size, *tests])
+    return columns, rows
+
+
+def _paired_table(found: Analysis) -> tuple[list[str], list[list[str | Cell]]]:
+    columns = ["measure", "mean difference", "Hodges-Lehmann", "dz", "p, permutation", "p, Wilcoxon", "p, carry-over"]
+    rows: list[list[str | Cell]] = []
+    for name in (*COMPARED, *LOADS):
+        e = found.effects[name]
+        mean, middle = Cell(_number(e.difference), _interval(e.paired_ci95)), _interval(e.hodges_lehmann_ci95)
+        dz = Cell(_number(e.paired_dz), _interval(e.paired_dz_ci95))
+        tests = [_p(e.paired_p), _p(e.wilcoxon_p), _p(e.carry_over_p)]
+        rows.append([pictures.title_of(name), mean, Cell(_number(e.hodges_lehmann), middle), dz, *tests])
+    return columns, rows
+
+
+def _mean(found: Analysis, name: str) -> str:
+    values = [value for value in found.means[name]["guided"] if not math.isnan(value)]
+    return _number(sum(values) / len(values) if values else None)
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:.3g}"
+
+
+def _p(value: float | None) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:.4f}" if value >= 0.0001 else f"{value:.1e}"
+
+
+def _interval(value: tuple[float, float] | None) -> str:
+    return "" if value is None else f"{value[0]:.3g} to {value[1]:.3g}"
+
+
+def _trials(found: Analysis) -> str:
+    keys = ("participant", "period", "condition", "number", "outcome", "simulated", "operator")
+    head = [*keys, "hole", "start", "counts", *(each.name for each in MEASURES)]
+    rows = [
+        [
+            *(trial.facts.get(key, "") for key in keys),
+            (trial.facts.get("hole") or {}).get("name", ""),
+            trial.facts.get("start", ""),
+            trial.counts,
+            *(_blank(trial.values[each.name]) for each in MEASURES),
+        ]
+        for trial in found.trials
+    ]
+    return _csv(head, rows)
+
+
+def _means(found: Analysis) -> str:
+    columns = found.means | {f"tlx_{name}": values for name, values in found.loads.items()}
+    rows = [
+        [
+            name,
+            condition,
+            "first" if (condition == "guided") == bool(first) else "second",
+            *(_blank(values[condition][i]) for values in columns.values()),
+        ]
+        for i, (name, first) in enumerate(zip(found.participants, found.guided_first, strict=True))
+        for condition in ("guided", "unguided")
+    ]
+    return _csv(["participant", "condition", "period", *columns], rows)
+
+
+def _effects(found: Analysis) -> str:
+    head: list[str] = []
+    for key in asdict(Effect(num_persons=0, num_guided_first=0)):
+        head += [f"{key}_low", f"{key}_high"] if key.endswith("_ci95") else [key]
+    rows = []
+    for name, effect in found.effects.items():
+        values = [(None, None) if value is None and key.endswith("_ci95") else value for key, value in asdict(effect).items()]
+        rows.append([name, *_flat(values), _blank(found.holm.get(name, math.nan))])
+    return _csv(["measure", *head, "p_holm"], rows)
+
+
+def _flat(values: Iterable) -> list:
+    """Returns numbers and the ends of intervals in one row; '' for what there is none of."""
+    row = [part for value in values for part in (value if isinstance(value, tuple) else (value,))]
+    return ["" if part is None else part for part in row]
+
+
+def _blank(value: float) -> float | str:
+    return "" if math.isnan(value) else value
+
+
+def _csv(head: Sequence[str], rows: Sequence[Sequence]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([head, *rows])
+    return text.getvalue()
+
+
+def _plain(value: Any) -> Any:
+    """Returns the same with `None` for NaN, which JSON does not know."""
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value

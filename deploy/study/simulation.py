@@ -1,0 +1,114 @@
+"""A whole study by simulated operators: the plan's trials on a simulated machine, questionnaires made up; all marked."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brokk_rl import record
+from brokk_rl.contracts import Operator, OperatorModel, OperatorView, TrialBatch, TrialGround
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from deploy.study import folder as folders
+from deploy.study import tlx
+from deploy.study.design import Design, Trial
+from deploy.study.measures import measure
+
+NOTICE = "simulated operators: no person took part, and nothing here is evidence about people"
+
+
+def simulate(
+    folder: Path,
+    design: Design,
+    planned: list[Trial],
+    machine: Machine,
+    session: Session,
+    ground: TrialGround,
+    guided: Operator,
+    unguided: Operator,
+) -> None:
+    """Does every trial that counts, and writes recordings, trials and questionnaires into a study's folder.
+
+    Args:
+        folder: The study's folder, with its plan.
+        design: What was planned with.
+        planned: Its trials; practice is left out, since these operators do not learn.
+        machine: The machine.
+        session: Gives the seed.
+        ground: Where the trials are done.
+        guided: Operators with advice.
+        unguided: The same persons without.
+    """
+    todo = [trial for trial in planned if trial.period]
+    names = list(dict.fromkeys(trial.participant for trial in todo))
+    persons = np.array([names.index(trial.participant) for trial in todo])
+    is_guided = np.array([trial.condition == "guided" for trial in todo])
+    batch = TrialBatch(
+        q=np.array([design.starts[trial.start] for trial in todo]),
+        rim_in_base_m=np.array([design.holes[trial.hole].center_in_base_m for trial in todo]),
+        radius_m=np.array([design.holes[trial.hole].radius_m for trial in todo]),
+        guided=is_guided,
+        limit_s=design.limit_s,
+    )
+    operators = Divided(machine, persons, is_guided, guided, unguided, session.stream("study operators"))
+    loads: dict[tuple[str, int], list[float]] = {}
+    for trial, recording in zip(todo, ground.run(machine, session, batch, operators), strict=True):
+        path = folder / folders.RECORDINGS / f"{trial.name}.parquet"
+        record.write(recording, path)
+        found = measure(recording, machine, design.holes[trial.hole], design.success, design.limit_s)
+        kind = type(guided if trial.condition == "guided" else unguided).__name__.lower()
+        facts: dict[str, Any] = {**asdict(trial), "hole": {"name": trial.hole, **asdict(design.holes[trial.hole])}}
+        facts |= {"limit_s": design.limit_s, "outcome": "inserted" if found["success"] else "time limit"}
+        facts |= {"recording": f"{folders.RECORDINGS}/{path.name}", "simulated": True, "operator": kind}
+        folders.write_trial(folder, trial.name, facts)
+        loads.setdefault((trial.participant, trial.period), []).append(
+            found["time_s"] / design.limit_s + 0.1 * found["control_effort"]
+        )
+    generator = session.generator("study questionnaires")
+    own = {name: generator.normal(0.0, 10.0) for name in names}
+    for (participant, period), load in loads.items():
+        answers = answered(float(np.mean(load)), own[participant], generator)
+        folders.write_questionnaire(folder, participant, period, {**answers, "simulated": True})
+
+
+def answered(load: float, habit: float, generator: np.random.Generator) -> dict[str, Any]:
+    """Returns a questionnaire as made up from how long and busy the trials were; it has the form of answers, no more."""
+    middle = 25.0 + 60.0 * load + habit
+    ratings = {
+        scale: int(np.clip(tlx.STEP * round((middle + generator.normal(0.0, 8.0)) / tlx.STEP), 0, 100)) for scale in tlx.SCALES
+    }
+    chosen = [{"pair": list(pair), "chosen": pair[int(generator.integers(2))]} for pair in tlx.pairs(generator)]
+    return {"ratings": ratings, "pairs": chosen, "note": NOTICE}
+
+
+class Divided:
+    """Operators of two kinds, each in the trials of their condition.
+
+    Args:
+        machine: The machine.
+        persons: Number of the person in each trial, `(N,)`.
+        is_guided: In which trials advice is shown, `(N,)` bool.
+        guided: Operators with advice.
+        unguided: Operators without.
+        seed: Who the persons are.
+    """
+
+    def __init__(
+        self, machine: Machine, persons: np.ndarray, is_guided: np.ndarray, guided: Operator, unguided: Operator, seed: int
+    ) -> None:
+        self._shape = (len(persons), machine.num_joints)
+        self._parts: list[tuple[np.ndarray, OperatorModel]] = [
+            (rows, operator.build(machine, persons[rows], seed))
+            for rows, operator in ((np.flatnonzero(is_guided), guided), (np.flatnonzero(~is_guided), unguided))
+            if len(rows)
+        ]
+
+    def step(self, view: OperatorView) -> np.ndarray:
+        """See `brokk_rl.contracts.OperatorModel`."""
+        given = np.zeros(self._shape)
+        for rows, model in self._parts:
+            given[rows] = model.step(OperatorView(view.q[rows], view.rim_in_base_m[rows], view.advice[rows]))
+        return given
