@@ -121,7 +121,7 @@ class _Training:
         total = torch.zeros((), device=self._device)
         log.info("%d frames to train on, %d to judge by, %s", len(self._train), len(self._unseen), self._device)
         begun = time.monotonic() - self._seconds
-        with _progress(self._update, settings.updates) as advance:
+        with training_data.forkable(), _progress(self._update, settings.updates) as advance:
             for picture, target in self._loader():
                 total += self._step(picture, target)
                 self._update += 1
@@ -286,7 +286,7 @@ def _several(folders: str | tuple[str, ...]) -> tuple[str, ...]:
 
 def _alone(_: int) -> None:
     """Keeps each process that makes samples to one core: there is one for each."""
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(0)
     torch.set_num_threads(1)
 
 

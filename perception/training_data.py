@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,6 +137,17 @@ class Batches:
 
     def __len__(self) -> int:
         return self._last - self._first
+
+
+@contextmanager
+def forkable() -> Iterator[None]:
+    """Keeps OpenCV from threads of its own while processes are forked: in those it would wait for threads that are not there."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(0)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def frames(folders: Sequence[str]) -> list[Path]:

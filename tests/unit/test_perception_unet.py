@@ -75,6 +75,14 @@ def test_a_small_network_learns_the_block_in_seconds(brokk: Callable[..., Any], 
     }  # fmt: skip
 
 
+def test_processes_make_the_same_samples(brokk: Callable[..., Any], frames: Path) -> None:
+    command = ("mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=4", "training.validate_every=2")
+    assert brokk(*command, "session.out=alone").code == 0
+    assert brokk(*command, "session.out=two", "training.workers=2").code == 0
+    one, other = (json.loads(Path(name, "training.json").read_text())["curve"] for name in ("alone", "two"))
+    assert one == other
+
+
 def test_an_interrupted_training_goes_on_exactly(brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     command = (
         "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=9", "training.validate_every=3",
