@@ -12,6 +12,7 @@ import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -31,6 +32,9 @@ from deploy.loop.records import Exchange
 from deploy.loop.station import Setting
 from deploy.loop.target import Target, TargetSource
 from deploy.loop.terminal import table
+from deploy.loop.wanted import Recorder, Wanted
+from deploy.page.from_loop import Beside
+from deploy.page.settings import OperatorPage
 from deploy.policy.adviser import Counsel
 from deploy.policy.bundle import Bundle
 from deploy.recorder.capture import Capture
@@ -62,6 +66,7 @@ class Loop:
         realtime: Whether to ask for real-time priority.
         seconds: When to stop; `null`: when told to.
         show: Whether to show levers and state in the terminal.
+        page: The operator's page; `null`: none.
     """
 
     wire: Wire
@@ -78,6 +83,7 @@ class Loop:
     realtime: bool
     seconds: float | None
     show: bool
+    page: OperatorPage | None
 
     def check(self) -> None:
         if self.armed and not self.commands:
@@ -102,17 +108,19 @@ class Loop:
         full_rad = float(LeverMap(self.guidance.levers or machine.levers, machine).full_rad.max())
         Bundle(self.policy, machine)
         exchange = Exchange.new(machine.num_joints, self.commands)
-        children = _Children(exchange)
+        children, recorder = _Children(exchange), self._recorder(exchange, machine, session.folder)
         try:
             for companion in companions:
                 children.start(companion.name, companion.target, companion.arguments, companion.realtime if self.realtime else None)
             self._start(children, machine, session)
-            write_json(session.folder / PROCESSES, children.pids)
-            self._watch(children, exchange, full_rad)
+            recorder.refresh()
+            write_json(session.folder / PROCESSES, children.pids | recorder.pids)
+            self._watch(children, exchange, full_rad, Wanted(exchange, recorder, self.armed, self.commands))
         except KeyboardInterrupt:
             log.info("stopping")
         finally:
             children.end()
+            recorder.end(PATIENCE_S)
             _report(exchange, session)
             exchange.close()
 
@@ -121,20 +129,29 @@ class Loop:
         counsel = Counsel(machine, self.policy, self.guidance, self.limits.joints_s, self.target_s, self.pitch_rad)
         children.start("bus", "deploy.loop.station:run", (setting,), BUS_PRIORITY if self.realtime else None)
         children.start("policy", "deploy.policy.adviser:run", (counsel,), POLICY_PRIORITY if self.realtime else None)
-        if self.record:
-            facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
-            children.start("log", "deploy.recorder.capture:run", (Capture(session.folder, self.dbc, machine, facts),), None)
+        if self.page is not None:
+            beside = Beside(self.page, machine, self.guidance, session, self.limits.joints_s, self.limits.levers_s, self.target_s)
+            children.start("page", "deploy.page.from_loop:run", (beside,), None)
 
-    def _watch(self, children: _Children, exchange: Exchange, full_rad: float) -> None:
+    def _recorder(self, exchange: Exchange, machine: Machine, folder: Path) -> Recorder:
+        facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
+
+        def start(folder: Path) -> Child:
+            capture = Capture(folder, self.dbc, machine, facts)
+            return Child("log", "deploy.recorder.capture:run", (capture, exchange), exchange.files)
+
+        recorder = Recorder(exchange, folder, start)
+        recorder.wanted = self.record
+        return recorder
+
+    def _watch(self, children: _Children, exchange: Exchange, full_rad: float, wanted: Wanted) -> None:
         """Shows, refreshes the borehole and looks after the children until it is time to stop."""
         target, end_s = self.target.build(), None if self.seconds is None else time.monotonic() + self.seconds
         with contextlib.ExitStack() as stack:
             live = stack.enter_context(Live(console=Console(stderr=True), refresh_per_second=10)) if self.show else None
             while end_s is None or time.monotonic() < end_s:
                 self._refresh(target, exchange)
-                controls = exchange.controls.new()
-                controls["t_s"], controls["armed"] = time.monotonic(), self.armed
-                exchange.controls.write(controls)
+                wanted.refresh()
                 children.check()
                 if live is not None:
                     live.update(table(view(exchange), full_rad))
@@ -182,15 +199,15 @@ class _Children:
             if child.code is None:
                 continue
             self.running.remove(child)
-            if child.name == "log":
-                log.error("ALARM: the log has died (exit code %s); nothing is recorded any more", child.code)
+            if child.name == "page":
+                log.error("ALARM: the operator's page has died (exit code %s); nothing is shown any more", child.code)
             else:
                 raise LinkError(f"the {child.name} process has died (exit code {child.code}); what it said stands above")
 
     def end(self) -> None:
-        """Ends policy before bus before log, so that each can say goodbye to the next; companions last."""
-        order = {"policy": 0, "bus": 1, "log": 2}
-        for child in sorted(self.running, key=lambda child: order.get(child.name, 3)):
+        """Ends policy before bus, so that it can say goodbye; companions last."""
+        order = {"policy": 0, "bus": 1}
+        for child in sorted(self.running, key=lambda child: order.get(child.name, 2)):
             child.end(PATIENCE_S)
 
 
@@ -202,5 +219,5 @@ def _report(exchange: Exchange, session: Session) -> None:
             "%s: %d cycles of %.0f ms, %d missed, late by %.1f ms (99 %%), %.1f ms at most",
             one["process"], one["cycles"], 1e3 * one["period_s"], one["missed"], 1e3 * one["late_p99_s"], 1e3 * one["late_max_s"],
         )  # fmt: skip
-    dropped = exchange.bus_log.dropped + exchange.policy_log.dropped
+    dropped = sum(pipe.dropped for pipe in exchange.logs)
     write_json(session.folder / TIMING, {"processes": reports, "log_dropped": dropped, "last": view(exchange).plain()})

@@ -7,6 +7,7 @@ drop. However slow a browser is, or if this process dies, the loop feels nothing
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,9 +24,11 @@ from deploy.loop.process import Stop
 from deploy.loop.records import Exchange
 from deploy.loop.station import TEXT
 from deploy.page.scene import approach
-from deploy.page.settings import OperatorPage
+from deploy.page.settings import LINK, OperatorPage
 from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Vector, Wish
 from deploy.study.chain import tool
+
+log = logging.getLogger(__name__)
 
 ADVICE_PERIODS = 3
 """Control periods without a new advice from which the last one is stale."""
@@ -62,7 +65,12 @@ def run(stop: Stop, beside: Beside, exchange: Exchange) -> None:
     Raises:
         LinkError: the address is taken.
     """
-    beside.page.serve(stop, beside.machine, LoopFeed(beside, exchange), beside.session, lambda link: None)
+    link = beside.session.folder / LINK
+
+    def tell(address: str) -> None:
+        log.info("%s; the link that may also have things done stands in %s", address.partition("#")[0], link)
+
+    beside.page.serve(stop, beside.machine, LoopFeed(beside, exchange), beside.session, tell)
 
 
 class LoopFeed:

@@ -16,7 +16,7 @@ const DE = {
   "machine status missing": "Maschinenzustand fehlt", "remote missing": "Fernbedienung fehlt", "joint positions missing": "Gelenkstellungen fehlen",
   "joint positions not plausible": "Gelenkstellungen unglaubwürdig", "messages corrupted": "Nachrichten verfälscht",
   "somebody else sends commands": "Ein anderer sendet Befehle", "operator moves a lever": "Bediener bewegt Hebel", "no fresh command": "Kein frischer Befehl",
-  "command is no number, or beyond full": "Befehl ungültig", "exclusive joint together with others": "Gelenk darf nur allein fahren", "not armed": "nicht scharf",
+  "command is no number, or beyond full": "Befehl ungültig", "exclusive joint together with others": "Gelenk darf nur allein fahren", "not armed": "nicht scharf", "the gateway does not follow": "Steuergerät folgt nicht",
   "nothing from the bus": "Nichts vom Bus", "positions are stale": "Gelenkstellungen veraltet", "positions are not plausible": "Gelenkstellungen unglaubwürdig",
   "history is filling": "Sammelt Messwerte", "no borehole is known": "Kein Bohrloch bekannt",
   "the borehole was found too long ago": "Bohrloch zu lange nicht gesehen", "the policy's answer makes no sense": "Vorschlag unbrauchbar",

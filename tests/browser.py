@@ -1,0 +1,105 @@
+"""A page's server in a thread, a feed that shows what a test says, and a headless Chromium."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from composed import option
+
+from brokk_rl.machine import Machine
+from brokk_rl.signals import Frame
+from deploy.page.server import Server
+from deploy.page.settings import OperatorPage
+from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Wish
+
+TOKEN = "correct horse battery staple"
+CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-headless-shell")
+# the page itself is painted by the processor: a card that is only simulated would be kept busy with it
+FLAGS = ["--no-sandbox", "--disable-gpu-compositing", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+LEVERS = Levers(0.0, 0.0, 0.0, 0.0, False)
+SHOWN = Shown(
+    t_s=0.0, alive=True, guiding=True, advice=Advice(True, "valid", 1, LEVERS, None), own=LEVERS, q=(0.0, -0.95, 0.55, 1.15, 0.6),
+    streams=tuple(Stream(name, 0.0, 1e6) for name in ("positions", "levers", "advice", "borehole")),
+    safety=Safety(False, "SILENT", "nothing", True, False, True), recording=Recording(False, 0.0, 0),
+    targets=(
+        Target("A", (2.6, 0.0, 0.75), (0.0, 0.0, 1.0), 0.05, 0.002, 0.97, True),
+        Target("B", (2.2, 0.4, 0.75), (0.0, 0.0, 1.0), 0.05, None, None, False),
+    ),
+    path_in_base_m=((2.6, 0.3, 1.2), (2.6, 0.0, 1.05), (2.6, 0.0, 0.65)), block_in_base_m=None,
+)  # fmt: skip
+"""All is well, all levers in neutral."""
+
+
+class Scripted:
+    """Shows `now` and remembers what came back."""
+
+    def __init__(self, now: Shown = SHOWN) -> None:
+        self.now, self.picture = now, None
+        self.wishes: list[Wish] = []
+        self.seen: list[Drawn] = []
+
+    def shown(self) -> Shown:
+        return self.now
+
+    def frame(self, after_s: float) -> Frame | None:
+        return self.picture if self.picture is not None and self.picture.t_s > after_s else None
+
+    def wish(self, wish: Wish) -> bool:
+        self.wishes.append(wish)
+        return True
+
+    def drawn(self, drawn: Drawn) -> None:
+        self.seen.append(drawn)
+
+    def advise(self, number: int, due_s: float | None = None, **axes: Any) -> None:
+        """Advises these lever positions, of full."""
+        self.now = replace(self.now, advice=Advice(True, "valid", number, replace(LEVERS, **axes), due_s))
+
+
+@contextmanager
+def served(feed: Any, port: int = 0, machine: Machine | None = None, **changes: Any) -> Iterator[int]:
+    """Serves the page of `conf/page/local.yaml` with `changes`; yields the port."""
+    page: OperatorPage = replace(option("page", "local"), port=port, token=TOKEN, **changes)
+    server = Server(page, machine or option("machine", "brokk170"), feed, TOKEN)
+    ready, ending, found, failed = threading.Event(), threading.Event(), list[int](), list[BaseException]()
+
+    def serve() -> None:
+        try:
+            asyncio.run(server.run(ending.is_set, lambda at: (found.append(at), ready.set())))
+        except BaseException as error:
+            failed.append(error)
+            ready.set()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        assert ready.wait(20)
+        if failed:
+            raise failed[0]
+        yield found[0]
+    finally:
+        ending.set()
+        thread.join(20)
+        assert not thread.is_alive()
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Yields a headless Chromium."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium: apt-get install chromium, or set CHROMIUM to its path")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()

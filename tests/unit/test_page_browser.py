@@ -1,0 +1,302 @@
+"""The operator's page as a person has it before them: in a real browser, against a real server."""
+
+from __future__ import annotations
+
+import io
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import LEVERS, SHOWN, TOKEN, Scripted, chromium, served
+from PIL import Image
+
+from brokk_rl.signals import Frame
+from deploy.page.shown import Stream, Wish
+
+SIZE = {"width": 1280, "height": 800}
+TRAVEL = 95.0
+GREEN, BLUE = np.array([0, 117, 43]), np.array([10, 75, 209])
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def feed() -> Scripted:
+    return Scripted()
+
+
+@pytest.fixture
+def port(feed: Scripted) -> Iterator[int]:
+    with served(feed) as found:
+        yield found
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Callable[..., Any]]:
+    """Opens pages; what the browser complains about fails the test."""
+    contexts, complaints = [], []
+
+    def open_page(port: int, token: str | None = TOKEN, scene: bool = False, query: str = "", **how: Any) -> Any:
+        contexts.append(browser.new_context(viewport=SIZE, locale="en-GB", **how))
+        page = contexts[-1].new_page()
+        if not scene:
+            page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("requestfinished", lambda request: None if f":{port}/" in request.url else complaints.append(request.url))
+        page.goto(f"http://localhost:{port}/{query}" + (f"#token={token}" if token else ""))
+        until(page, "() => window.measured?.drawn > 0")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def eventually(claim: Callable[[], bool], seconds: float = 10.0) -> None:
+    end_s = time.monotonic() + seconds
+    while not claim():
+        assert time.monotonic() < end_s, "it did not come true"
+        time.sleep(0.02)
+
+
+def until(page: Any, claim: str, seconds: float = 20.0) -> None:
+    """Waits for something on a page; Playwright's own way needs `eval`, which the page forbids."""
+    eventually(lambda: page.evaluate(claim), seconds)
+
+
+def drawn(page: Any) -> dict[str, tuple[float, float]]:
+    """Returns where each mark is drawn, of full travel: psi to the right, theta up."""
+    text = page.evaluate(
+        """() => Object.fromEntries(["left", "right"].flatMap(side => ["own", "advised"].map(what =>
+        [`${side} ${what}`, document.querySelector(`#${side} > g.${what}`).getAttribute("transform")])))"""
+    )
+    found = {}
+    for name, transform in text.items():
+        x, y = map(float, re.findall(r"-?[\d.]+", transform))
+        found[name] = (x / TRAVEL, -y / TRAVEL)
+    return found
+
+
+def test_levers_are_drawn_where_they_are_and_should_be(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port)
+    feed.now = replace(feed.now, own=replace(LEVERS, left_theta=0.5, left_psi=-0.25, right_theta=-1.0, right_psi=1.0))
+    feed.advise(2, left_theta=-0.75, left_psi=1.0, right_theta=0.1, right_psi=-0.6)
+    eventually(lambda: drawn(page)["left advised"] != (0.0, 0.0))
+    found = drawn(page)
+    assert found["left own"] == pytest.approx((-0.25, 0.5), abs=1e-3)
+    assert found["left advised"] == pytest.approx((1.0, -0.75), abs=1e-3)
+    assert found["right own"] == pytest.approx((1.0, -1.0), abs=1e-3)
+    assert found["right advised"] == pytest.approx((-0.6, 0.1), abs=1e-3)
+
+
+def test_pixels_are_green_where_the_lever_should_be_and_blue_where_it_is(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
+    page = opened(port)
+    own, advised = (0.8, -0.5), (-0.4, 0.6)  # psi, theta
+    feed.now = replace(feed.now, own=replace(LEVERS, left_psi=own[0], left_theta=own[1]))
+    feed.advise(2, left_psi=advised[0], left_theta=advised[1])
+    eventually(lambda: drawn(page)["left advised"] != (0.0, 0.0))
+    box = page.locator("#left").bounding_box()
+    picture = np.asarray(Image.open(io.BytesIO(page.locator("#left").screenshot())).convert("RGB")).astype(int)
+    scale = min(box["width"], box["height"]) / 260
+    middle = np.array([picture.shape[1] / 2, picture.shape[0] / 2])
+
+    def center(color: np.ndarray, radius: float, about: tuple[float, float]) -> np.ndarray:
+        """Returns the middle of what has that colour near a position, of full travel."""
+        y, x = np.nonzero((np.abs(picture - color) < 12).all(-1))
+        at = (np.stack([x + 0.5, y + 0.5], 1) - middle) / (scale * TRAVEL) * [1, -1]
+        near = at[(np.abs(at - about) < radius).all(1)]
+        assert len(near) > 30
+        return (near.min(0) + near.max(0)) / 2
+
+    np.testing.assert_allclose(center(GREEN, 0.31, advised), advised, atol=0.02)  # the diamond, without what leads to it
+    blue = center(BLUE, 0.155, own)
+    np.testing.assert_allclose(blue, own, atol=0.03)
+
+
+def test_the_button_is_announced_and_then_green(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port)
+    button = page.locator("#button")
+    assert "q2: Release button" in button.inner_text()
+    feed.advise(2, due_s=1.2)
+    page.wait_for_selector("#button.due")
+    assert "1.2 s" in button.inner_text()
+    began_s = time.monotonic()
+    feed.advise(3, due_s=0.0, button_right=True, right_theta=0.5)
+    page.wait_for_selector("#button.now")
+    assert time.monotonic() - began_s < 2.0
+    assert button.evaluate("node => getComputedStyle(node).backgroundColor") == "rgb(0, 117, 43)"
+    assert "HOLD" in button.inner_text()
+    assert page.locator("#right text", has_text="q2").count() == 1, "the shared axis bears the name of the joint that is meant"
+
+
+def test_what_is_stale_is_grey_and_says_so(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port)
+    feed.advise(2, due_s=0.0, button_right=True, right_theta=0.5)
+    page.wait_for_selector("#button.now")
+    old = tuple(replace(one, age_s=0.4, limit_s=0.15) if one.name == "advice" else one for one in SHOWN.streams)
+    feed.now = replace(feed.now, streams=old)
+    page.wait_for_selector("#left.stale")
+    page.wait_for_selector("#button.stale:not(.now)")
+    stroke = page.locator("#left .advised .target").evaluate("node => getComputedStyle(node).stroke")
+    assert stroke == "rgb(118, 118, 118)"
+    assert page.locator("#streams li.stale").get_attribute("data-stream") == "advice"
+    assert page.locator("#right .own circle").evaluate("node => getComputedStyle(node).fill") == "rgb(10, 75, 209)", (
+        "the rest stays"
+    )
+
+
+def test_a_stream_that_stops_grows_old_by_itself(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    feed.now = replace(feed.now, streams=(Stream("positions", 0.0, 0.1), *SHOWN.streams[1:]))
+    page = opened(port)
+    page.wait_for_selector("#streams li[data-stream=positions]:not(.stale)")
+    page.evaluate("performance.now = (real => () => real() + 500)(performance.now.bind(performance))")  # half a second without news
+    page.wait_for_selector("body.lost, #streams li.stale[data-stream=positions]")
+
+
+def test_together_within_the_tolerance_is_said_by_more_than_colour(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port)
+    feed.now = replace(feed.now, own=replace(LEVERS, left_psi=0.45, right_psi=0.3))
+    feed.advise(2, left_psi=0.5, right_psi=0.5)
+    page.wait_for_selector("#left.together")
+    assert page.locator("#left .tick").evaluate("node => getComputedStyle(node).visibility") == "visible"
+    assert page.locator("#right.together").count() == 0
+
+
+def test_the_page_comes_back_after_the_server_was_away(feed: Scripted, opened: Callable[..., Any]) -> None:
+    with served(feed) as port:
+        page = opened(port)
+        page.wait_for_selector("body:not(.lost)")
+    page.wait_for_selector("body.lost")
+    assert page.locator("#connection").inner_text() == "NO CONNECTION"
+    feed.advise(7, left_psi=0.9)
+    with served(feed, port):
+        page.wait_for_selector("body:not(.lost)")
+        eventually(lambda: drawn(page)["left advised"] == pytest.approx((0.9, 0.0), abs=1e-3))
+        page.keyboard.press("g")
+        eventually(lambda: feed.wishes == [Wish("start", "")])
+
+
+def test_safety_and_connection_are_told_apart_in_words(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port)
+    assert page.locator("#safety.good").inner_text() == "Listens only"
+    assert SHOWN.safety is not None
+    feed.now = replace(SHOWN, safety=replace(SHOWN.safety, commands=True, state="LATCHED", trip="messages corrupted"))
+    page.wait_for_selector("#safety.bad")
+    assert page.locator("#safety").inner_text() == "LATCHED – messages corrupted"
+    feed.now = replace(SHOWN, safety=replace(SHOWN.safety, estop=True, trip="emergency stop"))
+    until(page, "document.getElementById('safety').textContent.includes('EMERGENCY STOP')")
+    page.wait_for_selector("#deadman.careful")
+    feed.now = replace(SHOWN, alive=False)
+    page.wait_for_selector("#connection.bad")
+    assert page.locator("#left.stale").count() == 1
+
+
+def test_german(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port, query="?lang=de")
+    assert page.locator("html").get_attribute("lang") == "de"
+    assert page.locator("#safety").inner_text() == "Hört nur zu"
+    assert "STOPP" in page.locator("#stop").inner_text()
+    assert SHOWN.advice is not None
+    feed.now = replace(SHOWN, advice=replace(SHOWN.advice, valid=False, reason="no borehole is known"))
+    page.wait_for_selector("#advice.none")
+    assert page.locator("#advice").inner_text() == "Kein Bohrloch bekannt"
+    page.keyboard.press("l")
+    assert page.locator("#stop b").inner_text() == "STOP"
+
+
+def test_everything_is_done_by_keys_and_by_gloves(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port, query="?lang=de")
+    for key, wish in (
+        ("g", Wish("start", "")),
+        ("Escape", Wish("stop", "")),
+        ("r", Wish("record", "on")),
+        ("2", Wish("target", "B")),
+    ):
+        page.keyboard.press(key)
+        eventually(lambda wish=wish: feed.wishes[-1:] == [wish])
+    for name, wish in (("#start", Wish("start", "")), ("#stop", Wish("stop", "")), ("#record", Wish("record", "on"))):
+        page.click(name)
+        eventually(lambda wish=wish: feed.wishes[-1] == wish)
+    for button in page.locator("button").all():
+        box = button.bounding_box()
+        assert min(box["width"], box["height"]) >= 15 / 25.4 * 96, button.inner_text()  # 15 mm by CSS
+        assert box["x"] >= 0 and box["x"] + box["width"] <= SIZE["width"] and box["y"] + box["height"] <= SIZE["height"]
+    reached = set()
+    for _ in range(10):
+        page.keyboard.press("Tab")
+        reached.add(page.evaluate("document.activeElement.id || document.activeElement.dataset.target"))
+    assert {"language", "scene", "A", "B", "start", "stop", "record"} <= reached
+
+
+def test_without_dead_man_or_token_nothing_is_done_and_the_page_says_why(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
+    assert SHOWN.safety is not None
+    feed.now = replace(SHOWN, safety=replace(SHOWN.safety, deadman=False))
+    page = opened(port)
+    page.click("#start")
+    until(page, "document.getElementById('answer').textContent === 'Refused: hold the dead-man'")
+    assert feed.wishes == []
+    page.click("#stop")
+    eventually(lambda: feed.wishes == [Wish("stop", "")])
+    feed.now = SHOWN
+    for token in ("wrong", None):
+        stranger = opened(port, token=token)
+        stranger.click("#stop")
+        until(stranger, "document.getElementById('answer').textContent.startsWith('No access')")
+    time.sleep(0.2)
+    assert len(feed.wishes) == 1
+
+
+def test_the_token_leaves_the_address_bar(port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port)
+    assert TOKEN not in page.url
+    page.reload()
+    until(page, "() => window.measured?.drawn > 0")
+    page.keyboard.press("Escape")
+    until(page, "document.getElementById('answer').textContent === ''")
+
+
+def test_two_pages_show_the_same_and_say_when(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    pages = [opened(port), opened(port)]
+    began_s = time.monotonic()
+    feed.advise(41, left_psi=0.3)
+    for page in pages:
+        eventually(lambda page=page: drawn(page)["left advised"][0] == pytest.approx(0.3, abs=1e-3))
+    eventually(lambda: len([one for one in feed.seen if one.number == 41]) == 2)
+    seen = [one for one in feed.seen if one.number == 41]
+    assert {one.page for one in seen} == {1, 2}
+    for one in seen:
+        assert began_s - one.round_trip_s <= one.t_s <= time.monotonic() + one.round_trip_s
+
+
+def test_the_scene_shows_machine_points_and_picture(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    color = np.zeros((90, 160, 3), np.uint8)
+    color[:] = (230, 20, 200)  # nothing else on the page is magenta
+    pose = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.6], [0, 0, 0, 1]])
+    matrix = np.array([[120.0, 0, 79.5], [0, 120.0, 44.5], [0, 0, 1.0]])
+    feed.now = replace(SHOWN, streams=(*SHOWN.streams, Stream("camera", 0.0, 1e6)))
+    page = opened(port, scene=True)
+    until(page, "window.measured.frames === 0")
+    feed.picture = Frame(color, np.full((90, 160), 3.0, np.float32), matrix, pose, 1.0)
+    until(page, "window.measured.frames >= 1 && window.measured.points === 14400")
+    eventually(lambda: _share(page, "#scene", [230, 20, 200]) > 0.05, 20)
+    assert _share(page, "#scene", [190, 130, 10], 60) > 0.005, "the machine's paint"
+    assert _share(page, "#picture", [230, 20, 200]) > 0.8
+    assert page.locator("#noscene").is_hidden()
+
+
+def _share(page: Any, name: str, color: list[int], within: int = 25) -> float:
+    picture = np.asarray(Image.open(io.BytesIO(page.locator(name).screenshot())).convert("RGB")).astype(int)
+    return float((np.abs(picture - color) < within).all(-1).mean())

@@ -1,0 +1,254 @@
+"""Who may ask the page's server for what, how frames are coded, whose clock it was."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from browser import SHOWN, TOKEN
+from composed import option
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.signals import Frame
+from deploy.page import access, cloud
+from deploy.page.clock import PageClock
+from deploy.page.demo import Demo
+from deploy.page.files import load
+from deploy.page.newest import Room
+from deploy.page.scene import approach
+from deploy.page.settings import link
+from deploy.page.shown import Stream, Wish
+
+MINE = access.names("127.0.0.1", 8170, ())
+
+
+@pytest.mark.parametrize("host", ["localhost:8170", "127.0.0.1:8170", "[::1]:8170"])
+def test_a_page_of_this_server_may_connect(host: str) -> None:
+    assert access.same_origin(f"http://{host}", host, MINE)
+
+
+@pytest.mark.parametrize(
+    ("origin", "host"),
+    [
+        ("http://evil.example", "localhost:8170"),
+        ("http://localhost:9999", "localhost:8170"),
+        ("https://localhost:8170", "localhost:8170"),
+        ("http://127.0.0.1:8170", "localhost:8170"),
+        ("null", "localhost:8170"),
+        ("http://evil.example:8170", "evil.example:8170"),  # DNS rebinding: its own origin, but not our name
+        (None, "evil.example:8170"),
+        (None, None),
+    ],
+)
+def test_nobody_else_may(origin: str | None, host: str | None) -> None:
+    assert not access.same_origin(origin, host, MINE)
+
+
+def test_in_a_network_the_names_are_those_of_the_configuration() -> None:
+    names = access.names("0.0.0.0", 80, ("site.lan",))
+    assert "site.lan:80" in names
+    assert "evil.example:80" not in names
+
+
+def test_only_the_whole_token_fits() -> None:
+    assert access.token_fits(TOKEN, TOKEN)
+    assert not any(access.token_fits(given, TOKEN) for given in (None, 7, "", TOKEN[:-1], TOKEN + " ", [TOKEN], "ключ"))
+
+
+def test_wishes_are_read() -> None:
+    assert access.read_wish('{"kind": "record", "value": "on"}') == Wish("record", "on")
+    assert access.read_wish('{"kind": "stop", "value": ""}') == Wish("stop", "")
+
+
+@given(
+    st.text(max_size=300)
+    | st.recursive(st.none() | st.floats() | st.text(), lambda v: st.lists(v) | st.dictionaries(st.text(), v)).map(json.dumps)
+)
+def test_nonsense_is_no_wish_and_no_error(text: str) -> None:
+    assert access.read_wish(text) is None
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        {"kind": "arm", "value": ""},
+        {"kind": "record", "value": "maybe"},
+        {"kind": "stop", "value": "x"},
+        {"kind": "stop"},
+        {"kind": ["stop"], "value": ""},
+        {"kind": "target", "value": "A" * 300},
+        {"kind": "target", "value": ""},
+        {"kind": "stop", "value": "", "token": "x"},
+    ],
+)
+def test_a_wish_that_is_not_quite_one_is_none(found: dict[str, object]) -> None:
+    assert access.read_wish(json.dumps(found)) is None
+
+
+def test_without_the_dead_man_only_stop_goes_through() -> None:
+    assert SHOWN.safety is not None
+    released = replace(SHOWN, safety=replace(SHOWN.safety, deadman=False))
+    stopped = replace(SHOWN, safety=replace(SHOWN.safety, estop=True))
+    old = replace(SHOWN, streams=(Stream("levers", 0.2, 0.15),))
+    dead, unknown = replace(SHOWN, alive=False), replace(SHOWN, safety=None)
+    for shown in (released, stopped, old, dead, unknown):
+        for wish in (Wish("start", ""), Wish("record", "on"), Wish("record", "off"), Wish("target", "A")):
+            assert access.refusal(wish, shown) == "deadman"
+        assert access.refusal(Wish("stop", ""), shown) is None
+    assert access.refusal(Wish("start", ""), SHOWN) is None
+    assert access.refusal(Wish("target", "B"), SHOWN) is None
+    assert access.refusal(Wish("target", "C"), SHOWN) == "target"
+
+
+def frame(height: int, width: int) -> Frame:
+    chance = np.random.default_rng(3)
+    depth_m = chance.uniform(0.3, 9.0, (height, width)).astype(np.float32)
+    depth_m[chance.random((height, width)) < 0.2] = np.nan
+    color = np.full((height, width, 3), (200, 30, 60), np.uint8)
+    return Frame(color, depth_m, np.array([[400.0, 0, 50.0], [0, 410.0, 30.0], [0, 0, 1]]), np.eye(4), 4.5)
+
+
+def test_depth_comes_back_to_the_millimetre_and_unknown_stays_unknown() -> None:
+    sent = frame(17, 33)
+    message = cloud.encode(sent, 640, 90)
+    length = int.from_bytes(message[:4], "little")
+    header = json.loads(message[4 : 4 + length])
+    back_m = cloud.depth_m(message[4 + length : 4 + length + header["depth_bytes"]], header["width"], header["height"])
+    np.testing.assert_array_equal(np.isnan(back_m), np.isnan(sent.depth_m))
+    assert np.nanmax(np.abs(back_m - sent.depth_m)) <= 0.00051
+    assert (header["focal_px"], header["center_px"], header["t_s"]) == ([400.0, 410.0], [50.0, 30.0], 4.5)
+
+
+def test_the_picture_is_a_jpeg_in_the_right_colours() -> None:
+    message = cloud.encode(frame(16, 32), 640, 95)
+    length = int.from_bytes(message[:4], "little")
+    jpeg = message[4 + length + json.loads(message[4 : 4 + length])["depth_bytes"] :]
+    with Image.open(io.BytesIO(jpeg)) as picture:
+        red, green, blue = picture.convert("RGB").getpixel((16, 8))
+    assert abs(red - 200) < 8 and abs(green - 30) < 8 and abs(blue - 60) < 8
+
+
+def test_a_frame_is_shrunk_and_its_camera_with_it() -> None:
+    message = cloud.encode(frame(40, 80), 40, 80)
+    header = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
+    assert (header["width"], header["height"], header["focal_px"]) == (40, 20, [200.0, 205.0])
+
+
+def test_what_is_too_far_or_infinite_is_unknown() -> None:
+    units = cloud.differences(np.array([[np.inf, 70.0, -1.0, 0.5, np.nan]], np.float32)).cumsum(1, dtype=np.uint16)
+    assert units.tolist() == [[0, 0, 0, 500, 0]]
+
+
+def test_depth_and_colour_of_different_sizes_are_refused() -> None:
+    with pytest.raises(FrameError, match="expected one size"):
+        cloud.encode(replace(frame(16, 32), depth_m=np.ones((8, 8), np.float32)), 640, 80)
+
+
+@given(ahead_s=st.floats(-1e5, 1e5), out_s=st.floats(0.0001, 0.05), back_s=st.floats(0.0001, 0.05), drawing_s=st.floats(0, 0.1))
+def test_draw_times_are_right_within_half_the_round_trip(ahead_s: float, out_s: float, back_s: float, drawing_s: float) -> None:
+    clock = PageClock()
+    clock.sent(1, 7, 100.0)
+    came_s = 100.0 + out_s
+    times = [1000 * (t_s + ahead_s) for t_s in (came_s, came_s + drawing_s, came_s + drawing_s)]
+    said = clock.heard(json.dumps([1, *times]), came_s + drawing_s + back_s)
+    assert said is not None and said.advice == 7
+    assert math.isclose(clock.round_trip_s, out_s + back_s, abs_tol=1e-6)
+    assert abs(said.drawn_s - (came_s + drawing_s)) <= clock.round_trip_s / 2 + 1e-6
+
+
+def test_an_advice_becomes_visible_once() -> None:
+    clock = PageClock()
+    seen = []
+    for number, advice in enumerate([5, 5, 6, None, 6]):
+        clock.sent(number, advice, float(number))
+        said = clock.heard(json.dumps([number, 0, 1, 1]), number + 0.01)
+        assert said is not None
+        seen.append(said.advice)
+    assert seen == [5, None, 6, None, 6]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "[9, 0, 0, 0]", "[1, null, 0, 0]", "[1, 2, 3, 1]", '["1", 0, 0, 0]', "[[1], 0, 0, 0]", "[1, 0, NaN, 0]"]
+)
+def test_nonsense_about_draw_times_is_noticed(text: str) -> None:
+    clock = PageClock()
+    clock.sent(1, None, 0.0)
+    assert clock.heard(text, 1.0) is None
+
+
+def test_a_page_has_no_more_undrawn_messages_than_the_limit() -> None:
+    room = Room(2)
+    room.sent(1)
+    assert room._free.is_set()
+    room.sent(2)
+    assert not room._free.is_set()
+    room.drawn(2)  # drawn the newest: the one before is of no use either
+    assert room._free.is_set()
+
+
+def test_the_way_leads_over_the_rim_and_then_down_the_axis() -> None:
+    center_m, up = np.array([2.0, 0.0, 0.5]), np.array([0.0, 0.0, 1.0])
+    assert np.allclose(approach(np.array([1.0, 1.0, 1.0]), center_m, up), [(1, 1, 1), (2, 0, 0.8), (2, 0, 0.4)])
+    assert np.allclose(approach(np.array([2.0, 0.01, 0.6]), center_m, up), [(2.0, 0.01, 0.6), (2, 0, 0.4)])
+
+
+def test_the_demo_keeps_to_the_machine() -> None:
+    machine, now_s = option("machine", "brokk170"), [0.0]
+    demo: Demo = option("feed", "demo")
+    feed = replace(demo, frames=False).build(machine)
+    feed._clock, feed._began_s = lambda: now_s[0], 0.0
+    before, speeds = None, []
+    for k in range(600):
+        now_s[0] = 0.05 * k
+        shown = feed.shown()
+        assert shown.q is not None and shown.advice is not None
+        q = np.array(shown.q)
+        assert (q >= machine.lower).all() and (q <= machine.upper).all()
+        if before is not None:
+            speeds.append(np.abs(q - before) / 0.05 / machine.max_speed)
+        before = q
+        if shown.advice.levers.button_right:
+            assert shown.advice.button_due_s == 0.0
+            assert shown.advice.levers.right_psi == shown.advice.levers.left_psi == 0.0, "q2 alone"
+    assert np.max(speeds) <= 1.0
+    import torch
+
+    tip = Kinematics(machine).pose(torch.tensor([shown.q], dtype=torch.float32)).tip_in_base_m[0].numpy()
+    np.testing.assert_allclose(shown.path_in_base_m[0], tip, atol=1e-4)
+
+
+def test_the_link_carries_the_token_where_browsers_keep_it_to_themselves() -> None:
+    page = option("page", "local")
+    address = link(page, 8170, TOKEN)
+    assert address.index("#") < address.index(TOKEN)
+    assert TOKEN not in json.dumps(page.setup(option("machine", "brokk170")))
+
+
+@pytest.mark.parametrize("change", [{"token": "short"}, {"port": 70000}, {"rate_hz": 0.0}, {"jpeg_quality": 0}, {"clients": 0}])
+def test_settings_that_make_no_sense_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match="page"):
+        replace(option("page", "local"), **change)
+
+
+def test_both_languages_say_everything() -> None:
+    text = load(b"")["/words.js"][1].decode()
+    german, english = text.split("const EN")
+    keys = {
+        name: set(re.findall(r'(?:^|[{,]\s*)"?([\w\- ,\']+?)"?:\s*"', part, re.M))
+        for name, part in (("de", german), ("en", english))
+    }
+    assert keys["en"] <= keys["de"]
+    from deploy.guard import Trip
+    from deploy.policy.adviser import Advised
+
+    said = {one.value for one in (*Trip, *Advised)} - {"valid"}
+    assert said - {key for key in said if f'"{key}":' in german or f" {key}:" in german} == set()

@@ -1,0 +1,98 @@
+"""The page's server without a browser: who is refused, and what slow ones cost."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from browser import TOKEN, Scripted, served
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+
+@pytest.fixture
+def feed() -> Scripted:
+    return Scripted()
+
+
+@pytest.fixture
+def port(feed: Scripted) -> Iterator[int]:
+    with served(feed) as found:
+        yield found
+
+
+def talk(port: int, path: str, said: list[str], origin: str | None = "own", host: str | None = None) -> Any:
+    """Says `said` on a WebSocket; returns the answers, or the refusal."""
+
+    async def run() -> Any:
+        headers = {"Host": host} if host else {}
+        try:
+            own = f"http://localhost:{port}" if origin == "own" else origin
+            async with connect(f"ws://localhost:{port}{path}", origin=own, additional_headers=headers, proxy=None) as socket:  # type: ignore[arg-type]
+                answers = []
+                for text in said:
+                    await socket.send(text)
+                    answers.append(json.loads(await asyncio.wait_for(socket.recv(), 5)))
+                return answers
+        except InvalidStatus as error:
+            return error.response.status_code
+        except ConnectionClosed as error:
+            return error.rcvd.reason if error.rcvd else "closed"
+
+    return asyncio.run(run())
+
+
+def test_strangers_are_refused(feed: Scripted, port: int) -> None:
+    ours = json.dumps({"token": TOKEN})
+    assert talk(port, "/control", [ours]) == [{"ready": True}]
+    assert talk(port, "/control", [ours], origin="http://evil.example") == 403
+    assert talk(port, "/control", [ours], origin=None) == 403
+    assert talk(port, "/state", ["x"], origin="http://evil.example") == 403
+    assert talk(port, "/control", ['{"token": "wrong"}']) == "token"
+    assert talk(port, "/control", ["[]"]) == "token"
+    assert talk(port, "/control", [ours, "nonsense"]) == [{"ready": True}, {"refused": "malformed", "kind": ""}]
+    assert talk(port, "/elsewhere", ["x"]) == 404
+    assert feed.wishes == []
+
+
+def test_who_never_reads_or_answers_costs_the_others_nothing(feed: Scripted, port: int) -> None:
+    async def run() -> tuple[int, int]:
+        async with (
+            connect(f"ws://localhost:{port}/state", proxy=None) as slow,
+            connect(f"ws://localhost:{port}/state", proxy=None) as quick,
+        ):
+            last, end_s, count = 0, time.monotonic() + 1.5, 0
+            while time.monotonic() < end_s:
+                feed.advise(count)
+                last = json.loads(await quick.recv())["number"]
+                now_ms = 1000 * time.monotonic()
+                await quick.send(json.dumps([last, now_ms, now_ms, now_ms]))
+                count += 1
+            waiting = 0
+            while True:
+                try:
+                    await asyncio.wait_for(slow.recv(), 0.2)
+                    waiting += 1
+                except TimeoutError:
+                    return count, waiting
+
+    count, waiting = asyncio.run(run())
+    assert waiting == 4, "newest values only, and no more than four that were not drawn"
+    assert count > 10
+
+
+def test_a_page_that_says_nonsense_is_closed(port: int) -> None:
+    async def run() -> str:
+        async with connect(f"ws://localhost:{port}/state", proxy=None) as socket:
+            await socket.send("[1, 2]")
+            try:
+                while True:
+                    await asyncio.wait_for(socket.recv(), 5)
+            except ConnectionClosed as error:
+                return error.rcvd.reason if error.rcvd else ""
+
+    assert asyncio.run(run()) == "malformed"
