@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from brokk_rl.diagnosis.closed import Estimate, Gap, JointClosed
 from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.session import write_json
 
@@ -20,14 +21,6 @@ FILE = "diagnosis.json"
 
 Verdict = Literal["effects", "none", "unknown"]
 Stage = Literal["actuation", "sensing", "kinematics", "timing", "perception"]
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its 95 % interval."""
-
-    mean: float
-    ci95: tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,23 +90,6 @@ class Where:
 
 
 @dataclass(frozen=True)
-class Gap:
-    """Free-running error over 5 s on parts of the field recordings that were not fitted to, all joints together.
-
-    Attributes:
-        before: Of the simulator as it was.
-        after: With the selected effects.
-        floor: What it would be without any effect: the simulator's on left-out reference recordings.
-        closed: `(before - after) / (before - floor)`; `None` where there is no gap to close.
-    """
-
-    before: float
-    after: float
-    floor: float
-    closed: Estimate | None
-
-
-@dataclass(frozen=True)
 class NextExperiment:
     """The excitation that would tell most about what is left open, and between which effects."""
 
@@ -162,8 +138,10 @@ class Answer:
             "stage": self.where.stage,
         }
         gap = self.gap and {
-            **{name: {"rmse_rad": getattr(self.gap, name)} for name in ("before", "after", "floor")},
+            **{name: {self.gap.key: getattr(self.gap, name)} for name in ("before", "after", "floor")},
             "closed": None if self.gap.closed is None else _estimate(self.gap.closed),
+            "floor_of": self.gap.floor_of,
+            "joints": {name: dataclasses.asdict(one) for name, one in self.gap.joints.items()},
         }
         return {
             "schema": SCHEMA,
@@ -217,9 +195,7 @@ def _answer(found: dict[str, Any]) -> Answer:
         found["where"]["stage"],
         units,
     )
-    given = found["gap"]
-    errors = [given[name]["rmse_rad"] for name in ("before", "after", "floor")] if given else []
-    gap = Gap(errors[0], errors[1], errors[2], _read_estimate(given["closed"])) if given else None
+    gap = _read_gap(found["gap"]) if found["gap"] else None
     following = found.get("next_experiment")
     known = {"schema", *(one.name for one in dataclasses.fields(Answer))}
     return Answer(
@@ -233,6 +209,14 @@ def _answer(found: dict[str, Any]) -> Answer:
         reason=found.get("reason", ""),
         more={key: value for key, value in found.items() if key not in known},
     )
+
+
+def _read_gap(given: dict[str, Any]) -> Gap:
+    key = next(iter(given["before"]))
+    before, after, floor = (given[name][key] for name in ("before", "after", "floor"))
+    joints = {name: JointClosed(**one) for name, one in given.get("joints", {}).items()}
+    floor_of = given.get("floor_of", "reference")
+    return Gap(before, after, floor, _read_estimate(given["closed"]), key.removeprefix("rmse_"), floor_of, joints)
 
 
 def _selected(one: Selected) -> dict[str, Any]:

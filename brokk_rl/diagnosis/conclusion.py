@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from brokk_rl.contracts import Excitation
-from brokk_rl.diagnosis import engine, gap, separation, verdict
-from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Ranked, Selected, Where
+from brokk_rl.diagnosis import engine, separation, verdict
+from brokk_rl.diagnosis.answer import Answer, Estimate, NextExperiment, Ranked, Selected, Where
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.engine import Findings, Prices, Tell
 from brokk_rl.diagnosis.free_runs import FreeRuns
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.outcome import Outcome
-from brokk_rl.diagnosis.repair import repair
+from brokk_rl.diagnosis.reach import Reach, apart
+from brokk_rl.diagnosis.repair import Repair
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.survey import survey
 from brokk_rl.inspection import Thresholds
@@ -61,39 +62,38 @@ class Diagnosis:
 
     def _outcome(self, findings: Findings) -> Outcome:
         field, evidence = self.base.field, findings.evidence
-        measured = evidence.candidates.cut.measured
         before, floor = field.runs(field.evidence.base), self._floor()
         unknown = verdict.is_unknown(findings, self.prices)
         repaired = None if unknown else findings.repair
         found = [] if unknown else findings.others
         mean = 0.0 if evidence.mean is None else evidence.mean
         paths = repaired.after if repaired else evidence.base + mean if found else field.evidence.base
-        square, left = (gap.squares(one, measured) for one in (field.evidence.base, paths))
-        floors = self._floor_squares() if self.base.nulls else np.zeros(1)
-        share = gap.closed(square, left, floors, self.generator) if self.base.nulls else None
+        reach = Reach(self.base, self.case.machine, paths, repaired and repaired.own, self.generator)
+        foretold = reach.foretold()
         selected = [verdict.other(one, self.prices, self.case.machine) for one in found]
-        selected += self._selected(findings, square, floors) if repaired else []
+        selected += self._selected(findings, reach) if repaired else []
         selected.sort(key=lambda one: -one.probability)
         told = "unknown" if unknown else "effects" if selected else "none"
         after = field.runs(paths) if selected else None
         machine = self.case.machine
-        seen = survey(before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator, before)
+        seen = survey(before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator)
+        remainder = self._remainder(findings, reach) if selected else None
         answer = Answer(
             verdict=told,
             selected=tuple(selected),
             ranking=tuple(verdict.ranking(findings, selected, self.prices, machine, self._unknown_chance(findings))),
             where=seen.where(),
-            gap=Gap(gap.rmse(square), gap.rmse(left), gap.rmse(floors), share),
+            gap=reach.gap(),
             next_experiment=self._next(findings, selected),
-            reason=self._reason(told, findings, selected),
-            more=seen.more() | self._more(findings, share),
+            reason=self._reason(told, findings, selected, remainder),
+            more=seen.more() | self._more(findings, foretold) | {"unknown_remainder": remainder} | self._unseen(findings, repaired),
         )
         return Outcome(answer, before, after, floor)
 
-    def _selected(self, findings: Findings, square: np.ndarray, floors: np.ndarray) -> list[Selected]:
+    def _selected(self, findings: Findings, reach: Reach) -> list[Selected]:
         kinds = {kind.name: kind for kind in self.kinds}
         chosen = verdict.chosen_kinds(findings, kinds)
-        shares = gap.shapley([kind.name for kind in chosen], lambda names: self._closed_by(findings, names, square, floors))
+        shares = reach.by_effect(findings, [kind.name for kind in chosen])
         assert findings.repair is not None, "what is selected has been simulated"
         found = []
         for kind in chosen:
@@ -108,28 +108,31 @@ class Diagnosis:
                     joints=tuple(name for name, has in zip(self.case.machine.joint_names, joints, strict=True) if has),
                     probability=chance,
                     parameters=verdict.numbers(findings, kind, self.case.machine),
-                    gap_closed=Estimate(shares[kind.name], (shares[kind.name], shares[kind.name])),
+                    gap_closed=shares[kind.name],
                     same_as=like,
                     decided_by=decided,
                 )
             )
         return sorted(found, key=lambda one: -one.probability)
 
-    def _closed_by(self, findings: Findings, names: frozenset[str], square: np.ndarray, floors: np.ndarray) -> float:
-        """Returns the share of the gap that some of the chosen effects close, their sizes fitted anew."""
-        if not names:
-            return 0.0
-        whole = findings.repair
-        assert whole is not None, "only chosen effects close anything"
-        evidence = findings.evidence
-        if names == findings.chosen.names:
-            after = whole.after
-        else:
-            subsets = [subset & names for subset in findings.chosen.subsets]
-            start = [table.score(s).sizes for table, s in zip(findings.tables, subsets, strict=True)]
-            after = repair(evidence, subsets, findings.rays, start, steps=2).after
-        before, left = gap.rmse(square), gap.rmse(gap.squares(after, evidence.candidates.cut.measured))
-        return (before - left) / max(before - gap.rmse(floors), 0.02 * before)
+    def _remainder(self, findings: Findings, reach: Reach) -> dict[str, Any] | None:
+        """Returns what is left beside the effects that were named and has no name; `None` where that is nothing."""
+        predictable = verdict.unexplained(findings, self.prices) > 0
+        names = self.case.machine.joint_names
+        beyond = reach.beyond()
+        joints = [name for name, more in zip(names, predictable, strict=True) if more or name in beyond]
+        if not joints:
+            return None
+        told = [name for name, more in zip(names, predictable, strict=True) if more]
+        why = f"a flexible model still predicts the error of {', '.join(told)}" if told else ""
+        over = f"the error of {', '.join(beyond)} exceeds the floor" if beyond else ""
+        return {"joints": joints, "reason": "; ".join(filter(None, (why, over)))}
+
+    def _unseen(self, findings: Findings, repaired: Repair | None) -> dict[str, Any]:
+        """Returns how far the effects carry on recordings apart."""
+        if not self.case.unseen or repaired is None:
+            return {}
+        return {"unseen": apart(findings, self.case.unseen, self.case.machine)}
 
     def _next(self, findings: Findings, selected: Sequence[Selected]) -> NextExperiment | None:
         """Returns the experiment that would separate what is left open: classes, and rivals that earn nearly as much."""
@@ -162,9 +165,6 @@ class Diagnosis:
             paths.append(one.evidence.base)
         return FreeRuns(recordings, np.concatenate(source), np.concatenate(row), np.concatenate(paths).astype(float))
 
-    def _floor_squares(self) -> np.ndarray:
-        return np.concatenate([gap.squares(one.evidence.base, one.evidence.candidates.cut.measured) for one in self.base.nulls])
-
     def _dead_time_s(self) -> np.ndarray:
         return np.full(self.case.machine.num_joints, self.case.machine.dead_time_s)
 
@@ -174,7 +174,7 @@ class Diagnosis:
             return max(0.5, verdict.probability(left, self.prices))
         return min(0.5, verdict.probability(left - 4.0 * self.prices.temperature, self.prices))
 
-    def _more(self, findings: Findings, share: Estimate | None) -> dict[str, Any]:
+    def _more(self, findings: Findings, foretold: Estimate | None) -> dict[str, Any]:
         names = self.case.machine.joint_names
         rivals = [
             {
@@ -196,12 +196,13 @@ class Diagnosis:
         return {
             "evidence": {"rivals": rivals, "threshold": self.prices.name + self.prices.joint, "unit": "log likelihood"},
             "remainder": left,
-            "predicted_closed": share.mean if share else None,
+            "predicted_closed": foretold and {"mean": foretold.mean, "ci95": list(foretold.ci95)},
         }
 
-    def _reason(self, told: str, findings: Findings, selected: Sequence[Selected]) -> str:
+    def _reason(self, told: str, findings: Findings, selected: Sequence[Selected], remainder: Mapping[str, Any] | None) -> str:
         if told == "effects":
-            return "; ".join(f"{one.effect} on {', '.join(one.joints) or 'the machine'}" for one in selected)
+            text = "; ".join(f"{one.effect} on {', '.join(one.joints) or 'the machine'}" for one in selected)
+            return text + (f"; an unknown remainder on {', '.join(remainder['joints'])}" if remainder else "")
         if told == "unknown":
             joints = np.flatnonzero(verdict.unexplained(findings, self.prices) > 0)
             where = ", ".join(self.case.machine.joint_names[j] for j in joints)
@@ -212,10 +213,8 @@ class Diagnosis:
         """Returns the answer of recordings that cannot tell anything."""
         field = self.base.field
         runs, floor = field.runs(field.evidence.base), self._floor()
-        measured = field.evidence.candidates.cut.measured
-        square = gap.squares(field.evidence.base, measured)
-        floors = self._floor_squares() if self.base.nulls else np.zeros(1)
-        known = Gap(gap.rmse(square), gap.rmse(square), gap.rmse(floors), None)
+        known = Reach(self.base, self.case.machine, field.evidence.base, None, self.generator).gap()
+        known = replace(known, closed=None)
         answer = Answer(
             verdict="unknown", selected=(), ranking=(Ranked("unknown", (), 1.0),), where=Where({}, (), None), gap=known,
             next_experiment=None, reason=f"cannot tell, because {why}",

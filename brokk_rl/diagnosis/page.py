@@ -36,7 +36,7 @@ def write(outcome: Outcome, folder: Path, machine: Machine) -> None:
     for remark in more.get("sanity", []):
         if remark["severity"] == "bad":
             page.text(_remark(remark), "bad")
-    _causes(page, outcome)
+    _causes(page, outcome, machine)
     _where(page, outcome, machine)
     _paths(page, outcome, machine)
     _growth(page, outcome, machine)
@@ -48,7 +48,7 @@ def write(outcome: Outcome, folder: Path, machine: Machine) -> None:
     page.write(folder / PAGE)
 
 
-def _causes(page: Page, outcome: Outcome) -> None:
+def _causes(page: Page, outcome: Outcome, machine: Machine) -> None:
     answer = outcome.answer
     page.heading("Effects")
     if not answer.selected:
@@ -86,9 +86,12 @@ def _causes(page: Page, outcome: Outcome) -> None:
         page.text(text)
     if answer.reason and answer.verdict == "none":
         page.text(f"{answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}.")
-    if isinstance(predicted := answer.more.get("predicted_closed"), float) and answer.gap and answer.gap.closed:
-        achieved = 100 * answer.gap.closed.mean
-        page.text(f"Before they were added, {100 * predicted:.0f} % were predicted to be closed; {achieved:.0f} % were.")
+    if (foretold := answer.more.get("predicted_closed")) and answer.gap and answer.gap.closed:
+        page.text(
+            f"Foretold, by the parts of the recordings that sizes were fitted to: {100 * foretold['mean']:.0f} % closed. "
+            f"Achieved, on parts that they were not fitted to: {100 * answer.gap.closed.mean:.0f} %."
+        )
+    _how_far(page, outcome, machine)
     for key, saying in (("undecided", "Left undecided"), ("remainder", "Remainder")):
         if isinstance(found := answer.more.get(key), str):
             page.text(f"{saying}: {found}")
@@ -100,6 +103,28 @@ def _causes(page: Page, outcome: Outcome) -> None:
         ]
         caption = "What a flexible model still predicts of the error that is left, and what it would by chance"
         page.table(["joint", "earned", "by chance"], rows, caption)
+
+
+def _how_far(page: Page, outcome: Outcome, machine: Machine) -> None:
+    """Tells errors before and after joint by joint, and on recordings apart."""
+    gap, unseen = outcome.answer.gap, outcome.answer.more.get("unseen")
+    if not outcome.answer.selected or gap is None or not gap.joints:
+        return
+    units = {joint.name: joint.unit for joint in machine.joints}
+    rows = []
+    for name, one in gap.joints.items():
+        floor = None if one.floor is None else f"{1e3 * one.floor:.1f}"
+        row = [f"{name} [m{units[name]}]", f"{1e3 * one.before:.1f}", f"{1e3 * one.after:.1f}", floor, f"{100 * one.share:.0f}"]
+        if unseen:
+            apart = unseen["joints"][name]
+            row += [f"{1e3 * apart['before']:.1f}", f"{1e3 * apart['after']:.1f}", f"{100 * apart['share']:.0f}"]
+        rows.append(row)
+    columns = ["joint", "before", "after", "floor", "% less"]
+    caption = "Root mean square error of free runs of 5 s on parts of the recordings that sizes were not fitted to"
+    if unseen:
+        columns += ["unseen: before", "after", "% less"]
+        caption += f"; unseen: {unseen['recordings']} recordings ({unseen['seconds']:.0f} s) that nothing was fitted to"
+    page.table(columns, rows, caption)
 
 
 def _where(page: Page, outcome: Outcome, machine: Machine) -> None:

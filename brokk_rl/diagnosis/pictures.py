@@ -14,6 +14,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, NullFormatter
 
+from brokk_rl.diagnosis import wording
 from brokk_rl.diagnosis.answer import Answer
 from brokk_rl.diagnosis.free_runs import FreeRuns
 from brokk_rl.diagnosis.growth import READINGS, curve
@@ -39,17 +40,23 @@ def ladder(answer: Answer) -> Figure | None:
         return None
     figure = Figure(figsize=(9.5, 2.0), layout="constrained")
     axis = figure.add_subplot()
-    rows = [("before", gap.before, BEFORE), ("floor", gap.floor, FLOOR)]
-    if answer.selected:
-        rows.insert(1, ("after", gap.after, AFTER))
+    rows = [("before", gap.before, BEFORE)]
+    rows += [("after", gap.after, AFTER)] if answer.selected else []
+    rows += (
+        [] if gap.floor is None else [("floor" if gap.floor_of == "reference" else f"{gap.floor_of}\n(floor)", gap.floor, FLOOR)]
+    )
+    scale = 100.0 if gap.unit == "travel" else 1e3
     for place, (_, width, colour) in enumerate(rows):
-        axis.barh(place, 1e3 * width, color=colour, height=0.62)
-        axis.annotate(f"{1e3 * width:.1f} mrad", (1e3 * width, place), (6, 0), textcoords="offset points", va="center")
+        axis.barh(place, scale * width, color=colour, height=0.62)
+        told = wording.size(width, gap.unit)
+        axis.annotate(told, (scale * width, place), (6, 0), textcoords="offset points", va="center")
     axis.set_yticks(range(len(rows)), [row[0] for row in rows])
     axis.invert_yaxis()
-    axis.axvline(1e3 * gap.floor, color=FLOOR, lw=1.0, ls=":")
-    axis.set_xlim(0.0, 1e3 * max(gap.before, gap.after, gap.floor) * 1.16)
-    axis.set_xlabel("error over 5 s free runs, all joints, RMS [mrad]")
+    if gap.floor is not None:
+        axis.axvline(scale * gap.floor, color=FLOOR, lw=1.0, ls=":")
+    axis.set_xlim(0.0, scale * max(width for _, width, _ in rows) * 1.16)
+    unit = "% of travel" if gap.unit == "travel" else f"m{gap.unit}"
+    axis.set_xlabel(f"error over 5 s free runs, all joints, RMS [{unit}]")
     clean(axis)
     return figure
 

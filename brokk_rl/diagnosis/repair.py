@@ -18,6 +18,8 @@ from brokk_rl.diagnosis.sizes import PRIOR
 
 STEPS = 6
 """Steps of a fit at most."""
+FEW = 2
+"""The same where it is only to be told what is left without some effects."""
 STEP = 0.05
 """Finite difference, of the typical size."""
 STARTS = (1.0, 0.5, 1.6)
@@ -44,7 +46,8 @@ class Repair:
         sizes: Fitted to all entries, `(R, J)`.
         halves: Fitted to the entries outside of each half, `(2, R, J)`.
         after: Positions of free runs with the sizes that were not fitted to their window, `(W, K, J)`.
-        z: Errors of these over the noise, `(J, E)`.
+        own: The same with the sizes that were fitted to their half: what `after` is foretold by.
+        z: Errors of `after` over the noise, `(J, E)`.
         deviation: Standard errors of the sizes, `(R, J)`.
     """
 
@@ -53,6 +56,7 @@ class Repair:
     sizes: np.ndarray
     halves: np.ndarray
     after: np.ndarray
+    own: np.ndarray
     z: np.ndarray
     deviation: np.ndarray
 
@@ -100,15 +104,7 @@ def repair(
         start: Sizes of each effect along its rays, by joint and name.
         steps: Steps of each fit at most.
     """
-    chosen = [(ray, place) for name in sorted(frozenset().union(*subsets)) for place, ray in enumerate(rays[name])]
-    mask = np.array([[ray.kind.name in subset for subset in subsets] for ray, _ in chosen])
-    sizes = np.array(
-        [
-            [start[j][ray.kind.name][place] if ray.kind.name in subset else 0.0 for j, subset in enumerate(subsets)]
-            for ray, place in chosen
-        ]
-    )
-    found = [ray for ray, _ in chosen]
+    found, mask, sizes = _laid_out(subsets, rays, start)
     every, halves = np.ones((1, len(evidence.fold))), np.stack([evidence.fold != 0, evidence.fold != 1]).astype(float)
     fit = _Fit(evidence, found, mask)
     whole = fit.descended(fit.nearest(sizes)[None], every, steps)
@@ -116,9 +112,37 @@ def repair(
     z, slopes, _ = _linear(evidence, found, whole)
     z_apart, paths = fit.simulated(apart)
     half = evidence.fold.reshape(len(evidence.way), -1)[:, 0]
-    after = np.where((half == 0)[:, None, None], paths[0], paths[1]) + (0.0 if evidence.mean is None else evidence.mean)
+    first = (half == 0)[:, None, None]
+    mean = 0.0 if evidence.mean is None else evidence.mean
+    after, own = np.where(first, paths[0], paths[1]) + mean, np.where(first, paths[1], paths[0]) + mean
     held = np.where(evidence.fold == 0, z_apart[0], z_apart[1])
-    return Repair(found, mask, whole[0], apart, after, held, _deviation(z[0], slopes[0], evidence, mask))
+    return Repair(found, mask, whole[0], apart, after, own, held, _deviation(z[0], slopes[0], evidence, mask))
+
+
+def refitted(
+    evidence: Evidence,
+    subsets: Sequence[frozenset[str]],
+    rays: Mapping[str, Sequence[Ray]],
+    start: Sequence[Mapping[str, np.ndarray]],
+) -> np.ndarray:
+    """Returns free runs `(W, K, J)` with a set of effects, sizes fitted to all entries in a few steps from `start`."""
+    found, mask, sizes = _laid_out(subsets, rays, start)
+    fit = _Fit(evidence, found, mask)
+    sizes = fit.descended(fit.nearest(sizes)[None], np.ones((1, len(evidence.fold))), FEW)
+    return fit.simulated(sizes)[1][0] + (0.0 if evidence.mean is None else evidence.mean)
+
+
+def _laid_out(
+    subsets: Sequence[frozenset[str]], rays: Mapping[str, Sequence[Ray]], start: Sequence[Mapping[str, np.ndarray]]
+) -> tuple[list[Ray], np.ndarray, np.ndarray]:
+    """Returns the rays of a set, which joints have them `(R, J)`, and sizes to begin at `(R, J)`."""
+    chosen = [(ray, place) for name in sorted(frozenset().union(*subsets)) for place, ray in enumerate(rays[name])]
+    mask = np.array([[ray.kind.name in subset for subset in subsets] for ray, _ in chosen])
+    sizes = [
+        [start[j][ray.kind.name][place] if ray.kind.name in subset else 0.0 for j, subset in enumerate(subsets)]
+        for ray, place in chosen
+    ]
+    return [ray for ray, _ in chosen], mask, np.array(sizes)
 
 
 def searched(

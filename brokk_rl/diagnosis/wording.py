@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from brokk_rl.diagnosis.answer import Answer, Estimate, Selected
+from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, Selected
 from brokk_rl.report import Tone
 
 MOST = 0.5
@@ -14,24 +14,40 @@ MOST = 0.5
 def headline(answer: Answer) -> tuple[str, Tone]:
     """Returns the answer in two or three sentences, and whether it is good news."""
     gap = answer.gap
-    size = ""
+    told = ""
     if gap is not None:
-        size = f" Error over 5 s free runs: {1e3 * gap.before:.1f} mrad before"
-        size += f", {1e3 * gap.after:.1f} mrad after" if answer.selected else ""
-        size += f"; the floor is {1e3 * gap.floor:.1f} mrad."
+        told = f" Error over 5 s free runs: {size(gap.before, gap.unit)} before"
+        told += f", {size(gap.after, gap.unit)} after" if answer.selected else ""
+        told += "; " + _floor(gap) + "."
     if answer.verdict == "none":
-        return f"No gap: the simulator is as right about these recordings as about its own.{size}", "good"
+        return f"No gap: the simulator is as right about these recordings as about its own.{told}", "good"
     if answer.verdict == "unknown":
         place = _place(answer)
         because = f" {answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}." if answer.reason else ""
         start = f"There is a gap that no effect of the library explains{place}" if place else "There is no telling"
-        return f"{start}.{because}{size}", "warn"
+        return f"{start}.{because}{told}", "warn"
     names = listed([named(one) for one in answer.selected])
     closed = gap.closed if gap else None
-    share = f" closes {100 * closed.mean:.0f} % of the gap (95 %: {_percent_range(closed)})." if closed else "."
-    it = "it" if len(answer.selected) == 1 else "them"
+    left_over = answer.more.get("unknown_remainder")
+    rest = f" An unknown remainder is left on {listed(left_over['joints'])}." if left_over else ""
     tone: Tone = "good" if closed is not None and closed.ci95[0] > MOST else "warn"
-    return f"The simulator lacks {names}; adding {it}{share}{size}" if closed else f"The simulator lacks {names}.{size}", tone
+    if closed is None:
+        return f"The simulator lacks {names}.{told}{rest}", tone
+    it = "it" if len(answer.selected) == 1 else "them"
+    share = f"{100 * closed.mean:.0f} % of the gap (95 %: {_percent_range(closed)})"
+    return f"The simulator lacks {names}; adding {it} closes {share}.{told}{rest}", tone
+
+
+def size(value: float, unit: str) -> str:
+    """Returns an error as a person reads it: in mrad, mm, or in percent of the joints' travel where units differ."""
+    return f"{100 * value:.1f} % of travel" if unit == "travel" else f"{1e3 * value:.1f} m{unit}"
+
+
+def _floor(gap: Gap) -> str:
+    if gap.floor is None:
+        return "without a reference, and with too little data for a flexible model, the floor is not known"
+    whose = "" if gap.floor_of == "reference" else f", that of a {gap.floor_of} on field recordings it was not fitted to"
+    return f"the floor is {size(gap.floor, gap.unit)}{whose}"
 
 
 def named(one: Selected) -> str:
@@ -69,10 +85,14 @@ def left(answer: Answer) -> str:
     gap = answer.gap
     if gap is None or not answer.selected:
         return ""
-    above = 1e3 * max(gap.after**2 - gap.floor**2, 0.0) ** 0.5
-    if above < 0.3 * 1e3 * gap.floor:
-        return f"What is left, {above:.1f} mrad beyond the floor, is within what the simulator errs by anyway."
-    return f"{above:.1f} mrad (RMS, beyond the floor) are left, which no effect of the library explains: an unknown remainder."
+    remainder = answer.more.get("unknown_remainder")
+    above = 0.0 if gap.floor is None else max(gap.after**2 - gap.floor**2, 0.0) ** 0.5
+    beyond = f"{size(above, gap.unit)} beyond the floor" if gap.floor is not None else size(gap.after, gap.unit)
+    if remainder:
+        return (
+            f"An unknown remainder is left on {listed(remainder['joints'])} ({beyond}): {remainder['reason']}, but no effect does."
+        )
+    return f"What is left, {beyond}, is within what the simulator errs by anyway." if gap.floor is not None else ""
 
 
 def estimate(value: Estimate | None, factor: float = 1.0, style: str = ".3g") -> tuple[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -34,12 +35,14 @@ class Subject:
     Attributes:
         case: Folder with `reference/` and `field/`; or `null`.
         field: Glob or globs of recordings of the machine as it is, held against `actuator`; instead of a case.
+        unseen: Glob or globs of further recordings of the machine as it is, to which nothing is fitted: how far the effects carry.
         effects: Names of the effects to choose among; `null`: all that are registered.
         prices: What an effect must earn.
     """
 
     case: str | None
     field: str | tuple[str, ...] | None
+    unseen: str | tuple[str, ...] | None
     effects: tuple[str, ...] | None
     prices: Prices
 
@@ -98,12 +101,13 @@ class Diagnose:
 
     def _case(self) -> Case:
         subject = self.diagnosis
+        unseen = record.read_all(subject.unseen, self.machine) if subject.unseen else ()
         if subject.case is not None:
-            return case.load(Path(subject.case), self.machine)
+            return replace(case.load(Path(subject.case), self.machine), unseen=unseen)
         assert subject.field is not None, "checked by Subject"
         if self.actuator is None:
             raise ConfigError("diagnosis.field needs a simulator to hold it against: add actuator=<name>")
-        return Case(self.machine, [], record.read_all(subject.field, self.machine))
+        return Case(self.machine, [], record.read_all(subject.field, self.machine), unseen)
 
     def _base(self, given: Case) -> Base:
         seed, device, folder = self.session.stream("base"), self.session.torch_device(), self.session.folder

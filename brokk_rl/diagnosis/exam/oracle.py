@@ -41,13 +41,13 @@ def closed_by(folder: Path, effects: Mapping[str, Sequence[str]], fit: ActuatorF
         for joint, errors in zip(machine.joint_names, found.errors, strict=True)
     ]
     measured = evidence.candidates.cut.measured
-    before = gap.rmse(gap.squares(evidence.base, measured))
-    floors = [gap.squares(one.evidence.base, one.evidence.candidates.cut.measured) for one in found.base.nulls]
+    before = gap.rmse(gap.squares(evidence.base, measured, machine))
+    floors = [gap.squares(one.evidence.base, one.evidence.candidates.cut.measured, machine) for one in found.base.nulls]
     floor = gap.rmse(np.concatenate(floors))
     if not any(subsets) or before < NO_GAP * floor:
         return None
     start = [_start(errors, subset) for errors, subset in zip(found.errors, subsets, strict=True)]
-    after = gap.rmse(gap.squares(repair(evidence, subsets, found.rays, start).after, measured))
+    after = gap.rmse(gap.squares(repair(evidence, subsets, found.rays, start).after, measured, machine))
     return (before - after) / (before - floor)
 
 
