@@ -104,7 +104,7 @@ class _Running:
 
     def _cycle(self, now_s: float) -> None:
         if (asked := self._port.poll(self._faults)) is not None:
-            log.info("fault: %s", asked)
+            log.debug("fault: %s", asked)
         faults, gateway = self._faults, self._gateway
         gateway.estop = faults.on("estop", "", now_s)
         if self._twin.remote:

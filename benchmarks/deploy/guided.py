@@ -1,0 +1,88 @@
+"""Insertion on the twin, guided and alone: python benchmarks/deploy/guided.py <folder> <trials> <at once> <person bundle>.
+
+Each trial is `preset=bench` with real processes, in real time. `guided`: the default mode, nothing is sent, a simulated person
+moves the levers as they are shown. `alone`: the shipped policy commands the valves itself. Success is the strict one, from the
+captured positions.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import hydra
+import numpy as np
+import torch
+from hydra.utils import instantiate
+
+from brokk_rl.kinematics import Kinematics
+from deploy.recorder import reading
+
+SECONDS = {"guided": 80, "alone": 60}
+"""Twice the time of one for two hands that move two levers at once, and some seconds until everything has started."""
+PORT = 43300
+
+
+def main(folder: Path, trials: int, at_once: int, bundle: str) -> None:
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        cfg = hydra.compose("config", overrides=["mode=evaluate"])
+    machine, task = instantiate(cfg.machine, _convert_="all"), instantiate(cfg.task, _convert_="all")
+    starts = task.build(machine, 1, torch.device("cpu")).starts(trials, 12345)
+    jobs = [(kind, n) for kind in SECONDS for n in range(trials)]
+
+    def one(job: tuple[str, int]) -> dict[str, object]:
+        kind, n = job
+        hole, q = starts["scene"][n, :3].tolist(), starts["q"][n].tolist()
+        out = folder / f"{kind}_{n:03d}"
+        choice = ["bench=guided", f"deploy.policy={bundle}"] if kind == "guided" else ["deploy=auto"]
+        command = [
+            str(Path(sys.executable).with_name("brokk")), "preset=bench", *choice, f"link.start={q}", f"link.hole_in_base_m={hole}",
+            f"target.center_in_base_m={hole}", f"bus.port={PORT + jobs.index(job)}", f"deploy.seconds={SECONDS[kind]}",
+            "deploy.show=false", f"session.seed={n}", f"session.out={out}",
+        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            return {"kind": kind, "trial": n, "error": done.stderr[-500:]}
+        return {"kind": kind, "trial": n, **judged(out, machine, task, np.array(hole))}
+
+    with ThreadPoolExecutor(at_once) as pool:
+        results = list(pool.map(one, jobs))
+    summary = {
+        kind: {"trials": trials, "success_strict": float(np.mean([bool(r.get("success")) for r in results if r["kind"] == kind]))}
+        for kind in SECONDS
+    }
+    alone = summary["alone"]["success_strict"]
+    found = {"summary": summary, "ratio": summary["guided"]["success_strict"] / max(alone, 1e-9), "trials": results}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "guided.json").write_text(json.dumps(found, indent=1) + "\n")
+    sys.stdout.write(json.dumps({key: found[key] for key in ("summary", "ratio")}) + "\n")
+
+
+def judged(out: Path, machine: object, task: object, hole: np.ndarray) -> dict[str, object]:
+    contents = reading.read(out / "capture.mcap")
+    positions = {}
+    for messages in contents.messages.values():
+        for name in machine.joint_names:
+            if f"Position_{name}" in messages[0][1]:
+                positions[name] = np.array([(t_s, values[f"Position_{name}"]) for t_s, values in messages])
+    if len(positions) < machine.num_joints:
+        return {"success": False, "error": "the twin was never heard"}
+    t_s = next(iter(positions.values()))[:, 0]
+    q = np.stack([np.interp(t_s, *positions[name].T) for name in machine.joint_names], 1)
+    tip = Kinematics(machine).pose(torch.tensor(q, dtype=torch.float32)).tip_in_base_m.numpy()
+    lateral = np.linalg.norm((tip - hole)[:, :2], axis=1)
+    rules = task.success
+    inside = (lateral <= task.hole.radius_m - rules.chisel_radius_m + rules.slack_m) & (hole[2] - tip[:, 2] >= rules.strict_depth_m)
+    timing = json.loads((out / "timing.json").read_text())
+    late = {one["process"]: one["late_p99_s"] for one in timing["processes"]}
+    moved = t_s[np.abs(q - q[0]).max(1) > 0.01]
+    first_s = float(t_s[inside.argmax()] - moved[0]) if inside.any() and len(moved) else None
+    sent = any(values.get("sent") for values in (message[1] for message in contents.messages.get("ValveCmd", [])))
+    return {"success": bool(inside.any()), "time_to_insert_s": first_s, "late_p99_s": late, "commands_sent": sent}
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])
