@@ -60,6 +60,7 @@ function draw() {
   drawSafety(shown, lost, good("levers"));
   drawLevers(shown, { own: good("levers"), advised: good("advice") && good("positions") && Boolean(shown.advice?.valid) });
   drawStreams(shown, since_s);
+  $("camera").hidden = !shown.streams.some(one => one.name === "camera");
   $("camera").classList.toggle("stale", !good("camera"));
   drawTargets(shown);
   $("start").setAttribute("aria-pressed", shown.guiding);
