@@ -50,8 +50,12 @@ class ContourArcs:
             in px; for an ellipse seen in part, as large a part of that.
         angle_rms_small: See `angle_rms_rad`.
         purity: Least part of the supporting edges, from corner to corner, that lies on the ellipse.
+        rest_px: Longest rest of a supporting edge, from corner to corner, that lies elsewhere, plus `rest_relative` per px of the
+            geometric mean semi-axis; asked where no size is given.
+        rest_relative: See `rest_px`.
         departure: Largest part of the circumference where the supporting chains run on beside the ellipse (spirals, hearts).
         evidence: Least decimal exponent by which the support is no accident.
+        score: Least score of an ellipse that is seen nearly all around; of half of one any will do.
         prior_slack: By how much wider the limits of residual, angle and departure are, and the one of purity lower, where a size is
             given: it shuts out most of what else they do, and rims are chipped.
         smallest_px: Least minor semi-axis.
@@ -75,8 +79,11 @@ class ContourArcs:
     angle_rms_rad: float
     angle_rms_small: float
     purity: float
+    rest_px: float
+    rest_relative: float
     departure: float
     evidence: float
+    score: float
     prior_slack: float
     smallest_px: float
     flattest: float
@@ -250,11 +257,17 @@ class ArcDetector:
         rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
         rms_limit, angle_limit = rms_limit[good], angle_limit[good]
         good = ellipse_support.gap(support >= 0, length) <= s.gap
-        good &= ellipse_support.purity(edges, support, length) >= s.purity / slack
+        purity, rest_px = ellipse_support.purity(edges, support, length)
+        size = np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3])
+        good &= purity >= s.purity / slack
+        good &= (rest_px <= s.rest_px + s.rest_relative * size) | (limits.lowest_px > 0)
         good &= (
             ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses)) <= s.departure * slack
         )
         score = coverage * np.clip(1 - 0.5 * spread / rms_limit, 0, 1) * np.clip(1 - 0.5 * angle / angle_limit, 0, 1)
+        good &= score * slack**2 >= s.score * np.clip(
+            3 * coverage - 1.5, 0.0, 1.0
+        )  # what is seen all around must fit well to count
         return Judged(candidates[good], support[good], rms[good], coverage[good], score[good])
 
     def _gather(
