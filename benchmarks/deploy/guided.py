@@ -29,6 +29,7 @@ PORT = 43300
 def main(folder: Path, trials: int, at_once: int, bundle: str) -> None:
     with hydra.initialize_config_module("conf", version_base="1.3"):
         cfg = hydra.compose("config", overrides=["mode=evaluate"])
+        has_page = "page" in hydra.compose("config", overrides=["preset=bench"])
     machine, task = instantiate(cfg.machine, _convert_="all"), instantiate(cfg.task, _convert_="all")
     starts = task.build(machine, 1, torch.device("cpu")).starts(trials, 12345)
     jobs = [(kind, n) for kind in SECONDS for n in range(trials)]
@@ -43,6 +44,8 @@ def main(folder: Path, trials: int, at_once: int, bundle: str) -> None:
             f"target.center_in_base_m={hole}", f"bus.port={PORT + jobs.index(job)}", f"deploy.seconds={SECONDS[kind]}",
             "deploy.show=false", f"session.seed={n}", f"session.out={out}",
         ]  # fmt: skip
+        if has_page:
+            command.append(f"page.port={PORT + 500 + jobs.index(job)}")
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
             return {"kind": kind, "trial": n, "error": done.stderr[-500:]}

@@ -7,13 +7,15 @@ die too or, in the kernel, go on repeating the last command while the program ha
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import can
+from can.io.blf import BLFParseError, BLFReader
 
-from brokk_rl.errors import LinkError
+from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -127,3 +129,85 @@ class OpenWire:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+@spec
+class Replay:
+    """Frames that were recorded once, said again in their own time: the same loop over yesterday's run. Nothing is sent.
+
+    Attributes:
+        path: BLF file; what the loop itself sent then is left out.
+        speed: Times real time.
+    """
+
+    path: str
+    speed: float
+
+    interface: ClassVar[str] = "replay"
+
+    def check(self) -> None:
+        if self.speed <= 0:
+            raise ConfigError(f"bus.speed: expected more than 0, got {self.speed}")
+
+    @property
+    def channel(self) -> str:
+        """The file."""
+        return self.path
+
+    def open(self, frame_ids: Sequence[int] | None = None) -> OpenReplay:
+        """Begins the replay; see `Wire.open`.
+
+        Raises:
+            LinkError: the file cannot be read.
+        """
+        try:
+            return OpenReplay(BLFReader(self.path), self.speed, None if frame_ids is None else frozenset(frame_ids))
+        except (OSError, ValueError, BLFParseError) as error:
+            raise LinkError(f"bus.path={self.path}: nothing can be replayed ({error})") from error
+
+
+class OpenReplay:
+    """A running replay; as `OpenWire`."""
+
+    def __init__(self, reader: BLFReader, speed: float, frame_ids: frozenset[int] | None) -> None:
+        self._reader, self._speed, self._frame_ids = reader, speed, frame_ids
+        self._messages, self._next = iter(reader), None
+        self._offset_s: float | None = None
+
+    def recv(self, timeout_s: float) -> Wired | None:
+        """Returns the next frame when its time has come; see `OpenWire.recv`.
+
+        Raises:
+            LinkError: the replay is over.
+        """
+        end_s = time.monotonic() + max(0.0, timeout_s)
+        if self._next is None:
+            self._next = self._following()
+        if self._offset_s is None:
+            self._offset_s = time.monotonic() - self._next.timestamp / self._speed
+        due_s = self._next.timestamp / self._speed + self._offset_s
+        time.sleep(max(0.0, min(due_s, end_s) - time.monotonic()))
+        if due_s > end_s:
+            return None
+        message, self._next = self._next, None
+        return Wired(message.arbitration_id, bytes(message.data), message.is_extended_id)
+
+    def send(self, frame: Wired) -> None:
+        """Sends nothing."""
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._reader.stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _following(self) -> can.Message:
+        for message in self._messages:
+            wanted = self._frame_ids is None or message.arbitration_id in self._frame_ids
+            if wanted and message.is_rx and not message.is_error_frame and not message.is_remote_frame:
+                return message
+        raise LinkError("bus: the replay is over")

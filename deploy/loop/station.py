@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from deploy.bus.description import Description
-from deploy.bus.wire import OpenWire, Wire, Wired
+from deploy.bus.wire import OpenReplay, OpenWire, Replay, Wire, Wired
 from deploy.guard import Decision, Guard, Request, State, Trip
 from deploy.limits import Limits
 from deploy.loop.process import Pace, Stop
@@ -48,7 +48,7 @@ class Setting:
         limits: Of the guard.
     """
 
-    wire: Wire
+    wire: Wire | Replay
     dbc: str
     machine: Machine
     limits: Limits
@@ -67,7 +67,7 @@ class Station:
         self._description = Description(setting.dbc, setting.machine)
         self._receiver = Receiver(self._description, setting.machine, setting.limits)
         self._guard = Guard(setting.limits, self._receiver.body)
-        self._bus: OpenWire | None = None
+        self._bus: OpenWire | OpenReplay | None = None
         self._was_down, self._reopen_s = False, 0.0
         self._log: list[bytes] = []
         self._counters: dict[str, int] = {}

@@ -1,0 +1,223 @@
+"""The bus: what is sent, how it is protected, and that every wire carries it alike."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import can
+import pytest
+from can.io.blf import BLFWriter
+from crccheck.crc import Crc8SaeJ1850
+from desk import DBC
+from desk import wire as udp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.machine import Machine
+from deploy.bus import description as described
+from deploy.bus.description import Description
+from deploy.bus.header import c_header
+from deploy.bus.protection import Channel, Fault, Trust, crc8
+from deploy.bus.wire import Replay, Wire, Wired
+
+
+@pytest.fixture(scope="module")
+def bus(machine: Machine) -> Description:
+    return Description(DBC, machine)
+
+
+@given(st.binary(max_size=8), st.integers(0, 0xFFFF))
+def test_the_crc_is_that_of_sae_j1850_over_data_and_data_id(data: bytes, data_id: int) -> None:
+    assert crc8(data, data_id) == Crc8SaeJ1850.calc(data + data_id.to_bytes(2, "little"))
+
+
+@settings(max_examples=50)
+@given(st.lists(st.floats(-1, 1), min_size=5, max_size=5), st.integers(0, 100))
+def test_commands_arrive_as_they_were_sent_to_half_a_step(machine: Machine, u: list[float], counter: int) -> None:
+    bus = Description(DBC, machine)
+    names = [f"Command_q{j}" for j in range(1, 6)]
+    data = bus.encode("ValveCmd", dict(zip(names, u, strict=True)) | {"CommandMode": 1}, counter)
+    values = bus.decode(bus.command, data)
+    assert isinstance(values, dict) and values["Counter"] == counter % 16 and values["CommandMode"] == 1
+    assert all(abs(values[name] - wanted) <= 0.001 + 1e-12 for name, wanted in zip(names, u, strict=True))
+
+
+def test_every_single_wrong_bit_is_found_in_every_message(bus: Description) -> None:
+    for layout in bus.layouts.values():
+        data = bus.encode(layout.name, {}, 3)
+        for bit in range(8 * len(data)):
+            wrong = bytearray(data)
+            wrong[bit // 8] ^= 1 << bit % 8
+            assert bus.decode(layout, bytes(wrong)) is Fault.CRC
+
+
+def test_a_message_under_the_name_of_another_is_found(bus: Description) -> None:
+    for one, other in itertools.permutations([layout for layout in bus.layouts.values() if layout.length == 8], 2):
+        assert bus.decode(other, bus.encode(one.name, {}, 1)) is Fault.CRC
+    assert bus.decode(bus.command, bus.encode("ValveCmd", {}, 1)[:-1]) is Fault.LENGTH
+
+
+def heard(channel: Channel, counters: list[int | None]) -> list[Fault | None]:
+    return [channel.refuse(Fault.CRC) if counter is None else channel.take(counter) for counter in counters]
+
+
+def test_a_channel_is_believed_after_two_messages_in_order() -> None:
+    channel = Channel(16)
+    heard(channel, [7])
+    assert channel.trust is Trust.INIT
+    heard(channel, [8])
+    assert channel.trust is Trust.VALID
+
+
+@pytest.mark.parametrize(
+    ("counters", "faults", "trust"),
+    [
+        ([0, 1, 2, 15, 0], [None, None, None, Fault.SEQUENCE, None], Trust.VALID),  # one out of order
+        ([14, 15, 0, 1], [None] * 4, Trust.VALID),  # the counter goes round
+        ([0, 1, 5, 6], [None] * 4, Trust.VALID),  # three lost
+        ([0, 1, 6, 7], [None, None, Fault.SEQUENCE, None], Trust.VALID),  # four lost: one error
+        ([0, 1, 1, 1], [None, None, Fault.REPEATED, Fault.REPEATED], Trust.INVALID),  # stands still
+        ([0, 1, None, None], [None, None, Fault.CRC, Fault.CRC], Trust.INVALID),
+        ([0, 1, None, 2, None, 3], [None, None, Fault.CRC, None, Fault.CRC, None], Trust.VALID),
+        ([None, None, None], [Fault.CRC] * 3, Trust.INIT),
+    ],
+    ids=str,
+)
+def test_a_channel_judges_by_counter_and_crc(counters: list[int | None], faults: list[Fault | None], trust: Trust) -> None:
+    channel = Channel(16)
+    assert heard(channel, counters) == faults
+    assert channel.trust is trust
+
+
+def test_what_became_invalid_needs_ten_good_messages() -> None:
+    channel = Channel(16)
+    heard(channel, [0, 1, None, None])
+    heard(channel, list(range(2, 11)))
+    assert channel.trust is Trust.INVALID
+    heard(channel, [11])
+    assert channel.trust is Trust.VALID
+
+
+def test_errors_that_come_often_but_never_twice_in_a_row_still_count() -> None:
+    channel = Channel(16)
+    story: list[int | None] = [0, 1]
+    for number in range(2, 16):
+        story += [None, number] if number % 2 == 0 else [None]
+    heard(channel, story)
+    assert channel.trust is Trust.INVALID
+
+
+def test_lost_messages_are_counted() -> None:
+    channel = Channel(16)
+    heard(channel, [0, 1, 4, 5])
+    assert channel.lost == 2
+
+
+def _virtual(tmp_path: Path) -> Wire:
+    return Wire(interface="virtual", channel=str(tmp_path), bitrate=None, port=None)
+
+
+def _udp(_: Path) -> Wire:
+    return udp()
+
+
+WIRES = pytest.mark.parametrize("make", [_virtual, _udp], ids=["virtual", "udp_multicast"])
+"""Every wire that this computer has; socketcan needs a kernel with CAN."""
+
+
+@WIRES
+def test_a_wire_carries_frames_to_all_others(make: Callable[[Path], Wire], tmp_path: Path) -> None:
+    wire, frame = make(tmp_path), Wired(0x0D001027, b"12345678")
+    with wire.open() as one, wire.open() as two, wire.open([0x123]) as three:
+        one.send(frame)
+        one.send(Wired(0x123, b"\x01", extended=False))
+        assert two.recv(1.0) == frame
+        assert three.recv(1.0) == Wired(0x123, b"\x01", extended=False)
+
+
+@WIRES
+def test_a_silent_wire_says_nothing_in_time(make: Callable[[Path], Wire], tmp_path: Path) -> None:
+    with make(tmp_path).open() as one:
+        assert one.recv(0.01) is None and one.recv(0.0) is None and one.recv(-1.0) is None
+
+
+@WIRES
+def test_a_closed_wire_is_an_error_and_may_be_closed_again(make: Callable[[Path], Wire], tmp_path: Path) -> None:
+    one = make(tmp_path).open()
+    one.close()
+    one.close()
+    with pytest.raises(LinkError):
+        one.send(Wired(1, b""))
+
+
+def test_a_wire_that_is_not_there_is_an_error_that_says_what_to_change() -> None:
+    with pytest.raises(LinkError, match=r"bus\.channel=nowhere"):
+        Wire(interface="socketcan", channel="nowhere", bitrate=None, port=None).open()
+
+
+def test_a_replay_says_what_was_recorded_in_its_own_time_and_sends_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "frames.blf"
+    with BLFWriter(path) as writer:
+        for number in range(5):
+            message = can.Message(timestamp=1000.0 + 0.02 * number, arbitration_id=0x100 + number, data=[number], is_rx=number != 3)
+            writer.on_message_received(message)
+    with Replay(path=str(path), speed=2.0).open() as one:
+        one.send(Wired(0x200, b""))
+        found = [one.recv(0.5) for _ in range(4)]
+        assert [frame.frame_id for frame in found if frame] == [0x100, 0x101, 0x102, 0x104]  # what was sent from here is left out
+        with pytest.raises(LinkError, match="over"):
+            one.recv(0.5)
+
+
+def test_a_replay_of_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(LinkError, match="nothing"):
+        Replay(path=str(tmp_path / "nothing.blf"), speed=1.0).open()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("Position_q3", "Pos3", "no signal 'Position_q3'"),
+        (" SG_ Crc : 56|8@1+ (1,0) [0|255] \"\" GATEWAY\n\nBO_ 2566918439", "\nBO_ 2566918439", "needs Counter, and Crc"),
+        ("BO_ 2365592067 JointPos1: 8", "BO_ JointPos1: 8", "no valid DBC"),
+    ],
+    ids=["signal", "crc", "syntax"],
+)  # fmt: skip
+def test_a_description_that_does_not_do_is_refused(machine: Machine, tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = described.located(DBC).read_text()
+    assert old in text
+    path = tmp_path / "other.dbc"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(ConfigError, match=message):
+        Description(str(path), machine)
+
+
+def test_another_layout_with_the_same_names_is_as_good(machine: Machine, tmp_path: Path) -> None:
+    text = (
+        described.located(DBC)
+        .read_text()
+        .replace("2365591591", "291")
+        .replace('"GenMsgCycleTime" BO_ 291 20', '"GenMsgCycleTime" BO_ 291 50')
+    )
+    path = tmp_path / "other.dbc"
+    path.write_text(text)
+    bus = Description(str(path), machine)
+    assert bus.command.frame_id == 291 and not bus.command.extended and bus.command.period_s == 0.05
+
+
+def test_a_description_for_other_joints_is_refused(machine: Machine) -> None:
+    other = replace(
+        machine, joints=tuple(replace(joint, name=f"j{n}") for n, joint in enumerate(machine.joints)), exclusive=(), levers=()
+    )
+    with pytest.raises(ConfigError, match="Command_j0"):
+        Description(DBC, other)
+
+
+def test_the_header_for_a_gateway_says_what_the_description_says(bus: Description) -> None:
+    text = c_header(bus)
+    assert "#define BROKK_VALVE_CMD_ID 0xD001027u" in text and "#define BROKK_VALVE_CMD_DATA_ID 0x1031u" in text
+    assert "#define BROKK_JOINT_POS1_PERIOD_MS 10u" in text and "brokk_crc8" in text
