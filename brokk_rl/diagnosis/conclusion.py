@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.contracts import Excitation
-from brokk_rl.diagnosis import engine, separation, verdict
+from brokk_rl.diagnosis import engine, separation, verdict, weighing
 from brokk_rl.diagnosis.answer import Answer, Estimate, NextExperiment, Ranked, Selected, Where
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.engine import Findings, Prices, Tell
@@ -81,7 +81,7 @@ class Diagnosis:
         answer = Answer(
             verdict=told,
             selected=tuple(selected),
-            ranking=tuple(verdict.ranking(findings, selected, self.prices, machine, self._unknown_chance(findings))),
+            ranking=tuple(verdict.ranking(findings, selected, self.prices, machine, verdict.unknown_chance(findings, self.prices))),
             where=seen.where(),
             gap=reach.gap(),
             next_experiment=self._next(findings, selected),
@@ -168,12 +168,6 @@ class Diagnosis:
     def _dead_time_s(self) -> np.ndarray:
         return np.full(self.case.machine.num_joints, self.case.machine.dead_time_s)
 
-    def _unknown_chance(self, findings: Findings) -> float:
-        left = verdict.unexplained(findings, self.prices).sum()
-        if verdict.is_unknown(findings, self.prices):
-            return max(0.5, verdict.probability(left, self.prices))
-        return min(0.5, verdict.probability(left - 4.0 * self.prices.temperature, self.prices))
-
     def _more(self, findings: Findings, foretold: Estimate | None) -> dict[str, Any]:
         names = self.case.machine.joint_names
         rivals = [
@@ -196,6 +190,7 @@ class Diagnosis:
         return {
             "evidence": {"rivals": rivals, "threshold": self.prices.name + self.prices.joint, "unit": "log likelihood"},
             "remainder": left,
+            "weighed": weighing.weighed(findings, self.prices),
             "predicted_closed": foretold and {"mean": foretold.mean, "ci95": list(foretold.ci95)},
         }
 

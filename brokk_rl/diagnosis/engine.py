@@ -127,10 +127,13 @@ class Search:
         on_tool = tool.search(self.case, self.kinds, prices.joint, prices.name)
         evidence = _adjusted(self.base.field.evidence, [*on_sensors, *on_tool.found])
         grown, shapes = self._simulated(evidence, tool.is_tracked(self.case.field, self.case.machine))
-        known = Nulls(self.base, {name: rays(ways[0].kind, SMALL) for name, ways in grown.items()}, grown)
+        known = Nulls(
+            self.base, {name: rays(ways[0].kind, SMALL) for name, ways in grown.items()}, grown, plain_joints(evidence), shapes
+        )
 
         def price(j: int, subset: frozenset[str]) -> float:
-            return prices.joint * len(subset) + prices.reference * known.earned(j, subset)
+            known_there = max(prices.reference * known.earned(j, subset), known.repeated(j, subset))
+            return prices.joint * len(subset) + known_there
 
         scatter = np.ones(self.case.machine.num_joints)
         tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)

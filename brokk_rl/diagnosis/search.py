@@ -24,7 +24,7 @@ NAMES = 12
 """Names among which whole sets are chosen."""
 LEAST = 0.15
 """Smallest size, over the typical one, that is worth naming: what is smaller any simulator gets wrong."""
-SURELY = 2.0
+SURELY = 1.0
 """Standard errors by which a set must earn more than a simpler one."""
 TRIED = 14
 """Subsets of each joint that are tried on the reference too."""
@@ -148,10 +148,7 @@ def choose(
     """
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
-        paying = [s for s in list(table.scored) if s and table.scored[s].total > least * len(s) and _each_adds(s, table, share)]
-        paying.sort(key=lambda s: table.scored[s].total, reverse=True)
-        promising = [s for place, s in enumerate(paying) if place < TRIED or len(s) == 1]
-        priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising}
+        priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising(table, least, share)}
         worth.append({subset: value for subset, value in priced.items() if value > 0})
     felt = [shared & table.shapes.keys() for table in tables]
     best = _best(worth, felt, name_price, partial)
@@ -201,6 +198,13 @@ def _simpler(
         if lost < max(SURELY * blocks.std() * np.sqrt(len(blocks)), share * whole):
             return other
     return None
+
+
+def promising(table: Table, least: float, share: float) -> list[Subset]:
+    """Returns the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most."""
+    paying = [s for s in list(table.scored) if s and table.scored[s].total > least * len(s) and _each_adds(s, table, share)]
+    paying.sort(key=lambda s: table.scored[s].total, reverse=True)
+    return [s for place, s in enumerate(paying) if place < TRIED or len(s) == 1]
 
 
 def _each_adds(subset: Subset, table: Table, share: float) -> bool:

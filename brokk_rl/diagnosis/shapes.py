@@ -12,7 +12,7 @@ import numpy as np
 
 from brokk_rl.diagnosis.evidence import Evidence, Ray
 from brokk_rl.diagnosis.noise import loss
-from brokk_rl.diagnosis.search import Table
+from brokk_rl.diagnosis.search import Scored, Table
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.sizes import Plain, Shape, fitted, plain, predicted
 
@@ -20,6 +20,8 @@ SHAPES = (0.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
 SMALL = (0.12, 0.5)
 """Sizes at which effects are simulated on the reference: what they find there is small."""
+THERE = 3.0
+"""Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be there already."""
 FELT = 1e-3
 """An effect that changes errors over the noise by less does nothing to a joint."""
 
@@ -68,30 +70,54 @@ def _all(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:
 
 @dataclass
 class Nulls:
-    """What sets of effects earn on reference recordings; an effect is simulated there when it is first asked for."""
+    """What sets of effects earn on reference recordings; an effect is simulated there when it is first asked for.
+
+    Attributes:
+        base: The simulator, and parts of the reference that it was not fitted to.
+        rays: Ways in which each effect grows, at small sizes.
+        grown: The same as they are simulated in the field.
+        plain: Errors of each joint in the field.
+        shapes: What each effect does to each joint in the field.
+        tables: Of each part and joint.
+        known: Effects that were simulated on the reference.
+    """
 
     base: Base
     rays: Mapping[str, Sequence[Ray]]
     grown: Mapping[str, Sequence[Ray]]
+    plain: Sequence[Plain]
+    shapes: Sequence[Mapping[str, Sequence[Shape]]]
     tables: list[list[Table]] = field(default_factory=list)
     known: set[str] = field(default_factory=set)
 
-    def _ways(self, name: str) -> list[Ray]:
-        """Returns the rays of an effect, shaped as they are in the field."""
-        return [replace(ray, shape=self.grown[name][0].shape) for ray in self.rays[name]]
-
-    def earned(self, j: int, subset: frozenset[str]) -> float:
-        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field."""
+    def _scored(self, j: int, subset: frozenset[str]) -> list[tuple[Scored, float]]:
+        """Returns what the subset earns on joint `j` in each part of the reference, and the length of the field over the part's."""
         if not self.tables:
             parts = [one.evidence for one in self.base.nulls]
             self.tables = [[Table(joint, {}, part.block) for joint in plain_joints(part)] for part in parts]
         for name in subset - self.known:
+            ways = [replace(ray, shape=self.grown[name][0].shape) for ray in self.rays[name]]  # shaped as they are in the field
             for tables, one in zip(self.tables, self.base.nulls, strict=True):
-                add([table.shapes for table in tables], name, self._ways(name), one.evidence)
+                add([table.shapes for table in tables], name, ways, one.evidence)
             self.known.add(name)
-        found, entries = 0.0, self.base.field.evidence.z.shape[1]
-        for tables in self.tables:
-            mine = tables[j]
+        found, entries = [], self.base.field.evidence.z.shape[1]
+        for mine in (tables[j] for tables in self.tables):
             usable = frozenset(name for name in subset if name in mine.shapes)
-            found = max(found, mine.score(usable).total * entries / len(mine.joint.z))
+            found.append((mine.score(usable), entries / len(mine.joint.z)))
         return found
+
+    def earned(self, j: int, subset: frozenset[str]) -> float:
+        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field."""
+        return max([0.0, *(scored.total * part for scored, part in self._scored(j, subset))])
+
+    def repeated(self, j: int, subset: frozenset[str]) -> float:
+        """Returns what the subset earns in the field at the sizes that it has on the reference already; 0 where it has none."""
+        parts = [scored for scored, _ in self._scored(j, subset)]
+        if not parts or sum(scored.total for scored in parts) < THERE:
+            return 0.0
+        joint, change = self.plain[j], np.zeros(len(self.plain[j].z))
+        for name in subset & self.shapes[j].keys():
+            if sizes := [scored.sizes[name] for scored in parts if name in scored.sizes]:
+                change = change + predicted(self.shapes[j][name], np.mean(sizes, 0))
+        left = plain(joint.z - change, joint.faults)
+        return max(0.0, float(joint.loss.sum() - left.loss.sum()) + joint.price - left.price)

@@ -115,7 +115,7 @@ def unexplained(findings: Findings, prices: Prices) -> np.ndarray:
     entries = findings.evidence.z.shape[1]
     noisy = {one.kind.stage for one in findings.others} & {"timing"}
     scattered = np.zeros(len(predicted)) if noisy else 0.5 * entries * np.log(np.maximum(findings.scatter / prices.scatter, 1.0))
-    return predicted + scattered
+    return np.maximum(predicted, scattered)
 
 
 def is_unknown(findings: Findings, prices: Prices) -> bool:
@@ -126,6 +126,14 @@ def is_unknown(findings: Findings, prices: Prices) -> bool:
     if findings.tool_left > prices.tool and not any(one.kind.stage in ("kinematics", "sensing") for one in findings.others):
         return True
     return bool(left.sum() > 0 and gained < prices.explained * (gained + left.sum()))
+
+
+def unknown_chance(findings: Findings, prices: Prices) -> float:
+    """Returns the probability that the cause lies outside the library."""
+    left = unexplained(findings, prices).sum()
+    if is_unknown(findings, prices):
+        return max(0.5, probability(left, prices))
+    return min(0.5, probability(left - 4.0 * prices.temperature, prices))
 
 
 def other(found: Found, prices: Prices, machine: Machine) -> Selected:

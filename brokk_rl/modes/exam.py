@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import secrets
@@ -9,14 +10,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import yaml
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 from brokk_rl import record
 from brokk_rl.contracts import ActuatorFit, Excitation
-from brokk_rl.diagnosis import answer
+from brokk_rl.diagnosis import answer, library
+from brokk_rl.diagnosis.engine import Prices
 from brokk_rl.diagnosis.exam import ledger, marking, oracle, page, paper, seal, sitting
+from brokk_rl.diagnosis.exam.calibration import Calibration, items
 from brokk_rl.diagnosis.exam.making import Half, Workshop
 from brokk_rl.diagnosis.exam.mix import Mix, Question
 from brokk_rl.diagnosis.exam.sitting import Candidate
@@ -25,7 +29,7 @@ from brokk_rl.diagnosis.exam.tally import tally
 from brokk_rl.errors import ConfigError, RecordingError, choices
 from brokk_rl.machine import Machine
 from brokk_rl.plan.schedule import Approach
-from brokk_rl.session import Session, write_json
+from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -38,11 +42,15 @@ class Examination:
     """What to do, and with which cases.
 
     Attributes:
-        do: `make` cases into the run folder, `run` a candidate on them, ask the `oracle`, `score` the answers of one or several.
+        do: `make` cases into the run folder, `run` a candidate on them, ask the `oracle`, `score` the answers of one or several,
+            `calibrate` prices by the answers to development exams.
         folder: The exam that all but `make` are about: the folder that `make` left.
         candidate: Who answers.
-        workers: Cases answered at once.
-        answers: What `score` compares: a name for each candidate, and the run folder with its answers.
+        workers: Cases answered, recorded or weighed at once.
+        answers: What `score` compares: a name for each candidate, and the run folder with its answers. `calibrate`: answers of the
+            diagnosis to one or several exams.
+        prices: Of `calibrate`: prices that it begins at.
+        trials: Of `calibrate`: other prices that it tries.
         oracle: Fit of the simulator whose gap the oracle closes; that of the candidate.
         oracles: Of `score`: run folder of `exam.do=oracle`; `null`: nobody asked it.
         ledger: File to which `score` appends its headlines; `null`: none.
@@ -57,7 +65,7 @@ class Examination:
         salt: That salt, to make the cases of an opened exam again; `null` draws one.
     """
 
-    do: Literal["make", "run", "oracle", "score"]
+    do: Literal["make", "run", "oracle", "score", "calibrate"]
     folder: str | None
     candidate: Candidate
     workers: int
@@ -65,6 +73,8 @@ class Examination:
     oracle: ActuatorFit
     oracles: str | None
     ledger: str | None
+    prices: Prices
+    trials: int
     mix: Mix
     plants: PlantFamily
     roughness: str
@@ -76,14 +86,15 @@ class Examination:
     salt: str | None
 
     def check(self) -> None:
-        if self.do != "make" and self.folder is None:
+        if self.do not in ("make", "calibrate") and self.folder is None:
             raise ConfigError(f"exam.do={self.do}: expected exam.folder=<folder>, the one that exam.do=make wrote")
-        if self.do == "score" and not self.answers:
+        if self.do in ("score", "calibrate") and not self.answers:
             raise ConfigError(
-                "exam.do=score: expected +exam.answers.<name>=<folder>, a folder that exam.do=run wrote; one or several"
+                f"exam.do={self.do}: expected +exam.answers.<name>=<folder>, a folder that exam.do=run wrote; one or several"
             )
-        if self.workers < 1:
-            raise ConfigError(f"exam.workers: expected 1 or more, got {self.workers}")
+        for name in ("workers", "trials"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"exam.{name}: expected 1 or more, got {getattr(self, name)}")
         for name in self.mix.troubles:
             if name not in self.plants.effects:
                 raise ConfigError(f"exam.mix.troubles: no plant has '{name}'; {choices(name, self.plants.effects)}")
@@ -136,7 +147,14 @@ class Exam:
         with Progress(transient=True) as progress:
             task = progress.add_task(f"{len(questions)} cases", total=total)
             labels = paper.write(
-                workshop, questions, settings.reference, settings.field, self.machine, folder, lambda n: progress.advance(task, n)
+                workshop,
+                questions,
+                settings.reference,
+                settings.field,
+                self.machine,
+                folder,
+                settings.workers,
+                lambda n: progress.advance(task, n),
             )
         facts = {
             "schema": 1,
@@ -195,6 +213,30 @@ class Exam:
         shares = [share for share in found.values() if share is not None]
         log.info("the true effects close %.2f of the gap (median of %d cases with one)", np.median(shares or [0.0]), len(shares))
 
+    def _calibrate(self) -> None:
+        """Opens the labels of development exams; writes `prices.yaml`, and prints what the answers were and would be."""
+        settings = self.exam
+        cases = items([Path(folder) for folder in settings.answers.values()])
+        classes, of_machine = settings.mix.classes, self._of_machine()
+        seed, kinds = self.session.stream("prices"), library.load(self.machine)
+        fit = Calibration(self.machine, kinds, classes, of_machine, settings.trials, seed, settings.workers)
+        with Progress(transient=True) as progress:
+            task = progress.add_task(f"{settings.trials} prices on {len(cases)} cases", total=settings.trials // 2 * 2)
+            found = fit.fitted(cases, settings.prices, lambda: progress.advance(task))
+            apart = [fit.fitted(cases[half::2], settings.prices, lambda: None) for half in (0, 1)]
+        before, after = (tally(fit.marks(cases, prices)) for prices in (settings.prices, found))
+        crosswise = tally([mark for half in (0, 1) for mark in fit.marks(cases[1 - half :: 2], apart[half])])
+        numbers = {"_target_": f"{Prices.__module__}.{Prices.__name__}", **dataclasses.asdict(found)}  # pyright: ignore[reportArgumentType]
+        write_text(self.session.folder / "prices.yaml", yaml.safe_dump(numbers, sort_keys=False))
+        write_json(
+            self.session.folder / "calibration.json", {"cases": len(cases), "before": before, "after": after, "cross": crosswise}
+        )
+        _show({"before": before, "after": after, "after, on the other half": crosswise})
+        log.info("prices: %s; they stand in conf/prices", self.session.folder / "prices.yaml")
+
+    def _of_machine(self) -> list[str]:
+        return [name for name, trouble in self.exam.mix.troubles.items() if trouble.joints == "all"]
+
     def _score(self) -> None:
         """Opens the labels; writes `marks.json`, `exam.html` and pictures, appends to the ledger, and prints the table."""
         labels = seal.opened(self._folder)
@@ -212,7 +254,7 @@ class Exam:
         """Returns the figures of the answers in `folder`."""
         mix, marks = self.exam.mix, []
         best = {} if self.exam.oracles is None else json.loads((Path(self.exam.oracles) / ORACLE).read_text())
-        of_machine = [name for name, trouble in mix.troubles.items() if trouble.joints == "all"]
+        of_machine = self._of_machine()
         for label in labels:
             place = folder / label["case"]
             said = answer.read(place / answer.FILE) if (place / answer.FILE).is_file() else None

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -138,23 +139,32 @@ class Workshop:
             job.plan = self._plan(job)
         return jobs
 
-    def record(self, jobs: Sequence[Job], folders: Sequence[Path], advance: Callable[[int], None]) -> list[Made]:
+    def record(self, jobs: Sequence[Job], folders: Sequence[Path], workers: int, advance: Callable[[int], None]) -> list[Made]:
         """Writes the files of one half of each case into its folder; returns what is in them, by case.
 
         Args:
             jobs: The files.
             folders: Where each case's files go.
+            workers: Processes; files are the same however many there are.
             advance: Told how many files are done.
         """
         specimens = [self._specimen(job) for job in jobs]
         makes = self._plants.makes(self._machine, specimens)
-        done = [Made([], [], []) for _ in folders]
+        size, batches = min(SIDE_BY_SIDE, -(-len(jobs) // workers)), []
         for make in sorted(set(makes)):
             mine = [i for i, other in enumerate(makes) if other == make]
-            for begin in range(0, len(mine), SIDE_BY_SIDE):
-                batch = mine[begin : begin + SIDE_BY_SIDE]
-                self._batch([jobs[i] for i in batch], [specimens[i] for i in batch], folders, done)
+            batches += [mine[begin : begin + size] for begin in range(0, len(mine), size)]
+        found: dict[int, Made] = {}
+        with ExitStack() as stack:
+            run = map if workers == 1 else stack.enter_context(ProcessPoolExecutor(workers)).map
+            parts = ([[items[i] for i in batch] for batch in batches] for items in (jobs, specimens))
+            for batch, made in zip(batches, run(self._batch, *parts, [folders] * len(batches)), strict=True):
+                found |= dict(zip(batch, made, strict=True))
                 advance(len(batch))
+        done = [Made([], [], []) for _ in folders]
+        for i, job in enumerate(jobs):  # a case's files are in order
+            for name in ("u", "q", "without_q"):
+                getattr(done[job.case], name).extend(getattr(found[i], name))
         return done
 
     def _specimen(self, job: Job) -> Specimen:
@@ -186,8 +196,8 @@ class Workshop:
                     raise
                 tried += 1
 
-    def _batch(self, jobs: Sequence[Job], specimens: Sequence[Specimen], folders: Sequence[Path], done: list[Made]) -> None:
-        """Records files of one half, of machines of one make."""
+    def _batch(self, jobs: Sequence[Job], specimens: Sequence[Specimen], folders: Sequence[Path]) -> list[Made]:
+        """Records files of one half, of machines of one make; returns what is in each."""
         half, is_field = jobs[0].half, jobs[0].is_field
         machine = self._machine
         plan = Plan(runs=tuple(job.plan.runs[0] for job in jobs), run_s=half.file_s, names=tuple(self._excitations))
@@ -215,9 +225,7 @@ class Workshop:
             path = folders[job.case] / ("field" if is_field else "reference") / f"{job.number:02d}.parquet"
             record.write(recording, path)
             os.utime(path, (EPOCH_S, EPOCH_S))
-            made = done[job.case]
-            for kept, path_of in ((made.u, u), (made.q, q), (made.without_q, without)):
-                kept.append(path_of[:, n])
+        return [Made([u[:, n]], [q[:, n]], [without[:, n]]) for n in range(len(jobs))]
 
     def _without(self, specimens: Sequence[Specimen], u: np.ndarray, half: Half) -> np.ndarray:
         """Returns the positions of the same machines without faults, under the same commands and chance, `(T, N, J)`."""

@@ -23,13 +23,14 @@ def write(
     field: Half,
     machine: Machine,
     folder: Path,
+    workers: int,
     advance: Callable[[int], None],
 ) -> list[dict[str, Any]]:
-    """Records all cases into `folder/cases/<id>`; returns their labels, plain JSON, in the same order."""
+    """Records all cases into `folder/cases/<id>`, in so many `workers`; returns their labels, plain JSON, in the same order."""
     names = [f"{number:04d}" for number in range(len(questions))]
     folders = [folder / CASES / name for name in names]
     halves = [workshop.planned(questions, half, is_field) for half, is_field in ((reference, False), (field, True))]
-    _, made = (workshop.record(jobs, folders, advance) for jobs in halves)
+    _, made = (workshop.record(jobs, folders, workers, advance) for jobs in halves)
     return [label(name, question, half, machine) for name, question, half in zip(names, questions, made, strict=True)]
 
 

@@ -1,0 +1,91 @@
+"""What was weighed can be chosen from again, and prices are found that separate what is there from what chance earns."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from composed import option
+
+from brokk_rl.diagnosis import library, weighing
+from brokk_rl.diagnosis.engine import Findings, Prices
+from brokk_rl.diagnosis.evidence import Evidence
+from brokk_rl.diagnosis.exam import seal
+from brokk_rl.diagnosis.exam.calibration import Calibration, Item, items
+from brokk_rl.diagnosis.search import Table
+from brokk_rl.diagnosis.sizes import Shape, plain
+from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.machine import Machine
+
+SIZES = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+
+
+@pytest.fixture
+def prices() -> Prices:
+    return option("prices", "default")
+
+
+def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findings:
+    """Returns findings on a machine whose first joint has a lag of some strength, in noise."""
+    random, kinds = np.random.default_rng(seed), library.load(machine, ["lag", "dead_band"])
+    tables, block = [], np.arange(800) // 80
+    for j in range(machine.num_joints):
+        columns = random.standard_normal((2, 800))
+        z = random.standard_normal(800) + (strength * columns[0] if j == 0 else 0.0)
+        shapes = {name: [Shape(SIZES, SIZES[:, None] * c)] for name, c in zip(("lag", "dead_band"), columns, strict=True)}
+        tables.append(Table(plain(z, []), shapes, block))
+        tables[-1].explore({"lag": 2.0, "dead_band": 2.0}, 2)
+
+    def price(j: int, subset: frozenset[str]) -> float:
+        return prices.joint * len(subset) + prices.reference * 1.5
+
+    evidence = cast(Evidence, SimpleNamespace(z=np.zeros((len(tables), 800)), block=block))
+    chosen, still = weighing.chosen_of(tables, price, prices, kinds), np.zeros(len(tables))
+    return Findings(evidence, tables, {"lag": [], "dead_band": []}, price, chosen, None, [], still, still, still + 1.0, 1.0)
+
+
+def test_what_was_weighed_is_chosen_from_again_as_it_was(machine: Machine, prices: Prices) -> None:
+    first, kinds = found(machine, prices, 0.5, 0), library.load(machine)
+    told = json.loads(json.dumps(weighing.weighed(first, prices)))
+    again = weighing.findings(told, prices, kinds)
+    assert first.chosen.names == {"lag"} and again.chosen.subsets == first.chosen.subsets
+    assert again.chosen.worth == pytest.approx(first.chosen.worth, abs=0.1)
+    assert not weighing.findings(told, dataclasses.replace(prices, joint=500.0), kinds).chosen.names
+
+
+def label(kind: str, effects: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"case": "0000", "kind": kind, "effects": effects, "outside": None, "moved_rad": {"q1": 0.0}}
+
+
+def test_prices_are_found_that_name_what_is_there_and_nothing_else(machine: Machine, prices: Prices) -> None:
+    cheap = dataclasses.replace(prices, joint=2.0, name=2.0, reference=0.5)
+    lag = {"effect": "lag", "joints": ["q1"], "size": 1.0, "parameters": {}, "nothing": {}}
+    cases = [
+        *(Item(label("none", []), weighing.weighed(found(machine, cheap, 0.14, seed), cheap)) for seed in range(3)),
+        *(Item(label("one", [lag]), weighing.weighed(found(machine, cheap, 0.4, seed), cheap)) for seed in range(3)),
+    ]
+    fit = Calibration(machine, library.load(machine), [], [], trials=8, seed=0, workers=1)
+    assert fit.value(cases, cheap) < 0.8
+    best = fit.fitted(cases, cheap, lambda: None)
+    assert fit.value(cases, best) == pytest.approx(1.0)
+
+
+def test_nothing_is_tuned_to_a_sealed_exam(tmp_path: Path) -> None:
+    (tmp_path / "answers").mkdir()
+    (tmp_path / "exam.json").write_text('{"sealed": true}')
+    (tmp_path / seal.LABELS).write_text("{}")
+    with pytest.raises(ConfigError, match="development exams only"):
+        items([tmp_path / "answers"])
+
+
+def test_answers_that_do_not_say_what_was_weighed_are_named(tmp_path: Path) -> None:
+    (tmp_path / "answers").mkdir()
+    (tmp_path / "exam.json").write_text('{"sealed": false}')
+    seal.seal(tmp_path, {"cases": []}, "salt")
+    with pytest.raises(RecordingError, match=r"what was weighed"):
+        items([tmp_path / "answers"])
