@@ -51,6 +51,8 @@ class Case:
             found.append(f"the field recordings last {total_s:.0f} s in all; {LEAST_S:.0f} s or more are needed")
         if open_loop.longest_s(self.field, self.machine) < HORIZON_S:
             found.append(f"no field recording is long enough for a free run of {HORIZON_S:g} s")
+        if not self.reference and len(self.field) == 1:
+            found.append("there is one recording only, and no reference: nothing to judge by that it was not fitted to")
         u = np.concatenate([recording.u for recording in self.field])
         if not (np.abs(u) > COMMANDED).any():
             found.append("no joint is ever commanded in the field recordings")
@@ -77,11 +79,20 @@ def load(folder: Path, machine: Machine) -> Case:
         if not any(part.glob("*.parquet")):
             why = "the simulator is fitted to it; without one give diagnosis.field=<glob> and actuator=<simulator>"
             raise RecordingError(f"{folder}: no {name}/*.parquet; a case has both" + (f" ({why})" if name == "reference" else ""))
-    read = [record.read_all(str(part / "*.parquet"), machine) for part in parts.values()]
-    for recording in (one for part in read for one in part):
+    return Case(machine, *(recorded(str(part / "*.parquet"), machine) for part in parts.values()))
+
+
+def recorded(where: str | tuple[str, ...], machine: Machine) -> list[Recording]:
+    """Reads recordings of the machine.
+
+    Raises:
+        RecordingError: there are none, or one cannot be used (another machine, NaN, gaps, …).
+    """
+    found = record.read_all(where, machine)
+    for recording in found:
         if stamp := recording.metadata.get("fingerprint"):
             _check_stamp(stamp, recording, machine)
-    return Case(machine, *read)
+    return found
 
 
 def _check_stamp(stamp: str, recording: Recording, machine: Machine) -> None:

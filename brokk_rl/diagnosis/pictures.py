@@ -36,7 +36,7 @@ AGES = 16
 def ladder(answer: Answer) -> Figure | None:
     """Draws the error before and after over the floor; `None` where there is none to draw."""
     gap = answer.gap
-    if gap is None:
+    if gap is None or not max(gap.before, gap.floor or 0.0):
         return None
     figure = Figure(figsize=(9.5, 2.0), layout="constrained")
     axis = figure.add_subplot()

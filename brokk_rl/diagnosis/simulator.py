@@ -147,7 +147,7 @@ def given(case: Case, actuator: Actuator, fit: ActuatorFit, folder: Path, seed: 
     field = held(actuator, _begun(case.field), machine, seed)
     pieces, nulls = parts(case.field), []
     try:
-        if len(pieces) > 1:
+        if len(pieces) > 1 and not case.doubts():
             nulls = _crosswise(case.field, pieces, fit, machine, folder, seed, device)[1]
     except RecordingError as error:
         log.warning("no floor: a flexible model cannot be fitted to the field (%s)", error)

@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from brokk_rl import record
 from brokk_rl.contracts import Actuator, ActuatorFit, Excitation
 from brokk_rl.diagnosis import answer, case, library, page, prescription, simulator
 from brokk_rl.diagnosis.answer import Answer
@@ -101,13 +100,13 @@ class Diagnose:
 
     def _case(self) -> Case:
         subject = self.diagnosis
-        unseen = record.read_all(subject.unseen, self.machine) if subject.unseen else ()
+        unseen = case.recorded(subject.unseen, self.machine) if subject.unseen else ()
         if subject.case is not None:
             return replace(case.load(Path(subject.case), self.machine), unseen=unseen)
         assert subject.field is not None, "checked by Subject"
         if self.actuator is None:
             raise ConfigError("diagnosis.field needs a simulator to hold it against: add actuator=<name>")
-        return Case(self.machine, [], record.read_all(subject.field, self.machine), unseen)
+        return Case(self.machine, [], case.recorded(subject.field, self.machine), unseen)
 
     def _base(self, given: Case) -> Base:
         seed, device, folder = self.session.stream("base"), self.session.torch_device(), self.session.folder
