@@ -1,0 +1,329 @@
+"""The parts of the loop without its processes: what they share, what the policy remembers, what is shown, and which bundle is
+refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from composed import option
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.machine import Machine
+from deploy.guidance import AXES, LeverDisplay, LeverMap
+from deploy.loop.exchange import Pipe, Slot
+from deploy.loop.outlet import view
+from deploy.loop.process import Pace
+from deploy.loop.records import Exchange, state_fields
+from deploy.loop.target import File
+from deploy.policy.adviser import Advised, Adviser, Counsel
+from deploy.policy.bundle import Bundle
+from deploy.policy.sampling import Ring
+
+SHIPPED = "tasks:policies/borehole_insertion"
+FIELDS = np.dtype([("a", float), ("b", float, (3,))])
+
+
+def test_a_slot_gives_the_newest_record_whole() -> None:
+    slot = Slot("test", FIELDS)
+    assert slot.read() is None
+    for number in range(1, 6):
+        record = slot.new()
+        record["a"], record["b"] = number, number
+        slot.write(record)
+        found = slot.read()
+        assert found is not None and found["a"] == number and (found["b"] == number).all()
+    slot.memory.close()
+
+
+def test_a_writer_killed_in_the_middle_leaves_the_record_before_it() -> None:
+    slot = Slot("test", FIELDS)
+    for number in (1.0, 2.0):
+        record = slot.new()
+        record["a"] = number
+        slot.write(record)
+    at = 8 + slot._stride * (3 % 2)
+    slot.memory.bytes[at : at + 8] = b"torn ..."  # the third record was begun, its number never written
+    found = slot.read()
+    assert found is not None and found["a"] == 2.0
+    slot.memory.close()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.lists(st.binary(max_size=40), max_size=5), max_size=20))
+def test_a_pipe_keeps_order_and_drops_only_what_finds_no_room(rounds: list[list[bytes]]) -> None:
+    pipe, dropped = Pipe("test", 128), 0
+    for batch in rounds:
+        kept = [one for one in batch if pipe.put(one)]
+        dropped += len(batch) - len(kept)
+        assert list(pipe.take()) == kept and pipe.waiting == 0
+    assert pipe.dropped == dropped
+    pipe.memory.close()
+
+
+def test_a_deadline_that_was_missed_is_skipped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [100.0]
+    monkeypatch.setattr("deploy.loop.process.time.monotonic", lambda: clock[0])
+    pace = Pace(0.05)
+    for now_s, skipped, next_s in ((100.05, 0, 100.10), (100.11, 0, 100.15), (100.27, 2, 100.30)):
+        clock[0] = now_s
+        assert pace.begin() == skipped
+        assert pace.next_s == pytest.approx(next_s)
+    report = pace.report()
+    assert report["cycles"] == 3 and report["missed"] == 2 and report["late_max_s"] == pytest.approx(0.12)
+
+
+def state(machine: Machine, number: int, flow: float, q: float, now_s: float = 0.0) -> Any:
+    record = np.zeros((), state_fields(machine.num_joints))
+    record["t_s"] = record["q_t_s"] = now_s
+    record["q"], record["flow_number"], record["flow_sum"], record["flow"] = q, number, flow * number, flow
+    record["q_plausible"] = record["trusted"] = True
+    return record
+
+
+def test_the_ring_holds_positions_and_mean_flows_of_each_period_as_training_does(machine: Machine) -> None:
+    ring = Ring(machine)
+    for k in range(machine.num_history):
+        assert not ring.full
+        ring.sample(state(machine, 10 + 2 * k, 0.0, float(k)), missed=0)
+    assert ring.full and ring.q[:, 0].tolist() == list(range(13))
+    record = state(machine, 40, 0.0, 13.0)
+    record["flow_sum"] = 0.9  # since number 34 six messages, 0.9 in all
+    ring.sample(record, missed=0)
+    assert ring.u[-1].tolist() == pytest.approx([0.15] * 5) and ring.q[-1, 0] == 13.0
+
+
+def test_one_missed_period_is_filled_in_and_two_empty_the_ring(machine: Machine) -> None:
+    ring = Ring(machine)
+    for k in range(13):
+        ring.sample(state(machine, k + 1, 0.0, 1.0), missed=0)
+    ring.sample(state(machine, 20, 0.0, 2.0), missed=1)
+    assert ring.full and ring.q[-2:, 0].tolist() == [1.5, 2.0]
+    ring.sample(state(machine, 30, 0.0, 3.0), missed=2)
+    assert ring.filled == 1
+
+
+def test_valves_that_say_nothing_more_empty_the_ring(machine: Machine) -> None:
+    ring = Ring(machine)
+    for k in range(13):
+        ring.sample(state(machine, k + 1, 0.0, 1.0), missed=0)
+    ring.sample(state(machine, 13, 0.0, 1.0), missed=0)
+    assert ring.filled == 1
+
+
+def test_levers_are_those_of_the_paper(machine: Machine) -> None:
+    levers = LeverMap(machine.levers, machine)
+    angles, button = levers.levers(np.array([0.1, 0.0, 0.3, 0.4, 0.5]))
+    assert angles == pytest.approx([0.35 * 0.4, 0.35 * 0.1, 0.35 * 0.3, 0.35 * 0.5]) and not button  # left q4, q1; right q3, q5
+    angles, button = levers.levers(np.array([0.0, -0.6, 0.0, 0.0, 0.0]))
+    assert angles == pytest.approx([0.0, 0.0, -0.21, 0.0]) and button  # q2 on the right lever, with the button
+
+
+@pytest.mark.parametrize("name", ["machine", "iso", "sae"])
+def test_hands_that_follow_exactly_give_the_command(name: str, machine: Machine) -> None:
+    levers, generator = LeverMap(option("guidance", name).levers or machine.levers, machine), np.random.default_rng(0)
+    for alone in (True, False) * 20:
+        command = np.where(machine.is_exclusive == alone, generator.uniform(-1, 1, 5), 0.0)
+        assert levers.command(*levers.levers(command)) == pytest.approx(command)
+
+
+def test_what_is_shown_changes_no_faster_than_a_hand_and_passes_neutral_before_the_button(machine: Machine) -> None:
+    display = LeverDisplay(option("guidance", "machine"), machine)
+    before, shown = np.zeros(4), []
+    for u in [np.array([0, 0, 1.0, 0, 0])] * 6 + [np.array([0, 1.0, 0, 0, 0])] * 12:
+        one = display.show(u, machine.period_s)
+        assert np.abs(one.angles_rad - before).max() <= 2.0 * machine.period_s + 1e-12
+        before = one.angles_rad
+        shown.append((round(one.angles_rad[2], 3), one.button_right))
+    assert shown[3] == (0.35, False) and shown[-1] == (0.35, True)
+    first = next(k for k, (_, button) in enumerate(shown) if button)
+    assert shown[first - 1] == (0.0, False)
+
+
+def test_a_small_command_is_shown_as_neutral(machine: Machine) -> None:
+    display = LeverDisplay(option("guidance", "machine"), machine)
+    assert not display.show(np.array([0.02, 0, -0.02, 0, 0]), 1.0).angles_rad.any()
+
+
+def test_levers_that_do_not_do_are_refused(machine: Machine) -> None:
+    with pytest.raises(ConfigError, match="no lever for q5"):
+        LeverMap(tuple(lever for lever in machine.levers if lever.joint != "q5"), machine)
+    both = tuple(replace(lever, side="left", axis="psi") for lever in machine.levers)
+    with pytest.raises(ConfigError, match="share"):
+        LeverMap(both, machine)
+    assert len(AXES) == 4
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    folder = Path(__file__).parents[2] / "tasks/policies/borehole_insertion"
+    for name in ("policy.onnx", "policy.json", "golden.json"):
+        shutil.copy(folder / name, tmp_path / name)
+    return tmp_path
+
+
+def change(folder: Path, name: str, **values: Any) -> None:
+    path = folder / name
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def test_the_shipped_policy_acts_here_as_where_it_was_made(machine: Machine) -> None:
+    bundle = Bundle(SHIPPED, machine)
+    golden = json.loads((Path(__file__).parents[2] / "tasks/policies/borehole_insertion/golden.json").read_text())
+    found = bundle.command(np.array(golden["observation"], np.float32))
+    assert np.abs(found - np.array(golden["command"])).max() < 1e-3 and np.abs(found).max() > 0.5
+
+
+def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(machine: Machine, copied: Path) -> None:
+    others = {
+        "joints": replace(machine, joints=machine.joints[::-1]),
+        "control": replace(machine, num_history=14),
+        "name": replace(machine, name="other"),
+    }
+    for field, other in others.items():
+        with pytest.raises(CheckpointError, match=field):
+            Bundle(str(copied), other)
+    with pytest.raises(CheckpointError, match="control"):
+        Bundle(str(copied), replace(machine, period_s=0.1, num_history=13))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"joints": ["q2", "q1", "q3", "q4", "q5"]}, "joints"),
+        ({"rate_hz": 10.0}, "rate_hz"),
+        ({"exclusive": []}, "exclusive"),
+        ({"schema": 9}, "schema"),
+        ({"command": {"order": ["q1"], "masked": True}}, "masked commands"),
+        ({"fingerprint": {}}, "another machine"),
+    ],
+    ids=str,
+)
+def test_a_contract_that_says_otherwise_is_refused(machine: Machine, copied: Path, values: dict[str, Any], message: str) -> None:
+    change(copied, "policy.json", **values)
+    with pytest.raises(CheckpointError, match=message):
+        Bundle(str(copied), machine)
+
+
+def test_a_policy_that_was_told_its_observations_otherwise_is_refused(machine: Machine, copied: Path) -> None:
+    observation = json.loads((copied / "policy.json").read_text())["observation"]
+    observation["q"]["std"][0] *= 2
+    change(copied, "policy.json", observation=observation)
+    with pytest.raises(CheckpointError, match="'q'"):
+        Bundle(str(copied), machine)
+
+
+def test_a_bundle_that_is_mixed_damaged_or_incomplete_is_refused(machine: Machine, copied: Path) -> None:
+    golden = json.loads((copied / "golden.json").read_text())
+    golden["command"][3][2] += 0.01
+    (copied / "golden.json").write_text(json.dumps(golden))
+    with pytest.raises(CheckpointError, match="answers"):
+        Bundle(str(copied), machine)
+    (copied / "golden.json").unlink()
+    with pytest.raises(CheckpointError, match=r"golden\.json is missing"):
+        Bundle(str(copied), machine)
+    content = (copied / "policy.onnx").read_bytes()
+    (copied / "policy.onnx").write_bytes(content[: len(content) // 2])
+    with pytest.raises(CheckpointError, match="damaged"):
+        Bundle(str(copied), machine)
+    with pytest.raises(CheckpointError, match=r"policy\.json is missing"):
+        Bundle("nowhere", machine)
+
+
+@pytest.fixture
+def adviser(machine: Machine) -> Adviser:
+    exchange = Exchange.new(machine.num_joints, commands=False)
+    counsel = Counsel(machine, SHIPPED, option("guidance", "machine"), stale_s=0.15, target_s=60.0, pitch_rad=None)
+    return Adviser(counsel, Bundle(SHIPPED, machine), exchange)
+
+
+def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(adviser: Adviser, machine: Machine) -> None:
+    exchange, now_s, found = adviser._exchange, 1000.0, []
+    assert adviser.cycle(0, now_s) is Advised.NO_STATE
+    for k in range(30):
+        now_s += machine.period_s
+        record = state(machine, 10 + k, 0.0, 0.0, now_s)
+        record["q"] = machine.home
+        exchange.state.write(record)
+        if k == 15:
+            target = exchange.target.new()
+            target["t_s"], target["center_in_base_m"] = now_s, (2.6, 0.0, 0.75)
+            exchange.target.write(target)
+        found.append(adviser.cycle(0, now_s))
+    assert (
+        found[:12] == [Advised.WARMING_UP] * 12 and found[12:15] == [Advised.NO_TARGET] * 3 and set(found[15:]) == {Advised.VALID}
+    )
+    shown = view(exchange)
+    assert shown.advice is not None and shown.advice.valid and any(shown.advice.command)
+    assert adviser.cycle(0, now_s + 0.16) is Advised.STALE
+    advice = exchange.advice.read()
+    assert advice is not None and not advice["u"].any() and exchange.request is None
+    json.dumps(view(exchange).plain(), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"), [({"q_plausible": False}, Advised.IMPLAUSIBLE), ({"trusted": False}, Advised.IMPLAUSIBLE)]
+)
+def test_positions_that_are_not_to_be_believed_give_no_advice(
+    adviser: Adviser, machine: Machine, change: dict[str, bool], reason: Advised
+) -> None:
+    record = state(machine, 1, 0.0, 0.0, 1000.0)
+    for name, value in change.items():
+        record[name] = value
+    adviser._exchange.state.write(record)
+    assert adviser.cycle(0, 1000.0) is reason
+
+
+def test_an_answer_that_makes_no_sense_is_not_shown(adviser: Adviser, machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    exchange, now_s = adviser._exchange, 1000.0
+    target = exchange.target.new()
+    target["t_s"] = now_s
+    exchange.target.write(target)
+    for answer in (np.array([np.nan, 0, 0, 0, 0]), np.array([1.1, 0, 0, 0, 0]), np.array([0.1, 0.1, 0, 0, 0])):
+        monkeypatch.setattr(adviser._bundle, "command", lambda _, answer=answer: answer[None])
+        for _ in range(14):
+            now_s += machine.period_s
+            exchange.state.write(state(machine, int(now_s * 100), 0.0, 0.0, now_s))
+            reason = adviser.cycle(0, now_s)
+        assert reason is Advised.REJECTED
+        advice = exchange.advice.read()
+        assert advice is not None and not advice["u"].any()
+
+
+def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_path: Path) -> None:
+    path, slot = (
+        tmp_path / "target.json",
+        Slot("target", np.dtype([("t_s", float), ("center_in_base_m", float, (3,)), ("std_m", float)])),
+    )
+    target = File(path=str(path)).build()
+    target.refresh(slot)
+    assert slot.read() is None
+    path.write_text('{"center_in_base_m": [2.5, 0.1, 0.7]}')
+    os.utime(path, ns=(time.time_ns() - 5 * 10**9,) * 2)
+    target.refresh(slot)
+    first = slot.read()
+    assert first is not None and first["center_in_base_m"].tolist() == [2.5, 0.1, 0.7]
+    assert time.monotonic() - first["t_s"] == pytest.approx(5.0, abs=0.5)
+    path.write_text('{"center": 1}')
+    with pytest.raises(ConfigError, match="center_in_base_m"):
+        target.refresh(slot)
+    target.refresh(slot)  # said once
+    slot.memory.close()
+
+
+def test_the_machines_computer_needs_no_torch_no_simulator_and_no_trainer() -> None:
+    modules = "deploy.loop.supervisor, deploy.policy.adviser, deploy.loop.station, deploy.recorder.capture, deploy.link"
+    code = f"import sys, {modules}; print([m for m in ('torch', 'warp', 'mujoco', 'rsl_rl') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
