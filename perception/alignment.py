@@ -31,6 +31,8 @@ MARGIN_PX, BORDER_PX, SATURATED = 6, 4, 248.0
 the grey level from which a picture shows nothing."""
 LEAST, LEAST_INSIDE = 200, 24
 """Pixels in which a plane is aligned, and in which an inside is compared."""
+ALIKE = 0.7
+"""Correlation of left and right below which they do not show the same; in haze and in the dark it is still 0.96."""
 LARGEST_PX = 1.0
 """Shift of the whole face beyond which the pictures agree on something else."""
 
@@ -112,8 +114,10 @@ def pair(frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, out
 
 def aligned(
     both: Pair, face: Plane, frame: Frame, allowed: np.ndarray, ellipse: np.ndarray, inner: float, cell_px: int, bias_per_m: float
-) -> Plane:
-    """Returns the plane by which the two pictures agree best on the face; `face` itself where they do not.
+) -> Plane | None:
+    """Returns the plane by which the two pictures agree best on the face; `face` itself where too little of it is in sight.
+
+    `None` where they do not agree: the right picture is another's, or shifted.
 
     What dust, exposure and vignetting add to one of them varies slowly, so only what departs from the mean of a window counts.
 
@@ -155,7 +159,7 @@ def aligned(
 
     mine = departing(both.left[::stride])
     slope = cv2.Sobel(both.right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
-    m, ray = face.m, rays[on]
+    m, ray, seen = face.m, rays[on], mine
     for _ in range(ROUNDS):
         seen, rise = (departing(both.seen(u, row, rays, m, picture)) for picture in (both.right, slope))
         push = np.column_stack([ray * (-both.pull_px / both.shrink * rise)[:, None], -mine])
@@ -165,6 +169,9 @@ def aligned(
         trust = np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
         heavy = push * trust[:, None]
         m = m - np.linalg.lstsq(heavy.T @ push, heavy.T @ off, rcond=1e-12)[0][:3]
+    likeness = float(seen @ mine) / max(float(np.sqrt((seen @ seen) * (mine @ mine))), 1e-9)
+    if likeness < ALIKE:
+        return None
     moved_px = both.pull_px * np.abs(ray @ (m - face.m)).max()
     if not np.isfinite(m).all() or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px:
         return face

@@ -132,7 +132,8 @@ class PlaneConicEstimator:
             return shape
         both = alignment.pair(frame, gray, face.m, row, face.extent)
         if both is not None:
-            face = alignment.aligned(both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m)
+            agreed = alignment.aligned(both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m)
+            both, face = (None, face) if agreed is None else (both, agreed)
             shape = self._shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape

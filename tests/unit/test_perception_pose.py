@@ -65,7 +65,12 @@ def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() ->
     both = alignment.pair(frame, gray_of(frame), face.m, row, face.extent)
     assert both is not None
     mended = alignment.aligned(both, face, frame, allowed, row, 1.25, 24, 1e-3)
+    shifted = replace(frame, right=np.roll(partner, 7, 0))
+    other = alignment.pair(shifted, gray_of(frame), face.m, row, face.extent)
+    assert other is not None
+    assert alignment.aligned(other, face, shifted, allowed, row, 1.25, 24, 1e-3) is None  # rows that belong to others
     ray = CENTER / CENTER[2]
+    assert mended is not None
     assert (face.m - m) @ ray == pytest.approx(off, rel=0.2)
     assert abs((mended.m - m) @ ray) < 0.2 * off
     assert float(mended.normal @ AXIS) > np.cos(np.radians(0.3))
