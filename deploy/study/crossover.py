@@ -17,6 +17,8 @@ from brokk_rl.intervals import CONFIDENCE
 from deploy.study import exact
 
 Interval = tuple[float, float]
+ROUNDING = 1e-12
+"""Relative spread below which values are the same."""
 
 
 @dataclass(frozen=True)
@@ -101,34 +103,41 @@ def _paired(difference: np.ndarray) -> dict:
         "hodges_lehmann": hodges_lehmann(difference)[0],
         "hodges_lehmann_ci95": hodges_lehmann(difference)[1],
     }
-    if std > 0:
+    if std > ROUNDING * float(np.abs(difference).max()):
         facts |= {"paired_dz": mean / std, "paired_dz_ci95": dz_interval(mean / std, math.sqrt(num), num - 1)}
     return facts
 
 
 def _adjusted(period_difference: np.ndarray, total: np.ndarray, first: np.ndarray) -> dict:
-    before, after = period_difference[first], period_difference[~first]
-    shape = math.sqrt(1 / len(before) + 1 / len(after))
-    free = len(first) - 2
-    std = math.sqrt((before.var(ddof=1) * (len(before) - 1) + after.var(ddof=1) * (len(after) - 1)) / free)
-    guidance, period = (before.mean() - after.mean()) / 2, -(before.mean() + after.mean()) / 2
+    before, after = period_difference[first].mean(), period_difference[~first].mean()
+    guidance, period = float(before - after) / 2, -float(before + after) / 2
+    shape, free = math.sqrt(1 / first.sum() + 1 / (~first).sum()), len(first) - 2
+    std = _within(period_difference, first)
     error = std * shape / 2
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, free)) * error
-    facts = {
-        "adjusted": float(guidance),
-        "adjusted_ci95": (float(guidance - half), float(guidance + half)),
+    facts: dict = {
+        "adjusted": guidance,
+        "adjusted_ci95": (guidance - half, guidance + half),
         "p": float(exact.sequence_p(period_difference, first)),
-        "period": float(period),
+        "period": period,
     }
     if std > 0:
         facts |= {
-            "dz": float(guidance / std),
-            "dz_ci95": dz_interval(float(guidance / std), 2 / shape, free),
+            "dz": guidance / std,
+            "dz_ci95": dz_interval(guidance / std, 2 / shape, free),
             "period_p": float(2 * stats.t.sf(abs(period / error), free)),
         }
-    if total[first].var() + total[~first].var() > 0:
-        facts["carry_over_p"] = float(stats.ttest_ind(total[first], total[~first])[1])  # type: ignore[arg-type]
+    if (spread := _within(total, first)) > 0:
+        apart = float(total[first].mean() - total[~first].mean())
+        facts["carry_over_p"] = float(2 * stats.t.sf(abs(apart) / (spread * shape), free))
     return facts
+
+
+def _within(values: np.ndarray, first: np.ndarray) -> float:
+    """Returns the standard deviation within sequences, 0 where it is rounding only."""
+    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in (values[first], values[~first]))
+    std = math.sqrt(squares / (len(values) - 2))
+    return std if std > ROUNDING * float(np.abs(values).max()) else 0.0
 
 
 def dz_interval(dz: float, scale: float, free: int) -> Interval:
@@ -148,7 +157,7 @@ def dz_interval(dz: float, scale: float, free: int) -> Interval:
         return share if math.isfinite(share) else float(shift < t)  # far out scipy gives NaN
 
     def bound(level: float) -> float:
-        low, high = t - 10.0 - abs(t), t + 10.0 + abs(t)
+        low, high = t - 10.0 - 4.0 * abs(t), t + 10.0 + 4.0 * abs(t)  # with 1 degree of freedom it reaches to 2.24 t
         return float(optimize.brentq(lambda shift: below(shift) - level, low, high)) / scale  # type: ignore[arg-type]
 
     return bound(0.5 + CONFIDENCE / 2), bound(0.5 - CONFIDENCE / 2)

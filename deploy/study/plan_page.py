@@ -80,7 +80,7 @@ def _numbers(found: Page, design: Design, paired_least: int, sequence_least: int
     found.text(
         "An exact paired test cannot go below p = 0.0625 with five participants: such a study can never be significant at 0.05. "
         f"It takes {paired_least} for that, and {sequence_least} for the test that keeps practice apart from guidance. "
-        f"Power is the share of {sample_size.STUDIES} simulated studies that find the effect; dz is the mean difference in "
+        f"Power is the share of up to {sample_size.STUDIES} simulated studies that find the effect; dz is the mean difference in "
         "standard deviations of it."
     )
     columns = [

@@ -19,6 +19,8 @@ from deploy.study import exact
 
 LARGE = 20_000
 """Persons from whose times the size of an effect is worked out."""
+STRONGEST = -5.0
+"""Logarithm of the shortest time that guidance can make of another."""
 
 
 @spec
@@ -79,16 +81,24 @@ class Practice:
         """Returns the effect with which guidance shortens times by `dz` standard deviations of a person's difference.
 
         The standard deviation is that within sequences, without what practice does to all.
+
+        Raises:
+            ConfigError: the limit is so short that no such effect could be seen.
         """
         first = np.arange(LARGE) % 2 == 0
 
         def found(effect: float) -> float:
             guided, unguided = self.draw(first, num_trials, practised, limit_s, effect, seed=1)
             saved = (unguided - guided)[0]
-            spread = np.sqrt((saved[first].var() + saved[~first].var()) / 2)
-            return float((saved[first].mean() + saved[~first].mean()) / 2 / spread) - dz
+            spread = float(np.sqrt((saved[first].var() + saved[~first].var()) / 2))
+            return float(saved[first].mean() + saved[~first].mean()) / 2 / spread - dz if spread > 0 else -dz
 
-        return float(optimize.brentq(found, -5.0, 1.0, xtol=1e-4))  # type: ignore[arg-type]
+        if found(STRONGEST) < 0:
+            raise ConfigError(
+                f"study.design.limit_s: nearly every trial of study.practice ends at the limit of {limit_s:g} s, so that no "
+                f"effect of dz {dz:g} could be seen; raise the limit, or lower study.practice.base_s"
+            )
+        return float(optimize.brentq(found, STRONGEST, 5.0, xtol=1e-4))  # type: ignore[arg-type]
 
 
 def share_significant(

@@ -13,7 +13,8 @@ from deploy.study import exact
 SIZES = (5, 6, 8, 10, 12, 14, 16, 20, 24)
 EFFECTS_DZ = (0.5, 0.8, 1.2)
 """A medium, a large and a very large effect, in standard deviations of a person's difference."""
-STUDIES = 1000
+STUDIES, MOST_COUNTED = 1000, 60_000_000
+"""Studies drawn for each number and effect, and fewer where there are so many ways to count."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Size:
 
 @cache
 def table(alpha: float, sizes: Sequence[int] = SIZES) -> list[Size]:
-    """Returns what each size can show, by `STUDIES` simulated studies with normal differences."""
+    """Returns what each size can show, by simulated studies with normal differences."""
     return [size(num, alpha) for num in sizes]
 
 
@@ -45,7 +46,9 @@ def size(num: int, alpha: float) -> Size:
     num_first = (num + 1) // 2
     first = np.arange(num) < num_first
     smallest = exact.smallest_sequence_p(num_first, num)
-    chance = np.random.default_rng(num).standard_normal((STUDIES, num))
+    ways = exact.num_sequences(num_first, num)
+    studies = min(STUDIES, MOST_COUNTED // ways) if ways <= exact.MOST_WAYS else STUDIES
+    chance = np.random.default_rng(num).standard_normal((studies, num))
     power = [
         float((exact.sequence_p(chance + np.where(first, dz, -dz), first) <= alpha).mean()) if smallest <= alpha else 0.0
         for dz in EFFECTS_DZ

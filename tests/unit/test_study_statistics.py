@@ -88,6 +88,8 @@ def test_the_interval_of_dz_turns_back_into_t() -> None:
     low, high = dz_interval(0.8, 4.0, 15)
     assert stats.nct.cdf(3.2, 15, 4 * low) == pytest.approx(0.975)
     assert stats.nct.cdf(3.2, 15, 4 * high) == pytest.approx(0.025)
+    low, high = dz_interval(-300.0, math.sqrt(2), 1)  # two persons who agree: almost anything is possible
+    assert low < -600 and -40 < high < 0
 
 
 def test_guidance_and_period_come_apart() -> None:
@@ -105,6 +107,8 @@ def test_guidance_and_period_come_apart() -> None:
     half = stats.t.ppf(0.975, 4) * math.sqrt(2.5) / 2 * math.sqrt(2 / 3)
     assert found.adjusted_ci95 == pytest.approx((-5 - half, -5 + half))
     test = stats.ttest_ind((guided - unguided)[first], (unguided - guided)[~first])
+    carried = stats.ttest_ind((guided + unguided)[first], (guided + unguided)[~first])
+    assert found.carry_over_p == pytest.approx(carried.pvalue)
     assert 2 * stats.t.sf(5 / (half / stats.t.ppf(0.975, 4)), 4) == pytest.approx(test.pvalue)
 
 

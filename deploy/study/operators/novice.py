@@ -11,8 +11,8 @@ from deploy.study.operators.hands import Hands
 from deploy.study.operators.sight import Sight
 from deploy.study.operators.traits import Range, Traits
 
-LONGER, LONGEST = 1.25, 2.5
-"""By how much a move that has to be repeated is made longer, and at most."""
+LONGER, SHORTER, RANGE = 1.25, 0.6, (0.05, 2.5)
+"""Factors on short moves of a joint after one that was not enough, and after one that was too much; bounds of their product."""
 
 
 @spec
@@ -28,7 +28,7 @@ class Novice:
         fine: Deflection of a short one, and the time below which a move is short, s.
         band: Command up to which valves stay shut, as the person knows it.
         lost_s: Time for which a lever must be held before anything moves at all, as the person knows it.
-        judgement: Length of a move over the right one; longer each time that it was not enough.
+        judgement: Length of a move over the right one; for short ones joint by joint corrected by what the last one did.
         scatter: Standard deviation of its logarithm, from move to move.
         wait_s: Pause after a move, beyond the time in which the machine comes to rest.
         good_rad: Error with which a joint is left alone, rad or m.
@@ -61,7 +61,8 @@ class NoviceModel:
         self._judgement = traits.draw("judgement", novice.judgement)[:, 0]
         self._pause_s = traits.draw("wait_s", novice.wait_s)[:, 0] + machine.dead_time_s
         self._lost_s = traits.draw("lost_s", novice.lost_s)[:, 0]
-        self._again = np.ones(len(persons))
+        self._learnt = np.ones((len(persons), machine.num_joints))
+        self._last = np.zeros((len(persons), machine.num_joints))
         self._left_s = np.zeros(len(persons))
         self._rest_s = np.zeros(len(persons))
         self._move = np.zeros((len(persons), machine.num_joints))
@@ -86,16 +87,19 @@ class NoviceModel:
         away = way[rows, joint]
         moves = idle & (np.abs(away) > config.good_rad)
         scattered = np.exp(config.scatter * self._generator.standard_normal(len(idle)))
-        level = np.where(
-            np.abs(away) / (speed[joint] * self._rate(self._deflection)) < config.fine[1], config.fine[0], self._deflection
-        )
-        repeated = self._move[rows, joint] * away > 0
-        self._again = np.where(moves, np.where(repeated, np.minimum(self._again * LONGER, LONGEST), 1.0), self._again)
-        time_s = np.abs(away) / (speed[joint] * self._rate(level)) * self._judgement * scattered * self._again + self._lost_s
+        full = self._rate(self._deflection)
+        short = np.abs(away) / (speed[joint] * full) < config.fine[1]
+        level = np.where(short, config.fine[0], self._deflection)
+        turned = self._last[rows, joint] * away
+        factor = self._learnt[rows, joint] * np.where(turned > 0, LONGER, np.where(turned < 0, SHORTER, 1.0))
+        factor = np.where(short, np.clip(factor, *RANGE), 1.0)
+        time_s = (np.abs(away) / (speed[joint] * self._rate(level)) * self._judgement * scattered + self._lost_s) * factor
+        self._learnt[rows[moves & short], joint[moves & short]] = factor[moves & short]
+        self._last[rows[moves], joint[moves]] = away[moves]
         chosen = np.zeros_like(self._move)
         chosen[rows, joint] = np.sign(away) * level
         self._move = np.where(moves[:, None], chosen, self._move)
-        self._left_s = np.where(moves, np.maximum(time_s, self._machine.period_s), self._left_s)
+        self._left_s = np.where(moves, time_s, self._left_s)
 
     def _rate(self, level: np.ndarray) -> np.ndarray:
         """Returns the share of full speed at a deflection."""
