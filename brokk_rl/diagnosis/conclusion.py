@@ -187,10 +187,19 @@ class Diagnosis:
             name: {"earned": float(a), "null": float(b), "scatter": float(c)}
             for name, a, b, c in zip(names, findings.left, findings.left_null, findings.scatter, strict=True)
         }
+        weighed = weighing.weighed(findings, self.prices)
+        null = [
+            row["null"] for joint in weighed["joints"] for row in joint["subsets"] if len(row["effects"]) == 1 and "null" in row
+        ]
         return {
-            "evidence": {"rivals": rivals, "threshold": self.prices.name + self.prices.joint, "unit": "log likelihood"},
+            "evidence": {
+                "rivals": rivals,
+                "threshold": self.prices.name + self.prices.joint,
+                "null": null,
+                "unit": "log likelihood",
+            },
             "remainder": left,
-            "weighed": weighing.weighed(findings, self.prices),
+            "weighed": weighed,
             "predicted_closed": foretold and {"mean": foretold.mean, "ci95": list(foretold.ci95)},
         }
 
