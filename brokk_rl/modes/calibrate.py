@@ -53,14 +53,16 @@ class Calibrate:
         path = self.session.folder / FILE
         write_text(path, yaml.safe_dump(told, sort_keys=False, default_flow_style=None, width=132))
         _show(told)
-        log.info("perception/source=zed source.base_from_camera=%s", path)
+        if "T_base_cam" in told:
+            log.info("perception/source=zed source.base_from_camera=%s", path)
         return float(told["point_std_m"]["std_m"])
 
 
 def _show(told: dict[str, Any]) -> None:
     table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
-    place = ", ".join(f"{row[3]:.4f}" for row in told["T_base_cam"][:3])
-    table.add_row("camera in the base frame", f"({place}) m")
+    frame = "base" if "T_base_cam" in told else "link"
+    place = ", ".join(f"{row[3]:.4f}" for row in told[f"T_{frame}_cam"][:3])
+    table.add_row(f"camera in the {frame} frame", f"({place}) m")
     work = told["point_std_m"]
     table.add_row(f"uncertainty at {work['at_m']:g} m", f"±{1000 * work['std_m']:.1f} mm")
     residual = told["residual"]

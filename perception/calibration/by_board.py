@@ -14,19 +14,14 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.sight import SourceSpec
 from brokk_rl.spec import spec
-from perception.calibration import arm, clock, rigid, spread
-from perception.calibration.hand_eye import FEWEST, Solution, refine, solve
+from perception.calibration import arm, clock, judgement, spread
+from perception.calibration.hand_eye import FEWEST, Solution, solve
 from perception.calibration.result import Judged, stored
 from perception.calibration.sights import Sight, sight
 from perception.calibration.views import Views, expected
 from perception.label_camera import BoardTracker
 
 log = logging.getLogger(__name__)
-
-CLOCK_STD_S = 0.02
-"""How well the correlation of speeds tells the offset of the clocks; the poses tell the rest."""
-JITTER_S = 0.005
-"""By which the time of a single frame may be off."""
 
 
 class BoardSpec(Protocol):
@@ -104,7 +99,7 @@ class ByBoard:
         track = arm.read(Path(self.joints), machine)
         seen, refused = self._seen(track)
         offset = self._offset(machine, track, seen)
-        shift_s = offset.offset_s if offset is not None and offset.correlation >= self.least_correlation else 0.0
+        shift_s = offset.offset_s if offset is not None and offset.is_trusted else 0.0
         seen = self._with_joints(track, seen, shift_s, refused)
         if len(seen) < FEWEST:
             reasons = sorted({one.left_out or "" for one in refused})[:3]
@@ -141,15 +136,7 @@ class ByBoard:
             return None
         times, turns = np.array([one.t_s for one in seen]), np.stack([one.sight.camera_from_board[0, :3, :3] for one in seen])
         link_turns = arm.links(machine, track.q).base_from_link[:, :3, :3]
-        found = clock.offset(times, turns, track.t_s, link_turns, self.clock_s)
-        if found is not None and found.correlation < self.least_correlation:
-            log.warning(
-                "clocks: speeds of board and joints correlate by %.2f, %g is needed to tell an offset; it is taken for 0. "
-                "Move the arm while recording, with starts and stops.",
-                found.correlation,
-                self.least_correlation,
-            )
-        return found
+        return clock.offset(times, turns, track.t_s, link_turns, self.clock_s, self.least_correlation)
 
     def _with_joints(self, track: arm.Track, seen: list[Seen], shift_s: float, refused: list[Judged]) -> list[Seen]:
         known = []
@@ -172,8 +159,8 @@ class ByBoard:
         if moving:
             speed = track.speed(np.array([one.t_s for one in seen]) + shift_s)
             late = np.einsum("nj,njk->nk", speed, links.joints)[:, None]
-            shared, std, names = np.concatenate([shared, late], 1), [*std, CLOCK_STD_S], [*names, "clock"]
-            slack.append(JITTER_S * late)
+            shared, std, names = np.concatenate([shared, late], 1), [*std, clock.STD_S], [*names, judgement.CLOCK]
+            slack.append(clock.JITTER_S * late)
         poses, covs = (np.stack([getattr(one.sight, name) for one in seen]) for name in ("camera_from_board", "cov"))
         return Views(
             links.base_from_link, poses, covs, np.concatenate(slack, 1), shared, np.array(std), tuple(one.name for one in seen),
@@ -193,53 +180,14 @@ class ByBoard:
             raise FrameError(f"calibration: the poses do not tell where the camera is: {'; '.join(missing) or 'too few agree'}")
         for one in missing:
             log.warning("calibration: %s", one)
-        judged = [
-            Judged(
-                name, float(np.linalg.norm(away[:3])), float(np.linalg.norm(away[3:])),
-                None if good else f"{np.sqrt(far / 6.0):.0f} times as far off as it should be",
-            )
-            for name, away, far, good in zip(views.names, solution.away, solution.distance, solution.used, strict=True)
-        ]  # fmt: skip
-        shared_std = np.sqrt(np.diag(solution.cov)[12:])
-        wrong = {
-            name: {"mean": round(float(value), 6), "std": round(float(std), 6)}
-            for name, value, std in zip(views.shared_names, solution.guess.shared, shared_std, strict=True)
-        }
-        late = wrong.pop("clock", None)
-        told = None
-        if offset is not None:
-            trusted = offset.correlation >= self.least_correlation
-            told = {"offset_s": round(shift_s + (late["mean"] if late else 0.0), 4), "std_s": late["std"] if late else None,
-                    "correlation": round(offset.correlation, 3), "trusted": trusted}  # fmt: skip
         more = {
             "temperature_c": self.temperature_c,
             "T_link_board": solution.guess.link_from_board.round(9).tolist(),
-            "joint_zeros": wrong,
-            "clock": told,
-            "arm_factor": round(solution.factor, 3),
+            **judgement.told(views, solution, offset, shift_s),
             "corners_px": round(float(np.median([one.sight.error_px for one in seen])), 3),
-            "other_half": _other_half(views, solution),
             "turns_rad": turns.round(4).tolist(),
             "missing": missing,
         }
+        judged = [*judgement.of_views(views, solution), *refused]
         cov = solution.cov[:6, :6]
-        return stored("board", machine, solution.guess.base_from_camera, cov, [*judged, *refused], self.work_m, more)
-
-
-def _other_half(views: Views, solution: Solution) -> dict[str, float] | None:
-    """Returns how far off the boards of each half of the poses are from where the other half's answer expects them."""
-    used = np.flatnonzero(solution.used)
-    halves = used[::2], used[1::2]
-    if min(len(half) for half in halves) < 2 * FEWEST:
-        return None
-    away = []
-    for half, other in (halves, halves[::-1]):
-        found = refine(views.part(half), solution)
-        rest = views.part(other)
-        seen = rigid.apart(rest.camera_from_board, expected(rest, found.guess)[:, None])
-        away.append(seen[np.arange(len(rest)), np.abs(seen).sum(-1).argmin(1)])
-    sizes = np.concatenate(away)
-    return {
-        "median_m": round(float(np.median(np.linalg.norm(sizes[:, :3], axis=1))), 6),
-        "median_rad": round(float(np.median(np.linalg.norm(sizes[:, 3:], axis=1))), 6),
-    }
+        return stored("board", machine, solution.guess.base_from_camera, cov, judged, self.work_m, more)

@@ -28,13 +28,11 @@ def turns_rad(base_from_link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (high - low)[order], axes[order]
 
 
-def missing(machine: Machine, q: np.ndarray, base_from_link: np.ndarray, distance_m: np.ndarray, least_rad: float) -> list[str]:
-    """Returns in words which poses should be added; empty where they say enough.
+def unturned(base_from_link: np.ndarray, distance_m: np.ndarray, least_rad: float) -> list[str]:
+    """Returns in words what poses, `(N, 4, 4)`, do not show; empty where they say enough.
 
     Args:
-        machine: Names and travel of the joints.
-        q: Joint positions of the poses that were used, `(N, J)`.
-        base_from_link: The link there, `(N, 4, 4)`.
+        base_from_link: The link in the poses that were used.
         distance_m: How far the camera was from the board, `(N,)`.
         least_rad: About two axes at least the poses should turn this far.
     """
@@ -47,7 +45,25 @@ def missing(machine: Machine, q: np.ndarray, base_from_link: np.ndarray, distanc
                 f"the poses turn by {np.degrees(turns[number]):.0f} degrees about their {what}axis (near the {nearest}), "
                 f"{np.degrees(least_rad):.0f} are needed"
             )
-    if found:
+    if distance_m.max() < 1.2 * distance_m.min():
+        found.append(
+            f"the board is always {distance_m.min():.1f} to {distance_m.max():.1f} m away: add poses nearer and farther, by a fifth"
+        )
+    return found
+
+
+def missing(machine: Machine, q: np.ndarray, base_from_link: np.ndarray, distance_m: np.ndarray, least_rad: float) -> list[str]:
+    """Returns in words which poses of a machine should be added; see `unturned`.
+
+    Args:
+        machine: Names and travel of the joints.
+        q: Joint positions of the poses that were used, `(N, J)`.
+        base_from_link: The link there.
+        distance_m: How far the camera was from the board.
+        least_rad: About two axes at least the poses should turn this far.
+    """
+    found = unturned(base_from_link, distance_m, least_rad)
+    if turns_rad(base_from_link)[0][1] < least_rad:
         low, high = q.min(0), q.max(0)
         for column, joint in enumerate(machine.joints):
             if joint.kind == "hinge" and high[column] - low[column] < 0.5 * least_rad:
@@ -56,8 +72,4 @@ def missing(machine: Machine, q: np.ndarray, base_from_link: np.ndarray, distanc
                     f"{joint.name} stays within {np.degrees(low[column]):.0f} to {np.degrees(high[column]):.0f} degrees: add poses "
                     f"with it {room}, as far as the board stays in view"
                 )
-    if distance_m.max() < 1.2 * distance_m.min():
-        found.append(
-            f"the board is always {distance_m.min():.1f} to {distance_m.max():.1f} m away: add poses nearer and farther, by a fifth"
-        )
     return found

@@ -139,7 +139,7 @@ def test_the_offset_of_the_clocks_is_found_to_a_few_milliseconds(offset_s: float
     chance = np.random.default_rng(0)
     elsewhere = Rotation.from_rotvec([0.4, 1.0, -0.3]).as_matrix()  # nobody knows how the camera and the board are turned
     turns = elsewhere @ turns @ Rotation.from_rotvec(0.002 * chance.standard_normal((len(turns), 3))).as_matrix()
-    found = clock.offset(frame_s, turns, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0)
+    found = clock.offset(frame_s, turns, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0, 0.4)
     assert found is not None and found.correlation > 0.6
     assert found.offset_s == pytest.approx(offset_s, abs=0.02)
 
@@ -147,9 +147,9 @@ def test_the_offset_of_the_clocks_is_found_to_a_few_milliseconds(offset_s: float
 def test_an_arm_that_rests_tells_nothing_about_clocks(machine: Machine) -> None:
     frame_s, turns, t_s, q = swing(machine, 0.1, moving=False)
     noisy = turns @ Rotation.from_rotvec(0.002 * np.random.default_rng(0).standard_normal((len(turns), 3))).as_matrix()
-    found = clock.offset(frame_s, noisy, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0)
+    found = clock.offset(frame_s, noisy, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0, 0.4)
     assert found is None or found.correlation < 0.4
-    assert clock.offset(frame_s[:9], turns[:9], t_s, turns[:1].repeat(len(t_s), 0), 1.0) is None
+    assert clock.offset(frame_s[:9], turns[:9], t_s, turns[:1].repeat(len(t_s), 0), 1.0, 0.4) is None
 
 
 @settings(deadline=None, max_examples=25)
@@ -293,3 +293,42 @@ def test_the_command_takes_touched_points(brokk: Callable[..., Any], machine: Ma
     (tmp_path / "bad.yaml").write_text("points: [{pixel: [1, 2], q: [0, 0]}]")
     done = brokk(*command, f"calibration.points={tmp_path / 'bad.yaml'}", "session.out=other")
     assert done.code == 2 and "q has 2 numbers, expected 5" in done.err
+
+
+def log_of(path: Path, t_s: np.ndarray, poses: np.ndarray, named: bool = True) -> str:
+    table = np.concatenate([t_s[:, None], poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()], 1)
+    np.savetxt(path, table, delimiter=",", header="t_s,x_m,y_m,z_m,qx,qy,qz,qw" if named else "", comments="")
+    return str(path)
+
+
+@pytest.mark.parametrize("camera_on", ["base", "link"])
+def test_logs_of_poses_of_any_arm_are_enough(camera_on: str, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    chance = np.random.default_rng(1)
+    t_s, eye_s, late_s = np.arange(0.0, 40.0, 0.02), np.arange(1.0, 38.0, 0.1), -0.23
+    phase = np.outer(t_s, [0.5, 0.7, 0.9, 0.4, 0.6, 0.8])
+    wave = 0.7 * np.sin(phase + chance.uniform(0, 6, 6)) + 0.2 * np.sin(2.3 * phase)
+    hand = rigid.pose(Rotation.from_rotvec(wave[:, 3:]).as_matrix(), [0.6, 0.0, 0.5] + 0.3 * wave[:, :3])
+    x, y = (rigid.pose(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 0.3, 3)) for _ in range(2))
+    there = hand[np.searchsorted(t_s, eye_s + late_s)]
+    seen = rigid.inverse(x) @ (there if camera_on == "base" else rigid.inverse(there)) @ y
+    seen = np.array([rigid.moved(one, np.repeat([0.001, 0.003], 3) * chance.standard_normal(6)) for one in seen])
+    for k in chance.permutation(len(seen))[:40]:
+        seen[k] = rigid.moved(seen[k], chance.normal(0, 0.4, 6))
+    arm_file = log_of(tmp_path / "arm.csv", t_s, rigid.inverse(hand))
+    camera_file = log_of(tmp_path / "camera.csv", eye_s, rigid.inverse(seen), named=False)
+    done = brokk(
+        "mode=calibrate", "calibration=poses", f"calibration.arm={arm_file}", f"calibration.camera={camera_file}",
+        "calibration.arm_tells=link_from_base", "calibration.camera_tells=board_from_camera",
+        f"calibration.camera_on={camera_on}", "session.out=run",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    told = yaml.safe_load(Path("run/calibration.yaml").read_text())
+    away = rigid.apart(np.array(told[f"T_{camera_on}_cam"]), x)
+    assert np.linalg.norm(away[:3]) < 0.0037 and np.linalg.norm(away[3:]) < np.radians(0.58)
+    assert told["clock"]["trusted"] and told["clock"]["offset_s"] == pytest.approx(late_s, abs=0.015)
+    assert 15 <= told["num_left_out"] <= 28  # of 200 of 371 poses, 40 of which are wrong
+    Path("two.csv").write_text("1,0,0,0,0,0,0,1\n2,0,0,0,0,0,0,2\n")
+    refused = brokk(
+        "mode=calibrate", "calibration=poses", "calibration.arm=two.csv", "calibration.camera=two.csv", "session.out=no"
+    )
+    assert refused.code == 2 and "line 2: expected numbers and a unit quaternion" in refused.err
