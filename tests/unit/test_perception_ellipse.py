@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.sight import Ellipse, SizePrior
-from perception import bench_patterns, conic
+from perception import bench_patterns, conic, ellipse_drawing
 
 K = np.array([[1056.0, 0.0, 959.5], [0.0, 1056.0, 539.5], [0.0, 0.0, 1.0]])
 
@@ -120,6 +121,27 @@ def test_only_the_region_is_looked_at(detector) -> None:
 def test_absurd_settings_are_refused() -> None:
     with pytest.raises(ConfigError, match="coverage"):
         replace(option("perception/ellipse", "contour_arcs"), coverage=0.0)
+
+
+def test_edge_drawing_is_refused_where_opencv_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(cv2, "ximgproc", raising=False)
+    with pytest.raises(ConfigError, match="opencv-contrib-python-headless"):
+        option("perception/ellipse", "edge_drawing").build()
+
+
+def test_what_edge_drawing_proposes_is_judged_like_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = np.array([[[60.0, 50.0, 0.0, 20.0, 30.0, 0.0]], [[120.0, 50.0, 25.0, 0.0, 0.0, 0.0]]])  # the second is not there
+    drawing = SimpleNamespace(setParams=lambda _: None, detectEdges=lambda _: None, detectEllipses=lambda: found)
+    parts = SimpleNamespace(createEdgeDrawing=lambda: drawing, EdgeDrawing=SimpleNamespace(Params=SimpleNamespace))
+    monkeypatch.setattr(cv2, "ximgproc", parts, raising=False)
+    picture = np.full((100, 160), 190, np.uint8)
+    cv2.ellipse(picture, (60, 50), (20, 30), 0, 0, 360, 40, -1, cv2.LINE_AA)
+    seen = option("perception/ellipse", "edge_drawing").build().detect(picture, None, None)
+    assert len(seen) == 1
+    assert row(seen[0])[:4] == pytest.approx([60, 50, 30, 20], abs=0.8)
+    rows = ellipse_drawing.rows_of(found)
+    assert rows == pytest.approx(np.array([[60, 50, 30, 20, np.pi / 2], [120, 50, 25, 25, 0]]))
+    assert len(ellipse_drawing.rows_of(None)) == 0
 
 
 def row(one: Ellipse) -> np.ndarray:

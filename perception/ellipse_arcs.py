@@ -1,0 +1,247 @@
+"""The detector of `perception.ellipse`: candidates of whole contours, arcs and groups of arcs, refined, judged, chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brokk_rl.sight import Ellipse, SizePrior
+from perception import conic, ellipse_edges, ellipse_groups, ellipse_support
+from perception.ellipse_edges import Edges
+from perception.ellipse_support import ANGLES, NUM_SAMPLES, Candidates
+
+if TYPE_CHECKING:
+    from perception.ellipse import ContourArcs
+
+NUM_SEEDS = 64
+"""Points that stand for an arc in its first fit."""
+NOTHING = np.empty((0, 5))
+LEAST_ARC = 0.2
+"""Part of an ellipse from which the rest of it can be told."""
+ROUNDS_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
+"""Rounds of refinement: the distance at which a point counts a quarter; the rougher ones where the size is known beforehand."""
+TAIL = 2.0
+"""Of the limit of what is typical, which holds for the residuals of all the support."""
+TIGHT = 0.7
+"""Of the reach, once the ellipse is refined."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Candidates that passed, with the figures of `Ellipse` and the edge points behind each, `(C, NUM_SAMPLES)`, -1 for none."""
+
+    candidates: Candidates
+    support: np.ndarray
+    rms_px: np.ndarray
+    coverage: np.ndarray
+    score: np.ndarray
+
+
+class ArcDetector:
+    """See `ContourArcs`.
+
+    Args:
+        settings: The spec.
+        propose: Gives further ellipses `(C, 5)` of a picture `(h, w)`, refined and judged like those of the arcs; `None` for none.
+    """
+
+    def __init__(self, settings: ContourArcs, propose: Callable[[np.ndarray], np.ndarray] | None = None) -> None:
+        self.settings = settings
+        self._propose = propose
+
+    def detect(self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None) -> list[Ellipse]:
+        """Returns ellipses, the best first; see `EllipseDetector`."""
+        s = self.settings
+        if roi is not None:
+            rows, columns = (np.flatnonzero(roi.any(k)) for k in (1, 0))
+            if not len(rows):
+                return []
+            top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
+        else:
+            top, bottom, left, right = 0, gray.shape[0], 0, gray.shape[1]
+        part = gray[top:bottom, left:right]
+        if min(part.shape) < 8:
+            return []
+        limits = prior or SizePrior(0.0, float(max(part.shape)))
+        where = None if roi is None else roi[top:bottom, left:right]
+        edges = ellipse_edges.find(part, where, s.sigma_px, s.percentile, s.noise, s.low, s.arc_points)
+        if not len(edges.points):
+            return []
+        edges = edges.cut(s.arc_tolerance_px, s.corner_rad, max(s.arc_points, int(0.5 * limits.lowest_px)))
+        found = self.on(edges, limits, self._propose(part) if self._propose else NOTHING)
+        shift = np.array([left, top, 0.0, 0.0, 0.0])
+        return [
+            Ellipse(*map(float, row + shift), rms_px=float(rms), coverage=float(cover), score=float(score))
+            for row, rms, cover, score in found
+        ]
+
+    def on(self, edges: Edges, limits: SizePrior, further: np.ndarray) -> list[tuple[np.ndarray, float, float, float]]:
+        """Returns ellipses with residual, coverage and score: of whole contours, single arcs and groups of arcs, the best first.
+
+        Args:
+            edges: Edges with their arcs.
+            limits: How large ellipses may be.
+            further: Ellipses from elsewhere, `(C, 5)`, that are judged as well.
+        """
+        spans = self._compact(edges.spans, edges, limits)
+        arcs = self._compact(edges.arcs, edges, limits)
+        whole = set(map(tuple, spans.tolist()))
+        parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int).reshape(-1, 2)
+        groups = [arcs[group] for group in ellipse_groups.find(arcs, edges, (4, 3, 2))]
+        kinds = (spans[:, None], parts[:, None], *groups)
+        seeds = np.concatenate([_seeds(some) for some in kinds])
+        lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
+        first = self.first(seeds, lengths, edges, limits)
+        known = np.repeat(further[self._sized(further, limits, 1.5)], 2, 0)  # dark inside, and bright inside
+        first = Candidates(
+            np.concatenate([first.ellipses, known]), np.concatenate([first.polarity, np.tile([1.0, -1.0], len(known) // 2)])
+        )
+        refined = self.refine(first, edges, ROUGH_PX if limits.lowest_px > 0 else ROUNDS_PX)
+        return sorted(self._chosen(self.judge(refined, edges, limits), edges), key=lambda one: -one[3])
+
+    def _chosen(self, judged: Judged, edges: Edges) -> list[tuple[np.ndarray, float, float, float]]:
+        """Returns the candidates that share their support with no better one."""
+        claimed = np.zeros(len(edges.points), bool)
+        found = []
+        for k in np.argsort(-judged.score, kind="stable"):
+            mine = judged.support[k][judged.support[k] >= 0]
+            if claimed[mine].mean() > 0.4:
+                continue
+            one = judged.candidates[k : k + 1]
+            claimed[mine] = True
+            number = max(NUM_SAMPLES, int(conic.perimeter(*one.ellipses[0, 2:4])) * 2)
+            dense = self._gather(one, edges, np.arange(number) * (2 * np.pi / number))[0][0]
+            claimed[dense[dense >= 0]] = True
+            found.append((one.ellipses[0], judged.rms_px[k], judged.coverage[k], judged.score[k]))
+        return found
+
+    def first(self, seeds: np.ndarray, lengths: np.ndarray, edges: Edges, limits: SizePrior) -> Candidates:
+        """Returns the candidates of seed points `(C, P)` that lie on an ellipse of a possible size, their gradients all one way.
+
+        The arcs that the seeds stand for have `lengths`, `(C,)` points, which must be a good part of the circumference.
+        """
+        smallest = conic.perimeter(np.array(limits.lowest_px / 1.5), np.array(limits.lowest_px / 1.5 * self.settings.flattest))
+        seeds, lengths = (some[lengths >= LEAST_ARC * smallest] for some in (seeds, lengths))
+        if not len(seeds):
+            return Candidates(np.empty((0, 5)), np.empty(0))
+        points = edges.points[seeds]
+        ellipses = conic.fit(points, np.ones(seeds.shape))
+        ellipses = ellipses.copy()
+        possible = self._sized(ellipses, limits, 1.5)
+        possible &= lengths >= LEAST_ARC * np.nan_to_num(conic.perimeter(ellipses[:, 2], ellipses[:, 3]))
+        ellipses, points, seeds = ellipses[possible], points[possible], seeds[possible]
+        off = conic.distance(ellipses, points)
+        outward = (conic.normals(ellipses, points) * edges.directions[seeds]).sum(-1)
+        reach = self._reach(ellipses)
+        near = (np.abs(off) < reach[:, None]).mean(1) > 0.5
+        keep = near & (np.abs(outward.mean(1)) > 0.5)
+        return Candidates(ellipses[keep], np.sign(outward.mean(1))[keep])
+
+    def refine(self, candidates: Candidates, edges: Edges, rounds_px: tuple[float, ...]) -> Candidates:
+        """Returns the candidates fitted again to the edge points that support them.
+
+        Points are weighted so that distances count, not form values, and so that those beside the ellipse, where the edge of
+        something else meets it, count less from round to round.
+        """
+        for scale_px in rounds_px:
+            if not len(candidates.ellipses):
+                break
+            e = candidates.ellipses
+            support, off, along = self._gather(candidates, edges, ANGLES)
+            size = np.sqrt(e[:, 2] * e[:, 3])
+            slope = conic.slopes(e, edges.points[support]) * size[:, None]
+            robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / 0.05) ** 2) ** 2
+            weights = np.where(support >= 0, robust / np.maximum(slope, 1e-3) ** 2, 0.0)
+            ellipses = conic.fit(edges.points[support], weights)
+            keep = np.isfinite(ellipses).all(1)
+            candidates = Candidates(ellipses[keep], candidates.polarity[keep])
+        return candidates
+
+    def judge(self, candidates: Candidates, edges: Edges, limits: SizePrior) -> Judged:
+        """Returns the candidates with enough support of the right kind."""
+        s = self.settings
+        candidates = candidates[self._sized(candidates.ellipses, limits, 1.0) & self._inside(candidates.ellipses, edges)]
+        e = candidates.ellipses
+        if not len(e):
+            return Judged(candidates, np.empty((0, NUM_SAMPLES), int), np.empty(0), np.empty(0), np.empty(0))
+        support, off, along = self._gather(candidates, edges, ANGLES, TIGHT)
+        there = support >= 0
+        length = conic.sample(e, ANGLES)[2]
+        coverage = (length * there).sum(1) / length.sum(1)
+        count = np.maximum(there.sum(1), 1)
+        rms = np.sqrt((off**2 * there).sum(1) / count)
+        spread, angle = (
+            ellipse_support.typical(np.abs(off), there),
+            ellipse_support.typical(np.arccos(np.clip(along, -1, 1)), there),
+        )
+        size = np.sqrt(e[:, 2] * e[:, 3])
+        whole = np.clip(2 * coverage - 1, 0.0, 1.0)  # what is seen in part must fit the better: a lobe of a heart nearly does
+        slack = s.prior_slack if limits.lowest_px > 0 else 1.0
+        rms_limit = slack * (s.rms_px * coverage + s.rms_relative * size * whole)
+        angle_limit = slack * (s.angle_rms_rad * coverage**1.5 + s.angle_rms_small / size * coverage)
+        good = (coverage >= s.coverage) & (spread <= rms_limit) & (rms <= TAIL * rms_limit) & (angle <= angle_limit)
+        good &= ellipse_support.evidence(coverage, angle, conic.perimeter(e[:, 2], e[:, 3]), s.angle_rad) >= s.evidence
+        candidates, support, length = candidates[good], support[good], length[good]
+        rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
+        rms_limit, angle_limit = rms_limit[good], angle_limit[good]
+        good = ellipse_support.gap(support >= 0, length) <= s.gap
+        purity, rest_px = ellipse_support.purity(edges, support, length)
+        size = np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3])
+        good &= purity >= s.purity / slack
+        good &= (rest_px <= s.rest_px + s.rest_relative * size) | (limits.lowest_px > 0)
+        good &= (
+            ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses)) <= s.departure * slack
+        )
+        score = coverage * np.clip(1 - 0.5 * spread / rms_limit, 0, 1) * np.clip(1 - 0.5 * angle / angle_limit, 0, 1)
+        good &= score * slack**2 >= s.score * np.clip(
+            3 * coverage - 1.5, 0.0, 1.0
+        )  # what is seen all around must fit well to count
+        return Judged(candidates[good], support[good], rms[good], coverage[good], score[good])
+
+    def _gather(
+        self, candidates: Candidates, edges: Edges, angles_rad: np.ndarray, tight: float = 1.0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return ellipse_support.gather(
+            candidates, edges, angles_rad, tight * self._reach(candidates.ellipses), self.settings.angle_rad
+        )
+
+    def _sized(self, ellipses: np.ndarray, limits: SizePrior, slack: float) -> np.ndarray:
+        a, b = ellipses[:, 2], ellipses[:, 3]
+        with np.errstate(invalid="ignore"):
+            return (
+                (a * slack >= limits.lowest_px)
+                & (a <= limits.highest_px * slack)
+                & (b * slack >= self.settings.smallest_px)
+                & (b * slack >= a * self.settings.flattest)
+            )
+
+    def _inside(self, ellipses: np.ndarray, edges: Edges) -> np.ndarray:
+        """Says which centres lie in the picture."""
+        height, width = edges.nearest.shape
+        x, y = ellipses[:, 0], ellipses[:, 1]
+        return (x >= 0) & (y >= 0) & (x < width) & (y < height)
+
+    def _compact(self, spans: np.ndarray, edges: Edges, limits: SizePrior) -> np.ndarray:
+        """Returns the spans that are neither larger nor smaller than a good part of an ellipse can be."""
+        if not len(spans):
+            return spans
+        places = edges.points[(spans[:, :1] + np.linspace(0, 1, 9) * (spans[:, 1:] - 1 - spans[:, :1])).astype(int)]
+        extent = np.ptp(places, axis=1)
+        return spans[(extent.max(1) <= 2.2 * limits.highest_px) & (np.hypot(*extent.T) >= 0.5 * limits.lowest_px)]
+
+    def _reach(self, ellipses: np.ndarray) -> np.ndarray:
+        size = np.sqrt(ellipses[:, 2] * ellipses[:, 3])
+        return np.clip(self.settings.reach_relative * size, self.settings.reach_px, 4.0 * self.settings.reach_px)
+
+
+def _seeds(groups: np.ndarray) -> np.ndarray:
+    """Returns evenly spread points of each group of spans `(C, G, 2)`, of each span as many as it is long, `(C, NUM_SEEDS)`."""
+    ends = np.cumsum(groups[..., 1] - groups[..., 0], 1)
+    place = (np.arange(NUM_SEEDS) + 0.5) / NUM_SEEDS * ends[:, -1:]
+    number = (place[..., None] >= ends[:, None]).sum(-1)
+    rows = np.arange(len(groups))[:, None]
+    before = np.concatenate([np.zeros((len(ends), 1), int), ends], 1)[rows, number]
+    return (groups[rows, number, 0] + place - before).astype(int)
