@@ -153,7 +153,7 @@ def _paths(page: Page, outcome: Outcome, machine: Machine) -> None:
     page.heading("Measured and simulated")
     caption = (
         "Joints with the largest gaps. The simulator is given the recorded commands (grey, below) and begins "
-        "anew every 5 s (thin lines). Black: measured; red: simulated as it was; blue: with the effects that were found."
+        "anew every 5 s (thin lines). Black: measured; orange: simulated as it was; blue: with the effects that were found."
     )
     page.picture(pictures.paths(outcome, machine), caption)
 

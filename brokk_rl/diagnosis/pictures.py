@@ -1,6 +1,6 @@
 """Pictures of a diagnosis, fit to be printed: the gap, where it lies, measured against simulated, how it grows, who caused it.
 
-Black is what was measured, red the simulator as it was, blue with the effects that were found, grey the floor.
+Black is what was measured, orange the simulator as it was, blue with the effects that were found, grey the floor.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def paths(outcome: Outcome, machine: Machine) -> Figure:
         second = next((w for w in worst[1:] if before.source[w] != before.source[worst[0]]), worst[min(1, len(worst) - 1)])
         whole = np.flatnonzero(before.source == before.source[worst[0]])
         for column, (title, windows) in enumerate(
-            (("a whole recording", whole), ("worst window", worst[:1]), ("worst elsewhere", np.array([second])))
+            (("a whole recording", whole), ("worst window", worst[:1]), ("elsewhere", np.array([second])))
         ):
             grid = rows[line, column].subgridspec(2, 1, height_ratios=[3.2, 1.0], hspace=0.1)
             above = figure.add_subplot(grid[0])
