@@ -44,6 +44,11 @@ class Device(Protocol):
         """Waits for a new capture; `None` when there is none within the time."""
         ...
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether no capture will come any more: a recording is at its end."""
+        ...
+
     def now_s(self) -> float:
         """Returns the time on the clock by which captures are stamped."""
         ...
@@ -106,7 +111,7 @@ class LiveSource:
         self._device.close()
 
     def read_latest(self) -> Frame | None:
-        """Returns the newest frame, waiting for one that has not been returned yet and is not too old.
+        """Returns the newest frame, waiting for one that has not been returned yet and is not too old; `None` after a recording.
 
         Raises:
             FrameError: no such frame came in time, or it cannot be used.
@@ -117,6 +122,8 @@ class LiveSource:
         until = time.monotonic() + left
         while left > 0:
             capture = self._device.capture(left)
+            if capture is None and self._device.has_ended:
+                return None
             if capture is not None and capture.t_s > self._last_s:
                 age_s = self._device.now_s() - capture.t_s
                 if age_s <= self._fresh.max_age_s:

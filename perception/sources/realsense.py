@@ -45,6 +45,8 @@ class RealSense:
 class RealSenseDevice:
     """The library behind `Device`; see `perception.sources.live`."""
 
+    has_ended = False
+
     def __init__(self, settings: RealSense) -> None:
         self._settings = settings
         self._pipeline: Any = None
@@ -60,6 +62,7 @@ class RealSenseDevice:
             rs = importlib.import_module("pyrealsense2")
         except ImportError as error:
             raise FrameError("RealSense camera: the Python package `pyrealsense2` is not installed") from error
+        self._rs = rs
         settings, config = self._settings, rs.config()
         if settings.serial is not None:
             config.enable_device(settings.serial)
@@ -77,7 +80,10 @@ class RealSenseDevice:
         self._scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
         lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
         matrix = np.array([[lens.fx, 0.0, lens.ppx], [0.0, lens.fy, lens.ppy], [0.0, 0.0, 1.0]])
-        return Lens(matrix, soundness.distortion(list(lens.coeffs), "RealSense camera"), None)
+        coefficients = np.array(lens.coeffs, float)
+        if lens.model == rs.distortion.inverse_brown_conrady and coefficients.any():
+            coefficients = forward(coefficients, matrix, size)
+        return Lens(matrix, soundness.distortion(coefficients.tolist(), "RealSense camera"), None)
 
     def capture(self, timeout_s: float) -> Capture | None:
         """Returns the next capture, `None` when there is none in time."""
@@ -90,10 +96,13 @@ class RealSenseDevice:
             return None
         # copies: the library reuses its memory
         values = np.asanyarray(depth.get_data()).astype(np.float32) * np.float32(self._scale_m)
-        return Capture(np.array(color.get_data(), np.uint8), values, float(color.get_timestamp()) * 1e-3)
+        # without its global time the library stamps by the camera's own clock, which nobody else knows: the time of arrival, then
+        own_clock = color.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock
+        t_s = time.time() if own_clock else float(color.get_timestamp()) * 1e-3
+        return Capture(np.array(color.get_data(), np.uint8), values, t_s)
 
     def now_s(self) -> float:
-        """Returns the host's time: the library stamps captures by it."""
+        """Returns the host's time: captures are stamped by it."""
         return time.time()
 
     def close(self) -> None:
@@ -101,3 +110,30 @@ class RealSenseDevice:
         if self._started:
             self._started = False
             self._pipeline.stop()
+
+
+def forward(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Returns OpenCV's coefficients `k1 k2 p1 p2 k3` of a lens of which the inverse is told, `(5,)`.
+
+    OpenCV's polynomial says where a ray is seen, RealSense's inverse one, the same in form, which ray is seen; the nearest of the
+    first kind is found on a grid over the picture.
+
+    Args:
+        inverse: Coefficients of the inverse.
+        matrix: Camera matrix.
+        size: Width and height of the picture, px.
+    """
+    columns, rows = np.meshgrid(np.linspace(0, size[0] - 1, 24), np.linspace(0, size[1] - 1, 16))
+    seen = np.stack([(columns.ravel() - matrix[0, 2]) / matrix[0, 0], (rows.ravel() - matrix[1, 2]) / matrix[1, 1]])
+    ray = seen + _bend(seen) @ inverse
+    table = _bend(ray)
+    return np.linalg.lstsq(table.reshape(-1, 5), (seen - ray).ravel(), rcond=None)[0]
+
+
+def _bend(point: np.ndarray) -> np.ndarray:
+    """Returns by how much each coefficient moves points `(2, M)` of the plane z = 1, `(2, M, 5)`."""
+    x, y = point
+    r2 = x * x + y * y
+    along_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], -1)
+    along_y = np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], -1)
+    return np.stack([along_x, along_y])

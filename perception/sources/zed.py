@@ -69,6 +69,7 @@ class ZedDevice:
         self._settings = settings
         self._sl: Any = None
         self._camera: Any = None
+        self.has_ended = False
 
     def open(self) -> Lens:
         """Opens the camera.
@@ -114,8 +115,9 @@ class ZedDevice:
     def capture(self, timeout_s: float) -> Capture | None:
         """Returns the next capture, `None` when there is none in time or the recording has ended."""
         sl, until = self._sl, time.monotonic() + timeout_s
-        while self._camera.grab(self._runtime) != sl.ERROR_CODE.SUCCESS:
-            if time.monotonic() > until:
+        while (status := self._camera.grab(self._runtime)) != sl.ERROR_CODE.SUCCESS:
+            self.has_ended = self._settings.recording is not None and status == sl.ERROR_CODE.END_OF_SVOFILE_REACHED
+            if self.has_ended or time.monotonic() > until:
                 return None
             time.sleep(_TRIES_S)
         self._camera.retrieve_image(self._picture, sl.VIEW.LEFT)

@@ -215,6 +215,8 @@ def test_a_pair_without_depth_is_matched(tmp_path: Path) -> None:
 class Clock:
     """A camera of 10 Hz whose frames reach us `lag_s` after they were taken; `grabs` says what each call finds."""
 
+    has_ended = False
+
     def __init__(self, stamps: list[float | None], lag_s: float = 0.0) -> None:
         self.stamps, self.lag_s, self.now, self.closed, self.opened = stamps, lag_s, 0.0, 0, True
 
@@ -270,7 +272,7 @@ def test_a_live_source_is_closed_when_opening_fails_and_read_only_when_open() ->
 class StubZed:
     """What `pyzed.sl.Camera` did on a ZED 2i with SDK 4: the recorded answers, for a picture that is small."""
 
-    status, opened = "SUCCESS", None
+    status, opened, left = "SUCCESS", None, 1000
 
     def open(self, init: Any) -> str:
         StubZed.opened = init
@@ -278,7 +280,8 @@ class StubZed:
 
     def grab(self, runtime: Any) -> str:
         self.fill = runtime.enable_fill_mode
-        return "SUCCESS"
+        self.left -= 1
+        return "SUCCESS" if self.left >= 0 else "END"
 
     def get_camera_information(self) -> Any:
         left = SimpleNamespace(fx=88.0, fy=88.0, cx=79.5, cy=44.5, disto=[-0.04, 0.01, 0, 0, 0])
@@ -311,8 +314,8 @@ class Mat:
 def pyzed(monkeypatch: pytest.MonkeyPatch) -> None:
     sl: Any = ModuleType("pyzed.sl")
     sl.Camera, sl.Mat = StubZed, Mat
-    sl.InitParameters = sl.RuntimeParameters = lambda: SimpleNamespace(enable_fill_mode=True)
-    sl.ERROR_CODE = SimpleNamespace(SUCCESS="SUCCESS")
+    sl.InitParameters = sl.RuntimeParameters = lambda: SimpleNamespace(enable_fill_mode=True, set_from_svo_file=lambda path: None)
+    sl.ERROR_CODE = SimpleNamespace(SUCCESS="SUCCESS", END_OF_SVOFILE_REACHED="END")
     sl.RESOLUTION, sl.DEPTH_MODE = SimpleNamespace(HD1080="HD1080"), SimpleNamespace(NEURAL="NEURAL")
     sl.UNIT, sl.COORDINATE_SYSTEM = SimpleNamespace(METER="metre"), SimpleNamespace(IMAGE="image")
     sl.VIEW, sl.MEASURE = SimpleNamespace(LEFT="left", RIGHT="right"), SimpleNamespace(DEPTH="depth")
@@ -334,6 +337,34 @@ def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(monkeypa
     assert frame.t_s == pytest.approx(1.7e9) and frame.baseline_m == pytest.approx(0.11986)
     assert frame.distortion is None  # the picture is rectified; the coefficients are those of the raw one
     np.testing.assert_array_equal(frame.camera_matrix, MATRIX)
+
+
+def test_a_recording_of_a_zed_ends_and_knows_where_the_camera_was(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pyzed(monkeypatch)
+    monkeypatch.setattr(StubZed, "left", 1)
+    (tmp_path / "calibration.yaml").write_text(yaml.safe_dump({"schema": 1, "T_base_cam": POSE.tolist()}))
+    place = str(tmp_path / "calibration.yaml")
+    with replace(option("perception/source", "zed"), recording="a.svo", base_from_camera=place).build() as source:
+        first = source.read_latest()
+        assert first is not None and source.read_latest() is None
+    np.testing.assert_allclose(first.base_from_camera, POSE)
+    with pytest.raises(FrameError, match=r"source.base_from_camera: nowhere.yaml cannot be read"):
+        replace(option("perception/source", "zed"), base_from_camera="nowhere.yaml").build()
+
+
+def test_a_lens_whose_inverse_is_told_bends_as_opencv_says() -> None:
+    inverse = np.array([0.06, -0.04, 0.0008, -0.0005, 0.01])
+    matrix = np.array([[640.0, 0.0, 639.5], [0.0, 640.0, 359.5], [0.0, 0.0, 1.0]])
+    coefficients = realsense.forward(inverse, matrix, (1280, 720))
+    pixel = np.array([[100.0, 60.0], [640.0, 300.0], [1200.0, 650.0]])
+    x, y = ((pixel - matrix[:2, 2]) / 640.0).T
+    r2, (k1, k2, p1, p2, k3) = x * x + y * y, inverse
+    bent = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3  # the library's own deprojection, written down
+    ray = np.stack(
+        [x * bent + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * bent + 2 * p2 * x * y + p1 * (r2 + 2 * y * y), 1 + 0 * x], 1
+    )
+    seen = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
+    np.testing.assert_allclose(seen, pixel, atol=0.3)
 
 
 def test_a_zed_that_is_not_there_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -358,7 +389,9 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
     streams: list[Any] = []
     rs.stream, rs.format = SimpleNamespace(depth="depth", color="color"), SimpleNamespace(z16="z16", rgb8="rgb8")
     rs.config = lambda: SimpleNamespace(enable_stream=lambda *stream: streams.append(stream))
-    lens = SimpleNamespace(fx=88.0, fy=88.0, ppx=79.5, ppy=44.5, coeffs=[0.0] * 5)
+    rs.distortion = SimpleNamespace(inverse_brown_conrady="inverse")
+    rs.timestamp_domain = SimpleNamespace(hardware_clock="own")
+    lens = SimpleNamespace(fx=88.0, fy=88.0, ppx=79.5, ppy=44.5, coeffs=[0.0] * 5, model="inverse")
     profile = SimpleNamespace(
         get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: SimpleNamespace(get_depth_scale=lambda: 0.001)),
         get_stream=lambda _: SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens)),
@@ -368,7 +401,9 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
     frames = SimpleNamespace(
         get_depth_frame=lambda: SimpleNamespace(get_data=lambda: z16),
         get_color_frame=lambda: SimpleNamespace(
-            get_data=lambda: np.full((*SIZE, 3), 7, np.uint8), get_timestamp=lambda: 1000 * realsense.time.time()
+            get_data=lambda: np.full((*SIZE, 3), 7, np.uint8),
+            get_timestamp=lambda: 5e6,  # of a clock that began with the camera
+            get_frame_timestamp_domain=lambda: "own",
         ),
     )
     waits: list[int] = []
