@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 from brokk_rl.contracts import Operator, TrialGround
 from brokk_rl.machine import Machine
@@ -13,9 +13,7 @@ from brokk_rl.spec import spec
 class Steps(Protocol):
     """What a study is made of; the room of the machine's computer has it."""
 
-    def run(
-        self, machine: Machine, session: Session, ground: TrialGround | None, guided: Operator | None, unguided: Operator | None
-    ) -> float | None:
+    def run(self, machine: Machine, session: Session, ground: TrialGround, guided: Operator, unguided: Operator) -> float | None:
         """Does the step that was asked for; simulated operators work on `ground`, with advice shown and without."""
         ...
 
@@ -28,17 +26,17 @@ class Study:
         session: Folder, seed, device.
         machine: The machine.
         study: Plan, measures, statistics.
-        ground: Where simulated operators work; `null`: nowhere, as on the machine's own computer.
-        guided: Simulated operators with advice; `null`: none.
+        ground: Where simulated operators work.
+        guided: Simulated operators with advice.
         unguided: Simulated operators without; the same persons.
     """
 
     session: Session
     machine: Machine
     study: Steps
-    ground: Any
-    guided: Any
-    unguided: Any
+    ground: TrialGround
+    guided: Operator
+    unguided: Operator
 
     def run(self) -> float | None:
         """Leaves `plan.{json,html}` or `report.html` with its pictures and tables in the run folder."""

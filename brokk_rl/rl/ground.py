@@ -29,6 +29,7 @@ class Simulated:
         actuator: How commands become motion.
         effect: Effects around the actuator model, by name.
         policy: Who advises, a spec of `conf/policy`.
+        assumed: Hands of the operator as the advice assumes them; the task's advice takes its numbers from here.
         noise: Standard deviation of recorded positions, rad or m.
         settle_s: Time for which a recording goes on after the insertion.
     """
@@ -38,6 +39,7 @@ class Simulated:
     actuator: Actuator
     effect: dict[str, Effect]
     policy: Any
+    assumed: Any
     noise: float
     settle_s: float
 

@@ -11,13 +11,24 @@ import numpy as np
 from brokk_rl import record
 from brokk_rl.contracts import Operator, OperatorModel, OperatorView, TrialBatch, TrialGround
 from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
 from brokk_rl.session import Session
+from brokk_rl.spec import spec
 from deploy.study import folder as folders
 from deploy.study import tlx
 from deploy.study.design import Design, Trial
 from deploy.study.measures import measure
 
 NOTICE = "simulated operators: no person took part, and nothing here is evidence about people"
+
+
+@spec
+class Nowhere:
+    """No simulator: studies are planned, done by people and reported, as on the machine's own computer."""
+
+    def run(self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel) -> list[Recording]:
+        """Is never asked: the study refuses before it begins; see `brokk_rl.contracts.TrialGround`."""
+        raise NotImplementedError
 
 
 def simulate(

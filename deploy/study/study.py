@@ -19,7 +19,7 @@ from deploy.study import plan_page, report
 from deploy.study.analysis import analyse
 from deploy.study.design import Design
 from deploy.study.practice import Practice, share_significant
-from deploy.study.simulation import simulate
+from deploy.study.simulation import Nowhere, simulate
 
 log = logging.getLogger(__name__)
 
@@ -48,19 +48,15 @@ class Steps:
     practice: Practice
     num_studies: int
 
-    def run(
-        self, machine: Machine, session: Session, ground: TrialGround | None, guided: Operator | None, unguided: Operator | None
-    ) -> None:
+    def run(self, machine: Machine, session: Session, ground: TrialGround, guided: Operator, unguided: Operator) -> None:
         """Does the step `do`; see `brokk_rl.modes.study.Steps`."""
         if self.do == "plan":
             self._plan(machine, session)
         elif self.do == "erase":
             self._erase(session)
         elif self.do == "simulate":
-            if ground is None or guided is None or unguided is None:
-                raise ConfigError(
-                    "study.do=simulate needs a ground and operators: ground=simulated, operator@guided=…, operator@unguided=…"
-                )
+            if isinstance(ground, Nowhere):
+                raise ConfigError("study.do=simulate needs a simulator: ground=simulated")
             planned = self._plan(machine, session)
             simulate(self._home(session), self.design, planned, machine, session, ground, guided, unguided)
             self._report(machine, session)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from deploy.study.operators.traits import Traits
 RNG = np.random.default_rng(0)
 START = np.array([0.0, -0.95, 0.5, 1.15, 0.6]) + RNG.uniform(-0.3, 0.3, (8, 5)) * [1.5, 0.2, 0.5, 0.5, 0.5]
 RIM_M = np.column_stack((RNG.uniform(2.4, 2.8, 8), RNG.uniform(-0.8, 0.8, 8), np.full(8, 0.75)))
+ROOT = Path(__file__).parents[2]
 EXACT: dict[str, Any] = {"delay_s": 0.27, "lag_s": 0.15, "gain": 0.9, "tremor": 0.0, "dead_zone": 0.04, "grip_s": 0.5}
 
 
@@ -118,7 +121,16 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(brokk: Calla
     assert again.code == 0 and (tmp_path / "again" / "report.html").exists()
 
 
+def test_a_study_needs_neither_torch_nor_simulator() -> None:
+    code = (
+        "import sys, brokk_rl.modes.study, deploy.study.study; print([m for m in ('torch', 'mujoco', 'warp') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout == "[]\n"
+
+
 def test_what_cannot_be_done_is_said(brokk: Callable[..., Any]) -> None:
+    done = brokk("mode=study", "study.do=simulate", "ground=none", "session.out=run")
+    assert done.code == 2 and "ground=simulated" in done.err
     done = brokk("mode=study", "study.do=report", "study.folder=nowhere", "session.out=run")
     assert done.code == 2 and "holds no study" in done.err
     done = brokk("mode=study", "study.do=erase", "session.out=run")
