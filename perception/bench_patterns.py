@@ -42,7 +42,7 @@ def pattern(generator: np.random.Generator, condition: str, width: int = 1024, h
             parts = (1.0, 0.62, 0.3) if rings and radius > 0.2 else (1.0,)
             for k, part in enumerate(parts):
                 circle = np.array([[i, j, radius * part, radius * part, 0.0]])
-                forms.append(_moved(circle, homography))
+                forms.append(moved(circle, homography))
                 levels.append(ink if k % 2 == 0 else paper)
     ellipses = np.concatenate(forms)
     table = _table(generator, width, height)
@@ -52,7 +52,7 @@ def pattern(generator: np.random.Generator, condition: str, width: int = 1024, h
     for ellipse, level in zip(ellipses, levels, strict=True):
         _fill(canvas, ellipse, float(level))
     picture = cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
-    lit = picture * _light(generator, width, height)
+    lit = picture * light(generator, width, height)
     large = (ellipses[:, 3] >= 2.5) & (ellipses[:, 0] - ellipses[:, 2] > 2) & (ellipses[:, 0] + ellipses[:, 2] < width - 2)
     return degraded(lit, condition, generator, ellipses), ellipses[large]
 
@@ -86,7 +86,7 @@ def negative(kind: str, generator: np.random.Generator, width: int = 1024, heigh
     if kind == "noise":
         return np.clip(generator.normal(128, 50, (height, width)), 0, 255).astype(np.uint8)
     if kind == "texture":
-        return np.clip(128 + 60 * _clouds(generator, width, height, 1.2), 0, 255).astype(np.uint8)
+        return np.clip(128 + 60 * clouds(generator, width, height, 1.2), 0, 255).astype(np.uint8)
     big = np.full((height * 2, width * 2), 230.0, np.float32)
     ink = 40.0
     if kind == "spiral":
@@ -135,7 +135,8 @@ def matches(found: Sequence[Ellipse], truth: np.ndarray, least: float = 0.8) -> 
     return len(used_rows)
 
 
-def _moved(circle: np.ndarray, homography: np.ndarray) -> np.ndarray:
+def moved(circle: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Returns the ellipses `(C, 5)` that circles, rows like theirs, are after a homography."""
     back = np.linalg.inv(homography)
     return conic.ellipse_of(back.T @ conic.form(circle) @ back)
 
@@ -147,7 +148,7 @@ def _fill(canvas: np.ndarray, ellipse: np.ndarray, level: float) -> None:
     cv2.ellipse(canvas, (round(place[0]), round(place[1])), size, float(np.degrees(theta)), 0, 360, level, -1, cv2.LINE_AA, 4)
 
 
-def _clouds(generator: np.random.Generator, width: int, height: int, power: float) -> np.ndarray:
+def clouds(generator: np.random.Generator, width: int, height: int, power: float) -> np.ndarray:
     """Returns noise whose spectrum falls with frequency, of unit variance."""
     fy, fx = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)
     spectrum = np.fft.rfft2(generator.normal(size=(height, width))) / np.maximum(np.hypot(fx, fy), 1 / width) ** power
@@ -156,14 +157,15 @@ def _clouds(generator: np.random.Generator, width: int, height: int, power: floa
 
 
 def _table(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
-    table = generator.uniform(60, 180) + 12 * _clouds(generator, width, height, 1.5)
+    table = generator.uniform(60, 180) + 12 * clouds(generator, width, height, 1.5)
     for _ in range(int(generator.integers(0, 12))):
         ends = (generator.uniform(0, 1, (2, 2)) * (width, height)).astype(int).tolist()
         cv2.rectangle(table, ends[0], ends[1], float(generator.uniform(0, 255)), -1)
     return table
 
 
-def _light(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
+def light(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
+    """Returns how bright a lamp from one side makes each place of a picture, `(height, width)`."""
     slope = generator.uniform(-0.25, 0.25, 2)
     x, y = np.meshgrid(np.linspace(-1, 1, width, dtype=np.float32), np.linspace(-1, 1, height, dtype=np.float32))
     return np.clip(0.85 + slope[0] * x + slope[1] * y, 0.3, 1.15)

@@ -12,7 +12,7 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.sight import Ellipse, SizePrior
-from perception import bench_patterns, conic, ellipse_drawing
+from perception import bench_patterns, bench_photographs, conic, ellipse_drawing
 
 K = np.array([[1056.0, 0.0, 959.5], [0.0, 1056.0, 539.5], [0.0, 0.0, 1.0]])
 
@@ -78,7 +78,15 @@ def test_patterns_are_found_in_any_light(condition: str, recall: float, detector
     assert hits >= 0.95 * len(found)
 
 
-@pytest.mark.parametrize("kind", ["noise", "spiral", "squares"])
+@pytest.mark.parametrize("style", ["dots", "rings", "board"])
+def test_coloured_photographs_are_searched_as_well(style: str, detector) -> None:
+    picture, truth = bench_photographs.photograph(np.random.default_rng(7), style, 512, 384)
+    found = detector.detect(picture, None, None)
+    hits = bench_patterns.matches(found, truth)
+    assert len(truth) > 5 and hits >= 0.95 * len(truth) and hits >= 0.95 * len(found)
+
+
+@pytest.mark.parametrize("kind", ["noise", "spiral", "squares", "octagons"])
 def test_nothing_is_found_where_nothing_is(kind: str, detector) -> None:
     assert not detector.detect(bench_patterns.negative(kind, np.random.default_rng(0), 512, 384), None, None)
 
