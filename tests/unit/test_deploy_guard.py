@@ -356,3 +356,22 @@ def test_nobody_needs_to_follow_what_is_not_commanded() -> None:
 
 def test_the_states_have_the_numbers_that_travel_on_the_bus() -> None:
     assert {state.name: state.value for state in State} == {"SILENT": 0, "LATCHED": 1, "READY": 2, "ACTIVE": 3}
+
+
+def test_what_lies_exactly_on_a_limit_of_time_or_reach_is_allowed() -> None:
+    limits = replace(LIMITS, gap_s=0.25, jump_slack=0.25, jump_margin=2.0)  # exact in binary
+    hand = Hand(limits)
+    hand.now_s = 0.0
+    hand.decide(RELEASED, dt=0.25)
+    hand.decide(RELEASED, dt=0.25)
+    assert hand.decide(WELL, dt=0.25).state is State.ACTIVE and hand.decide(WELL, dt=0.25).trip is Trip.NONE
+    watch = Plausibility(limits, BODY)
+    assert watch.accept(0, 0.0, 0.0) and watch.accept(0, 0.25, 0.5) and not watch.accept(0, 0.25, 0.7501)
+
+
+def test_positions_are_plausible_until_as_many_jumps_as_it_takes() -> None:
+    watch = Plausibility(LIMITS, BODY)
+    for _ in range(LIMITS.num_jumps):
+        assert watch.plausible
+        watch.accept(1, 0.0, 9.0)
+    assert not watch.plausible
