@@ -48,6 +48,8 @@ function fresh(shown, name, since_s) {
   return Boolean(stream && stream.age_s !== null && stream.age_s + since_s <= stream.limit_s);
 }
 
+const CALM_MS = 90;  // what is read, not followed, changes no faster
+let calm = 0;
 function draw() {
   const since_s = (performance.now() - came) / 1000;
   const lost = newest === null || since_s > setup.stale_s;
@@ -57,8 +59,11 @@ function draw() {
   const shown = newest.shown;
   if (!lost) put($("connection"), say(shown.alive ? "connected" : "dead"), shown.alive ? "good" : "bad");
   const good = name => !lost && shown.alive && fresh(shown, name, since_s);
-  drawSafety(shown, lost, good("levers"));
   drawLevers(shown, { own: good("levers"), advised: good("advice") && good("positions") && Boolean(shown.advice?.valid) });
+  const now = performance.now();
+  if (now - calm < CALM_MS && !lost) return;
+  calm = now;
+  drawSafety(shown, lost, good("levers"));
   drawStreams(shown, since_s);
   $("camera").hidden = !shown.streams.some(one => one.name === "camera");
   $("camera").classList.toggle("stale", !good("camera"));
@@ -174,6 +179,7 @@ addEventListener("keydown", event => {
 
 function speak() {
   say = words(language);
+  calm = 0;
   document.documentElement.lang = language;
   document.title = `${setup.machine} – ${say("title")}`;
   for (const id of ["start", "stop", "record"]) put($(id).querySelector("b"), say(id));

@@ -6,11 +6,12 @@ import { Shapes, block, boreholes, ground, machine, path } from "./shapes.js";
 import { Socket } from "./socket.js";
 
 const FOV = 0.7, NEAR = 0.1, FAR = 40, REPORT_MS = 1000;
+const APART_MS = 24;  // 30 frames a second are enough here; what is left belongs to the levers
 const view = { at: [1.7, 0, 0.7], distance: 6.2, azimuth: -1.05, height: 0.42 };
 const floor = new Shapes();
 ground(floor);
 let painter = null, setup = null, state = null, changed = true, drawn = 0, since = performance.now();
-let frames = 0, undrawn = null;
+let frames = 0, undrawn = null, latest = 0;
 
 function start({ canvas, geometry, points, size }) {
   setup = { canvas, geometry, points };
@@ -20,9 +21,8 @@ function start({ canvas, geometry, points, size }) {
   requestAnimationFrame(tick);
 }
 
-function resize([width, height]) {
-  setup.canvas.width = Math.max(1, width);
-  setup.canvas.height = Math.max(1, height);
+function resize(size) {
+  [setup.canvas.width, setup.canvas.height] = size.map(length => Math.max(1, length));
   changed = true;
 }
 
@@ -44,8 +44,10 @@ async function take(data, socket) {
 
 function tick() {
   requestAnimationFrame(tick);
-  if (!changed) return;
-  changed = false;
+  const now = performance.now();
+  if (now - since >= REPORT_MS) report(now);
+  if (!changed || now - latest < APART_MS) return;
+  [changed, latest] = [false, now];
   const shapes = new Shapes();
   if (state) {
     if (setup.geometry && state.q) machine(shapes, setup.geometry, state.q);
@@ -62,11 +64,11 @@ function tick() {
     postMessage({ measured: { frames: undrawn.number, frame_ms: performance.now() - undrawn.began, points: painter.points } });
     undrawn = null;
   }
-  const now = performance.now();
-  if (now - since >= REPORT_MS) {
-    postMessage({ measured: { fps: 1000 * drawn / (now - since) } });
-    [drawn, since] = [0, now];
-  }
+}
+
+function report(now) {
+  postMessage({ measured: { fps: 1000 * drawn / (now - since) } });
+  [drawn, since] = [0, now];
 }
 
 const acts = {
