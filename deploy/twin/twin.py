@@ -16,10 +16,11 @@ import numpy as np
 from brokk_rl.contracts import Connection, Link
 from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
-from brokk_rl.session import Session
+from brokk_rl.session import Session, write_text
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from deploy.bus.description import GATEWAY, Description
+from deploy.bus.header import c_header
 from deploy.bus.wire import OpenWire, Wire, Wired
 from deploy.loop.process import Pace, Stop
 from deploy.twin.faults import FaultPort, Faults
@@ -30,6 +31,7 @@ log = logging.getLogger(__name__)
 
 CYCLE_S = 0.01
 PRESS_S = 1.0
+HEADER = "gateway.h"
 FLOOD = 30
 """Frames a cycle of a babbling node."""
 
@@ -59,11 +61,13 @@ class Twin:
             raise ConfigError(f"twin.fault_port: expected 1 to 65535, or null, got {self.fault_port}")
 
     def run(self, stop: Stop, machine: Machine, plant: Connection, session: Session) -> None:
-        """Runs until told to stop, or the time is over.
+        """Runs until told to stop, or the time is over; leaves `gateway.h`, the bus for the firmware of a real gateway.
 
         Raises:
             LinkError: the bus cannot be opened.
         """
+        session.folder.mkdir(parents=True, exist_ok=True)
+        write_text(session.folder / HEADER, c_header(Description(self.dbc, machine)))
         with plant.build(machine, 1, session) as link, self.wire.open() as bus, FaultPort(self.fault_port) as port:
             _Running(self, machine, link, bus, port).run(stop)
 

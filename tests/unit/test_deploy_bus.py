@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -215,6 +217,25 @@ def test_a_description_for_other_joints_is_refused(machine: Machine) -> None:
     )
     with pytest.raises(ConfigError, match="Command_j0"):
         Description(DBC, other)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_the_header_computes_the_same_crc_in_c(bus: Description, tmp_path: Path) -> None:
+    layout = bus.command
+    data = bus.encode("ValveCmd", {"Command_q1": 0.4}, 5)
+    numbers = ", ".join(map(str, data))
+    (tmp_path / "bus.h").write_text(c_header(bus))
+    (tmp_path / "main.c").write_text(
+        f"""#include <stdio.h>
+#include "bus.h"
+int main(void) {{
+  const uint8_t data[] = {{{numbers}}};
+  printf("%d", brokk_crc8(data, BROKK_VALVE_CMD_LENGTH, BROKK_VALVE_CMD_CRC_BYTE, BROKK_VALVE_CMD_DATA_ID));
+}}"""
+    )
+    subprocess.run(["cc", "-Wall", "-Werror", "-std=c99", "-o", "main", "main.c"], cwd=tmp_path, check=True)
+    found = subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert int(found) == data[layout.crc_byte]
 
 
 def test_the_header_for_a_gateway_says_what_the_description_says(bus: Description) -> None:
