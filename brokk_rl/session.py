@@ -140,7 +140,7 @@ class Session:
             )
         fields = {
             "schema": 1, "outcome": "running", "objective": None, "started": _now(), "ended": None,
-            "command": [Path(sys.argv[0]).name, *sys.argv[1:]], **facts,
+            "command": ["brokk", *sys.argv[1:]], **facts,
             "seed": self.seed, "device": self.device, "commit": commit(), "versions": versions(), "pid": os.getpid(),
         }  # fmt: skip
         if before:

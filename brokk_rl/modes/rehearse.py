@@ -134,7 +134,7 @@ class Rehearse:
                 words += [f"resume={place}"]
             else:
                 shutil.rmtree(place)  # half of it: what is not finished has no record that says so
-        with subprocess.Popen([str(Path(sys.executable).with_name("brokk")), *words]) as process:
+        with subprocess.Popen([sys.executable, "-P", "-m", "brokk_rl", *words]) as process:
             try:
                 code = process.wait()
             except BaseException:

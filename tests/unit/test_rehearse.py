@@ -29,6 +29,7 @@ class Played:
 
     def __call__(self, words: list[str]) -> Self:
         place = Path(next(word for word in words if word.startswith("session.out=")).partition("=")[2])
+        words = words[words.index("brokk_rl") :]
         self.commands[place.name] = words[1:]
         self.code = int(place.name == self.failing)
         place.mkdir(exist_ok=True)

@@ -62,8 +62,7 @@ class Command:
         """Starts the program in an empty folder and waits for it."""
         words = [word.format(case=case, out=out) for word in self.command]
         if words[0] == "brokk":
-            beside = Path(sys.executable).with_name("brokk")
-            words[0] = str(beside) if beside.is_file() else shutil.which("brokk") or str(beside)
+            words[:1] = [sys.executable, "-P", "-m", "brokk_rl"]
         environment = {
             **os.environ,
             **{name: str(self.threads) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")},
