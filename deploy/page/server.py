@@ -74,7 +74,7 @@ class Server:
         try:
             server = await serve(
                 self._connection, page.host, page.port, process_request=self._answer, compression=None, server_header=None,
-                max_size=4 * access.LONGEST, max_queue=4, write_limit=BUFFER_BYTES, ping_interval=5, ping_timeout=10,
+                max_size=2 * access.LONGEST, max_queue=4, write_limit=BUFFER_BYTES, ping_interval=5, ping_timeout=10,
                 close_timeout=1, open_timeout=5, logger=logging.getLogger("deploy.page.websockets"),
             )  # fmt: skip
         except OSError as error:
@@ -91,14 +91,16 @@ class Server:
                 task.cancel()
 
     async def _watch(self) -> None:
-        """Looks at the feed; what is new goes out at once, though no faster than the rate."""
-        sent_s, before = 0.0, None
+        """Looks at the feed. A new advice goes out at once, what else is new no faster than the rate."""
+        sent_s, before, advised = 0.0, None, None
         while True:
             shown, now_s = self._feed.shown(), time.monotonic()
             since_s = now_s - sent_s
             facts = (shown.advice, shown.own, shown.q, shown.safety, shown.alive, shown.guiding, shown.recording.on, shown.targets)
-            if since_s >= HEARTBEAT_S or (facts != before and since_s >= 1.0 / self._page.rate_hz):
-                sent_s, before = now_s, facts
+            due = since_s >= HEARTBEAT_S or (facts != before and since_s >= 1.0 / self._page.rate_hz)
+            number = shown.advice.number if shown.advice else None
+            if due or number != advised:
+                sent_s, before, advised = now_s, facts, number
                 text = json.dumps({"number": self._state.number + 1, "shown": shown.plain()}, separators=(",", ":"))
                 await self._state.put((shown, text))
             await asyncio.sleep(POLL_S)
