@@ -47,7 +47,7 @@ class Measure:
 
 
 MEASURES = (
-    Measure("time_s", "time to insertion (limit where there was none)", "s", -1),
+    Measure("time_s", "time to insertion", "s", -1),
     Measure("success", "trials inserted", "share", 1),
     Measure("path_m", "path of the tool", "m", -1),
     Measure("efficiency", "shortest way over path", "share", 1),

@@ -85,7 +85,7 @@ def pairs(found: Analysis, names: Sequence[str]) -> Figure:
         axis.set_xlim(-0.35, 1.35)
         title = title_of(name)
         if (effect := found.effects.get(name)) and effect.p is not None:
-            title += f"\np = {effect.p:.3f}"
+            title += "\np < 0.001" if effect.p < 0.001 else f"\np = {effect.p:.3f}"
         axis.set_title(title, fontsize=9)
         clean(axis)
     if figure.axes:

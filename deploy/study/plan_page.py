@@ -19,7 +19,7 @@ RULES = (
 )
 
 
-def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: dict[str, Any]) -> Page:
+def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: dict[str, Any], notice: str = "") -> Page:
     """Returns the page.
 
     Args:
@@ -28,6 +28,7 @@ def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: 
         seed: Seed of the draw.
         planned: All trials.
         errors: How often simulated studies of this plan err; see `deploy.study.study`.
+        notice: Said on top.
     """
     num, num_trials, inside = design.num_participants, len(design.holes), design.success
     can = sample_size.size(num, design.alpha)
@@ -46,6 +47,7 @@ def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: 
         tone = "good" if can.power[1] >= 0.8 else "warn"
         summary += "" if tone == "good" else f" {wanted} would find it in four of five."
     found = Page(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
+    found.text(notice, "warn")
     found.facts(
         {
             "participants": num,
@@ -86,8 +88,8 @@ def _numbers(found: Page, design: Design, paired_least: int, sequence_least: int
     columns = [
         "participants",
         "smallest p, paired",
-        "smallest p, period in the model",
-        *(f"power at dz {dz:g}" for dz in sample_size.EFFECTS_DZ),
+        "with the period in the model",
+        *(f"dz {dz:g}" for dz in sample_size.EFFECTS_DZ),
     ]
     sizes = sorted({*sample_size.SIZES, design.num_participants})
     rows = []
@@ -95,7 +97,7 @@ def _numbers(found: Page, design: Design, paired_least: int, sequence_least: int
         here = size.num_participants == design.num_participants
         name = Cell(str(size.num_participants), note="this plan" if here else "")
         rows.append([name, f"{size.smallest_paired_p:.2g}", f"{size.smallest_p:.2g}", *(f"{power:.2f}" for power in size.power)])
-    found.table(columns, rows)
+    found.table(columns, rows, "smallest possible p of both tests, and power with the period in the model")
 
 
 def _errors(found: Page, errors: dict[str, Any]) -> None:

@@ -36,8 +36,8 @@ def write(folder: Path, data: StudyData, found: Analysis) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_text(folder / "trials.csv", _trials(found))
-        write_text(folder / "means.csv", _means(found))
-        write_text(folder / "effects.csv", _effects(found))
+        write_text(folder / "means.csv", _means(found, data.is_simulated))
+        write_text(folder / "effects.csv", _effects(found, data.is_simulated))
         effects = {name: asdict(effect) for name, effect in found.effects.items()}
         remarks = [asdict(remark) for remark in found.remarks]
         facts = {"primary": found.primary, "alpha": found.alpha, "simulated": data.is_simulated, "participants": found.participants}
@@ -61,7 +61,7 @@ def write(folder: Path, data: StudyData, found: Analysis) -> Path:
     return path
 
 
-def verdict(found: Analysis) -> tuple[str, str]:
+def verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str]:
     """Returns what the primary measure says, in words, and whether that is good, bad or no news."""
     effect, title = found.effects[found.primary], pictures.title_of(found.primary)
     better = next(each.better for each in MEASURES if each.name == found.primary)
@@ -77,14 +77,16 @@ def verdict(found: Analysis) -> tuple[str, str]:
     if effect.p > found.alpha:
         return f"No effect of guidance is shown on the primary measure. {size}; {effect.num_persons} participants.", "warn"
     helps = effect.adjusted * better > 0
-    return f"Guidance {'helps' if helps else 'harms'}. {size}; {effect.num_persons} participants.", "good" if helps else "bad"
+    who = "In this simulation guidance" if is_simulated else "Guidance"
+    return f"{who} {'helps' if helps else 'harms'}. {size}; {effect.num_persons} participants.", "good" if helps else "bad"
 
 
 def _page(folder: Path, data: StudyData, found: Analysis) -> Page:
-    summary, tone = verdict(found)
-    page = Page("Does guidance help?", summary, tone)  # type: ignore[arg-type]
+    summary, tone = verdict(found, data.is_simulated)
+    title = "Does guidance help?" + (" (simulated operators)" if data.is_simulated else "")
+    page = Page(title, summary, tone)  # type: ignore[arg-type]
     if data.is_simulated:
-        page.text(f"Simulated: {NOTICE}.", "warn")
+        page.text(f"{NOTICE[0].upper()}{NOTICE[1:]}.", "warn")
     num, num_first = len(found.participants), int(found.guided_first.sum())
     least = max(smallest_paired_p(num), smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0)
     if least > found.alpha:
@@ -122,7 +124,7 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Page:
         "The usual paired tests, for comparison; practice is part of the differences here, though not of their mean where as many "
         "had one order as the other."
     )
-    page.table(*_paired_table(found), "guided minus unguided")
+    page.table(*_paired_table(found), "guided minus unguided; period: second minus first, with guidance in the model")
     page.heading("How the advice was followed")
     page.table(["measure", "mean, guided"], [[pictures.title_of(name), _mean(found, name)] for name in GUIDED_ONLY])
     page.heading("What to beware of")
@@ -134,25 +136,25 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Page:
 
 
 def _table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list[list[str | Cell]]]:
-    columns = ["measure", "people", "guided", "unguided", "difference", "dz", "p", "p, Holm", "period", "p of it"]
+    columns = ["measure", "guided", "unguided", "difference", "dz", "p", "p, Holm"]
     rows: list[list[str | Cell]] = []
     for name in names:
-        e, note = found.effects[name], "primary" if name == found.primary else ""
-        people = [Cell(pictures.title_of(name), note), str(e.num_persons), _number(e.guided), _number(e.unguided)]
+        e, is_primary = found.effects[name], name == found.primary
+        note = f"{e.num_persons} people" + ", the primary measure" * is_primary
+        means = [Cell(pictures.title_of(name), note), _number(e.guided), _number(e.unguided)]
         size = [Cell(_number(e.adjusted), _interval(e.adjusted_ci95)), Cell(_number(e.dz), _interval(e.dz_ci95))]
-        tests = [_p(e.p), "decides" if note else _p(found.holm.get(name)), _number(e.period), _p(e.period_p)]
-        rows.append([*people, *size, *tests])
+        rows.append([*means, *size, _p(e.p), "decides" if is_primary else _p(found.holm.get(name))])
     return columns, rows
 
 
 def _paired_table(found: Analysis) -> tuple[list[str], list[list[str | Cell]]]:
-    columns = ["measure", "mean difference", "Hodges-Lehmann", "dz", "p, permutation", "p, Wilcoxon", "p, carry-over"]
+    columns = ["measure", "difference", "Hodges-Lehmann", "dz", "p, permuted", "p, Wilcoxon", "period", "p, carry-over"]
     rows: list[list[str | Cell]] = []
     for name in (*COMPARED, *LOADS):
         e = found.effects[name]
         mean, middle = Cell(_number(e.difference), _interval(e.paired_ci95)), _interval(e.hodges_lehmann_ci95)
         dz = Cell(_number(e.paired_dz), _interval(e.paired_dz_ci95))
-        tests = [_p(e.paired_p), _p(e.wilcoxon_p), _p(e.carry_over_p)]
+        tests = [_p(e.paired_p), _p(e.wilcoxon_p), Cell(_number(e.period), f"p {_p(e.period_p)}"), _p(e.carry_over_p)]
         rows.append([pictures.title_of(name), mean, Cell(_number(e.hodges_lehmann), middle), dz, *tests])
     return columns, rows
 
@@ -163,7 +165,7 @@ def _mean(found: Analysis, name: str) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.3g}"
+    return "–" if value is None or math.isnan(value) else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def _p(value: float | None) -> str:
@@ -171,7 +173,7 @@ def _p(value: float | None) -> str:
 
 
 def _interval(value: tuple[float, float] | None) -> str:
-    return "" if value is None else f"{value[0]:.3g} to {value[1]:.3g}"
+    return "" if value is None else f"{_number(value[0])} to {_number(value[1])}"
 
 
 def _trials(found: Analysis) -> str:
@@ -190,11 +192,12 @@ def _trials(found: Analysis) -> str:
     return _csv(head, rows)
 
 
-def _means(found: Analysis) -> str:
+def _means(found: Analysis, is_simulated: bool) -> str:
     columns = found.means | {f"tlx_{name}": values for name, values in found.loads.items()}
     rows = [
         [
             name,
+            is_simulated,
             condition,
             "first" if (condition == "guided") == bool(first) else "second",
             *(_blank(values[condition][i]) for values in columns.values()),
@@ -202,18 +205,18 @@ def _means(found: Analysis) -> str:
         for i, (name, first) in enumerate(zip(found.participants, found.guided_first, strict=True))
         for condition in ("guided", "unguided")
     ]
-    return _csv(["participant", "condition", "period", *columns], rows)
+    return _csv(["participant", "simulated", "condition", "period", *columns], rows)
 
 
-def _effects(found: Analysis) -> str:
+def _effects(found: Analysis, is_simulated: bool) -> str:
     head: list[str] = []
     for key in asdict(Effect(num_persons=0, num_guided_first=0)):
         head += [f"{key}_low", f"{key}_high"] if key.endswith("_ci95") else [key]
     rows = []
     for name, effect in found.effects.items():
         values = [(None, None) if value is None and key.endswith("_ci95") else value for key, value in asdict(effect).items()]
-        rows.append([name, *_flat(values), _blank(found.holm.get(name, math.nan))])
-    return _csv(["measure", *head, "p_holm"], rows)
+        rows.append([name, is_simulated, *_flat(values), _blank(found.holm.get(name, math.nan))])
+    return _csv(["measure", "simulated", *head, "p_holm"], rows)
 
 
 def _flat(values: Iterable) -> list:

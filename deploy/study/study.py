@@ -19,7 +19,7 @@ from deploy.study import plan_page, report
 from deploy.study.analysis import analyse
 from deploy.study.design import Design
 from deploy.study.practice import Practice, share_significant
-from deploy.study.simulation import Nowhere, simulate
+from deploy.study.simulation import NOTICE, Nowhere, simulate
 
 log = logging.getLogger(__name__)
 
@@ -57,22 +57,23 @@ class Steps:
         elif self.do == "simulate":
             if isinstance(ground, Nowhere):
                 raise ConfigError("study.do=simulate needs a simulator: ground=simulated")
-            planned = self._plan(machine, session)
+            planned = self._plan(machine, session, is_simulated=True)
             simulate(self._home(session), self.design, planned, machine, session, ground, guided, unguided)
             self._report(machine, session)
         else:
             self._report(machine, session)
 
-    def _plan(self, machine: Machine, session: Session) -> list[designs.Trial]:
+    def _plan(self, machine: Machine, session: Session, is_simulated: bool = False) -> list[designs.Trial]:
         plan = plan_study(self.design, machine, session)
         folder = self._home(session)
         if (folder / folders.PLAN).exists():
             raise ConfigError(f"{folder} already holds a study; plan another one with study.folder=<folder>")
         errors = study_errors(self.design, self.practice, self.num_studies, session.stream("study errors"))
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / folders.PLAN, designs.as_json(self.design, machine, session.seed, plan))
+        write_json(folder / folders.PLAN, designs.as_json(self.design, machine, session.seed, plan) | {"simulated": is_simulated})
         write_json(folder / "plan_errors.json", errors)
-        page = plan_page.page(self.design, machine.name, session.seed, plan, errors)
+        notice = f"The trials of this study are done by {NOTICE}." if is_simulated else ""
+        page = plan_page.page(self.design, machine.name, session.seed, plan, errors, notice)
         page.write(folder / "plan.html")
         for entry in errors["studies"]:
             log.info(
@@ -93,7 +94,7 @@ class Steps:
         folders.note_report(data.folder, session.folder)
         for remark in found.remarks:
             log.warning("%s: %s", remark.where, remark.text)
-        log.info("%s%s", "SIMULATED. " if data.is_simulated else "", report.verdict(found)[0])
+        log.info("%s", report.verdict(found, data.is_simulated)[0])
         log.info("report: %s", path)
 
     def _erase(self, session: Session) -> None:
