@@ -21,13 +21,15 @@ from deploy.bus.wire import Wire
 from deploy.guard import State
 from deploy.limits import Limits
 from deploy.loop.outlet import view
-from deploy.loop.process import Child
+from deploy.loop.process import Child, ask_for_priority, back_to_ordinary
 from deploy.loop.records import Exchange
 from deploy.loop.station import Setting
 from deploy.loop.supervisor import BUS_PRIORITY, PATIENCE_S
 
 log = logging.getLogger(__name__)
 
+COMMANDER_PRIORITY = 40
+"""Of the process that commands, below that of the bus."""
 ANSWER_S = 0.2
 """Time for the bus process to act on a command."""
 
@@ -132,10 +134,14 @@ class CanLink:
         except BaseException:
             self.__exit__()
             raise
+        if can.realtime:
+            ask_for_priority(COMMANDER_PRIORITY)
         self._arm()
         return self
 
     def __exit__(self, *exc: Any) -> None:
+        if self._can.realtime:
+            back_to_ordinary()
         if self._child is not None:
             self._child.end(PATIENCE_S)  # sends zero before it goes
         if self._exchange is not None:

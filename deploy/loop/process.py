@@ -96,19 +96,29 @@ def become_realtime(priority: int) -> Literal["fifo", "ordinary"]:
     gc.collect()
     gc.freeze()
     gc.disable()
-    granted = "fifo"
+    granted = ask_for_priority(priority)
+    if _libc().mlockall(_LOCK_ALL) != 0:
+        log.debug("memory is not locked: %s", os.strerror(ctypes.get_errno()))
+    return granted
+
+
+def ask_for_priority(priority: int) -> Literal["fifo", "ordinary"]:
+    """Asks for SCHED_FIFO alone; returns what was granted."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
-        granted = "ordinary"
         log.warning(
             "no real-time priority (%s): the loop may run late. Allow it, for example by RTPRIO and MEMLOCK limits for this user, "
             "or `setcap cap_sys_nice,cap_ipc_lock+ep` on a copy of the interpreter",
             error.strerror,
         )
-    if _libc().mlockall(_LOCK_ALL) != 0:
-        log.debug("memory is not locked: %s", os.strerror(ctypes.get_errno()))
-    return granted
+        return "ordinary"
+    return "fifo"
+
+
+def back_to_ordinary() -> None:
+    """Gives the priority of `ask_for_priority` back."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 class Pace:

@@ -11,10 +11,7 @@ from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.guidance import Guidance, LeverMap
 from deploy.loop.supervisor import Companion
-from deploy.twin.twin import Twin
-
-TWIN_PRIORITY = 45
-"""Below bus and policy: the loop must not look better or worse for the company it has on a desk."""
+from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 
 @spec
@@ -26,7 +23,7 @@ class Bench:
         plant: The simulated machine behind it.
         operator: Who moves the levers as they are shown; `null`: nobody, the levers stay in neutral.
         guidance: How the levers are shown.
-        assumed: What policies for such an operator assume of them; `null` without one.
+        assumed: What policies for such an operator assume of them (`advice=person`), for the record; `null` without one.
     """
 
     twin: Twin

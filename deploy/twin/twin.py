@@ -22,7 +22,7 @@ from brokk_rl.spec import spec
 from deploy.bus.description import GATEWAY, Description
 from deploy.bus.header import c_header
 from deploy.bus.wire import OpenWire, Wire, Wired
-from deploy.loop.process import Pace, Stop
+from deploy.loop.process import Pace, Stop, ask_for_priority
 from deploy.twin.faults import FaultPort, Faults
 from deploy.twin.gateway import Gateway
 from deploy.twin.remote import Remote
@@ -32,6 +32,8 @@ log = logging.getLogger(__name__)
 CYCLE_S = 0.01
 PRESS_S = 1.0
 HEADER = "gateway.h"
+TWIN_PRIORITY = 45
+"""Below bus and policy: the loop must not look better or worse for the company it has on a desk."""
 FLOOD = 30
 """Frames a cycle of a babbling node."""
 
@@ -47,6 +49,7 @@ class Twin:
         deadman: Whether an operator at that remote presses the dead-man, one second after the PC is first heard, and holds it.
         fault_port: Local port for faults on request; `null`: none.
         seconds: When to stop; `null`: when told to.
+        realtime: Whether to ask for real-time priority: a machine is never late.
     """
 
     wire: Wire
@@ -55,6 +58,7 @@ class Twin:
     deadman: bool
     fault_port: int | None
     seconds: float | None
+    realtime: bool
 
     def check(self) -> None:
         if self.fault_port is not None and not 0 < self.fault_port < 65536:
@@ -66,6 +70,8 @@ class Twin:
         Raises:
             LinkError: the bus cannot be opened.
         """
+        if self.realtime:
+            ask_for_priority(TWIN_PRIORITY)
         session.folder.mkdir(parents=True, exist_ok=True)
         write_text(session.folder / HEADER, c_header(Description(self.dbc, machine)))
         with plant.build(machine, 1, session) as link, self.wire.open() as bus, FaultPort(self.fault_port) as port:

@@ -54,24 +54,20 @@ def operator(stop: threading.Event, wire: Wire, port: int, machine: Machine) -> 
     """Does what the checklist asks for: dead-man, emergency stop, then each joint both ways."""
     remote = Remote(Description(DBC, machine))
     begun_s, asked = time.monotonic(), False
-    axes = [(1, False), (2, True), (2, False), (0, False), (3, False)]  # axis and button of q1 … q5
     with wire.open([]) as bus:
         pace = Pace(remote.period_s)
         while not stop.is_set():
             pace.wait()
             pace.begin()
-            t_s = (time.monotonic() - begun_s) % 24.0
+            t_s = (time.monotonic() - begun_s) % 9.6  # first q1, q3, q4 and q5 together, then q2 with the button
             remote.deadman = 0.5 < t_s % 2 < 1.0
             if int(t_s) % 4 == 1 and not asked:
                 with contextlib.suppress(TimeoutError):
                     ask(port, {"fault": "estop", "seconds": 0.3})
             asked = int(t_s) % 4 == 1
-            joint, part = divmod(t_s, 4.8)
-            levers = [0.0] * 4
-            axis, remote.button_right = axes[min(4, int(joint))]
-            pressed = 1.0 < part < 1.6 or 3.4 < part < 4.0
-            levers[axis] = (0.6 if part < 2.0 else -0.6) if pressed else 0.0
-            remote.levers = levers
+            part, remote.button_right = t_s % 4.8, t_s >= 4.8
+            pushed = (0.6 if part < 2.0 else -0.6) if 1.0 < part < 1.6 or 3.4 < part < 4.0 else 0.0
+            remote.levers = (0.0, 0.0, pushed, 0.0) if remote.button_right else (pushed,) * 4
             bus.send(remote.frame())
 
 
@@ -81,7 +77,7 @@ def test_the_checklist_runs_with_an_operator_and_finds_a_sound_machine(
 ) -> None:
     bus_port, port = free_port(), free_port()
     wire = Wire(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=bus_port)
-    twin = Twin(wire=wire, dbc=DBC, remote=False, deadman=False, fault_port=port, seconds=None)
+    twin = Twin(wire=wire, dbc=DBC, remote=False, deadman=False, fault_port=port, seconds=None, realtime=False)
     session, stop = Session(out=str(tmp_path / "twin"), seed=0, device="cpu"), threading.Event()
     child = Child("twin", "deploy.twin.twin:run", (twin, machine, NominalMachine(), session), (), 60)
     time.sleep(2.0)
