@@ -32,7 +32,7 @@ from brokk_rl.record import Recording
 CPU = torch.device("cpu")
 PLANT = Lag(dead_time_s=0.31, dead_band_extend=0.07, dead_band_retract=0.1, gain=0.9, time_constant_s=0.08, spread={})
 PRICES = Prices(
-    joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.03, temperature=3.0, remainder=30.0, explained=0.45, scatter=1.6,
+    joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06, temperature=3.0, remainder=30.0, explained=0.4, scatter=1.6,
     tool=2.0,
 )  # fmt: skip
 
