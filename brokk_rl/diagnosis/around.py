@@ -88,7 +88,7 @@ def grown(
     part = _thinned(evidence)
     least = _losses(part, repaired.rays, repaired.sizes)
     found, most = None, 0.0
-    for name in _promising(tables, chosen):
+    for name in _promising(tables, chosen, ways):
         subsets = [s | {name} if s and name in t.shapes else s for t, s in zip(tables, chosen.subsets, strict=True)]
         rays_ = [ray for one in sorted(frozenset().union(*subsets)) for ray in ways[one]]
         mask = np.array([[ray.kind.name in subset for subset in subsets] for ray in rays_])
@@ -103,10 +103,10 @@ def grown(
     return _repaired(evidence, ways, *found) if found else None
 
 
-def best(evidence: Evidence, ways: Mapping[str, Sequence[Ray]], tried: Sequence[Repair], price: Price) -> Repair:
+def best(evidence: Evidence, ways: Mapping[str, Sequence[Ray]], tried: Sequence[Repair], price: Price) -> Repair | None:
     """Returns the repair that takes for each joint the best of those `tried`, none where errors of free runs only grow by it.
 
-    `price` is what a set costs on a joint.
+    `price` is what a set costs on a joint. `None` where no joint is left.
     """
     measured = evidence.candidates.cut.measured
     squares = [np.square(paths - measured).mean((0, 1)) for paths in (evidence.base, *(one.after for one in tried))]
@@ -119,7 +119,24 @@ def best(evidence: Evidence, ways: Mapping[str, Sequence[Ray]], tried: Sequence[
         subsets.append(own[closing[0]] if closing else frozenset())
         if closing:
             start[:, j] = _known(rays_, tried[closing[0]])[:, j]
-    return _repaired(evidence, ways, subsets, rays_, start)
+    return _repaired(evidence, ways, subsets, rays_, start) if any(subsets) else None
+
+
+def paying(
+    tables: Sequence[Table], subsets: Sequence[frozenset[str]], price: Price, name_price: float
+) -> tuple[frozenset[str], ...]:
+    """Returns the sets without effects that add less than they cost."""
+    own = dict.fromkeys(frozenset().union(*subsets), -name_price)
+    for j, (table, subset) in enumerate(zip(tables, subsets, strict=True)):
+        for name in subset:
+            gain = table.score(subset).total - table.score(subset - {name}).total
+            own[name] += gain - (price(j, subset) - price(j, subset - {name}))
+    return tuple(frozenset(name for name in subset if own[name] > 0.0) for subset in subsets)
+
+
+def without(evidence: Evidence, ways: Mapping[str, Sequence[Ray]], repaired: Repair, subsets: Sequence[frozenset[str]]) -> Repair:
+    """Returns the repair with fewer effects, fitted anew from its sizes."""
+    return _repaired(evidence, ways, subsets, repaired.rays, repaired.sizes)
 
 
 def subsets_of(repaired: Repair) -> tuple[frozenset[str], ...]:
@@ -161,11 +178,11 @@ def _losses(evidence: Evidence, rays_: Sequence[Ray], sizes: np.ndarray) -> np.n
     return loss(evidence.whitened(evidence.error_of(paths))[:, 0], 1)
 
 
-def _promising(tables: Sequence[Table], chosen: Chosen) -> list[str]:
-    """Returns the effects that add most to the set, those that some joint with a set lacks."""
+def _promising(tables: Sequence[Table], chosen: Chosen, ways: Mapping[str, Sequence[Ray]]) -> list[str]:
+    """Returns effects that some joint with a set lacks: those on the command, which hide behind each other, then what adds most."""
     found: dict[str, float] = {}
     for table, subset in zip(tables, chosen.subsets, strict=True):
         own = table.score(subset).total
         for name in table.shapes.keys() - subset if subset else ():
             found[name] = found.get(name, 0.0) + max(0.0, table.score(subset | {name}).total - own)
-    return sorted(found, key=lambda name: -found[name])[:TRIED]
+    return sorted(found, key=lambda name: (ways[name][0].kind.target.side != "command", -found[name]))[:TRIED]

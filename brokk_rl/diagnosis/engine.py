@@ -230,11 +230,17 @@ class Search:
                 break
             wide = around.simulated(evidence, grown, more or now)
         best = around.best(evidence, wide[1], tried, price)
-        wide = around.simulated(evidence, grown, best)
-        tables, subsets = self._tables(evidence, *wide[1:], scatter, wide[0]), around.subsets_of(best)
+        if best is None:
+            return wide, tables, Chosen((frozenset(),) * len(tables), 0.0), None
+        for drops in (True, False):
+            wide, subsets = around.simulated(evidence, grown, best), around.subsets_of(best)
+            tables = self._tables(evidence, *wide[1:], scatter, wide[0])
+            paying = around.paying(tables, subsets, price, self.prices.name)
+            if not drops or paying == subsets or not any(paying):
+                break
+            best = around.without(evidence, wide[1], best, paying)
         worth = sum(table.score(s).total - price(j, s) for j, (table, s) in enumerate(zip(tables, subsets, strict=True)) if s)
-        chosen = Chosen(subsets, worth - self.prices.name * len(frozenset().union(*subsets)))
-        return wide, tables, chosen, best if chosen.names else None
+        return wide, tables, Chosen(subsets, worth - self.prices.name * len(frozenset().union(*subsets))), best
 
     def _scatter(self, evidence: Evidence, repaired: Repair | None) -> np.ndarray:
         """Returns the mean square of errors over the noise over that of the reference, outliers cut, `(J,)`."""

@@ -25,7 +25,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 BEYOND = 1.25
-"""So many times the floor, for sure, is more than what the simulator errs by anyway."""
+"""So many times the floor is more than what the simulator errs by anyway, where it exceeds the floor for sure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +107,10 @@ class Reach:
         left = np.square(self.after - self._measured).mean(1)  # (W, J)
         parts = [one.evidence for one in self.base.nulls]
         floor = np.concatenate([np.square(one.base - one.candidates.cut.measured).mean(1) for one in parts])
-        ratio = [np.sqrt(left[f].mean(0) / np.maximum(floor[g].mean(0), 1e-18)) for f, g in self.draws]
-        low = np.quantile(ratio, 0.025, axis=0)
-        return [name for name, value in zip(self.machine.joint_names, low, strict=True) if value > BEYOND]
+        drawn = [np.sqrt(left[f].mean(0) / np.maximum(floor[g].mean(0), 1e-18)) for f, g in self.draws]
+        ratio = np.sqrt(left.mean(0) / np.maximum(floor.mean(0), 1e-18))
+        beyond = (ratio > BEYOND) & (np.quantile(drawn, 0.025, axis=0) > 1.0)
+        return [name for name, is_beyond in zip(self.machine.joint_names, beyond, strict=True) if is_beyond]
 
     def _with(self, findings: Findings, names: frozenset[str]) -> np.ndarray:
         """Returns free runs with some of the chosen effects, their sizes fitted anew."""
