@@ -57,19 +57,21 @@ class Capture:
 
 
 def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
-    """Runs until it is asked to stop, then takes what is left.
+    """Runs until it is asked to stop, then takes what is there: those who write may go on without being recorded.
 
     Raises:
         StorageError: the disk is full, or the files cannot be written; what was written stays readable.
     """
     try:
         with Log(capture) as target:
-            while not (stop() and not any(pipe.waiting for pipe in exchange.logs)):
+            asked = False
+            while not asked:
+                time.sleep(POLL_S)
+                asked = stop()
                 for pipe in exchange.logs:
                     for data in pipe.take():
                         target.add(data)
                 target.flush_when_due()
-                time.sleep(POLL_S)
     except OSError as error:
         raise StorageError(f"log: {error.strerror or error} ({capture.folder}); nothing more is recorded") from error
 

@@ -1,0 +1,79 @@
+"""The operator's page beside a real loop and a real twin, as a person starts them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.asyncio.client import connect
+
+TOKEN = "correct horse battery staple"
+
+
+@pytest.mark.slow
+def test_the_loop_is_shown_recorded_again_on_a_wish_and_outlives_its_page(tmp_path: Path) -> None:
+    # a simulated operator, who holds the dead-man
+    command = [sys.executable, "-c", "from brokk_rl.cli import main; main()", "preset=bench", "bench=guided", "deploy.show=false"]
+    command += [f"session.out={tmp_path / 'run'}", "page.port=0", f"page.token='{TOKEN}'", "deploy.seconds=300"]
+    loop = subprocess.Popen(command, cwd=tmp_path, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    try:
+        address = _patiently(lambda: (tmp_path / "run" / "page.url").read_text().strip(), 90).partition("/#")[0]
+        pids = json.loads((tmp_path / "run" / "processes.json").read_text())
+        asyncio.run(_use(address.removeprefix("http://"), tmp_path / "run"))
+        os.kill(pids["page"], signal.SIGKILL)
+        time.sleep(1.0)
+        assert loop.poll() is None, "the loop goes on without its page"
+    finally:
+        loop.send_signal(signal.SIGINT)
+        assert loop.wait(60) == 0
+    timing = json.loads((tmp_path / "run" / "timing.json").read_text())
+    assert {one["process"] for one in timing["processes"]} >= {"bus", "policy"}
+
+
+async def _use(host: str, run: Path) -> None:
+    async with (
+        connect(f"ws://{host}/state", proxy=None) as state,
+        connect(f"ws://{host}/control", origin=f"http://{host}", proxy=None) as control,
+    ):  # type: ignore[arg-type]
+        await control.send(json.dumps({"token": TOKEN}))
+        assert json.loads(await control.recv()) == {"ready": True}
+        await _shown(
+            state, lambda shown: shown["alive"] and shown["advice"] and shown["advice"]["valid"] and shown["safety"]["deadman"]
+        )
+        assert (await _shown(state, lambda shown: shown["recording"]["on"]))["path_in_base_m"]
+        for value, on in (("off", False), ("on", True)):
+            await control.send(json.dumps({"kind": "record", "value": value}))
+            assert json.loads(await control.recv()) == {"done": "record", "kind": "record"}
+            await _shown(state, lambda shown, on=on: shown["recording"]["on"] == on)
+        assert (run / "capture.mcap").stat().st_size > 0
+        _patiently(lambda: (run / "recording_2" / "capture.mcap").stat(), 20)
+
+
+async def _shown(state: Any, claim: Any) -> dict[str, Any]:
+    """Returns the first state of which the claim is true; draws all on the way."""
+    end_s = time.monotonic() + 60
+    while time.monotonic() < end_s:
+        said = json.loads(await asyncio.wait_for(state.recv(), 10))
+        now_ms = 1000 * time.monotonic()
+        await state.send(json.dumps([said["number"], now_ms, now_ms, now_ms]))
+        if claim(said["shown"]):
+            return said["shown"]
+    raise AssertionError(f"it did not come true: {said['shown']}")
+
+
+def _patiently(look: Any, seconds: float) -> Any:
+    end_s = time.monotonic() + seconds
+    while True:
+        try:
+            return look()
+        except FileNotFoundError:
+            assert time.monotonic() < end_s, "it never came"
+            time.sleep(0.1)
