@@ -28,7 +28,7 @@ from deploy.page.cloud import encode
 from deploy.page.demo import Demo, DemoFeed
 from deploy.page.shown import Drawn
 
-SECONDS, WARM_S = 20.0, 6.0
+SECONDS, WARM_S = 10.0, 6.0
 QUANTILES = {"p50": 0.5, "p95": 0.95, "max": 1.0}
 SIZE = {"width": 1366, "height": 900}
 
