@@ -9,6 +9,7 @@ from dataclasses import dataclass
 ROOMS = ("tasks", "actuators", "perception", "deploy")
 FLOORS = (
     ("brokk_rl.cli", 5),
+    ("brokk_rl.__main__", 5),
     ("brokk_rl.extensions", 5),
     ("brokk_rl.sweep", 5),
     ("conf", 5),
