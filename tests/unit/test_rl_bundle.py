@@ -69,8 +69,9 @@ def copied(bundle: Bundle, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_bundle_is_three_files_and_nothing_else(bundle: Bundle) -> None:
-    assert sorted(path.name for path in bundle.folder.iterdir()) == ["policy.json", "policy.onnx", "policy.safetensors"]
+def test_a_bundle_is_four_files_and_nothing_else(bundle: Bundle) -> None:
+    names = ["golden.json", "policy.json", "policy.onnx", "policy.safetensors"]
+    assert sorted(path.name for path in bundle.folder.iterdir()) == names
 
 
 def test_the_contract_says_all_that_the_machine_needs(bundle: Bundle, machine: Machine) -> None:
@@ -176,7 +177,8 @@ def test_an_observation_group_that_the_task_does_not_give_is_refused(bundle: Bun
 def test_a_file_that_says_something_else_is_not_left_behind(
     bundle: Bundle, copied: Path, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (copied / "policy.onnx").unlink()
+    for name in ("policy.onnx", "golden.json"):
+        (copied / name).unlink()
 
     class Wrong:
         def __init__(self, *args: Any, **kwargs: Any) -> None:
