@@ -227,6 +227,9 @@ def disagreement(
     if within.sum() < LEAST_INSIDE or around.sum() < LEAST_INSIDE:
         return float("nan")
     mine, seen = both.left[part], both.seen(u, row, rays, face.m, both.right)
+    within &= seen < np.median(seen[around])  # the right camera may see there what stands before a disc
+    if within.sum() < LEAST_INSIDE:
+        return float("nan")
     off = mine - seen * (np.median(mine[around]) / max(float(np.median(seen[around])), 1.0))
     usual = 1.4826 * float(np.median(np.abs(off[around] - np.median(off[around]))))
     return float(np.std(off[within])) / max(usual, 0.1)
