@@ -41,7 +41,7 @@ def main(path: Path, trials: int) -> None:
         desk.wait_for_state()
         for trial in range(trials):
             for name, number in (KILLS[trial % len(KILLS)],):
-                desk.set_moving()
+                desk.set_moving(60.0)
                 key = f"{name} {signal.Signals(number).name}"
                 found.setdefault(key, []).append(desk.still_after(desk.signal(name, number)))
                 if number == signal.SIGSTOP:
@@ -50,10 +50,10 @@ def main(path: Path, trials: int) -> None:
                 else:
                     desk.children[name].end(1.0)
                     desk.start(name)
-                    desk.wait_for_state()
+                    desk.wait_for_state(60.0)
         for fault, message in FAULTS:
             for _ in range(3):
-                desk.set_moving()
+                desk.set_moving(60.0)
                 found.setdefault(f"{fault} {message}".strip(), []).append(desk.still_after(desk.fault(fault, message), 0.6))
                 desk.fault("none")
     table = {key: {"trials": len(v), "median_s": sorted(v)[len(v) // 2], "worst_s": max(v)} for key, v in found.items()}

@@ -23,7 +23,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.bus.description import Description
-from deploy.bus.wire import Wire
+from deploy.bus.wire import Replay, Wire
 from deploy.guidance import Guidance, LeverMap
 from deploy.limits import Limits
 from deploy.loop.outlet import view
@@ -69,7 +69,7 @@ class Loop:
         page: The operator's page; `null`: none.
     """
 
-    wire: Wire
+    wire: Wire | Replay
     dbc: str
     limits: Limits
     guidance: Guidance
