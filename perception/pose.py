@@ -198,8 +198,11 @@ class PlaneConicEstimator:
                 return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
             if mouth >= looks.sure_mouth:
                 return None
-        witnesses = (inside.slope / looks.slope, inside.deeper / looks.deeper, (parallax - 1.0) / (looks.parallax - 1.0))
-        evidence = sum(max(one, 0.0) for one in witnesses if np.isfinite(one))
+        shown = [max(one, 0.0) for one in (inside.slope / looks.slope, inside.deeper / looks.deeper) if np.isfinite(one)]
+        against = (parallax - 1.0) / (
+            looks.parallax - 1.0
+        )  # a dark disc is noisier nowhere than the face: below 1 it speaks against
+        evidence = sum(shown) + (against if np.isfinite(against) else 0.0)
         return None if evidence >= 1.0 else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
 
 
