@@ -73,7 +73,7 @@ class ValveFit:
             for turn, j in progress.track(rounds, description=f"{self.name}: dead times and lags"):
                 if turn and known is None:
                     known = data.factors(data.statics(dynamics, self.sweeps), dynamics)
-                dynamics[j] = self._dynamics(data, j, known and known[j], dynamics[j] if turn else None)
+                dynamics[j] = self._dynamics(data, j, known[j] if known else None, dynamics[j] if turn else None)
         fitted = self._spec(data, dynamics)
         facts = {key: _plain(value) for key, value in dataclasses.asdict(fitted).items()}  # pyright: ignore[reportArgumentType]
         try:
