@@ -4,12 +4,15 @@ BIN := .venv/bin
 UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
 SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact
 
-.PHONY: train test check setup clean
+.PHONY: train test test-all check setup clean
 
 train: setup            ## train the main job on whatever is there and leave a run folder
 	$(BIN)/brokk mode=train
 
-test: setup             ## all tests that run without a GPU
+test: setup             ## the tests that run without a GPU, but for the slow ones
+	$(BIN)/python -m pytest -q -m "not gpu and not slow"
+
+test-all: setup         ## the slow ones too
 	$(BIN)/python -m pytest -q -m "not gpu"
 
 check: setup            ## format, lint, types
