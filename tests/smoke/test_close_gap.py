@@ -19,6 +19,7 @@ SMALL = (
 FOUND = "# @package effect\ndead_band: {_target_: actuators.effects.command.DeadBand, joints: [q3], extend: 0.1, retract: 0.1}\n"
 
 
+@pytest.mark.slow
 def test_a_policy_is_retrained_and_judged_on_three_plants(brokk: Callable[..., Done], tmp_path: Path) -> None:
     (tmp_path / "found.yaml").write_text(FOUND)
     assert (done := brokk(*SMALL)).code == 0, done.err

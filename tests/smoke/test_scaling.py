@@ -69,6 +69,7 @@ def test_the_processes_see_different_worlds(run: Path) -> None:
     assert first["history.q"].shape == second["history.q"].shape and not torch.equal(first["history.q"], second["history.q"])
 
 
+@pytest.mark.slow
 def test_two_processes_that_were_stopped_go_on_exactly(run: Path) -> None:
     arguments = ("mode=train", "session.out=parts", *SMALL)
     assert together(run.parent, *arguments, "rl.budget.max_env_steps=2304").returncode == 0
@@ -139,6 +140,7 @@ def _learn_together(folder: Path, device: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_two_processes_learn_together_what_rsl_rls_own_learn(tmp_path: Path) -> None:
     """The parts of the update that a GPU captures, with gloo between them, against rsl-rl's own way over several processes."""
     _learn_together(tmp_path, "cpu")
@@ -150,6 +152,7 @@ def test_two_gpus_learn_together_what_rsl_rls_own_learn(tmp_path: Path) -> None:
     _learn_together(tmp_path, "cuda")
 
 
+@pytest.mark.slow
 def test_the_bench_adds_up_what_two_processes_reach_and_compares_it_with_one(tmp_path: Path) -> None:
     assert started(tmp_path, str(BIN / "brokk"), *BENCH, "session.out=one").returncode == 0
     one = tmp_path / "one" / "benchmark.json"

@@ -105,7 +105,9 @@ def test_whatever_was_recorded_the_answer_is_a_place(seed: int, count: int, wron
     found = hand_eye.solve(views)
     assert found is not None
     place = found.guess.base_from_camera
-    assert np.isfinite(place).all() and np.isfinite(found.cov).all() and np.linalg.eigvalsh(found.cov).min() > -1e-9
+    assert np.isfinite(place).all() and np.isfinite(found.cov).all()
+    spread = np.linalg.eigvalsh(found.cov)
+    assert spread[0] > -1e-12 * max(1.0, spread[-1])  # an arm that does not move leaves 1e12 square metres open: rounding
     np.testing.assert_allclose(place[:3, :3] @ place[:3, :3].T, np.eye(3), atol=1e-9)
     assert found.used.sum() >= min(hand_eye.FEWEST, count)
 
