@@ -16,10 +16,10 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
+from deploy.chain import tool
 from deploy.page.demo_camera import Camera
 from deploy.page.scene import approach
 from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Wish
-from deploy.study.chain import tool
 
 EXCLUSIVE_S, OTHERS_S = 5.0, 9.0
 """How long each part of the programme takes."""

@@ -18,6 +18,7 @@ import numpy as np
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
+from deploy.chain import tool
 from deploy.guidance import AXES, Guidance
 from deploy.loop import outlet
 from deploy.loop.process import Stop
@@ -26,7 +27,6 @@ from deploy.loop.station import TEXT
 from deploy.page.scene import approach
 from deploy.page.settings import LINK, OperatorPage
 from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Vector, Wish
-from deploy.study.chain import tool
 
 log = logging.getLogger(__name__)
 

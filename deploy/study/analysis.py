@@ -17,8 +17,8 @@ from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from deploy.chain import tool
 from deploy.study import exact, tlx
-from deploy.study.chain import tool
 from deploy.study.crossover import Effect, effect
 from deploy.study.design import CONDITIONS, PERIODS, Hole, Success
 from deploy.study.folder import Remark, StudyData

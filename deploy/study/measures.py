@@ -13,7 +13,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from deploy.study.chain import tool
+from deploy.chain import tool
 from deploy.study.design import Hole, Success
 from deploy.study.smoothness import sparc
 

@@ -13,7 +13,7 @@ import numpy as np
 from brokk_rl.contracts import OperatorView
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from deploy.study.chain import tool
+from deploy.chain import tool
 from deploy.study.operators.traits import Range, Traits
 
 DAMPING = 0.05
