@@ -16,8 +16,8 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
+from deploy.chain import tool
 from deploy.study import analysis, design, folder, report, tlx
-from deploy.study.chain import tool
 
 RATE_HZ = 20.0
 

@@ -11,8 +11,8 @@ import torch
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from deploy.chain import tool
 from deploy.study import measures, tlx
-from deploy.study.chain import tool
 from deploy.study.design import Hole, Success
 from deploy.study.smoothness import sparc
 

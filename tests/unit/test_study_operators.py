@@ -17,7 +17,7 @@ from composed import every, option
 from actuators.person import Person
 from brokk_rl.contracts import OperatorView
 from brokk_rl.machine import Machine
-from deploy.study.chain import tool
+from deploy.chain import tool
 from deploy.study.operators.hands import Hands
 from deploy.study.operators.traits import Traits
 
