@@ -133,7 +133,7 @@ class Tracer:
         offsets = (np.stack(np.meshgrid(*[np.arange(OVER)] * 2), -1).reshape(-1, 2) + 0.5) / OVER - 0.5
         for part in np.array_split(edges, max(1, len(edges) * OVER**2 // CHUNK)):
             pixel = np.stack([part % camera.width, part // camera.width], 1)[:, None] + offsets
-            radiance[part] = self._shoot(camera, pixel.reshape(-1, 2)).radiance.reshape(len(part), -1, 3).mean(1)
+            radiance[part] = self._shoot(camera, pixel.reshape(-1, 2)).radiance.reshape(len(part), OVER**2, 3).mean(1)
         depth = np.where(whole.solid == NOTHING, np.nan, whole.depth_m).astype(np.float32)
         return View(radiance.reshape(*size, 3), depth.reshape(size), whole.solid.reshape(size), whole.mouth.reshape(size))
 

@@ -85,12 +85,13 @@ def test_a_poor_arm_and_wrong_sights_leave_millimetres(zero_deg: float, count: i
         found = hand_eye.solve(views)
         assert found is not None and not (bad & found.used).any() and (~bad & ~found.used).sum() <= 1
         ours.append(off(found.guess.base_from_camera))
-        theirs.append(off(opencv(views)))
+        if hasattr(cv2, "calibrateHandEye"):  # OpenCV 5.0.0 has forgotten it
+            theirs.append(off(opencv(views)))
         away = rigid.apart(found.guess.base_from_camera, board.CAMERA)
         surprise.append(away @ np.linalg.solve(found.cov[:6, :6], away))
-    (mm, degrees), (their_mm, _) = np.median(ours, axis=0), np.median(theirs, axis=0)
+    mm, degrees = np.median(ours, axis=0)
     assert mm <= 3.7 and degrees <= 0.58 and np.max(ours, axis=0)[0] < 8.0
-    assert mm < (0.2 if wrong else 1.0) * their_mm
+    assert not theirs or mm < (0.2 if wrong else 1.0) * np.median(theirs, axis=0)[0]
     assert 2.0 < np.mean(surprise) < 12.0  # six degrees of freedom: 6, and 1.4 is the standard deviation of a mean of six
 
 

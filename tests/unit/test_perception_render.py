@@ -63,6 +63,13 @@ def studio(name: str, rig: Rig, depth: str = "exact") -> Studio:
     return Studio(rig=rig, scene=kind(name), stereo=option("stereo", "sgbm"), depth=depth, pair=True)  # type: ignore[arg-type]
 
 
+def test_a_wall_that_fills_the_picture_is_drawn_though_no_edge_crosses_it() -> None:
+    wall = Plane("ground", Pose(FACING, np.array([0.0, 0.0, 2.0])), (GREY,))
+    view = Tracer([wall], NOON, (0.0, 0.0, 0.0)).view(SMALL)
+    np.testing.assert_allclose(view.depth_m, 2.0, rtol=1e-6)
+    np.testing.assert_allclose(view.radiance, 0.5 * (1.0 + 0.5), rtol=1e-5)
+
+
 def test_depths_into_a_hole_are_those_worked_by_hand() -> None:
     # f = 400 px: the pixel 8 px right of the axis looks along x / z = 0.02. The face is at z = 2 m, so x = 0.04 m there: inside the
     # rim of 0.05 m. It would meet the wall at z = 0.05 / 0.02 = 2.5 m, and meets the floor at 2.3 m before. 9.6 px: x / z = 0.024,
