@@ -25,15 +25,10 @@ def resident_bytes(pid: int) -> int | None:
 
 
 def main(folder: Path, seconds: float) -> None:
-    brokk = Path(sys.executable).with_name("brokk")
     command = [
-        str(brokk),
-        "preset=bench",
-        "link=nominal",
-        f"deploy.seconds={seconds}",
-        "deploy.show=false",
+        sys.executable, "-P", "-m", "brokk_rl", "preset=bench", "link=nominal", f"deploy.seconds={seconds}", "deploy.show=false",
         f"session.out={folder}",
-    ]
+    ]  # fmt: skip
     run, memory, begun_s = subprocess.Popen(command), [], time.monotonic()
     while run.poll() is None:
         time.sleep(10.0)
