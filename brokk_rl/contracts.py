@@ -331,6 +331,8 @@ class TrialBatch:
         radius_m: Radius of its hole, `(N,)`.
         guided: Whether advice is shown, `(N,)` bool.
         limit_s: Time after which each ends at the latest.
+        depth_m: Depth of the tip below the rim at which the tool is in.
+        clearance_m: Distance of the tip from the hole's axis within which it is.
     """
 
     q: np.ndarray
@@ -338,6 +340,8 @@ class TrialBatch:
     radius_m: np.ndarray
     guided: np.ndarray
     limit_s: float
+    depth_m: float
+    clearance_m: float
 
 
 @dataclass(frozen=True)

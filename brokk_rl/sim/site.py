@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Self
 
 import numpy as np
@@ -66,20 +67,14 @@ class SiteLink:
         self._generator = session.generator("link")
         cpu = torch.device("cpu")
         self._world = site.sim.build(machine, cpu, 1)
-        everywhere, shape = torch.ones(1, dtype=torch.bool), (1, machine.num_history, machine.num_joints)
-        start = torch.tensor(np.array([site.start if site.start is not None else machine.home]), dtype=torch.float32)
-        scene = nominal(1)
-        scene[0, :3] = torch.tensor(site.hole_in_base_m)
+        shape = (1, machine.num_history, machine.num_joints)
         with torch.random.fork_rng([]):
             torch.manual_seed(session.stream("link"))
             self._model = site.actuator.build(machine, 1, cpu)
-            self._model.reset(everywhere)
-        self._world.reset(everywhere, start, scene)
         self._history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-        self._history.reset(everywhere, start)
         self._logged = {path.rpartition(".")[2]: path for path in self._model.state if path.rpartition(".")[2] in LOGGED}
         self._steps, self._measured = 0, np.zeros(machine.num_joints)
-        self._measure()
+        self.place(np.array(site.start if site.start is not None else machine.home), np.array(site.hole_in_base_m))
 
     def read(self) -> JointState:
         """Returns the state after the last control period; reading twice gives the same."""
@@ -95,6 +90,19 @@ class SiteLink:
         self._steps += 1
         self._measure()
         return Command(u)
+
+    def place(self, q: np.ndarray, hole_in_base_m: np.ndarray) -> None:
+        """Puts the machine, at rest, at `q`, `(J,)`, and the block with the rim of its hole at `hole_in_base_m`, its side to it."""
+        everywhere = torch.ones(1, dtype=torch.bool)
+        start, scene = torch.as_tensor(q[None], dtype=torch.float32), nominal(1)
+        x, y, z = hole_in_base_m.tolist()
+        scene[0, :4] = torch.tensor([x, y, z, math.atan2(y, x)])
+        with torch.random.fork_rng([]):
+            torch.manual_seed(int(self._generator.integers(2**31)))
+            self._model.reset(everywhere)
+        self._world.reset(everywhere, start, scene)
+        self._history.reset(everywhere, start)
+        self._measure()
 
     def extra(self) -> dict[str, np.ndarray]:
         """Returns the contact force, and the oil's temperature where the model knows one, each `(1,)`."""

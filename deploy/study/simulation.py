@@ -63,6 +63,8 @@ def simulate(
         radius_m=np.array([design.holes[trial.hole].radius_m for trial in todo]),
         guided=is_guided,
         limit_s=design.limit_s,
+        depth_m=design.success.depth_m,
+        clearance_m=design.success.clearance_m,
     )
     operators = Divided(machine, persons, is_guided, guided, unguided, session.stream("study operators"))
     loads: dict[tuple[str, int], list[float]] = {}

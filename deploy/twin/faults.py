@@ -1,7 +1,8 @@
 """Faults on request: what can go wrong with messages and machine, switched on over a local port. Off unless a port is configured.
 
 A request is one JSON datagram: `{"fault": "drop", "message": "JointPos1", "seconds": 0.2}`. `message` names one message, or is left
-out for all; without `seconds` a fault stays until `{"fault": "none"}`.
+out for all; without `seconds` a fault stays until `{"fault": "none"}`. The same port takes
+`{"place": {"q": [...], "hole_in_base_m": [x, y, z]}}`: machine and block are put elsewhere, as somebody does between two trials.
 """
 
 from __future__ import annotations
@@ -52,6 +53,7 @@ class Faults:
     _late: list[tuple[float, Wired]] = field(default_factory=list)
     _chance: random.Random = field(default_factory=lambda: random.Random(0))
     _since_s: dict[str, float] = field(default_factory=dict)
+    _place: tuple[list[float], list[float]] | None = None
 
     def request(self, text: bytes, now_s: float) -> None:
         """Takes a request; see the module.
@@ -61,6 +63,9 @@ class Faults:
         """
         try:
             asked = json.loads(text)
+            if "place" in asked:
+                self._place = [float(q) for q in asked["place"]["q"]], [float(x) for x in asked["place"]["hole_in_base_m"]]
+                return
             fault, message, seconds = asked["fault"], asked.get("message", ""), float(asked.get("seconds", 1e9))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ConfigError(f"fault: expected JSON with 'fault', got {text[:80]!r} ({error})") from error
@@ -71,6 +76,11 @@ class Faults:
         else:
             self.until_s[fault, message] = now_s + seconds
             self._since_s[fault] = now_s
+
+    def take_place(self) -> tuple[list[float], list[float]] | None:
+        """Returns where machine and block are to be put, once: joint positions and the centre of the rim."""
+        place, self._place = self._place, None
+        return place
 
     def on(self, fault: str, message: str, now_s: float) -> bool:
         """Says whether a fault is on for a message."""

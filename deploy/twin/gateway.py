@@ -22,7 +22,7 @@ from deploy.guidance import AXES, LeverMap
 
 TIMEOUT_S = 0.07
 """Age of the last valid command from which there is none; three cycles and a half, within the 100 ms that are promised."""
-REMOTE_S, FORGET_S = 0.15, 1.0
+REMOTE_S, FORGET_S = 0.13, 1.0
 IDLE_FRAMES = 3
 NEUTRAL = 0.03
 NOBODY, LEVERS, PC = 0, 1, 2

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from deploy.bus.description import GATEWAY, Description
 from deploy.bus.header import c_header
-from deploy.bus.wire import OpenWire, Wire, Wired
+from deploy.bus.wire import Wire, Wired
 from deploy.loop.process import Pace, Stop, ask_for_priority
 from deploy.twin.faults import FaultPort, Faults
 from deploy.twin.gateway import Gateway
@@ -75,7 +75,7 @@ class Twin:
         session.folder.mkdir(parents=True, exist_ok=True)
         write_text(session.folder / HEADER, c_header(Description(self.dbc, machine)))
         with plant.build(machine, 1, session) as link, self.wire.open() as bus, FaultPort(self.fault_port) as port:
-            _Running(self, machine, link, bus, port).run(stop)
+            Running(self, machine, link, bus, port).run(stop)
 
 
 def run(stop: Stop, twin: Twin, machine: Machine, plant: Connection, session: Session, exchange: Any = None) -> None:
@@ -83,8 +83,30 @@ def run(stop: Stop, twin: Twin, machine: Machine, plant: Connection, session: Se
     twin.run(stop, machine, plant, session)
 
 
-class _Running:
-    def __init__(self, twin: Twin, machine: Machine, link: Link, bus: OpenWire, port: FaultPort) -> None:
+class Bus(Protocol):
+    """Where a twin's messages go: an open wire, or whatever stands in for one."""
+
+    def recv(self, timeout_s: float) -> Wired | None:
+        """Returns the next frame, `None` when none came in time."""
+        ...
+
+    def send(self, frame: Wired) -> None:
+        """Sends a frame."""
+        ...
+
+
+class Running:
+    """A twin at work; `run` in real time, or cycle by cycle by whoever keeps the time.
+
+    Args:
+        twin: What it is.
+        machine: The machine.
+        link: The simulated machine.
+        bus: Where its messages go.
+        port: Where faults are asked for.
+    """
+
+    def __init__(self, twin: Twin, machine: Machine, link: Link, bus: Bus, port: FaultPort) -> None:
         self._twin, self._machine, self._link, self._bus, self._port = twin, machine, link, bus, port
         self._description = Description(twin.dbc, machine)
         self._gateway, self._remote = Gateway(self._description, machine), Remote(self._description)
@@ -92,6 +114,7 @@ class _Running:
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
         self._q = self._before = np.asarray(link.read().q, dtype=float)
+        self._flow = np.zeros(machine.num_joints)
         self._period_began_s = -np.inf
         self._stuck: np.ndarray | None = None
         remote = self._description.layouts[self._description.message_of("DeadMan")]
@@ -99,36 +122,44 @@ class _Running:
         self._own = {remote.frame_id} if twin.remote else set()
 
     def run(self, stop: Stop) -> None:
+        """Runs in real time until told to stop, or until its time is over."""
         end_s = np.inf if self._twin.seconds is None else time.monotonic() + self._twin.seconds
         while not stop() and time.monotonic() < end_s:
             try:
                 while (left_s := self._pace.next_s - time.monotonic()) > 0:
                     frame = self._bus.recv(left_s)
-                    if frame is not None and frame.frame_id not in self._own:
-                        self._gateway.take(frame, time.monotonic())
+                    if frame is not None:
+                        self.hear(frame, time.monotonic())
                 self._pace.begin()
-                self._cycle(time.monotonic())
+                self.cycle(time.monotonic())
             except LinkError as error:
                 log.warning("%s", error)
                 self._pace.wait()
 
-    def _cycle(self, now_s: float) -> None:
+    def hear(self, frame: Wired, now_s: float) -> None:
+        """Takes in a frame of PC or remote, and acts on it if it stops the machine."""
+        if frame.frame_id not in self._own:
+            self._gateway.take(frame, now_s)
+            self._valves(now_s)
+
+    def cycle(self, now_s: float) -> None:
+        """Lets `CYCLE_S` go by: valves, motion, messages."""
         if (asked := self._port.poll(self._faults)) is not None:
             log.debug("fault: %s", asked)
+        if (place := self._faults.take_place()) is not None:
+            self._place(*place)
         faults, gateway = self._faults, self._gateway
         gateway.estop = faults.on("estop", "", now_s)
         if self._twin.remote:
             self._play_remote(now_s)
-        flow, source, state = gateway.flow(now_s)
+        flow, said = self._valves(now_s)
         if now_s - self._period_began_s >= self._machine.period_s - CYCLE_S / 2:
             late = now_s - self._period_began_s > 1.5 * self._machine.period_s
             self._period_began_s = now_s if late else self._period_began_s + self._machine.period_s
             self._before = self._q
             self._link.send(Command(flow))
             self._q = np.asarray(self._link.read().q, dtype=float)
-        values = self._positions(now_s) | {f"Flow_{name}": u for name, u in zip(self._machine.joint_names, flow, strict=True)}
-        values |= {"FlowSource": source, "EStop": gateway.estop, "ExclusiveSelected": gateway.exclusive_selected}
-        values |= {"GatewayState": state.value, "OilTemperature": self._oil_c(), "Stamp": round(now_s % 65.5, 3)}
+        values = self._positions(now_s) | said | {"Stamp": int(1e3 * now_s) % 65536 / 1e3}
         for layout in self._description.sent_by(GATEWAY):
             self._send(layout.name, values, now_s)
         for frame in faults.due(now_s):
@@ -140,15 +171,35 @@ class _Running:
             for _ in range(FLOOD):
                 self._bus.send(Wired(0x1FFF0000, bytes(8)))
 
+    def _place(self, q: list[float], hole_in_base_m: list[float]) -> None:
+        """Puts machine and block elsewhere, as between two trials of a study; a plant that cannot be put stays where it is."""
+        if not hasattr(self._link, "place"):
+            log.warning("this simulated machine cannot be put elsewhere; link=site can")
+            return
+        self._link.place(np.array(q), np.array(hole_in_base_m))  # type: ignore[attr-defined]
+        self._q = self._before = np.asarray(self._link.read().q, dtype=float)
+
+    def _valves(self, now_s: float) -> tuple[np.ndarray, dict[str, float]]:
+        """Returns what the valves get, `(J,)`, and what is said of it; that they get nothing any more is said at once."""
+        gateway, before = self._gateway, self._flow
+        self._flow, source, state = gateway.flow(now_s)
+        said = {f"Flow_{name}": float(u) for name, u in zip(self._machine.joint_names, self._flow, strict=True)}
+        said |= {"FlowSource": source, "EStop": gateway.estop, "ExclusiveSelected": gateway.exclusive_selected}
+        said |= {"GatewayState": state.value, "OilTemperature": self._oil_c()}
+        if before.any() and not self._flow.any():
+            for signal in ("FlowSource", "EStop"):
+                self._send(self._description.message_of(signal), said, now_s, at_once=True)
+        return self._flow, said
+
     def _play_remote(self, now_s: float) -> None:
         faults, remote = self._faults, self._remote
         layout = self._description.layouts[self._description.message_of("DeadMan")]
-        if now_s < self._due_s.get(layout.name, now_s):
+        held = self._twin.deadman and now_s - self._gateway.heard_s > PRESS_S and not faults.on("deadman_released", "", now_s)
+        released = remote.deadman and not held  # which does not wait for its turn either
+        if now_s < self._due_s.get(layout.name, now_s) and not released:
             return
         self._due_s[layout.name] = max(self._due_s.get(layout.name, now_s), now_s - layout.period_s) + layout.period_s
-        remote.deadman = (
-            self._twin.deadman and now_s - self._gateway.heard_s > PRESS_S and not faults.on("deadman_released", "", now_s)
-        )
+        remote.deadman = held
         remote.on = not faults.on("remote_off", "", now_s)
         remote.levers = (0.5 if faults.on("lever", "", now_s) else 0.0, 0.0, 0.0, 0.0)
         frame = remote.frame()
@@ -156,10 +207,10 @@ class _Running:
         for one in faults.pass_on(layout, frame, now_s):
             self._bus.send(one)
 
-    def _send(self, name: str, values: dict[str, float], now_s: float) -> None:
+    def _send(self, name: str, values: dict[str, float], now_s: float, at_once: bool = False) -> None:
         layout = self._description.layouts[name]
         due_s = self._due_s.get(name, now_s)
-        if now_s < due_s - CYCLE_S / 2:
+        if now_s < due_s - CYCLE_S / 2 and not at_once:
             return
         self._due_s[name] = max(due_s, now_s - layout.period_s) + layout.period_s
         counter = self._counters[name] = self._counters.get(name, -1) + 1

@@ -1,0 +1,236 @@
+"""Where simulated operators do trials on the twin: the real time's own parts, one process, and a clock that runs as fast as it can.
+
+Each trial has a twin (`deploy.twin`: plant, gateway, its messages), a remote, and of the loop the receiver and the adviser with
+policy and lever display. Frames go through the bus description both ways: coded, counted, checked. What is not there: a bus with
+latencies, processes and their scheduling, guard and page. A simulated person sees an advice in the control period in which it is
+made, a real one some tens of milliseconds later.
+Axes: `N` trials, `J` joints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+
+from brokk_rl.contracts import Connection, OperatorModel, OperatorView, TrialBatch
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from deploy.bus.description import Description
+from deploy.bus.wire import Wire, Wired
+from deploy.chain import tool
+from deploy.guidance import Guidance, LeverMap
+from deploy.limits import Limits
+from deploy.loop.receiver import Receiver
+from deploy.loop.records import advice_fields, state_fields
+from deploy.policy.adviser import REASONS, Advised, Adviser, Counsel
+from deploy.policy.bundle import Bundle
+from deploy.twin.faults import FaultPort
+from deploy.twin.gateway import axis_full_rad
+from deploy.twin.remote import Remote
+from deploy.twin.twin import CYCLE_S, Running, Twin
+
+BEGIN_S = 1000.0
+"""Of the clock; nothing in the loop may take a small number for a time."""
+BEFORE_S = 1.0
+"""For which everything runs before a trial begins: the policy's history is full then."""
+NO_BUS = Wire(interface="virtual", channel="none", bitrate=None, port=None)
+VALID = REASONS.index(Advised.VALID)
+TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,))])
+
+
+@spec
+class Twins:
+    """The twin, with gateway, messages, receiver, policy and lever display of the loop, as fast as it computes.
+
+    Attributes:
+        plant: The machine beside its block.
+        dbc: Description of the bus.
+        limits: Of what the loop believes.
+        guidance: How advice is shown.
+        policy: Policy bundle that advises.
+        settle_s: Time for which a recording goes on after the insertion.
+    """
+
+    plant: Connection
+    dbc: str
+    limits: Limits
+    guidance: Guidance
+    policy: str
+    settle_s: float
+
+    def run(self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel) -> list[Recording]:
+        """See `brokk_rl.contracts.TrialGround`."""
+        bundle, description = Bundle(self.policy, machine), Description(self.dbc, machine)
+        num = len(trials.q)
+        desks = []
+        for n in track(range(num), "setting up twins", transient=True):
+            own = replace(session, seed=session.stream(f"twin {n}"))
+            desks.append(_Desk(self, machine, description, bundle, own, trials.q[n], trials.rim_in_base_m[n]))
+        for desk in desks:
+            desk.wait(BEFORE_S)
+        steps, left = round(trials.limit_s / machine.period_s), np.full(num, round(self.settle_s / machine.period_s))
+        running = np.ones(num, bool)
+        for _ in track(range(steps), "simulated operators at the twin", transient=True):
+            q = np.stack([desk.seen() for desk in desks])
+            advice = np.stack([desk.shown if guided else np.full(machine.num_joints, np.nan)
+                               for desk, guided in zip(desks, trials.guided, strict=True)])  # fmt: skip
+            given = operators.step(OperatorView(q=q, rim_in_base_m=trials.rim_in_base_m, advice=advice))
+            for n in np.flatnonzero(running):
+                desks[n].period(given[n])
+            left -= _inserted(machine, q, trials) & running
+            running &= left > 0
+            if not running.any():
+                break
+        return [desk.recording(session, bool(guided)) for desk, guided in zip(desks, trials.guided, strict=True)]
+
+
+def _inserted(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray:
+    away = tool(machine, q).tip_in_base_m - trials.rim_in_base_m
+    return (np.hypot(away[:, 0], away[:, 1]) <= trials.clearance_m) & (away[:, 2] <= -trials.depth_m)
+
+
+class _Newest:
+    """The newest record, for one process; see `deploy.loop.exchange.Slot`."""
+
+    def __init__(self, fields: np.dtype, record: Any = None) -> None:
+        self._fields, self._record = fields, record
+
+    def new(self) -> Any:
+        return np.zeros((), self._fields)
+
+    def write(self, record: Any) -> None:
+        self._record = record
+
+    def read(self) -> Any:
+        return self._record
+
+
+class _NoLog:
+    def put(self, data: bytes) -> bool:
+        return True
+
+
+@dataclass
+class _Shared:
+    """What an adviser reads and writes of an exchange."""
+
+    state: _Newest
+    advice: _Newest
+    target: _Newest
+    request: None
+    policy_log: _NoLog
+
+
+class _Air:
+    """Frames on their way from the twin."""
+
+    def __init__(self) -> None:
+        self.frames: list[Wired] = []
+
+    def recv(self, timeout_s: float) -> Wired | None:
+        return None
+
+    def send(self, frame: Wired) -> None:
+        self.frames.append(frame)
+
+
+class _Desk:
+    """One trial: twin, remote and loop on a clock of their own."""
+
+    def __init__(
+        self, ground: Twins, machine: Machine, description: Description, bundle: Bundle, session: Session, q: np.ndarray,
+        rim_m: np.ndarray,
+    ) -> None:  # fmt: skip
+        self._machine, self._rim_m, self._now_s = machine, rim_m, BEGIN_S
+        start, hole = tuple(q.tolist()), tuple(rim_m.tolist())
+        placed = replace(ground.plant, start=start, hole_in_base_m=hole)  # type: ignore[type-var]
+        self._link, self._air = placed.build(machine, 1, session), _Air()
+        twin = Twin(wire=NO_BUS, dbc=ground.dbc, remote=False, deadman=False, fault_port=None, seconds=None, realtime=False)
+        self._twin = Running(twin, machine, self._link, self._air, FaultPort(None))
+        self._remote, self._receiver = Remote(description), Receiver(description, machine, ground.limits)
+        self._remote.deadman = True
+        target = np.zeros((), TARGET)
+        target["t_s"], target["center_in_base_m"] = BEGIN_S, rim_m
+        fields = state_fields(machine.num_joints), advice_fields(machine.num_joints)
+        self._shared = _Shared(_Newest(fields[0]), _Newest(fields[1]), _Newest(TARGET, target), None, _NoLog())
+        counsel = Counsel(machine, ground.policy, ground.guidance, ground.limits.joints_s, 1e9, None)
+        self._adviser = Adviser(counsel, bundle, self._shared)  # type: ignore[arg-type]
+        self._own, self._display = LeverMap(machine.levers, machine), LeverMap(ground.guidance.levers or machine.levers, machine)
+        self._full_rad, self._cycles = axis_full_rad(machine), 0
+        self._rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
+        self.shown = np.zeros(machine.num_joints)
+        """Commands that the lever positions shown now stand for, `(J,)`."""
+
+    def seen(self) -> np.ndarray:
+        """Returns the arm as a person beside it sees it, `(J,)`."""
+        return np.asarray(self._link.read().q, float)
+
+    def wait(self, seconds: float) -> None:
+        """Lets time go by before the trial, levers in neutral."""
+        for _ in range(round(seconds / self._machine.period_s)):
+            self.period(np.zeros(self._machine.num_joints))
+        self._rows.clear()
+
+    def period(self, given: np.ndarray) -> None:
+        """Lets a control period go by in which the levers stand as `given`, `(J,)`, wants them."""
+        receiver, before = self._receiver, (self._receiver.flow_sum, self._receiver.flow_number)
+        q = receiver.q.copy() if receiver.frames else self.seen()
+        force = getattr(self._link, "extra", dict)().get("force_n", np.zeros(1))
+        angles_rad, self._remote.button_right = self._own.levers(given)
+        self._remote.levers = (angles_rad / self._full_rad).clip(-1.0, 1.0).tolist()
+        advised = self._shared.advice.read()
+        advice = np.full(len(given), np.nan) if advised is None or int(advised["reason"]) != VALID else np.array(advised["u"])
+        for _ in range(round(self._machine.period_s / CYCLE_S)):
+            self._cycle()
+        u = (receiver.flow_sum - before[0]) / max(1, receiver.flow_number - before[1])
+        self._rows.append((q, u, advice, float(force[0])))
+        self._advise()
+
+    def _cycle(self) -> None:
+        self._now_s += CYCLE_S
+        if self._cycles % round(self._remote.period_s / CYCLE_S) == 0:
+            frame = self._remote.frame()
+            self._twin.hear(frame, self._now_s)
+            self._receiver.take(frame, self._now_s)
+        self._cycles += 1
+        self._twin.cycle(self._now_s)
+        for frame in self._air.frames:
+            self._receiver.take(frame, self._now_s)
+        self._air.frames.clear()
+
+    def _advise(self) -> None:
+        """Publishes what is known, as the bus process does, and lets the policy speak."""
+        receiver, record, now_s = self._receiver, self._shared.state.new(), self._now_s
+        seen = receiver.seen(now_s, bus_up=True)
+        record["t_s"], record["q"], record["q_t_s"] = now_s, receiver.q, max(0.0, receiver.q_t_s.min())
+        record["q_plausible"], record["trusted"] = seen.joints_plausible, seen.trusted
+        record["flow"], record["flow_sum"], record["flow_number"] = receiver.flow, receiver.flow_sum, receiver.flow_number
+        self._shared.state.write(record)
+        self._adviser.cycle(0, now_s)
+        advice = self._shared.advice.read()
+        self.shown = self._display.command(np.array(advice["lever_rad"]), bool(advice["button_right"]))
+
+    def recording(self, session: Session, guided: bool) -> Recording:
+        """Returns the trial at the control rate, commands as the valves got them."""
+        machine = self._machine
+        q, u, advice = (np.stack([row[i] for row in self._rows]).astype(np.float32) for i in range(3))
+        extra = {"force_n": np.array([row[3] for row in self._rows], np.float32)}
+        extra |= {f"target_{axis}_m": np.full(len(q), self._rim_m[i], np.float32) for i, axis in enumerate("xyz")}
+        if guided:
+            extra |= {f"advice_{name}": advice[:, j] for j, name in enumerate(machine.joint_names)}
+        return Recording(
+            machine=machine.name,
+            joints=machine.joint_names,
+            units=tuple(joint.unit for joint in machine.joints),
+            rate_hz=1.0 / machine.period_s,
+            t_s=np.arange(len(q)) * machine.period_s,
+            u=u.clip(-1.0, 1.0),
+            q=q,
+            extra=extra,
+            metadata={"source": "simulated operator, twin", "seed": str(session.seed)},
+        )
