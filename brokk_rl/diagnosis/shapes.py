@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from brokk_rl.diagnosis.evidence import Evidence, Ray
+from brokk_rl.diagnosis.evidence import GRID, Evidence, Ray
 from brokk_rl.diagnosis.noise import loss
 from brokk_rl.diagnosis.search import Scored, Table
 from brokk_rl.diagnosis.simulator import Base
@@ -18,8 +18,8 @@ from brokk_rl.diagnosis.sizes import Plain, Shape, fitted, plain, predicted
 
 SHAPES = (0.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
-SMALL = (0.12, 0.5)
-"""Sizes at which effects are simulated on the reference: what they find there is small."""
+SMALL = GRID[:4]
+"""Sizes at which effects are simulated on the reference: those of the field, as what begins at a threshold shows at no smaller one."""
 THERE = 3.0
 """Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be there already."""
 FELT = 1e-3
