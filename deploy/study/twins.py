@@ -16,6 +16,7 @@ import numpy as np
 from rich.progress import track
 
 from brokk_rl.contracts import Connection, OperatorModel, OperatorView, TrialBatch
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
@@ -29,6 +30,7 @@ from deploy.loop.receiver import Receiver
 from deploy.loop.records import advice_fields, state_fields
 from deploy.policy.adviser import REASONS, Advised, Adviser, Counsel
 from deploy.policy.bundle import Bundle
+from deploy.study.crew import Crew, cores
 from deploy.twin.faults import FaultPort
 from deploy.twin.gateway import axis_full_rad
 from deploy.twin.remote import Remote
@@ -54,6 +56,7 @@ class Twins:
         guidance: How advice is shown.
         policy: Policy bundle that advises.
         settle_s: Time for which a recording goes on after the insertion.
+        num_processes: Processes that the twins are spread over; 0: one a core.
     """
 
     plant: Connection
@@ -62,31 +65,45 @@ class Twins:
     guidance: Guidance
     policy: str
     settle_s: float
+    num_processes: int
+
+    def check(self) -> None:
+        if self.num_processes < 0:
+            raise ConfigError(f"ground.num_processes: expected 0 or more, got {self.num_processes}")
 
     def run(self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel) -> list[Recording]:
         """See `brokk_rl.contracts.TrialGround`."""
-        bundle, description = Bundle(self.policy, machine), Description(self.dbc, machine)
-        num = len(trials.q)
-        desks = []
-        for n in track(range(num), "setting up twins", transient=True):
-            own = replace(session, seed=session.stream(f"twin {n}"))
-            desks.append(_Desk(self, machine, description, bundle, own, trials.q[n], trials.rim_in_base_m[n]))
-        for desk in desks:
-            desk.wait(BEFORE_S)
+        num, nothing = len(trials.q), np.full(machine.num_joints, np.nan)
+        places = [(session.stream(f"twin {n}"), trials.q[n], trials.rim_in_base_m[n], bool(trials.guided[n])) for n in range(num)]
+        processes = min(self.num_processes or cores(), num)
+        rows = [np.arange(first, num, processes) for first in range(processes)]
+        parts = [(self, machine, session, [places[n] for n in mine]) for mine in rows]
         steps, left = round(trials.limit_s / machine.period_s), np.full(num, round(self.settle_s / machine.period_s))
         running = np.ones(num, bool)
-        for _ in track(range(steps), "simulated operators at the twin", transient=True):
-            q = np.stack([desk.seen() for desk in desks])
-            advice = np.stack([desk.shown if guided else np.full(machine.num_joints, np.nan)
-                               for desk, guided in zip(desks, trials.guided, strict=True)])  # fmt: skip
-            given = operators.step(OperatorView(q=q, rim_in_base_m=trials.rim_in_base_m, advice=advice))
-            for n in np.flatnonzero(running):
-                desks[n].period(given[n])
-            left -= _inserted(machine, q, trials) & running
-            running &= left > 0
-            if not running.any():
-                break
-        return [desk.recording(session, bool(guided)) for desk, guided in zip(desks, trials.guided, strict=True)]
+        with Crew("deploy.study.twins:desks", parts, rows, num) as crew:
+            now = crew.ask("seen", running)
+            for _ in track(range(steps), "simulated operators at the twin", transient=True):
+                q = np.stack([now[n][0] for n in range(num)])
+                advice = np.stack([now[n][1] if trials.guided[n] else nothing for n in range(num)])
+                given = operators.step(OperatorView(q=q, rim_in_base_m=trials.rim_in_base_m, advice=advice))
+                now |= crew.ask("period", running, given)
+                left -= _inserted(machine, q, trials) & running
+                running &= left > 0
+                if not running.any():
+                    break
+            found = crew.ask("recording", np.ones(num, bool))
+        return [found[n] for n in range(num)]
+
+
+def desks(ground: Twins, machine: Machine, session: Session, places: list[tuple[int, np.ndarray, np.ndarray, bool]]) -> list[_Desk]:
+    """Returns a desk for each of `places`: seed, start, rim, and whether advice is shown there."""
+    bundle, description = Bundle(ground.policy, machine), Description(ground.dbc, machine)
+    made = [
+        _Desk(ground, machine, description, bundle, replace(session, seed=seed), q, rim, guided) for seed, q, rim, guided in places
+    ]
+    for desk in made:
+        desk.wait(BEFORE_S)
+    return made
 
 
 def _inserted(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray:
@@ -144,8 +161,9 @@ class _Desk:
 
     def __init__(
         self, ground: Twins, machine: Machine, description: Description, bundle: Bundle, session: Session, q: np.ndarray,
-        rim_m: np.ndarray,
+        rim_m: np.ndarray, guided: bool,
     ) -> None:  # fmt: skip
+        self._seed, self._guided = session.seed, guided
         self._machine, self._rim_m, self._now_s = machine, rim_m, BEGIN_S
         start, hole = tuple(q.tolist()), tuple(rim_m.tolist())
         placed = replace(ground.plant, start=start, hole_in_base_m=hole)  # type: ignore[type-var]
@@ -163,12 +181,11 @@ class _Desk:
         self._own, self._display = LeverMap(machine.levers, machine), LeverMap(ground.guidance.levers or machine.levers, machine)
         self._full_rad, self._cycles = axis_full_rad(machine), 0
         self._rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
-        self.shown = np.zeros(machine.num_joints)
-        """Commands that the lever positions shown now stand for, `(J,)`."""
+        self._shown = np.zeros(machine.num_joints)
 
-    def seen(self) -> np.ndarray:
-        """Returns the arm as a person beside it sees it, `(J,)`."""
-        return np.asarray(self._link.read().q, float)
+    def seen(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the arm as a person beside it sees it, and the commands that the levers shown now stand for, `(J,)` each."""
+        return np.asarray(self._link.read().q, float), self._shown
 
     def wait(self, seconds: float) -> None:
         """Lets time go by before the trial, levers in neutral."""
@@ -176,10 +193,10 @@ class _Desk:
             self.period(np.zeros(self._machine.num_joints))
         self._rows.clear()
 
-    def period(self, given: np.ndarray) -> None:
-        """Lets a control period go by in which the levers stand as `given`, `(J,)`, wants them."""
+    def period(self, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lets a control period go by in which the levers stand as `given`, `(J,)`, wants them; returns what is `seen` then."""
         receiver, before = self._receiver, (self._receiver.flow_sum, self._receiver.flow_number)
-        q = receiver.q.copy() if receiver.frames else self.seen()
+        q = receiver.q.copy() if receiver.frames else self.seen()[0]
         force = getattr(self._link, "extra", dict)().get("force_n", np.zeros(1))
         angles_rad, self._remote.button_right = self._own.levers(given)
         self._remote.levers = (angles_rad / self._full_rad).clip(-1.0, 1.0).tolist()
@@ -190,6 +207,7 @@ class _Desk:
         u = (receiver.flow_sum - before[0]) / max(1, receiver.flow_number - before[1])
         self._rows.append((q, u, advice, float(force[0])))
         self._advise()
+        return self.seen()
 
     def _cycle(self) -> None:
         self._now_s += CYCLE_S
@@ -213,15 +231,15 @@ class _Desk:
         self._shared.state.write(record)
         self._adviser.cycle(0, now_s)
         advice = self._shared.advice.read()
-        self.shown = self._display.command(np.array(advice["lever_rad"]), bool(advice["button_right"]))
+        self._shown = self._display.command(np.array(advice["lever_rad"]), bool(advice["button_right"]))
 
-    def recording(self, session: Session, guided: bool) -> Recording:
+    def recording(self) -> Recording:
         """Returns the trial at the control rate, commands as the valves got them."""
         machine = self._machine
         q, u, advice = (np.stack([row[i] for row in self._rows]).astype(np.float32) for i in range(3))
         extra = {"force_n": np.array([row[3] for row in self._rows], np.float32)}
         extra |= {f"target_{axis}_m": np.full(len(q), self._rim_m[i], np.float32) for i, axis in enumerate("xyz")}
-        if guided:
+        if self._guided:
             extra |= {f"advice_{name}": advice[:, j] for j, name in enumerate(machine.joint_names)}
         return Recording(
             machine=machine.name,
@@ -232,5 +250,5 @@ class _Desk:
             u=u.clip(-1.0, 1.0),
             q=q,
             extra=extra,
-            metadata={"source": "simulated operator, twin", "seed": str(session.seed)},
+            metadata={"source": "simulated operator, twin", "seed": str(self._seed)},
         )
