@@ -173,13 +173,13 @@ class Companion:
         name: What it is.
         target: `module:function`, called as `function(stop, *arguments, exchange)`.
         arguments: Its arguments.
-        realtime: Real-time priority, where the loop asks for one: a machine is never late.
+        realtime: Real-time priority, where the loop asks for one: a machine is never late; `None`: an ordinary process.
     """
 
     name: str
     target: str
     arguments: tuple[Any, ...]
-    realtime: int
+    realtime: int | None
 
 
 @dataclass

@@ -30,6 +30,8 @@ class Recorder:
         self._child: Child | None = None
         self._asked, self._number = False, 0
         self.wanted = False
+        self.into: Path | None = None
+        """Folder of the next recording, where it has one of its own."""
         self.since_s = 0.0
         """When the recording began, monotonic."""
 
@@ -53,7 +55,8 @@ class Recorder:
             self._child = child = None
         if child is None and self.wanted:
             self._number += 1
-            folder = self._folder if self._number == 1 else self._folder / f"recording_{self._number}"
+            folder = self.into or (self._folder if self._number == 1 else self._folder / f"recording_{self._number}")
+            self.into = None
             self._child, self._asked, self.since_s = self._start(folder), False, time.monotonic()
         elif child is not None and not self.wanted and not self._asked:
             child.ask_to_stop()
@@ -88,6 +91,7 @@ class Wanted:
             wish = json.loads(data)
             if wish["kind"] == "record":
                 self._recorder.wanted = wish["value"] == "on"
+                self._recorder.into = Path(wish["into"]) if "into" in wish else self._recorder.into
             else:
                 self._armed = self._commands and wish["kind"] == "start"
             log.info("wished: %s %s", wish["kind"], wish["value"])

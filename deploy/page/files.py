@@ -24,10 +24,16 @@ SECURITY = {
 
 def load(setup: bytes) -> dict[str, tuple[str, bytes]]:
     """Returns type and content of each file by its path; `/setup.json` is `setup`."""
-    found = {"/setup.json": (FILES[".json"], setup)}
-    for entry in files("deploy.page").joinpath("static").iterdir():
+    found = {"/setup.json": (FILES[".json"], setup)} | static("deploy.page")
+    found["/"] = found["/index.html"]
+    return found
+
+
+def static(package: str) -> dict[str, tuple[str, bytes]]:
+    """Returns type and content of each file in the folder `static` of a package, by its path."""
+    found = {}
+    for entry in files(package).joinpath("static").iterdir():
         kind = FILES.get("." + entry.name.rpartition(".")[2])
         if kind and entry.is_file():
             found[f"/{entry.name}"] = (kind, entry.read_bytes())
-    found["/"] = found["/index.html"]
     return found

@@ -11,10 +11,10 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from http import HTTPStatus
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -31,6 +31,24 @@ from deploy.page.shown import Drawn, Feed, Shown
 
 if TYPE_CHECKING:
     from deploy.page.settings import OperatorPage
+
+
+class Annex(Protocol):
+    """What else a server serves: the pages of a study."""
+
+    files: Mapping[str, tuple[str, bytes]]
+    """Type and content by path; a path that is the page's own takes its place."""
+    path: str
+    """Of its WebSocket, to which only those come who know the token."""
+
+    async def talk(self, connection: ServerConnection) -> None:
+        """Talks to a browser until it goes."""
+        ...
+
+    async def run(self) -> None:
+        """Runs beside the server, as long as it does."""
+        ...
+
 
 log = logging.getLogger(__name__)
 
@@ -53,11 +71,16 @@ class Server:
         machine: The machine.
         feed: What to show.
         token: What a browser must show to have something done.
+        annex: What else is served; `None`: nothing.
     """
 
-    def __init__(self, page: OperatorPage, machine: Machine, feed: Feed, token: str) -> None:
-        self._page, self._feed, self._token = page, feed, token
+    def __init__(self, page: OperatorPage, machine: Machine, feed: Feed, token: str, annex: Annex | None = None) -> None:
+        self._page, self._feed, self._token, self._annex = page, feed, token, annex
         self._files = load(json.dumps(page.setup(machine)).encode())
+        self._talks = {STATE: self._states, FRAMES: self._frames, CONTROL: self._control}
+        if annex is not None:
+            self._files |= annex.files
+            self._talks[annex.path] = self._visit
         self._names: frozenset[str] = frozenset()
         self._state: Newest[tuple[Shown | None, str]] = Newest((None, ""))
         self._frame = Newest(b"")
@@ -84,6 +107,7 @@ class Server:
         logging.getLogger("deploy.page.websockets").setLevel(logging.WARNING)
         async with server, asyncio.TaskGroup() as group:
             tasks = [group.create_task(self._watch()), group.create_task(self._watch_frames())]
+            tasks += [group.create_task(self._annex.run())] if self._annex else []
             ready(port)
             while not stop():
                 await asyncio.sleep(0.05)
@@ -120,11 +144,11 @@ class Server:
         path, host = request.path.partition("?")[0], request.headers.get("Host")
         if host not in self._names:
             return _refused(HTTPStatus.MISDIRECTED_REQUEST, "unknown host name; see page.names")
-        if path not in (STATE, FRAMES, CONTROL):
+        if path not in self._talks:
             found = self._files.get(path)
             return _refused(HTTPStatus.NOT_FOUND, "no such page") if found is None else _response(HTTPStatus.OK, *found)
         origin = request.headers.get("Origin")
-        if not access.same_origin(origin, host, self._names) or (path == CONTROL and origin is None):
+        if not access.same_origin(origin, host, self._names) or (path not in (STATE, FRAMES) and origin is None):
             log.warning("refused a connection from another origin")
             return _refused(HTTPStatus.FORBIDDEN, "another origin")
         if self._open >= 3 * self._page.clients:
@@ -133,7 +157,7 @@ class Server:
 
     async def _connection(self, connection: ServerConnection) -> None:
         assert connection.request is not None
-        talk = {STATE: self._states, FRAMES: self._frames, CONTROL: self._control}[connection.request.path.partition("?")[0]]
+        talk = self._talks[connection.request.path.partition("?")[0]]
         self._open += 1
         try:
             with suppress(ConnectionClosed):
@@ -188,7 +212,17 @@ class Server:
 
         await _both(listen(), speak())
 
+    async def _visit(self, connection: ServerConnection) -> None:
+        if self._annex and await self._let_in(connection):
+            await self._annex.talk(connection)
+
     async def _control(self, connection: ServerConnection) -> None:
+        if await self._let_in(connection):
+            async for text in connection:
+                await connection.send(json.dumps(self._hand_on(text)))
+
+    async def _let_in(self, connection: ServerConnection) -> bool:
+        """Asks for the token, and says that it fits; closes the connection where it does not."""
         try:
             given = json.loads(await asyncio.wait_for(connection.recv(), 5.0))
         except (ValueError, TimeoutError):
@@ -198,10 +232,9 @@ class Server:
                 await asyncio.sleep(WRONG_TOKEN_S)
             log.warning("refused a page with a wrong token")
             await connection.close(1008, "token")
-            return
+            return False
         await connection.send(json.dumps({"ready": True}))
-        async for text in connection:
-            await connection.send(json.dumps(self._hand_on(text)))
+        return True
 
     def _hand_on(self, text: str | bytes) -> dict[str, str]:
         """Checks a wish against what holds now, not against what the page showed; returns the answer."""

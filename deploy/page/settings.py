@@ -15,7 +15,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.page.scene import geometry
-from deploy.page.server import Server
+from deploy.page.server import Annex, Server
 from deploy.page.shown import Feed
 
 LINK = "page.url"
@@ -68,8 +68,18 @@ class OperatorPage:
         if not 1 <= self.jpeg_quality <= 100 or not 16 <= self.picture_px <= 4096:
             raise ConfigError("page: expected jpeg_quality in 1 … 100 and picture_px in 16 … 4096")
 
-    def serve(self, stop: Callable[[], bool], machine: Machine, feed: Feed, session: Session, tell: Callable[[str], None]) -> None:
-        """Serves until `stop` says so or a person stops it; tells the link to open, and leaves it in `page.url`.
+    def serve(
+        self,
+        stop: Callable[[], bool],
+        machine: Machine,
+        feed: Feed,
+        session: Session,
+        tell: Callable[[str], None],
+        annex: Annex | None = None,
+    ) -> None:
+        """Serves the page, and what `annex` has, until `stop` says so or a person stops it.
+
+        It tells the link to open, and leaves it in `page.url`.
 
         Raises:
             LinkError: the address is taken or not this computer's.
@@ -82,7 +92,7 @@ class OperatorPage:
             tell(address)
 
         with contextlib.suppress(KeyboardInterrupt):
-            asyncio.run(Server(self, machine, feed, token).run(stop, ready))
+            asyncio.run(Server(self, machine, feed, token, annex).run(stop, ready))
 
     def setup(self, machine: Machine) -> dict[str, Any]:
         """Returns what a page needs to know once, as plain data; nothing secret."""
