@@ -1,42 +1,46 @@
-"""Augmentations: what light, dust, lens, sensor and file do to a picture, without moving anything in it.
+"""Augmentations: what light, dust, lens, sensor and file do to pictures, without moving anything in them.
 
-The paper's five are blur, crop, contrast, gamma and noise; crop changes the geometry and is a window (`segment_window`). All
-take and return RGB float32 in [0, 1], `(h, w, 3)`, and draw from the generator they are given and nothing else.
+The paper's five are blur, crop, contrast, gamma and noise; crop changes the geometry and is `training_data.Crop`. All take and
+return a batch of RGB pictures in [0, 1], `(B, 3, h, w)` float32 on any device, each picture changed by a draw of its own from the
+generator that they are given, which is of the same device, and from nothing else.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Protocol
 
-import cv2
-import numpy as np
+import torch
+from torch.nn import functional
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
+from perception import jpeg
 
 Range = tuple[float, float]
 
 
 class Augmentation(Protocol):
-    """Changes a picture at random."""
+    """Changes pictures at random."""
 
     @property
     def probability(self) -> float:
         """How often it does; 0 switches it off."""
         ...
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns a changed picture; values may leave [0, 1], they are clipped after the last one."""
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns changed pictures; values may leave [0, 1], they are clipped after the last one."""
         ...
 
 
-def augmented(picture: np.ndarray, steps: Mapping[str, Augmentation], generator: np.random.Generator) -> np.ndarray:
-    """Returns the picture after all augmentations in their order, each with its probability, clipped to [0, 1]."""
+def augmented(pictures: torch.Tensor, steps: Mapping[str, Augmentation], generator: torch.Generator) -> torch.Tensor:
+    """Returns the pictures after all augmentations in their order, each with its probability, clipped to [0, 1]."""
     for step in steps.values():
-        if generator.random() < step.probability:
-            picture = step.changed(picture, generator).astype(np.float32, copy=False)
-    return np.clip(picture, 0.0, 1.0)
+        if step.probability > 0.0:
+            chosen = _drawn((0.0, 1.0), pictures, generator) < step.probability
+            pictures = torch.where(chosen, step.changed(pictures, generator), pictures)
+    return pictures.clamp(0.0, 1.0)
 
 
 @spec
@@ -56,10 +60,10 @@ class Exposure:
     def check(self) -> None:
         _check(self, gain=self.gain)
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns the picture with another exposure."""
-        gain = np.exp(generator.uniform(*np.log(self.gain)))
-        return picture * (gain * generator.uniform(1.0 - self.tint, 1.0 + self.tint, 3)).astype(np.float32)
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with another exposure."""
+        gain = _drawn((math.log(self.gain[0]), math.log(self.gain[1])), pictures, generator).exp()
+        return pictures * gain * _drawn((1.0 - self.tint, 1.0 + self.tint), pictures, generator, 3)
 
 
 @spec
@@ -77,10 +81,10 @@ class Contrast:
     def check(self) -> None:
         _check(self, gain=self.gain)
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns the picture with another contrast."""
-        mean = picture.mean()
-        return mean + (picture - mean) * np.float32(generator.uniform(*self.gain))
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with another contrast."""
+        mean = pictures.mean((1, 2, 3), keepdim=True)
+        return mean + (pictures - mean) * _drawn(self.gain, pictures, generator)
 
 
 @spec
@@ -98,9 +102,9 @@ class Gamma:
     def check(self) -> None:
         _check(self, exponent=self.exponent)
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns the picture with another tone curve."""
-        return np.clip(picture, 0.0, 1.0) ** np.float32(generator.uniform(*self.exponent))
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with another tone curve."""
+        return pictures.clamp(0.0, 1.0) ** _drawn(self.exponent, pictures, generator)
 
 
 @spec
@@ -122,15 +126,16 @@ class Shadow:
     def check(self) -> None:
         _check(self, width=self.width, softness=self.softness)
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns the picture with a shadow across it."""
-        angle_rad, place = generator.uniform(0.0, np.pi), generator.uniform(0.2, 0.8, 2)
-        half, soft = generator.uniform(*self.width) / 2.0, generator.uniform(*self.softness)
-        height, width = picture.shape[:2]
-        across = (np.arange(width) / width - place[0]) * np.cos(angle_rad)
-        down = (np.arange(height) / width - place[1] * height / width) * np.sin(angle_rad)
-        inside = np.clip((half - np.abs(across[None] + down[:, None])) / soft + 0.5, 0.0, 1.0)
-        return picture * (1.0 - inside * (1.0 - generator.uniform(*self.depth))).astype(np.float32)[..., None]
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with a shadow across them."""
+        height, width = pictures.shape[2:]
+        angle_rad = _drawn((0.0, math.pi), pictures, generator)
+        x, y = (_drawn((0.2, 0.8), pictures, generator) for _ in range(2))
+        across = torch.arange(width, device=pictures.device) / width - x
+        down = torch.arange(height, device=pictures.device)[:, None] / width - y * height / width
+        half, soft = _drawn(self.width, pictures, generator) / 2.0, _drawn(self.softness, pictures, generator)
+        inside = ((half - (across * angle_rad.cos() + down * angle_rad.sin()).abs()) / soft + 0.5).clamp(0.0, 1.0)
+        return pictures * (1.0 - inside * (1.0 - _drawn(self.depth, pictures, generator)))
 
 
 @spec
@@ -152,13 +157,13 @@ class Haze:
     def check(self) -> None:
         _check(self, transmission=self.transmission, brightness=self.brightness)
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns the picture through dust."""
-        coarse = generator.uniform(-1.0, 1.0, (4, 5)).astype(np.float32) * self.unevenness
-        drift = cv2.resize(coarse, picture.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-        through = np.clip(generator.uniform(*self.transmission) + drift, 0.05, 1.0)[..., None]
-        dust = (generator.uniform(*self.brightness) * generator.uniform([0.95, 0.9, 0.85], [1.0, 1.0, 1.0])).astype(np.float32)
-        return picture * through + dust * (1.0 - through)
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures through dust."""
+        coarse = _drawn((-self.unevenness, self.unevenness), pictures, generator, 20).reshape(-1, 1, 4, 5)
+        drift = functional.interpolate(coarse, pictures.shape[2:], mode="bicubic", align_corners=False)
+        through = (_drawn(self.transmission, pictures, generator) + drift).clamp(0.05, 1.0)
+        tint = torch.cat([_drawn((low, 1.0), pictures, generator) for low in (0.95, 0.9, 0.85)], 1)
+        return pictures * through + _drawn(self.brightness, pictures, generator) * tint * (1.0 - through)
 
 
 @spec
@@ -176,9 +181,10 @@ class Blur:
     def check(self) -> None:
         _check(self, sigma_px=self.sigma_px)
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns the picture out of focus."""
-        return cv2.GaussianBlur(picture, (0, 0), generator.uniform(*self.sigma_px))
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures out of focus."""
+        kernel = _gaussian(_drawn(self.sigma_px, pictures, generator), self.sigma_px[1])
+        return _filtered(_filtered(pictures, kernel), kernel.transpose(2, 3))
 
 
 @spec
@@ -196,17 +202,16 @@ class MotionBlur:
     def check(self) -> None:
         _check(self, length_px=self.length_px)
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns the picture smeared along a line; what is shown stays where it was, in the middle of the way."""
-        length, angle_rad = generator.uniform(*self.length_px), generator.uniform(0.0, np.pi)
-        half = int(np.ceil(length / 2.0)) + 1
-        kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-        for along in np.linspace(-length / 2.0, length / 2.0, 8 * half + 1):
-            x, y = half + along * np.cos(angle_rad), half + along * np.sin(angle_rad)
-            column, row = int(x), int(y)
-            right, lower = x - column, y - row
-            kernel[row : row + 2, column : column + 2] += np.outer([1.0 - lower, lower], [1.0 - right, right]).astype(np.float32)
-        return cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures smeared along a line; what is shown stays where it was, in the middle of the way."""
+        half = math.ceil(self.length_px[1] / 2.0) + 1
+        length, angle_rad = (_drawn(one, pictures, generator) for one in (self.length_px, (0.0, math.pi)))
+        way = length * torch.linspace(-0.5, 0.5, 8 * half + 1, device=pictures.device)[:, None, None]
+        place = torch.arange(-half, half + 1, device=pictures.device).float()
+        # each step along the way falls on the four pixels around it
+        near = (1.0 - (place - way * angle_rad.cos()).abs()).clamp_min(0.0)
+        near = near * (1.0 - (place[:, None] - way * angle_rad.sin()).abs()).clamp_min(0.0)
+        return _filtered(pictures, near.mean(1, keepdim=True))
 
 
 @spec
@@ -228,13 +233,13 @@ class Noise:
     def check(self) -> None:
         _check(self, grain_px=self.grain_px)
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns the picture with noise."""
-        noise, grain_px = generator.standard_normal(picture.shape, np.float32), generator.uniform(*self.grain_px)
-        if grain_px > 0.3:
-            noise = cv2.GaussianBlur(noise, (0, 0), grain_px) * np.float32(2.0 * np.sqrt(np.pi) * grain_px)
-        constant, photon = generator.uniform(*self.constant), generator.uniform(*self.photon)
-        return picture + noise * np.sqrt(constant**2 + photon**2 * np.clip(picture, 0.0, 1.0))
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with noise."""
+        noise = torch.randn(pictures.shape, device=pictures.device, generator=generator)
+        kernel = _gaussian(_drawn(self.grain_px, pictures, generator), self.grain_px[1])
+        noise = _filtered(_filtered(noise, kernel), kernel.transpose(2, 3)) / kernel.square().sum((2, 3), keepdim=True)
+        constant, photon = (_drawn(one, pictures, generator) for one in (self.constant, self.photon))
+        return pictures + noise * (constant.square() + photon.square() * pictures.clamp(0.0, 1.0)).sqrt()
 
 
 @spec
@@ -252,11 +257,32 @@ class Jpeg:
     def check(self) -> None:
         _check(self, quality=self.quality)
 
-    def changed(self, picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Returns the picture as a JPEG file gives it back."""
-        levels = (np.clip(picture, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-        _, coded = cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, round(generator.uniform(*self.quality))])
-        return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)).astype(np.float32) / 255.0
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures as a JPEG file gives them back."""
+        return jpeg.recompressed(pictures, _drawn(self.quality, pictures, generator))
+
+
+def _drawn(limits: Range, pictures: torch.Tensor, generator: torch.Generator, count: int = 1) -> torch.Tensor:
+    """Returns evenly drawn numbers, `(B, count, 1, 1)`, for a batch of pictures."""
+    low, high = limits
+    drawn = torch.rand((len(pictures), count, 1, 1), device=pictures.device, generator=generator)
+    return low + (high - low) * drawn
+
+
+def _gaussian(sigma_px: torch.Tensor, largest_px: float) -> torch.Tensor:
+    """Returns kernels, `(B, 1, 1, k)`, of standard deviations `(B, 1, 1, 1)` up to `largest_px`."""
+    half = max(1, math.ceil(3.0 * largest_px))
+    place = torch.arange(-half, half + 1, device=sigma_px.device)
+    kernel = (-0.5 * (place / sigma_px.clamp_min(0.05)).square()).exp()
+    return kernel / kernel.sum(3, keepdim=True)
+
+
+def _filtered(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
+    """Returns each picture filtered by its own kernel, `(B, 1, k, l)`; what lies beyond a border is like the border."""
+    down, across = kernels.shape[2] // 2, kernels.shape[3] // 2
+    wide = functional.pad(pictures, (across, across, down, down), mode="replicate").flatten(0, 1)[None]
+    each = kernels.repeat_interleave(pictures.shape[1], 0)
+    return functional.conv2d(wide, each, groups=len(each))[0].unflatten(0, pictures.shape[:2])
 
 
 def _check(step: Augmentation, **ranges: Range) -> None:

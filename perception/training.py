@@ -1,4 +1,4 @@
-"""Training the segmenter: samples made on the CPU's cores, the network on whatever there is, best by unseen frames."""
+"""Training the segmenter: samples and network on whatever device there is, best by unseen frames."""
 
 from __future__ import annotations
 
@@ -6,24 +6,21 @@ import hashlib
 import io
 import logging
 import math
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import cv2
-import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from torch.utils.data import DataLoader
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from perception import export, training_data, training_report
 from perception.augment import Augmentation
-from perception.training_data import Batches, Crop, Samples, Views
+from perception.segment_network import found
+from perception.training_data import Crop, Samples, Views
 from perception.unet import UNet, loss
 
 STATE = "training.pt"
@@ -42,6 +39,8 @@ class SegmenterTraining:
         hold_out: Without `validation`, one part in so many is kept from the training: a run of frames at the end.
         size_px: Width and height of the network's picture.
         widths: Channels of the network at each size, the full picture first.
+        start: Checkpoint whose weights it begins with, to go on with other frames: a path, or the name of one that ships with the
+            package; `null` begins with chance.
         updates: Steps of the optimiser.
         max_seconds: It ends after as many seconds too, those before a resume included; `null` for no such end. What was learned
             until then depends on the speed of the machine.
@@ -51,7 +50,6 @@ class SegmenterTraining:
         closer: How often a sample is cut from the closer view of the block.
         margin: Room around the block in that view, as a part of its box; that of the segmenter.
         validate_every: Updates between two judgements, after each of which the training can go on if it is stopped.
-        workers: Processes that make samples; 0 makes them in this one, `null` takes one for each CPU core but one.
         crop: Which part of a view a sample shows.
         augment: What happens to its picture, by name, in this order.
     """
@@ -61,6 +59,7 @@ class SegmenterTraining:
     hold_out: int
     size_px: tuple[int, int]
     widths: tuple[int, ...]
+    start: str | None
     updates: int
     max_seconds: float | None
     batch: int
@@ -69,7 +68,6 @@ class SegmenterTraining:
     closer: float
     margin: float
     validate_every: int
-    workers: int | None
     crop: Crop
     augment: dict[str, Augmentation]
 
@@ -106,7 +104,7 @@ class _Training:
         self._device = session.torch_device()
         session.seed_all()
         self._train, self._unseen = self._views()
-        self._network = UNet(settings.widths).to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._network = self._begun().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimizer = torch.optim.AdamW(self._network.parameters(), lr=settings.rate, weight_decay=settings.decay)
         self._update, self._best, self._curve = 0, {"score": -1.0, "update": 0}, []
         self._seconds = 0.0
@@ -121,9 +119,13 @@ class _Training:
         total = torch.zeros((), device=self._device)
         log.info("%d frames to train on, %d to judge by, %s", len(self._train), len(self._unseen), self._device)
         begun = time.monotonic() - self._seconds
-        with training_data.forkable(), _progress(self._update, settings.updates) as advance:
-            for picture, target in self._loader():
-                total += self._step(picture, target)
+        samples = Samples(
+            self._train, settings.crop, settings.augment, settings.size_px, settings.closer, self._session.stream("samples"),
+            self._device,
+        )  # fmt: skip
+        with _progress(self._update, settings.updates) as advance:
+            while self._spent() < 1.0:
+                total += self._step(*samples.batch(self._update, settings.batch))
                 self._update += 1
                 self._seconds = time.monotonic() - begun
                 advance()
@@ -133,9 +135,20 @@ class _Training:
                     self._validate(pictures, known, float(total) / since)
                     total.zero_()
                     self._save()
-                if over:
-                    break
         return self._finish(pictures, known)
+
+    def _begun(self) -> UNet:
+        """Returns the network as the training begins with it."""
+        network, settings = UNet(self._settings.widths), self._settings
+        if settings.start is not None:
+            first, _ = export.read(found(settings.start))
+            if first.widths != network.widths:
+                raise CheckpointError(
+                    f"training.start: {settings.start} has widths {list(first.widths)}, training.widths are "
+                    f"{list(network.widths)}; both must be the same"
+                )
+            network.load_state_dict(first.state_dict())
+        return network
 
     def _views(self) -> tuple[Views, Views]:
         settings, seed = self._settings, self._session.stream("views")
@@ -150,30 +163,15 @@ class _Training:
         if not stems:
             raise ConfigError("training.frames: one frame is too few to train on and to judge by")
         both = training_data.read([*stems, *unseen], settings.size_px, settings.margin, seed)
-        number = np.arange(len(both))
-        return both.part(number[: len(stems)]), both.part(number[len(stems) :])
-
-    def _loader(self) -> DataLoader:
-        settings = self._settings
-        samples = Samples(
-            self._train, settings.crop, settings.augment, settings.size_px, settings.closer, self._session.stream("samples")
-        )
-        workers = len(os.sched_getaffinity(0)) - 1 if settings.workers is None else settings.workers
-        return DataLoader(
-            samples,
-            batch_sampler=Batches(self._update, settings.updates, settings.batch),
-            num_workers=workers,
-            pin_memory=self._device.type == "cuda",
-            prefetch_factor=4 if workers else None,
-            worker_init_fn=_alone,
-        )
+        return both.part(slice(0, len(stems))), both.part(slice(len(stems), None))
 
     def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         self._network.train()
         for group in self._optimizer.param_groups:
             group["lr"] = self._rate()
-        inputs = picture.to(self._device, non_blocking=True).to(memory_format=torch.channels_last).float() / 255.0
-        value = loss(self._network(inputs), target.to(self._device, non_blocking=True).float() / 255.0)
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._device.type == "cuda"):
+            logits = self._network(picture.to(memory_format=torch.channels_last))
+        value = loss(logits.float(), target)
         self._optimizer.zero_grad(set_to_none=True)
         value.backward()
         torch.nn.utils.clip_grad_norm_(self._network.parameters(), 1.0)
@@ -240,11 +238,10 @@ class _Training:
         """Returns what must be the same for a training to go on."""
         settings = self._settings
         same = (settings.size_px, settings.widths, settings.updates, settings.batch, settings.rate, settings.decay, settings.closer,
-                settings.margin, settings.crop, settings.augment, self._session.seed)  # fmt: skip
+                settings.margin, settings.crop, settings.augment, settings.start, self._session.seed)  # fmt: skip
         data = hashlib.sha256()
         for views in (self._train, self._unseen):
-            data.update(views.pictures[:: max(1, len(views) // 50)].tobytes())
-            data.update(views.shares[:: max(1, len(views) // 50)].tobytes())
+            data.update(views.layers[:: max(1, len(views) // 50)].numpy().tobytes())
         return {"settings": hashlib.sha256(repr(same).encode()).hexdigest()[:16], "data": data.hexdigest()[:16]}
 
     def _save(self) -> None:
@@ -282,12 +279,6 @@ class _Training:
 
 def _several(folders: str | tuple[str, ...]) -> tuple[str, ...]:
     return (folders,) if isinstance(folders, str) else folders
-
-
-def _alone(_: int) -> None:
-    """Keeps each process that makes samples to one core: there is one for each."""
-    cv2.setNumThreads(0)
-    torch.set_num_threads(1)
 
 
 @contextmanager

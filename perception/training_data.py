@@ -1,14 +1,14 @@
 """Pictures to train on: each frame becomes the two views at which the segmenter looks, with room to crop.
 
-A sample is a function of the seed and its number alone, whichever process makes it, so a training goes on exactly where it stopped.
+A batch is a function of the seed and its number alone, so a training goes on exactly where it stopped. All of it is made by torch
+where the network is: a processor's cores took five times as long to make a batch as a graphics card takes to learn from it.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import torch
 from rich.progress import track
-from torch.utils.data import Dataset
+from torch.nn import functional
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.spec import spec
@@ -28,6 +28,10 @@ from perception.segment_window import Window, around, block_box, whole
 ROOM = 1.5
 """Size of a stored view over the network's picture: what a crop can take away without loss of detail."""
 LOOKS = ("whole", "closer")
+FINER = 2
+"""Places at which a pixel of a sample is looked at, in each direction: it may be larger than one of the view."""
+PART_OF_MEMORY = 0.5
+"""Views that take no more of a device's free memory are kept there."""
 
 
 @spec
@@ -50,24 +54,19 @@ class Crop:
         if not 0 < self.width[0] <= self.width[1]:
             raise ConfigError(f"training.crop.width: expected 0 < lowest <= highest, got {list(self.width)}")
 
-    def drawn(
-        self, picture: np.ndarray, shares: np.ndarray, size_px: tuple[int, int], generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the same random part of a picture `(H, W, 3)` and of what is known of it `(H, W, 2)`, each of size `size_px`."""
-        height, width = picture.shape[:2]
-        scale = generator.uniform(*self.width)
-        middle = np.array([width, height]) * (0.5 + generator.uniform(-self.shift, self.shift, 2))
-        box = (middle[0] - scale * width / 2.0, middle[1] - scale * height / 2.0, scale * width, scale * height)
-        window = around(box, size_px, 0.0)
-        both = [window.take(picture, size_px), window.take(shares, size_px)]
-        roll_rad = generator.uniform(-self.roll_rad, self.roll_rad)
-        if roll_rad:
-            centre = ((size_px[0] - 1) / 2.0, (size_px[1] - 1) / 2.0)
-            turn = cv2.getRotationMatrix2D(centre, float(np.degrees(roll_rad)), 1.0)
-            both = [cv2.warpAffine(values, turn, size_px, flags=cv2.INTER_LINEAR) for values in both]
-        if generator.random() < self.mirror:
-            both = [values[:, ::-1] for values in both]
-        return both[0], both[1]
+    def windows(self, count: int, shape: tuple[int, int], generator: torch.Generator) -> torch.Tensor:
+        """Returns random parts of views of a `shape` (height, width), `(count, 2, 3)`: maps from a sample's places to the view's.
+
+        Both run from -1 to 1 from border to border, as `torch.nn.functional.affine_grid` wants them.
+        """
+        draw = torch.rand((5, count), device=generator.device, generator=generator)
+        scale = self.width[0] + (self.width[1] - self.width[0]) * draw[0]
+        shift = 2.0 * self.shift * (2.0 * draw[1:3] - 1.0)
+        roll_rad, slant = self.roll_rad * (2.0 * draw[3] - 1.0), shape[1] / shape[0]
+        side = torch.where(draw[4] < self.mirror, -scale, scale)
+        cos, sin = roll_rad.cos(), roll_rad.sin()
+        rows = ((side * cos, -scale * sin / slant, shift[0]), (side * sin * slant, scale * cos, shift[1]))
+        return torch.stack([torch.stack(row, -1) for row in rows], 1)
 
 
 @dataclass(frozen=True)
@@ -75,79 +74,79 @@ class Views:
     """Views of all frames, in memory.
 
     Attributes:
-        pictures: `(F, 2, H, W, 3)` uint8, RGB: the whole frame, and the block with room around it.
-        shares: How much of each pixel shows block and mouth, `(F, 2, H, W, 2)` uint8, 255 for all of it.
+        layers: `(F, 2, 5, H, W)` uint8: of the whole frame, and of the block with room around it, RGB, and how much of each pixel
+            shows block and mouth, 255 for all of it.
         conditions: Under what each frame was taken.
         names: Path of each frame without its endings.
     """
 
-    pictures: np.ndarray
-    shares: np.ndarray
+    layers: torch.Tensor
     conditions: Sequence[str]
     names: Sequence[str]
 
     def __len__(self) -> int:
         return len(self.names)
 
-    def part(self, chosen: np.ndarray) -> Views:
-        """Returns the chosen frames, by index."""
-        conditions, names = ([part[int(k)] for k in chosen] for part in (self.conditions, self.names))
-        return Views(self.pictures[chosen], self.shares[chosen], tuple(conditions), tuple(names))
+    def part(self, chosen: slice) -> Views:
+        """Returns the chosen frames."""
+        return Views(self.layers[chosen], self.conditions[chosen], self.names[chosen])
 
 
-class Samples(Dataset):
-    """Endless samples by number.
+class Samples:
+    """Endless batches by number, cut and changed where the network is trained.
 
     Args:
-        views: What they are cut from.
+        views: What they are cut from; kept on the device where it has room for them, else in the computer's memory.
         crop: How.
         steps: What happens to them.
         size_px: Width and height of a sample.
         closer: How often a sample is cut from the closer view.
         seed: Of all draws.
+        device: Where samples are made.
     """
 
     def __init__(
-        self, views: Views, crop: Crop, steps: Mapping[str, Augmentation], size_px: tuple[int, int], closer: float, seed: int
+        self,
+        views: Views,
+        crop: Crop,
+        steps: Mapping[str, Augmentation],
+        size_px: tuple[int, int],
+        closer: float,
+        seed: int,
+        device: torch.device,
     ) -> None:
-        self._views, self._crop, self._steps = views, crop, steps
-        self._size_px, self._closer, self._seed = size_px, closer, seed
+        layers = views.layers
+        if device.type == "cuda" and layers.nbytes < PART_OF_MEMORY * torch.cuda.mem_get_info(device)[0]:
+            layers = layers.to(device)
+        self._layers, self._crop, self._steps, self._size_px = layers, crop, steps, size_px
+        self._closer, self._seed, self._device = closer, seed, device
 
-    def __getitem__(self, number: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns picture `(3, h, w)` and shares of block and mouth `(2, h, w)` of sample `number`, uint8."""
-        generator = np.random.default_rng((self._seed, number))
-        frame, look = int(generator.integers(len(self._views))), int(generator.random() < self._closer)
-        picture, shares = self._crop.drawn(
-            self._views.pictures[frame, look], self._views.shares[frame, look], self._size_px, generator
-        )
-        changed = augmented(picture.astype(np.float32) / np.float32(255.0), self._steps, generator)
-        picture = (changed * 255.0 + 0.5).astype(np.uint8)
-        return torch.from_numpy(picture.transpose(2, 0, 1).copy()), torch.from_numpy(shares.transpose(2, 0, 1).copy())
-
-
-class Batches:
-    """The numbers of the samples of each update, from one update on; a batch sampler for torch's loader."""
-
-    def __init__(self, first: int, last: int, size: int) -> None:
-        self._first, self._last, self._size = first, last, size
-
-    def __iter__(self) -> Iterator[list[int]]:
-        for update in range(self._first, self._last):
-            yield list(range(update * self._size, (update + 1) * self._size))
-
-    def __len__(self) -> int:
-        return self._last - self._first
+    def batch(self, number: int, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns pictures `(count, 3, h, w)` and shares of block and mouth `(count, 2, h, w)` of a batch, float32 in [0, 1]."""
+        seed = (self._seed * 0x9E3779B97F4A7C15 + number) % 2**63
+        chance = torch.Generator().manual_seed(seed)
+        frame = torch.randint(len(self._layers), (count,), generator=chance)
+        look = (torch.rand(count, generator=chance) < self._closer).long()
+        generator = torch.Generator(self._device).manual_seed(seed)
+        taken = self._layers[frame.to(self._layers.device), look.to(self._layers.device)].to(self._device)
+        windows = self._crop.windows(count, (taken.shape[2], taken.shape[3]), generator)
+        layers = cut(taken, windows, self._size_px)
+        return augmented(layers[:, :3], self._steps, generator), layers[:, 3:]
 
 
-@contextmanager
-def forkable() -> Iterator[None]:
-    """Keeps OpenCV from threads of its own while processes are forked: in those it would wait for threads that are not there."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(0)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
+def cut(layers: torch.Tensor, windows: torch.Tensor, size_px: tuple[int, int]) -> torch.Tensor:
+    """Returns parts of pictures `(B, C, H, W)` uint8 in the size of a sample, `(B, C, h, w)` float32 in [0, 1].
+
+    Args:
+        layers: Pictures.
+        windows: Which part, `(B, 2, 3)`, see `Crop.windows`; what lies beyond the picture is black.
+        size_px: Width and height.
+    """
+    width, height = size_px
+    fine = [len(layers), layers.shape[1], FINER * height, FINER * width]
+    grid = functional.affine_grid(windows, fine, align_corners=False)
+    seen = functional.grid_sample(layers.float() / 255.0, grid, align_corners=False)
+    return functional.avg_pool2d(seen, FINER)
 
 
 def frames(folders: Sequence[str]) -> list[Path]:
@@ -179,21 +178,20 @@ def read(stems: Sequence[Path], size_px: tuple[int, int], margin: float, seed: i
         seed: Of the closer view of frames without a block, which shows any part of them.
     """
     width, height = (round(ROOM * side) for side in size_px)
-    pictures = np.empty((len(stems), len(LOOKS), height, width, 3), np.uint8)
-    shares = np.empty((len(stems), len(LOOKS), height, width, 2), np.uint8)
+    layers = np.empty((len(stems), len(LOOKS), 5, height, width), np.uint8)
 
     def fill(number: int) -> str:
         picture, known, condition = _frame(stems[number])
         generator = np.random.default_rng((seed, number))
         for look, window in enumerate(_looks(known, (width, height), margin, generator)):
-            pictures[number, look] = window.take(picture, (width, height))
-            shares[number, look] = window.take(known, (width, height))
+            layers[number, look, :3] = window.take(picture, (width, height)).transpose(2, 0, 1)
+            layers[number, look, 3:] = window.take(known, (width, height)).transpose(2, 0, 1)
         return condition
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         work = pool.map(fill, range(len(stems)))
         conditions = list(track(work, "reading frames", total=len(stems), transient=True))
-    return Views(pictures, shares, conditions, [str(stem) for stem in stems])
+    return Views(torch.from_numpy(layers), tuple(conditions), tuple(str(stem) for stem in stems))
 
 
 def _frame(stem: Path) -> tuple[np.ndarray, np.ndarray, str]:

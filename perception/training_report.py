@@ -25,16 +25,17 @@ COLOURS = {"block": (0, 114, 178), "mouth": (213, 94, 0)}
 
 def looked_at(views: Views, size_px: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns what the segmenter would see of each frame, `(F, 2, 3, h, w)` uint8, and what is there, `(F, 2, 2, h, w)` bool."""
-    count, (width, height) = len(views), size_px
-    pictures = np.empty((count, len(LOOKS), height, width, 3), np.uint8)
-    known = np.empty((count, len(LOOKS), height, width, len(CHANNELS)), bool)
-    full = views.pictures.shape[2:4]
-    part = (full[1] * (1.0 - 1.0 / ROOM) / 2.0, full[0] * (1.0 - 1.0 / ROOM) / 2.0, full[1] / ROOM, full[0] / ROOM)
-    for look, window in enumerate((whole(full, size_px), around(part, size_px, 0.0))):
-        for frame in range(count):
-            pictures[frame, look] = window.take(views.pictures[frame, look], size_px)
-            known[frame, look] = window.take(views.shares[frame, look], size_px) > 127
-    return torch.from_numpy(pictures.transpose(0, 1, 4, 2, 3).copy()), torch.from_numpy(known.transpose(0, 1, 4, 2, 3).copy())
+    width, height = size_px
+    full = tuple(views.layers.shape[3:])
+    room = (full[1] * (1.0 - 1.0 / ROOM) / 2.0, full[0] * (1.0 - 1.0 / ROOM) / 2.0, full[1] / ROOM, full[0] / ROOM)
+    seen = np.empty((len(views), len(LOOKS), 5, height, width), np.uint8)
+    for look, window in enumerate((whole(full, size_px), around(room, size_px, 0.0))):
+        for frame in range(len(views)):
+            layers = views.layers[frame, look].numpy().transpose(1, 2, 0)
+            for part in (slice(0, 3), slice(3, 5)):
+                seen[frame, look, part] = window.take(np.ascontiguousarray(layers[..., part]), size_px).transpose(2, 0, 1)
+    layers = torch.from_numpy(seen)
+    return layers[:, :, :3], layers[:, :, 3:] > 127
 
 
 @torch.no_grad()

@@ -58,7 +58,8 @@ def built(name: str, overrides: list[str], folder: str) -> tuple[Segmenter, Fram
 
 def judged(segmenter: Segmenter, source: FrameSource, name: str) -> dict[str, float | int | None]:
     """Returns overlaps over all pixels of all frames, pieces that are mouths or none, and the time of a frame."""
-    shared, either, counts, ms = np.zeros(2, int), np.zeros(2, int), np.zeros(3, int), []
+    shared, either, real, counts = (np.zeros(size, int) for size in (2, 2, 2, 3))
+    ms = []
     with source:
         for _ in track(range(source.num_frames or 0), name, transient=True):
             frame = source.read_latest()
@@ -72,8 +73,9 @@ def judged(segmenter: Segmenter, source: FrameSource, name: str) -> dict[str, fl
             for channel, (said, known) in enumerate(((masks.block > THRESHOLD, label.block), (mouth, label.mouth))):
                 shared[channel] += (said & known).sum()
                 either[channel] += (said | known).sum()
+                real[channel] += known.sum()
             counts += pieces(mouth, label.mouth)
-    block, mouth = (float(a / b) if b else None for a, b in zip(shared, either, strict=True))
+    block, mouth = (float(a / b) if any_real else None for a, b, any_real in zip(shared, either, real, strict=True))
     found, there, false = counts
     return {
         "frames": len(ms), "block": block, "mouth": mouth, "found": float(found / there) if there else None,

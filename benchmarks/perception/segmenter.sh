@@ -1,10 +1,11 @@
 #!/bin/bash
 # Makes the segmenter that ships: renders pictures on all cores, trains on a GPU, exports, judges on scenes it has not seen.
-#   OUT=<folder> [CORES=64 RENDER_S=600 TRAIN_S=600 GPU=0] bash benchmarks/perception/segmenter.sh
+#   OUT=<folder> [CORES=64 RENDER_S=600 TRAIN_S=600 GPU=0 START=<network to go on from> SEED=<of the scenes>] bash benchmarks/perception/segmenter.sh
 # Leaves in $OUT: segmenter.{safetensors,onnx} (for perception/weights), training.json, masks.json, curve.png, samples.png, log.
 # To try it: CORES=2 RENDER_S=60 TRAIN_S=60 SMALL=1 GPU= ; pictures lie in $TMPDIR meanwhile, some 1.2 MB each.
 set -u
 CORES=${CORES:-$(nproc)} RENDER_S=${RENDER_S:-600} TRAIN_S=${TRAIN_S:-600} GPU=${GPU-0} SMALL=${SMALL:-}
+START=${START:-null} SEED=${SEED:-1000}
 mkdir -p "$OUT"
 work=$(mktemp -d "${TMPDIR:-/tmp}/segmenter.XXXX")
 begun=$(date +%s); say() { echo "[$(( $(date +%s) - begun )) s] $*" | tee -a "$work/log"; }
@@ -14,7 +15,7 @@ half="rig.width=960 rig.height=540 rig.focal_px=528.0"; full=""
 
 each=8; (( CORES < 40 )) && each=5
 # One process a core. Of each eight (five, if there are few) one draws scenes to judge by, a condition at a time; of the others
-# every fourth draws varied scenes at 1080p, the rest at half of that, which is what the network sees of a block at 1 to 2 m.
+# every third draws varied scenes at 1080p, the rest at half of that, which is what the network sees of a block at 1 to 2 m.
 render() {  # scene, size, seed, folder, first, count, until
   local left=$(( $7 - $(date +%s) )); (( left > 3 )) || return
   timeout -k 5 -s INT $left brokk mode=render scene="$1" rig=zed_2i_1080p $2 session.seed="$3" session.out="$work/$4" \
@@ -22,12 +23,12 @@ render() {  # scene, size, seed, folder, first, count, until
 }
 draw() {  # number of the process
   local k=$1 until=$(( begun + RENDER_S ))
-  if (( CORES >= 8 ? k % each == each - 1 : k == 0 )); then
+  if (( CORES >= 5 ? k % each == each - 1 : k == 0 )); then
     for scene in varied clean haze dark hidden decoy empty; do
-      render $scene "$full" 900 test/$scene/$k $(( k * 100 )) $(( CORES >= 8 ? 5 : 2 )) $until
+      render $scene "$full" 900 test/$scene/$k $(( k * 100 )) $(( CORES >= 5 ? 6 : 2 )) $until
     done
-  elif (( k % 4 == 0 )); then render varied "$full" $(( k + 1 )) train/$k 0 100000 $until
-  else render varied "$half" $(( k + 1 )) train/$k 0 100000 $until; fi
+  elif (( k % 3 == 0 )); then render varied "$full" $(( SEED + k )) train/$k 0 100000 $until
+  else render varied "$half" $(( SEED + k )) train/$k 0 100000 $until; fi
 }
 say "renders on $CORES cores for $RENDER_S s"
 for (( k = 0; k < CORES; k++ )); do draw "$k" & done; wait
@@ -36,15 +37,12 @@ say "$(count train) frames to train on, $(count test) to judge by; $(du -sh "$wo
 
 # the scenes to judge by also choose the best of about eight updates, which flatters them little
 folders=$(find "$work/test" -name '*.mask.png' -printf '%h\n' | sort -u | paste -sd,)
-shm_mb=$(df -m --output=avail /dev/shm 2>/dev/null | tail -1); workers=$(( CORES > 32 ? 28 : CORES - 2 ))
-(( workers * 90 > ${shm_mb:-0} )) && workers=$(( ${shm_mb:-0} / 90 ))  # a process holds four batches of 15 MB and one in making
-(( workers < 1 )) && workers=0; say "/dev/shm has ${shm_mb:-0} MB: $workers processes make samples"
 device=cuda; [ -z "$GPU" ] && device=cpu; export CUDA_VISIBLE_DEVICES=$GPU
 few=(); [ -n "$SMALL" ] && few=("training.size_px=[160,96]" training.batch=8)
-say "trains for $TRAIN_S s on $device"
+say "trains for $TRAIN_S s on $device from $START"
 timeout -s KILL $(( TRAIN_S + 90 )) brokk mode=train_perception training.frames="$work/train" "training.validation=[$folders]" \
-  training.updates=20000 training.max_seconds="$TRAIN_S" training.validate_every=$(( ${#few[@]} ? 20 : 1000 )) \
-  training.workers=$workers session.device=$device session.out="$work/run" "${few[@]}" 2>&1 | tee -a "$work/log"
+  training.updates=1000000 training.start="$START" training.max_seconds="$TRAIN_S" training.validate_every=$(( ${#few[@]} ? 20 : 1500 )) \
+  session.device=$device session.out="$work/run" "${few[@]}" 2>&1 | tee -a "$work/log"
 say "trained: $(ls "$work/run" | tr '\n' ' ')"
 
 kind=onnx file=segmenter.onnx; [ -f "$work/run/$file" ] || { kind=unet file=segmenter.safetensors; }

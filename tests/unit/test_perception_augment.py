@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import torch
 import yaml
 from hydra.utils import instantiate
 
 import conf
 from brokk_rl.errors import ConfigError
-from perception import augment
-from perception.training_data import Crop
+from perception import augment, jpeg
+from perception.training_data import Crop, cut
 
 SHIPPED: dict[str, Any] = instantiate(
     yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())["training"]["augment"],
@@ -22,37 +25,43 @@ SHIPPED: dict[str, Any] = instantiate(
 )
 
 
-def picture() -> np.ndarray:
-    """A grey ramp with a bright square."""
-    values = np.tile(np.linspace(0.2, 0.6, 96, dtype=np.float32), (64, 1))
+def picture() -> torch.Tensor:
+    """Two pictures of a grey ramp with a bright square, `(2, 3, 64, 96)`."""
+    values = torch.linspace(0.2, 0.6, 96).repeat(64, 1)
     values[20:36, 40:60] = 0.9
-    return np.repeat(values[..., None], 3, 2)
+    return values.repeat(2, 3, 1, 1)
+
+
+def chance(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_each_changes_the_picture_the_same_way_for_the_same_seed(name: str) -> None:
+def test_each_changes_each_picture_its_own_way_and_the_same_for_the_same_seed(name: str) -> None:
     step = {name: replace(SHIPPED[name], probability=1.0)}
-    one, same, other = (augment.augmented(picture(), step, np.random.default_rng(seed)) for seed in (1, 1, 2))
-    assert one.shape == (64, 96, 3) and one.dtype == np.float32
+    one, same, other = (augment.augmented(picture(), step, chance(seed)) for seed in (1, 1, 2))
+    assert one.shape == (2, 3, 64, 96) and one.dtype == torch.float32
     assert one.min() >= 0.0 and one.max() <= 1.0
-    np.testing.assert_array_equal(one, same)
-    assert not np.array_equal(one, other)
-    assert not np.array_equal(one, picture())
+    assert torch.equal(one, same)
+    for different in (other[0], picture()[0], one[1]):
+        assert not torch.equal(one[0], different)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_each_is_switched_off_by_its_probability(name: str) -> None:
-    step = {name: replace(SHIPPED[name], probability=0.0)}
-    np.testing.assert_array_equal(augment.augmented(picture(), step, np.random.default_rng(0)), picture())
+def test_each_happens_as_often_as_its_probability_says(name: str) -> None:
+    off = {name: replace(SHIPPED[name], probability=0.0)}
+    assert torch.equal(augment.augmented(picture(), off, chance(0)), picture())
+    half, many = {name: replace(SHIPPED[name], probability=0.5)}, picture()[:1, :, :16, :16].repeat(200, 1, 1, 1)
+    changed = (augment.augmented(many, half, chance(0)) != many).flatten(1).any(1)
+    assert 0.35 < changed.float().mean() < 0.65
 
 
 @pytest.mark.parametrize("name", sorted(SHIPPED.keys() - {"shadow", "haze"}))  # those change the light from place to place
 def test_nothing_moves_in_the_picture(name: str) -> None:
-    step, bright = {name: replace(SHIPPED[name], probability=1.0)}, np.zeros((64, 96, 3), np.float32)
-    bright[28:36, 44:52] = 0.6
+    step, bright = {name: replace(SHIPPED[name], probability=1.0)}, torch.zeros(8, 3, 64, 96)
+    bright[:, :, 28:36, 44:52] = 0.6
     rows, columns = np.meshgrid(np.arange(64), np.arange(96), indexing="ij")
-    for seed in range(8):
-        seen = augment.augmented(bright, step, np.random.default_rng(seed)).mean(2)
+    for seen in augment.augmented(bright, step, chance(0)).mean(1).numpy():
         weight = np.clip(seen - np.median(seen) - 0.12, 0.0, None)
         if weight.sum() > 1.0:  # strong dust leaves nothing to see
             assert abs((rows * weight).sum() / weight.sum() - 31.5) < 1.0
@@ -60,50 +69,85 @@ def test_nothing_moves_in_the_picture(name: str) -> None:
 
 
 def test_contrast_gamma_exposure_and_haze_follow_their_formulas() -> None:
-    generator = np.random.default_rng
-    flat = np.full((8, 8, 3), 0.25, np.float32)
+    flat, close = torch.full((1, 3, 8, 8), 0.25), functools.partial(torch.testing.assert_close, rtol=1e-5, atol=1e-6)
     gamma = augment.Gamma(probability=1.0, exponent=(2.0, 2.0))
-    np.testing.assert_allclose(gamma.changed(flat, generator(0)), 0.0625)
+    close(gamma.changed(flat, chance(0)), flat * 0.25)
     exposure = augment.Exposure(probability=1.0, gain=(2.0, 2.0), tint=0.0)
-    np.testing.assert_allclose(exposure.changed(flat, generator(0)), 0.5, rtol=1e-6)
+    close(exposure.changed(flat, chance(0)), flat * 2.0)
     contrast = augment.Contrast(probability=1.0, gain=(0.5, 0.5))
-    stretched = contrast.changed(picture(), generator(0))
-    assert stretched.mean() == pytest.approx(picture().mean(), abs=1e-5)
-    assert stretched.std() == pytest.approx(0.5 * picture().std(), rel=1e-5)
+    stretched = contrast.changed(picture(), chance(0))
+    close(stretched.mean(), picture().mean())
+    close(stretched.std(), 0.5 * picture().std())
     haze = augment.Haze(probability=1.0, transmission=(0.25, 0.25), brightness=(0.8, 0.8), unevenness=0.0)
-    far, near = haze.changed(0 * flat, generator(0)), haze.changed(0 * flat + 1.0, generator(0))
-    np.testing.assert_allclose(near - far, 0.25, rtol=1e-5)  # what is left of the contrast
+    far, near = haze.changed(0 * flat, chance(0)), haze.changed(0 * flat + 1.0, chance(0))
+    close(near - far, flat)  # what is left of the contrast
     assert far.min() >= 0.75 * 0.8 * 0.85 and far.max() <= 0.75 * 0.8
 
 
 def test_noise_has_the_strength_it_is_given_whatever_its_grain() -> None:
-    flat = np.full((200, 200, 3), 0.5, np.float32)
-    for grain_px in (0.0, 1.0):
+    flat = torch.full((1, 3, 200, 200), 0.5)
+    for grain_px in (0.0, 0.3, 1.0):
         noise = augment.Noise(probability=1.0, constant=(0.03, 0.03), photon=(0.0, 0.0), grain_px=(grain_px, grain_px))
-        assert noise.changed(flat, np.random.default_rng(0)).std() == pytest.approx(0.03, rel=0.05)
+        assert float(noise.changed(flat, chance(0)).std()) == pytest.approx(0.03, rel=0.05)
 
 
 def test_a_shadow_only_darkens_and_motion_smears_as_far_as_it_says() -> None:
     shadow = augment.Shadow(probability=1.0, depth=(0.3, 0.3), width=(0.3, 0.3), softness=(0.05, 0.05))
-    dark = shadow.changed(picture(), np.random.default_rng(4)) / picture()
-    assert dark.max() <= 1.0 and dark.min() == pytest.approx(0.3, abs=0.01)
-    point = np.zeros((41, 41, 3), np.float32)
-    point[20, 20] = 1.0
-    smear = augment.MotionBlur(probability=1.0, length_px=(9.0, 9.0)).changed(point, np.random.default_rng(2))[..., 0]
+    dark = shadow.changed(picture(), chance(4)) / picture()
+    assert dark.max() <= 1.0 and float(dark.min()) == pytest.approx(0.3, abs=0.01)
+    point = torch.zeros(1, 3, 41, 41)
+    point[:, :, 20, 20] = 1.0
+    smear = augment.MotionBlur(probability=1.0, length_px=(9.0, 9.0)).changed(point, chance(2))[0, 0].numpy()
     rows, columns = np.nonzero(smear > 0.02)
     assert smear.sum() == pytest.approx(1.0, abs=1e-4)
     assert 7.0 <= np.hypot(np.ptp(rows), np.ptp(columns)) <= 11.0
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_a_crop_keeps_picture_and_mask_together(seed: int) -> None:
+def test_a_blur_is_that_of_opencv() -> None:
+    blur = augment.Blur(probability=1.0, sigma_px=(1.2, 1.2))
+    theirs = cv2.GaussianBlur(picture()[0, 0].numpy(), (9, 9), 1.2, borderType=cv2.BORDER_REPLICATE)
+    np.testing.assert_allclose(blur.changed(picture(), chance(0))[0, 0], theirs, atol=1e-5)
+
+
+@pytest.mark.parametrize("quality", [20, 60])
+def test_what_jpeg_leaves_is_what_opencv_writes_into_a_file(quality: int) -> None:
+    level = np.random.default_rng(0).uniform(30, 220, (9, 13, 3)).astype(np.float32)
+    written = cv2.resize(level, (100, 68), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
+    full = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    theirs = np.asarray(cv2.imdecode(cv2.imencode(".jpg", written[..., ::-1], full)[1], cv2.IMREAD_COLOR), float)[..., ::-1]
+    pictures = torch.from_numpy(written.transpose(2, 0, 1).copy())[None] / 255.0
+    ours = jpeg.recompressed(pictures, torch.full((1, 1, 1, 1), float(quality)))[0].numpy().transpose(1, 2, 0) * 255.0
+    # their steps are whole numbers: most pixels are theirs but for rounding, and all is much nearer to theirs than what was written
+    assert np.median(np.abs(ours - theirs)) < 1.0
+    assert np.abs(ours - theirs).mean() < 0.35 * np.abs(written - theirs).mean()
+
+
+def test_a_crop_keeps_picture_and_mask_together() -> None:
     crop = Crop(width=(0.5, 1.1), shift=0.2, roll_rad=0.3, mirror=0.5)
-    bright = np.zeros((144, 240, 3), np.uint8)
-    bright[50:90, 80:150] = 255
-    shares = np.stack([bright[..., 0], 255 - bright[..., 0]], axis=-1)
-    taken, known = crop.drawn(bright, shares, (80, 48), np.random.default_rng(seed))
-    assert taken.shape == (48, 80, 3) and known.shape == (48, 80, 2)
-    np.testing.assert_array_equal(taken[..., 0], known[..., 0])
+    bright = torch.zeros(12, 2, 144, 240, dtype=torch.uint8)
+    bright[:, 0, 50:90, 80:150] = 255
+    bright[:, 1] = 255 - bright[:, 0]
+    windows = crop.windows(12, (144, 240), chance(3))
+    seen = cut(bright, windows, (80, 48))
+    assert seen.shape == (12, 2, 48, 80)
+    inside = cut(torch.full_like(bright, 255), windows, (80, 48))[:, 0]
+    torch.testing.assert_close(seen[:, 0] + seen[:, 1], inside)
+    assert len({round(float(one.sum()), 1) for one in seen[:, 0]}) == 12
+
+
+def test_a_crop_is_the_part_that_opencv_cuts_out() -> None:
+    view = (255 * np.random.default_rng(0).random((12, 20))).astype(np.uint8)
+    view = cv2.resize(view, (240, 144), interpolation=cv2.INTER_CUBIC)
+    crop = Crop(width=(0.5, 0.5), shift=0.1, roll_rad=0.3, mirror=0.0)
+    window = crop.windows(1, (144, 240), chance(5))
+    seen = cut(torch.from_numpy(view)[None, None], window, (80, 48))[0, 0].numpy()
+    # from a sample's pixels to places from -1 to 1, to places in the view, to its pixels
+    into = np.array([[2 / 80, 0, 1 / 80 - 1], [0, 2 / 48, 1 / 48 - 1], [0, 0, 1]])
+    out = np.array([[120, 0, 119.5], [0, 72, 71.5], [0, 0, 1]])
+    matrix = out @ np.vstack([window[0].numpy(), [0, 0, 1]]) @ into
+    theirs = cv2.warpAffine(view.astype(np.float32), matrix[:2], (80, 48), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP) / 255.0
+    assert matrix[0, 0] == pytest.approx(1.5 * np.cos(np.arctan2(matrix[1, 0], matrix[0, 0])), rel=1e-4)  # half of 240 px on 80
+    assert np.abs(seen - theirs).max() < 0.03
 
 
 @pytest.mark.parametrize("bad", [{"probability": 1.5}, {"sigma_px": (2.0, 1.0)}, {"sigma_px": (-1.0, 1.0)}])
