@@ -174,6 +174,10 @@ class Guard:
         assert request is not None
         return self._say(self._limited(request.u, seen.q, elapsed_s), Trip.NONE)
 
+    def stops(self, seen: Seen) -> bool:
+        """Says whether what is seen now ends a motion: then the caller decides at once, not in its next cycle."""
+        return self._state is State.ACTIVE and (not seen.deadman or self._health(seen, 0.0) is not Trip.NONE)
+
     def _health(self, seen: Seen, elapsed_s: float) -> Trip:
         """Returns the first thing that is wrong, whatever is asked for."""
         limits = self._limits

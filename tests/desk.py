@@ -7,8 +7,9 @@ import os
 import signal
 import socket
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from deploy.bus.protection import Fault
 from deploy.bus.wire import Wire
 from deploy.limits import Limits
 from deploy.loop.outlet import view
-from deploy.loop.process import Child, Stop
+from deploy.loop.process import Child
 from deploy.loop.records import Exchange
 from deploy.loop.station import Setting
 from deploy.twin.faults import ask
@@ -28,15 +29,20 @@ from deploy.twin.twin import Twin
 
 DBC = "deploy:dbc/example_gateway.dbc"
 COMMAND = (0.3, 0.0, -0.3, 0.0, 0.2)
-"""What the commander asks for."""
+"""What the commander asks for at first; later the same the other way."""
+REACH_RAD = 0.2
 
 
-def command(stop: Stop, exchange: Exchange) -> None:
-    """Asks for the same motion twenty times a second, as a policy would."""
+def command(stop: Callable[[], bool], home: np.ndarray, exchange: Exchange) -> None:
+    """Asks for motion twenty times a second, as a policy would: to and fro, so that no joint ever comes to its end."""
     assert exchange.request is not None
+    u = np.array(COMMAND)
     while not stop():
-        request = exchange.request.new()
-        request["t_s"], request["u"] = time.monotonic(), COMMAND
+        request, state = exchange.request.new(), exchange.state.read()
+        if state is not None and state["q_t_s"] > 0:
+            away = state["q"] - home
+            u = np.where(np.abs(away) > REACH_RAD, -np.sign(away) * np.abs(u), u)
+        request["t_s"], request["u"] = time.monotonic(), u
         exchange.request.write(request)
         time.sleep(0.05)
 
@@ -51,6 +57,18 @@ def free_port() -> int:
 def wire() -> Wire:
     """Returns a bus that nobody else uses."""
     return Wire(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=free_port())
+
+
+class Stop(NamedTuple):
+    """How a machine came to rest.
+
+    Attributes:
+        flow_s: Until the valves got nothing any more.
+        command_s: Until zero was commanded; `None` where nobody was left to do so.
+    """
+
+    flow_s: float
+    command_s: float | None
 
 
 class Desk:
@@ -79,7 +97,7 @@ class Desk:
         what: dict[str, tuple[str, tuple[Any, ...], int | None]] = {
             "twin": ("deploy.twin.twin:run", self._twin_arguments, 60),
             "bus": ("deploy.loop.station:run", (self._setting, self.exchange), 55),
-            "commander": ("desk:command", (self.exchange,), 50),
+            "commander": ("desk:command", (self.machine.home, self.exchange), 50),
         }
         target, arguments, priority = what[name]
         self.children[name] = Child(name, target, arguments, self.exchange.files, priority)
@@ -120,22 +138,32 @@ class Desk:
         while time.monotonic() < end_s:
             self.fault("deadman_released", seconds=0.15)
             time.sleep(0.4)
-            if all(abs(values["Flow_q1"] - COMMAND[0]) < 0.01 for _, values in self.heard("ValveFeedback", 0.05)):
+            if all(abs(abs(values["Flow_q1"]) - COMMAND[0]) < 0.01 for _, values in self.heard("ValveFeedback", 0.05)):
                 return
         raise AssertionError(f"the machine does not move: {view(self.exchange).plain()}")
 
-    def still_after(self, since_s: float, seconds: float = 1.0) -> float:
-        """Returns how long after `since_s` the valves got nothing any more, up to the end of `seconds`."""
-        layout, end_s, last_s = self._description.layouts["ValveFeedback"], since_s + seconds, since_s
+    def still_after(self, since_s: float, seconds: float = 1.0) -> Stop:
+        """Returns how long after `since_s` the valves got nothing any more, and zero was commanded, to the end of `seconds`.
+
+        The gateway says zero flow at once, so this is what an observer on the bus sees, and not rounded up to its cycle.
+        """
+        kinds = {self._description.layouts[name].frame_id: name for name in ("ValveFeedback", "ValveCmd")}
+        found: dict[str, float | None] = dict.fromkeys(kinds.values())
+        end_s = since_s + seconds
         while (left_s := end_s - time.monotonic()) > 0:
-            frame = self.bus.recv(left_s)
-            if frame is None or frame.frame_id != layout.frame_id:
+            frame, now_s = self.bus.recv(left_s), time.monotonic()
+            if frame is None or (name := kinds.get(frame.frame_id)) is None:
                 continue
-            values = self._description.decode(layout, frame.data)
-            if not isinstance(values, Fault) and any(values[f"Flow_{name}"] for name in self.machine.joint_names):
-                last_s = max(last_s, time.monotonic())
-        assert last_s < end_s - 0.1, f"still moving after {seconds} s"
-        return last_s - since_s + layout.period_s  # the next message would have said zero
+            values = self._description.decode(self._description.layouts[name], frame.data)
+            if isinstance(values, Fault):
+                continue
+            if any(value for signal, value in values.items() if signal.startswith(("Flow_", "Command_"))):
+                found[name] = None
+            elif found[name] is None:
+                found[name] = max(0.0, now_s - since_s)
+        flow_s, command_s = found.values()
+        assert flow_s is not None, f"still moving after {seconds} s"
+        return Stop(flow_s, command_s)
 
     def signal(self, name: str, number: int) -> float:
         """Sends a signal to a process; returns when."""

@@ -1,6 +1,6 @@
 """A policy trained behind a person, made ready for the machine: python benchmarks/deploy/person_bundle.py <trained> <folder>.
 
-`<trained>` holds weights and contract only (`policy.safetensors`, `policy.json`: what a training run on another computer sent back).
+`<trained>` holds weights and contract only (`policy.safetensors`, `policy.json`: what a training run elsewhere sent back).
 The network acts 16 episodes with the simulated person; over what it saw there, the ONNX file is compared with it and its golden
 answers are taken, as `mode=export` does with a checkpoint.
 """

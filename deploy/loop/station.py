@@ -1,7 +1,9 @@
 """The bus process: reads the bus, watches over it, and sends what the guard lets pass. It waits for nobody.
 
-One cycle of 10 ms: receive until the deadline, hand what is known to the guard, send, publish. A command that stops motion is sent
-at once, others with the cycle time of the DBC. Where nothing is ever commanded there is no request slot, and nothing is ever sent.
+One cycle of 10 ms: receive until the deadline, hand what is known to the guard, send, publish. A message that ends a motion
+(dead-man, emergency stop, a channel that cannot be trusted) ends the cycle too: it is acted on when it arrives. A command that
+stops motion is sent at once, others with the cycle time of the DBC. Where nothing is ever commanded there is no request slot, and
+nothing is ever sent.
 """
 
 from __future__ import annotations
@@ -91,16 +93,25 @@ class Station:
             self._pace.wait()
             return
         try:
-            while (left_s := self._pace.next_s - time.monotonic()) > 0:
+            while self._bus is not None and (left_s := self._pace.next_s - time.monotonic()) > 0:
                 frame = self._bus.recv(left_s)
                 if frame is not None:
-                    now_s = time.monotonic()
-                    fault = self._receiver.take(frame, now_s)
-                    self._note(frame, now_s, sent=False)
-                    if fault is not None:
-                        self._say("fault", now_s, {"frame_id": frame.frame_id, "fault": fault.value})
+                    self._take(frame, time.monotonic())
         except LinkError as error:
             self._down(error)
+
+    def _take(self, frame: Wired, now_s: float) -> None:
+        """Takes in a frame; one that ends a motion is acted on at once."""
+        fault = self._receiver.take(frame, now_s)
+        self._note(frame, now_s, sent=False)
+        if fault is not None:
+            self._say("fault", now_s, {"frame_id": frame.frame_id, "fault": fault.value})
+        if (
+            self._decision is not None
+            and self._decision.state is State.ACTIVE
+            and self._guard.stops(self._receiver.seen(now_s, True))
+        ):
+            self._cycle()
 
     def _cycle(self) -> None:
         """Decides, sends, publishes."""

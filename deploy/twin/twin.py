@@ -114,7 +114,7 @@ class Running:
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
         self._q = self._before = np.asarray(link.read().q, dtype=float)
-        self._flow = np.zeros(machine.num_joints)
+        self._flow, self._oil_c = np.zeros(machine.num_joints), _oil_c(link)
         self._period_began_s = -np.inf
         self._stuck: np.ndarray | None = None
         remote = self._description.layouts[self._description.message_of("DeadMan")]
@@ -158,7 +158,7 @@ class Running:
             self._period_began_s = now_s if late else self._period_began_s + self._machine.period_s
             self._before = self._q
             self._link.send(Command(flow))
-            self._q = np.asarray(self._link.read().q, dtype=float)
+            self._q, self._oil_c = np.asarray(self._link.read().q, dtype=float), _oil_c(self._link)
         values = self._positions(now_s) | said | {"Stamp": int(1e3 * now_s) % 65536 / 1e3}
         for layout in self._description.sent_by(GATEWAY):
             self._send(layout.name, values, now_s)
@@ -185,7 +185,7 @@ class Running:
         self._flow, source, state = gateway.flow(now_s)
         said = {f"Flow_{name}": float(u) for name, u in zip(self._machine.joint_names, self._flow, strict=True)}
         said |= {"FlowSource": source, "EStop": gateway.estop, "ExclusiveSelected": gateway.exclusive_selected}
-        said |= {"GatewayState": state.value, "OilTemperature": self._oil_c()}
+        said |= {"GatewayState": state.value, "OilTemperature": self._oil_c}
         if before.any() and not self._flow.any():
             for signal in ("FlowSource", "EStop"):
                 self._send(self._description.message_of(signal), said, now_s, at_once=True)
@@ -242,6 +242,8 @@ class Running:
         values = {f"Position_{name}": float(np.clip(value, -3.2, 3.2)) for name, value in zip(names, q, strict=True)}
         return values | {f"Valid_{name}": valid for name in names}
 
-    def _oil_c(self) -> float:
-        extra = getattr(self._link, "extra", dict)()
-        return float(np.clip(np.round(np.asarray(extra["oil_c"]).mean()), -40, 215)) if "oil_c" in extra else 20.0
+
+def _oil_c(link: Link) -> float:
+    """Returns the oil's temperature as the bus can say it, in degrees Celsius."""
+    extra = getattr(link, "extra", dict)()
+    return float(np.clip(np.round(np.asarray(extra["oil_c"]).mean()), -40, 215)) if "oil_c" in extra else 20.0

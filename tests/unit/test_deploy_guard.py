@@ -139,6 +139,17 @@ def test_anything_wrong_is_zero_in_the_same_cycle_and_latches_until_release_and_
     assert pressed.state is State.ACTIVE and pressed.cause is Trip.NONE
 
 
+@pytest.mark.parametrize("change", [change for change, _ in WRONG if "dt" not in change] + [{"deadman": False}], ids=str)
+def test_what_ends_a_motion_is_known_when_it_is_seen_and_nothing_else_needs_haste(change: dict[str, Any]) -> None:
+    hand = Hand()
+    assert not hand.guard.stops(replace(WELL, **change))  # nothing moves: the next cycle does
+    hand.active()
+    assert not hand.guard.stops(WELL)
+    assert hand.guard.stops(replace(WELL, **change))
+    assert hand.decide(u=(0.05, 0.0, 0.0)).u == (0.05, 0.0, 0.0)  # asking decides nothing
+    assert hand.decide(u=(0.1, 0.0, 0.0), **change).u == STILL
+
+
 @pytest.mark.parametrize(("change", "trip"), WRONG, ids=str)
 def test_nobody_is_let_out_of_the_latch_while_something_is_wrong(change: dict[str, Any], trip: Trip) -> None:
     hand = Hand()

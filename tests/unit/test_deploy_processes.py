@@ -68,7 +68,7 @@ def test_a_fault_stops_the_machine_in_time(desk: Desk, fault: str, message: str,
     since_s = desk.fault(fault, message)
     found_s = _stopped(desk, fault, since_s)
     desk.fault("none")
-    assert found_s <= limit_s + 0.03 * SLACK  # the twin's own cycles: 10 ms to take up the fault, 20 ms between messages
+    assert found_s <= limit_s + 0.02 * SLACK
     safety = view(desk.exchange).safety
     assert safety is not None and safety.state in ("LATCHED", "READY")
 
@@ -80,7 +80,7 @@ def _stopped(desk: Desk, fault: str, since_s: float) -> float:
             if safety is not None and not any(safety.sent):
                 return time.monotonic() - since_s
             time.sleep(0.001)
-    return desk.still_after(since_s, 0.6)
+    return desk.still_after(since_s, 0.6).flow_s
 
 
 def test_the_operators_lever_always_wins(desk: Desk) -> None:
@@ -109,7 +109,7 @@ def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero_but_is_never_used
 def test_a_process_that_dies_or_hangs_stops_the_machine(desk: Desk, name: str, number: int) -> None:
     desk.set_moving()
     since_s = desk.signal(name, number)
-    found_s = desk.still_after(since_s)
+    found_s = desk.still_after(since_s).flow_s
     if number == signal.SIGSTOP:
         desk.signal(name, signal.SIGCONT)
         time.sleep(0.2)
@@ -118,11 +118,11 @@ def test_a_process_that_dies_or_hangs_stops_the_machine(desk: Desk, name: str, n
         desk.children[name].end(1.0)
         desk.start(name)
         desk.wait_for_state()
-    assert found_s <= 0.2 + 0.03 * SLACK
+    assert found_s <= 0.2 + 0.02 * SLACK
 
 
 def test_what_is_shown_says_who_has_the_valves(desk: Desk) -> None:
     desk.set_moving()
     safety = view(desk.exchange).safety
     assert safety is not None and safety.state == "ACTIVE" and safety.commands
-    assert [round(u, 3) for u in safety.sent] == [round(u, 3) for u in COMMAND]
+    assert [round(abs(u), 3) for u in safety.sent] == [round(abs(u), 3) for u in COMMAND]
