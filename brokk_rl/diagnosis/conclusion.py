@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.contracts import Excitation
-from brokk_rl.diagnosis import engine, separation, verdict, weighing
+from brokk_rl.diagnosis import certainty, engine, separation, verdict, weighing
 from brokk_rl.diagnosis.answer import Answer, Estimate, NextExperiment, Ranked, Selected, Where
 from brokk_rl.diagnosis.case import Case
+from brokk_rl.diagnosis.certainty import Certainty
 from brokk_rl.diagnosis.engine import Findings, Prices, Tell
 from brokk_rl.diagnosis.free_runs import FreeRuns
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.outcome import Outcome
 from brokk_rl.diagnosis.reach import Reach, apart
+from brokk_rl.diagnosis.remainder import CLUES
 from brokk_rl.diagnosis.repair import Repair
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.survey import survey
@@ -40,6 +42,7 @@ class Diagnosis:
         base: The simulator.
         kinds: The library.
         prices: What effects must earn.
+        certainty: How sure what is said is.
         thresholds: When a stretch of a recording is worth telling.
         excitations: Experiments that could follow, by name.
         generator: Draws bootstraps, permutations and excitations.
@@ -49,6 +52,7 @@ class Diagnosis:
     base: Base
     kinds: Sequence[Kind]
     prices: Prices
+    certainty: Certainty
     thresholds: Thresholds
     excitations: Mapping[str, Excitation]
     generator: np.random.Generator
@@ -63,14 +67,14 @@ class Diagnosis:
     def _outcome(self, findings: Findings) -> Outcome:
         field, evidence = self.base.field, findings.evidence
         before, floor = field.runs(field.evidence.base), self._floor()
-        unknown = verdict.is_unknown(findings, self.prices)
+        unknown = verdict.is_unknown(findings, self.prices, self.certainty)
         repaired = None if unknown else findings.repair
         found = [] if unknown else findings.others
         mean = 0.0 if evidence.mean is None else evidence.mean
         paths = repaired.after if repaired else evidence.base + mean if found else field.evidence.base
         reach = Reach(self.base, self.case.machine, paths, repaired and repaired.own, self.generator)
         foretold = reach.foretold()
-        selected = [verdict.other(one, self.prices, self.case.machine) for one in found]
+        selected = [verdict.other(findings, one, self.certainty, self.case.machine) for one in found]
         selected += self._selected(findings, reach) if repaired else []
         selected.sort(key=lambda one: -one.probability)
         told = "unknown" if unknown else "effects" if selected else "none"
@@ -78,10 +82,11 @@ class Diagnosis:
         machine = self.case.machine
         seen = survey(before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator)
         remainder = self._remainder(findings, reach) if selected else None
+        chance = verdict.unknown_chance(findings, self.prices, self.certainty)
         answer = Answer(
             verdict=told,
             selected=tuple(selected),
-            ranking=tuple(verdict.ranking(findings, selected, self.prices, machine, verdict.unknown_chance(findings, self.prices))),
+            ranking=tuple(verdict.ranking(findings, selected, self.prices, self.certainty, machine, chance)),
             where=seen.where(),
             gap=reach.gap(),
             next_experiment=self._next(findings, selected),
@@ -99,15 +104,15 @@ class Diagnosis:
         for kind in chosen:
             swaps = verdict.rivals(findings, kind.name)
             like = verdict.same_as(swaps, verdict.own_gain(findings, kind.name))
-            chance = verdict.probability(verdict.margin(findings, self.prices, kind.name, swaps, like), self.prices)
+            signs = verdict.named_signs(findings, self.prices, self.certainty, kind.name, swaps, like)
             joints = findings.repair.joints_of(kind)
             decided = next((how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)), None)
             found.append(
                 Selected(
                     effect=kind.name,
                     joints=tuple(name for name, has in zip(self.case.machine.joint_names, joints, strict=True) if has),
-                    probability=chance,
-                    parameters=verdict.numbers(findings, kind, self.case.machine),
+                    probability=certainty.chance(self.certainty.right, signs),
+                    parameters=verdict.numbers(findings, kind, self.case.machine, self.certainty.form[kind.stage]),
                     gap_closed=shares[kind.name],
                     same_as=like,
                     decided_by=decided,
@@ -117,7 +122,7 @@ class Diagnosis:
 
     def _remainder(self, findings: Findings, reach: Reach) -> dict[str, Any] | None:
         """Returns what is left beside the effects that were named and has no name; `None` where that is nothing."""
-        predictable = verdict.unexplained(findings, self.prices) > 0
+        predictable = verdict.unexplained(findings)
         names = self.case.machine.joint_names
         beyond = reach.beyond()
         joints = [name for name, more in zip(names, predictable, strict=True) if more or name in beyond]
@@ -183,9 +188,11 @@ class Diagnosis:
             if len(subset) == 1 and (name := next(iter(subset)))
         ]
         rivals = sorted(rivals, key=lambda row: -row["score"])[:40]
+        clues = tuple(CLUES)
         left = {
-            name: {"earned": float(a), "null": float(b), "scatter": float(c)}
-            for name, a, b, c in zip(names, findings.left, findings.left_null, findings.scatter, strict=True)
+            name: {"clue": clues[best], "earned": float(a[best]), "null": float(b[best]), "scatter": float(c)}
+            for name, a, b, c in zip(names, findings.left.T, findings.left_null.T, findings.scatter, strict=True)
+            for best in [int(np.argmax(a - b))]
         }
         weighed = weighing.weighed(findings, self.prices)
         null = [
@@ -208,7 +215,7 @@ class Diagnosis:
             text = "; ".join(f"{one.effect} on {', '.join(one.joints) or 'the machine'}" for one in selected)
             return text + (f"; an unknown remainder on {', '.join(remainder['joints'])}" if remainder else "")
         if told == "unknown":
-            joints = np.flatnonzero(verdict.unexplained(findings, self.prices) > 0)
+            joints = np.flatnonzero(verdict.unexplained(findings))
             where = ", ".join(self.case.machine.joint_names[j] for j in joints)
             return f"the gap of {where} can be predicted from commands and positions, but by no effect of the library"
         return "no effect earns more on the field recordings than it would by chance"

@@ -46,10 +46,6 @@ class Prices:
         name: For the effect as such.
         partial: For each joint that lacks an effect with one cause for all joints.
         share: Of what its joint's set earns: an effect that adds less only mends the form of another.
-        temperature: Of the probabilities: a worth of so much makes odds of e to 1.
-        remainder: Worth from which a flexible model shows that something is there.
-        explained: Share of what can be predicted that a set must explain for the verdict `effects`.
-        scatter: Mean square error over that of the reference from which something unknown is there.
         tool: Error of measured tool points over that of the reference from which something unknown is there.
     """
 
@@ -58,10 +54,6 @@ class Prices:
     name: float
     partial: float
     share: float
-    temperature: float
-    remainder: float
-    explained: float
-    scatter: float
     tool: float
 
 
@@ -77,9 +69,10 @@ class Findings:
         chosen: The set.
         repair: Its simulation; `None` for the empty set.
         others: Effects that sensors, frames and tool points show.
-        left: What a flexible model earns on what is left, by joint, `(J,)`.
-        left_null: The same on reference recordings, the most of any part, at the length of the field, `(J,)`.
+        left: What each of `remainder.CLUES` earns on what is left, `(clues, J)`.
+        left_null: The same on reference recordings, the most of any part, at the length of the field, `(clues, J)`.
         scatter: Mean square of what is left over that of the reference, by joint, `(J,)`.
+        strays: How far free runs with the set stray over those on the reference, each over what its noise lets expect, `(J,)`.
         tool_left: Error of measured tool points that is left over that of the reference.
     """
 
@@ -93,6 +86,7 @@ class Findings:
     left: np.ndarray
     left_null: np.ndarray
     scatter: np.ndarray
+    strays: np.ndarray
     tool_left: float
 
     @property
@@ -159,10 +153,10 @@ class Search:
             tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter, z)
         self.tell("what is left", 0.92)
         others = [*on_sensors, *on_tool.found, *([late] if late else [])]
-        left, left_null = self._left(evidence, repaired, scatter)
+        left, left_null = self._left(evidence, repaired)
         return Findings(
             evidence, tables, grown, price, chosen, repaired, others, left, left_null, self._scatter(evidence, repaired),
-            on_tool.left,
+            self._strays(evidence, repaired), on_tool.left,
         )  # fmt: skip
 
     def _simulated(self, evidence: Evidence, tracked: bool) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
@@ -249,13 +243,19 @@ class Search:
         usual = np.mean(np.minimum(np.concatenate(nulls, 1) ** 2, CUT), 1) if nulls else np.ones(len(z))
         return np.mean(np.minimum(z**2, CUT), 1) / usual
 
-    def _left(self, evidence: Evidence, repaired: Repair | None, scatter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        z = (repaired.z if repaired else evidence.z) / np.sqrt(scatter)[:, None]
-        entries, of_nulls = z.shape[1], [np.zeros(len(z))]
-        for one in self.base.nulls:
-            earned = remainder.predictable(one.evidence, one.evidence.z).sum(1)
-            of_nulls.append(earned * entries / one.evidence.z.shape[1])
-        return remainder.predictable(evidence, z).sum(1), np.max(of_nulls, 0)
+    def _left(self, evidence: Evidence, repaired: Repair | None) -> tuple[np.ndarray, np.ndarray]:
+        """Returns what clues earn on what is left and, at most, on reference recordings, both `(clues, J)`."""
+        z = repaired.z if repaired else evidence.z
+        nulls = [one.evidence for one in self.base.nulls]
+        earned = remainder.predictable(evidence, z)
+        on_nulls = [remainder.predictable(one, one.z) for one in nulls]
+        return earned, remainder.beyond(earned, on_nulls, [z.shape[1] / one.z.shape[1] for one in nulls])
+
+    def _strays(self, evidence: Evidence, repaired: Repair | None) -> np.ndarray:
+        mean = 0.0 if evidence.mean is None else evidence.mean  # `after` has it in, errors have it out
+        own = remainder.strayed(evidence, evidence.error_of(repaired.after - mean) if repaired else evidence.error)
+        nulls = [remainder.strayed(one.evidence, one.evidence.error) for one in self.base.nulls]
+        return np.sqrt(own / np.maximum(np.mean(nulls, 0), 1e-9)) if nulls else np.ones_like(own)
 
 
 def _promised(tables: Sequence[Table], chosen: Chosen) -> float:
@@ -265,7 +265,7 @@ def _promised(tables: Sequence[Table], chosen: Chosen) -> float:
 def _adjusted(evidence: Evidence, found: Sequence[Found]) -> Evidence:
     """Returns the evidence where encoders err as was found, and where sensors that scatter more say less."""
     steady = [(one.kind, one.values()) for one in found if one.kind.target.side == "measurement" and _is_steady(one.kind)]
-    evidence = replace(evidence, candidates=replace(evidence.candidates, fixed=steady))
+    evidence = replace(evidence, candidates=replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady]))
     for one in found:
         if one.kind.target.side == "measurement" and not _is_steady(one.kind):
             assert evidence.noise is not None, "noise is known by now"

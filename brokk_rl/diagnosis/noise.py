@@ -65,6 +65,10 @@ class Noise:
         single = self.sensor**2 + (self.change * turn) ** 2
         return self.wander**2 * way[:, :, None] * way[:, None, :] * kept + single[:, :, None] * np.eye(way.shape[1])
 
+    def strayed(self, way: np.ndarray) -> np.ndarray:
+        """Returns the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
+        return np.diagonal(self.covariance(way).cumsum(1).cumsum(2), axis1=1, axis2=2)
+
     def whitener(self, way: np.ndarray) -> np.ndarray:
         """Returns the inverse Cholesky factors of the covariance, `(B, S, S)`."""
         return np.linalg.inv(np.linalg.cholesky(self.covariance(way)))

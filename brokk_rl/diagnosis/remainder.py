@@ -1,49 +1,202 @@
-"""Whether a flexible model still predicts what is left: then something is there, and the library has no name for it.
+"""Whether a flexible model still predicts what is left, and from what: then something is there, and the library has no name for it.
 
-The model is a ridge regression of increments on what a machine could depend on: its own speed and changes of speed now and a little
-ago, position, direction, running time, the other joints. It is judged as effects are, on entries that it was not fitted to, and by
-what it earns on reference recordings.
+Each clue is a small ridge regression of increments on one thing that a machine could depend on: its speed, where it stands, how it
+changes speed, the other joints, the time it has run, the work it did just before. Small models find what a large one drowns. They
+are judged as effects are, on parts of the recordings that they were not fitted to, and by what they earn on reference recordings.
 Axes: `W` windows, `I` increments, `J` joints, `E` entries, `F` features.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 
-from brokk_rl.diagnosis.discrepancy import features, ridge
+from brokk_rl.diagnosis.discrepancy import WARM_S, ridge
 from brokk_rl.diagnosis.evidence import Evidence
-from brokk_rl.diagnosis.noise import loss
+from brokk_rl.diagnosis.noise import SPAN, loss
 
-RIDGES = (3.0, 30.0, 300.0)
+RIDGES = (10.0, 100.0, 1000.0, 10000.0)
+"""Pulls towards nothing, in features of unit size over the noise; that which predicts best is used."""
+PARTS = 4
+"""Parts of the recordings, each predicted from the others."""
+PAST_S = (2.0, 4.0, 8.0, 16.0)
+"""Over how long work before may matter."""
+FAR = 9.0
+"""A window that strays further, over what the noise lets expect, counts no more than this."""
+FAST = 0.25
+"""Share of full speed from which another joint counts as moving."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A simulator's own motion, as far as errors of joint `j` could depend on it; columns are `(W, I)`."""
+
+    evidence: Evidence
+    j: int
+
+    @cached_property
+    def own(self) -> np.ndarray:
+        """Increments."""
+        return self.evidence.way[..., self.j]
+
+    @cached_property
+    def share(self) -> np.ndarray:
+        """Speeds of all joints over their full speed, `(W, I, J)`."""
+        machine = self.evidence.candidates.machine
+        return self.evidence.way / (machine.max_speed * machine.period_s * SPAN)
+
+    @cached_property
+    def sides(self) -> tuple[np.ndarray, np.ndarray]:
+        """1 where the joint extends; where it retracts."""
+        out = (self.own > 0).astype(float)
+        return out, 1.0 - out
+
+    @cached_property
+    def place(self) -> np.ndarray:
+        """Positions at both ends of each increment, over the travel, `(2, W, I)`."""
+        machine, end = self.evidence.candidates.machine, self.evidence.start[:, None, self.j] + np.cumsum(self.own, 1)
+        low, high = machine.lower[self.j], machine.upper[self.j]
+        return np.clip((np.stack([end - self.own, end]) - low) / (high - low), 0.0, 1.0)
+
+    @cached_property
+    def work(self) -> np.ndarray:
+        """Demand of all joints, over full speed."""
+        return np.abs(self.share).sum(-1)
+
+    @cached_property
+    def time(self) -> list[np.ndarray]:
+        """Courses of the running time, `(W, 1)`: even, bent, to and fro, warming up."""
+        at = np.linspace(-1.0, 1.0, len(self.own))[:, None]
+        warm = 1.0 - np.exp(-self.evidence.candidates.running_s / WARM_S)[:, None]
+        slow = [at, at**2 - 0.5, np.sin(3 * np.pi * at), np.cos(3 * np.pi * at)]
+        return [*slow, (warm - warm.mean()) / max(float(warm.std()), 1e-9)]
+
+
+def _speed(m: Motion) -> list[np.ndarray]:
+    return [m.own * hat * side for hat in _hats(np.abs(m.share[..., m.j]), 1.0, 8) for side in m.sides]
+
+
+def _position(m: Motion) -> list[np.ndarray]:
+    return [m.own * hat * side for hat in _hats(m.place.mean(0), 1.0, 10) for side in m.sides]
+
+
+def _sensor(m: Motion) -> list[np.ndarray]:
+    """An encoder whose error depends on where it stands."""
+    return [np.diff(wave(2 * np.pi * turns * m.place), axis=0)[0] for turns in (0.5, 1, 1.5, 2, 3, 4) for wave in (np.sin, np.cos)]
+
+
+def _changes(m: Motion) -> list[np.ndarray]:
+    """Starts and stops, just before and after."""
+    turn, faster = np.diff(m.own, axis=1, prepend=m.own[:, :1]), np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0
+    return [_late(turn * when * side, by) for by in (-1, 0, 1, 2, 3) for when in (faster, ~faster) for side in m.sides]
+
+
+def _joints(m: Motion) -> list[np.ndarray]:
+    """What the others do, and all together ask for."""
+    full, columns = np.abs(m.own).max() + 1e-12, []
+    for k in range(m.share.shape[-1]):
+        if k != m.j:
+            other = m.share[..., k]
+            columns += [m.own * np.abs(other), m.own * (np.abs(other) > FAST), full * other, full * np.maximum(other, 0.0)]
+    return columns + [m.own * hat for hat in _hats(m.work, 2.0, 5)] + [m.own * np.maximum(m.work - at, 0.0) for at in (0.5, 1.0)]
+
+
+def _time(m: Motion) -> list[np.ndarray]:
+    return [m.own * course for course in m.time] + [m.own * m.time[-1] * side for side in m.sides]
+
+
+def _delay_over_time(m: Motion) -> list[np.ndarray]:
+    turn = np.diff(m.own, axis=1, prepend=m.own[:, :1])
+    return [_late(turn, by) * m.time[k] for by in (0, 1, 2) for k in (0, 1, -1)]
+
+
+def _past(m: Motion) -> list[np.ndarray]:
+    """Work done just before, by all and by itself, and the direction it went."""
+    machine, columns = m.evidence.candidates.machine, []
+    went = np.sign(m.own) * (np.abs(m.share[..., m.j]) > 0.03)
+    for past_s in PAST_S:
+        kept = np.exp(-SPAN * machine.period_s / past_s)
+        tired, own, way = (_faded(one, kept) for one in (np.minimum(m.work, 1.0), np.abs(m.share[..., m.j]), went))
+        columns += [m.own * tired, m.own * own, np.abs(m.own) * way]
+    return columns
+
+
+CLUES: Mapping[str, Callable[[Motion], list[np.ndarray]]] = {
+    "its speed": _speed,
+    "its position": _position,
+    "the angle that the sensor reads": _sensor,
+    "starts and stops": _changes,
+    "the other joints": _joints,
+    "running time": _time,
+    "timing over the running time": _delay_over_time,
+    "what it did before": _past,
+}
 
 
 def predictable(evidence: Evidence, z: np.ndarray) -> np.ndarray:
-    """Returns what the flexible model earns on errors over the noise `z` `(J, E)`, entry by entry on the other half, `(J, E)`."""
-    found = np.zeros_like(z)
-    for j in range(len(z)):
-        x = _whitened(evidence, _features(evidence, j), j)
-        gains = []
-        for pull in RIDGES:
-            gain = np.zeros(z.shape[1])
-            for half in (0, 1):
-                own, other = evidence.fold != half, evidence.fold == half
-                change = x[other] @ ridge(x[own], z[j, own], pull)
-                gain[other] = loss(z[j, other][:, None], 1) - loss((z[j, other] - change)[:, None], 1)
-            gains.append(gain)
-        found[j] = max(gains, key=lambda gain: gain.sum())
+    """Returns what each clue earns on errors over the noise `z` `(J, E)`, on parts that it was not fitted to, `(clues, J)`."""
+    part, found = evidence.block % PARTS, np.zeros((len(CLUES), len(z)))
+    for row, columns in zip(found, CLUES.values(), strict=True):
+        for j, errors in enumerate(z):
+            x = evidence.whitened_joint(np.stack(columns(Motion(evidence, j)), -1), j)
+            size = np.sqrt(np.mean(np.square(x), 0))
+            x = x / np.where(size > 1e-9, size, np.inf)
+            row[j] = max(0.0, *(_earned(x, errors, part, pull) for pull in RIDGES))
     return found
 
 
-def _features(evidence: Evidence, j: int) -> np.ndarray:
-    """Returns features of joint `j`, those of the simulator's own discrepancy and the course of the field, `(W, I, F)`."""
-    own = evidence.way[..., j]
-    time = np.linspace(-1.0, 1.0, len(own))[:, None]
-    slow = [own * time, own * (time**2 - 0.5), own * np.sin(3 * np.pi * time), own * np.cos(3 * np.pi * time)]
-    return np.concatenate([features(evidence, j), np.stack(slow, -1)], -1)
+def beyond(earned: np.ndarray, nulls: Sequence[np.ndarray], entries: Sequence[float]) -> np.ndarray:
+    """Returns the most that clues earn on reference recordings at the length of the field, `(clues, J)`; 0 without any.
+
+    Args:
+        earned: What they earn in the field.
+        nulls: The same on each part of the reference.
+        entries: Length of the field over that of each part.
+    """
+    return np.max([np.zeros_like(earned), *(one * by for one, by in zip(nulls, entries, strict=True))], 0)
 
 
-def _whitened(evidence: Evidence, features: np.ndarray, j: int) -> np.ndarray:
-    """Returns features over the noise of joint `j`, of equal size, `(E, F)`."""
-    x = evidence.whitened_joint(features, j)
-    size = np.sqrt(np.mean(np.square(x), 0))
-    return x / np.where(size > 1e-9, size, np.inf)
+def strayed(evidence: Evidence, error: np.ndarray) -> np.ndarray:
+    """Returns how far free runs stray over what the noise lets expect, `(J,)`: mean squares of windows, cut at `FAR`.
+
+    Args:
+        evidence: The simulator against recordings.
+        error: Increments that it misses, `(W, I, J)`.
+    """
+    assert evidence.noise is not None, "noise is known by now"
+    expected = np.stack([noise.strayed(evidence.way[..., j]).mean(1) for j, noise in enumerate(evidence.noise)], -1)
+    over = np.minimum(np.square(np.cumsum(error, 1)).mean(1) / np.maximum(expected, 1e-18), FAR) * evidence.claims
+    return over.sum(0) / np.maximum(evidence.claims.sum(0), 1)
+
+
+def _earned(x: np.ndarray, z: np.ndarray, part: np.ndarray, pull: float) -> float:
+    gain = 0.0
+    for one in np.unique(part):
+        held = part == one
+        gain += float(loss(z[held]) - loss(z[held] - x[held] @ ridge(x[~held], z[~held], pull))) if not held.all() else 0.0
+    return gain
+
+
+def _hats(values: np.ndarray, high: float, count: int) -> list[np.ndarray]:
+    """Returns `count` + 1 tents over 0 to `high`, whose sum is 1."""
+    return [np.maximum(1.0 - np.abs(np.minimum(values, high) / high * count - place), 0.0) for place in range(count + 1)]
+
+
+def _late(column: np.ndarray, by: int) -> np.ndarray:
+    """Returns a column by so many increments later; 0 where a window has nothing before."""
+    moved = np.roll(column, by, 1)
+    moved[:, : max(by, 0)] = 0.0
+    if by < 0:
+        moved[:, by:] = 0.0
+    return moved
+
+
+def _faded(column: np.ndarray, kept: float) -> np.ndarray:
+    """Returns the mean of what came before in each window, the longer ago the less."""
+    found = np.zeros_like(column)
+    for i in range(1, column.shape[1]):
+        found[:, i] = kept * found[:, i - 1] + (1.0 - kept) * column[:, i - 1]
+    return found

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from brokk_rl.diagnosis import certainty
 from brokk_rl.diagnosis.answer import Estimate, Ranked, Selected
+from brokk_rl.diagnosis.certainty import Certainty
 from brokk_rl.diagnosis.engine import Findings, Prices
 from brokk_rl.diagnosis.found import Found
 from brokk_rl.diagnosis.library import Kind
@@ -18,6 +20,12 @@ SAME = 0.9
 AS_GOOD = 3.0
 """Difference in log likelihood that says nothing."""
 LISTED = 8
+LEFT = 15.0
+"""Evidence of a clue, beyond that on the reference, from which the report says that something is left on a joint."""
+TOLD = 0.9
+"""Probability of an unknown cause where tool points are off and no effect moves them so."""
+SCATTERED = 1.6
+"""Mean square error over that of the reference from which it says the same."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +83,32 @@ def margin(findings: Findings, prices: Prices, name: str, swaps: Sequence[Swap],
     return min([own - saved - prices.name, *others])
 
 
-def probability(margin: float, prices: Prices) -> float:
-    """Returns the probability that goes with a margin of worth."""
-    return float(1.0 / (1.0 + np.exp(-np.clip(margin / prices.temperature, -30.0, 30.0))))
+def named_signs(
+    findings: Findings, prices: Prices, weights: Certainty, name: str, swaps: Sequence[Swap], like: Sequence[str]
+) -> dict[str, float]:
+    """Returns the signs that a chosen effect is rightly named."""
+    places = [(t, s) for t, s in zip(findings.tables, findings.chosen.subsets, strict=True) if name in s]
+    whole = sum(table.score(subset).total for table, subset in places)
+    size = max(float(np.abs(table.score(subset).sizes[name]).max()) for table, subset in places)
+    adds = own_gain(findings, name) / max(whole, 1e-9)
+    outside = certainty.odds(weights.outside, certainty.outside(findings))
+    return certainty.right(margin(findings, prices, name, swaps, like), adds, size, len(findings.names), outside)
 
 
-def numbers(findings: Findings, kind: Kind, machine: Machine) -> dict[str, dict[str, Estimate]]:
-    """Returns the numbers of a selected effect by joint."""
+def other_signs(findings: Findings, weights: Certainty, found: Found) -> dict[str, float]:
+    """Returns the same of an effect that sensors, frames or tool points show."""
+    outside = certainty.odds(weights.outside, certainty.outside(findings))
+    return certainty.right(found.worth, 1.0, 1.0, len(findings.names), outside)
+
+
+def none_signs(findings: Findings, prices: Prices, weights: Certainty) -> dict[str, float]:
+    """Returns the signs that there is nothing to find."""
+    nearest = max((_alone(findings, prices, name)[0] for name in findings.rays), default=-prices.name)
+    return certainty.none(nearest, certainty.odds(weights.outside, certainty.outside(findings)))
+
+
+def numbers(findings: Findings, kind: Kind, machine: Machine, form: float) -> dict[str, dict[str, Estimate]]:
+    """Returns the numbers of a selected effect by joint; `form`: what its real forms add to the error, over its size."""
     repair = findings.repair
     assert repair is not None, "a selected effect has been simulated"
     found: dict[str, dict[str, Estimate]] = {}
@@ -91,7 +118,7 @@ def numbers(findings: Findings, kind: Kind, machine: Machine) -> dict[str, dict[
         for name in (ray.name,) if ray.name else kind.fitted:
             number, unit = kind.numbers[name], kind.size(name)
             for j in np.flatnonzero(mask):
-                ends = number.none + unit * (size[j] + np.array([-1.96, 0.0, 1.96]) * deviation[j])
+                ends = number.none + unit * certainty.widened(size[j] + np.array([-1.96, 0.0, 1.96]) * deviation[j], form)
                 low, mean, high = (float(v) for v in np.sort(np.clip(ends, *number.bounds)))
                 joint = machine.joint_names[j] if number.per_joint else "machine"
                 found.setdefault(name, {})[joint] = Estimate(mean, (low, high))
@@ -109,64 +136,72 @@ def chosen_kinds(findings: Findings, kinds: Mapping[str, Kind]) -> list[Kind]:
     return [kinds[name] for name in sorted(findings.chosen.names, key=lambda name: -own_gain(findings, name))]
 
 
-def unexplained(findings: Findings, prices: Prices) -> np.ndarray:
-    """Returns what shows that something is left, by joint, `(J,)`: predicted by a flexible model, or scattered too much."""
-    predicted = np.maximum(findings.left - 1.5 * findings.left_null - prices.remainder, 0.0)
-    entries = findings.evidence.z.shape[1]
-    noisy = {one.kind.stage for one in findings.others} & {"timing"}
-    scattered = np.zeros(len(predicted)) if noisy else 0.5 * entries * np.log(np.maximum(findings.scatter / prices.scatter, 1.0))
-    return np.maximum(predicted, scattered)
+def unexplained(findings: Findings) -> np.ndarray:
+    """Returns which joints have something left, `(J,)` bool: predicted by a flexible model, or scattered too much."""
+    late = any(one.kind.stage == "timing" for one in findings.others)
+    return (certainty.predicted(findings) > LEFT) | ((findings.scatter > SCATTERED) & (not late))
 
 
-def is_unknown(findings: Findings, prices: Prices) -> bool:
-    """Says whether something is there that the library does not explain."""
-    left = unexplained(findings, prices)
-    subsets = zip(findings.tables, findings.chosen.subsets, strict=True)
-    gained = sum(table.score(s).total if s else 0.0 for table, s in subsets) + sum(one.gain for one in findings.others)
-    if findings.tool_left > prices.tool and not any(one.kind.stage in ("kinematics", "sensing") for one in findings.others):
-        return True
-    return bool(left.sum() > 0 and gained < prices.explained * (gained + left.sum()))
-
-
-def unknown_chance(findings: Findings, prices: Prices) -> float:
+def unknown_chance(findings: Findings, prices: Prices, weights: Certainty) -> float:
     """Returns the probability that the cause lies outside the library."""
-    left = unexplained(findings, prices).sum()
-    if is_unknown(findings, prices):
-        return max(0.5, probability(left, prices))
-    return min(0.5, probability(left - 4.0 * prices.temperature, prices))
+    found = certainty.chance(weights.outside, certainty.outside(findings))
+    seen = any(one.kind.stage in ("kinematics", "sensing") for one in findings.others)
+    return max(found, TOLD) if findings.tool_left > prices.tool and not seen else found
 
 
-def other(found: Found, prices: Prices, machine: Machine) -> Selected:
+def is_unknown(findings: Findings, prices: Prices, weights: Certainty) -> bool:
+    """Says whether something is there that the library does not explain."""
+    return unknown_chance(findings, prices, weights) > 0.5
+
+
+def other(findings: Findings, found: Found, weights: Certainty, machine: Machine) -> Selected:
     """Returns what is said of an effect that sensors, frames or tool points show."""
     near = sorted(found.rivals, key=lambda name: -found.rivals[name])
     like = tuple(name for name in near if found.rivals[name] > max(SAME * found.gain, found.gain - AS_GOOD))[:3]
+    form = weights.form[found.kind.stage]
+    parameters = {
+        name: {joint: _widened(one, found.kind.numbers[name].none or 0.0, form) for joint, one in estimates.items()}
+        for name, estimates in found.parameters.items()
+    }
     return Selected(
         effect=found.kind.name,
         joints=tuple(name for name, has in zip(machine.joint_names, found.joints, strict=True) if has),
-        probability=probability(found.worth, prices),
-        parameters=found.parameters,
+        probability=certainty.chance(weights.right, other_signs(findings, weights, found)),
+        parameters=parameters,
         gap_closed=Estimate(found.closed, (found.closed, found.closed)),
         same_as=like,
     )
 
 
-def ranking(findings: Findings, selected: Sequence[Selected], prices: Prices, machine: Machine, unknown: float) -> list[Ranked]:
+def _widened(one: Estimate, none: float, form: float) -> Estimate:
+    low, value, high = certainty.widened(np.array([one.ci95[0], one.mean, one.ci95[1]]) - none, form) + none
+    return Estimate(float(value), (float(low), float(high)))
+
+
+def ranking(
+    findings: Findings, selected: Sequence[Selected], prices: Prices, weights: Certainty, machine: Machine, unknown: float
+) -> list[Ranked]:
     """Returns all rivals worth naming, most probable first; `none` and `unknown` among them."""
     named = {one.effect: Ranked(one.effect, one.joints, one.probability) for one in selected}
+    over = max(findings.chosen.worth, 0.0)
     for name in findings.rays:
-        if name in named:
-            continue
-        worth = [
-            (table.scored[frozenset({name})].total - findings.price(j, frozenset({name})), j)
-            for j, table in enumerate(findings.tables)
-            if frozenset({name}) in table.scored and table.scored[frozenset({name})].total > prices.joint
-        ]
-        alone = sum(max(value, 0.0) for value, _ in worth) - prices.name
-        chance = probability(alone - max(findings.chosen.worth, 0.0), prices)
-        joints = tuple(machine.joint_names[j] for value, j in worth if value > 0)
-        if joints:
-            named[name] = Ranked(name, joints, chance)
+        worth, places = _alone(findings, prices, name)
+        if name not in named and places:
+            odds = float(np.clip((worth - over) / weights.temperature, -30.0, 30.0))
+            joints = tuple(machine.joint_names[j] for j in places)
+            named[name] = Ranked(name, joints, float(1.0 / (1.0 + np.exp(-odds))))
     chances = [one.probability for one in selected]
-    none = 1.0 - max(chances) if chances else max(0.0, 1.0 - unknown)
+    nothing = certainty.chance(weights.none, none_signs(findings, prices, weights))
+    none = 1.0 - max(chances) if chances else min(nothing, 1.0 - unknown) if unknown > 0.5 else nothing
     rows = [*named.values(), Ranked("none", (), none), Ranked("unknown", (), unknown)]
     return sorted(rows, key=lambda one: -one.probability)[:LISTED]
+
+
+def _alone(findings: Findings, prices: Prices, name: str) -> tuple[float, list[int]]:
+    """Returns what an effect by itself is worth, and the joints on which it is worth something."""
+    only, worth, places = frozenset({name}), -prices.name, []
+    for j, table in enumerate(findings.tables):
+        if only in table.scored and table.scored[only].total > prices.joint:
+            more = table.scored[only].total - findings.price(j, only)
+            worth, places = worth + max(more, 0.0), [*places, *([j] if more > 0 else [])]
+    return worth, places

@@ -37,7 +37,7 @@ def weighed(findings: Findings, prices: Prices) -> dict[str, Any]:
         "others": [{"effect": one.kind.name, "joints": one.joints.tolist(), "worth": one.worth, "gain": one.gain,
                     "rivals": dict(one.rivals)} for one in findings.others],
         "left": findings.left.tolist(), "left_null": findings.left_null.tolist(), "scatter": findings.scatter.tolist(),
-        "tool_left": findings.tool_left, "entries": findings.evidence.z.shape[1],
+        "strays": findings.strays.tolist(), "tool_left": findings.tool_left, "entries": findings.evidence.z.shape[1],
         "blocks": int(findings.evidence.block.max()) + 1,
         "prices": {"joint": prices.joint, "name": prices.name},
     }  # fmt: skip
@@ -75,9 +75,9 @@ def findings(told: Mapping[str, Any], prices: Prices, kinds: Sequence[Kind]) -> 
         if worth > 0:
             others.append(Found(by_name[one["effect"]], mask, {}, worth, one["gain"], 0.0, one["rivals"]))
     evidence = cast(Evidence, SimpleNamespace(z=np.zeros((len(tables), told["entries"]))))
-    left, left_null, scatter = (np.array(told[name]) for name in ("left", "left_null", "scatter"))
+    left, left_null, scatter, strays = (np.array(told[name]) for name in ("left", "left_null", "scatter", "strays"))
     rays = {name: [] for joint in told["joints"] for name in joint["felt"]}
-    return Findings(evidence, tables, rays, price, chosen, None, others, left, left_null, scatter, told["tool_left"])
+    return Findings(evidence, tables, rays, price, chosen, None, others, left, left_null, scatter, strays, told["tool_left"])
 
 
 def chosen_of(tables: Sequence[Table], price: Any, prices: Prices, kinds: Sequence[Kind]) -> Chosen:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,11 +13,13 @@ from rich.progress import Progress
 from rich.table import Table
 
 from brokk_rl.contracts import Actuator, ActuatorFit, Excitation
-from brokk_rl.diagnosis import answer, case, library, page, prescription, simulator
+from brokk_rl.diagnosis import already, answer, case, library, page, prescription, simulator
 from brokk_rl.diagnosis.answer import Answer
 from brokk_rl.diagnosis.case import Case
+from brokk_rl.diagnosis.certainty import Certainty
 from brokk_rl.diagnosis.conclusion import Diagnosis
 from brokk_rl.diagnosis.engine import Prices
+from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.errors import ConfigError
 from brokk_rl.inspection import Thresholds
@@ -37,6 +40,7 @@ class Subject:
         unseen: Glob or globs of further recordings of the machine as it is, to which nothing is fitted: how far the effects carry.
         effects: Names of the effects to choose among; `null`: all that are registered.
         prices: What an effect must earn.
+        certainty: How sure what is said is.
     """
 
     case: str | None
@@ -44,6 +48,7 @@ class Subject:
     unseen: str | tuple[str, ...] | None
     effects: tuple[str, ...] | None
     prices: Prices
+    certainty: Certainty
 
     def check(self) -> None:
         if (self.case is None) == (self.field is None):
@@ -88,9 +93,10 @@ class Diagnose:
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
         with Progress(transient=True) as progress:
             task = progress.add_task("simulator", total=1.0)
-            base = self._base(given)
+            base = self._base(given, kinds)
             generator = self.session.generator("diagnosis")
-            work = Diagnosis(given, base, kinds, self.diagnosis.prices, self.thresholds, self.excitation, generator)
+            prices, certainty = self.diagnosis.prices, self.diagnosis.certainty
+            work = Diagnosis(given, base, kinds, prices, certainty, self.thresholds, self.excitation, generator)
             outcome = work.run(lambda doing, done: progress.update(task, description=doing, completed=done))
         folder = self.session.folder
         outcome.save(folder)
@@ -108,10 +114,10 @@ class Diagnose:
             raise ConfigError("diagnosis.field needs a simulator to hold it against: add actuator=<name>")
         return Case(self.machine, [], case.recorded(subject.field, self.machine), unseen)
 
-    def _base(self, given: Case) -> Base:
+    def _base(self, given: Case, kinds: Sequence[Kind]) -> Base:
         seed, device, folder = self.session.stream("base"), self.session.torch_device(), self.session.folder
         if given.reference:
-            return simulator.fitted(given, self.fit, folder / "base", seed, device)
+            return already.refined(simulator.fitted(given, self.fit, folder / "base", seed, device), kinds, self.machine)
         assert self.actuator is not None, "there is one where there is no reference"
         return simulator.given(given, self.actuator, self.fit, folder / "flexible", seed, device)
 

@@ -18,9 +18,10 @@ from rich.table import Table
 from brokk_rl import record
 from brokk_rl.contracts import ActuatorFit, Excitation
 from brokk_rl.diagnosis import answer, library
+from brokk_rl.diagnosis.certainty import Certainty
 from brokk_rl.diagnosis.engine import Prices
 from brokk_rl.diagnosis.exam import ledger, marking, oracle, page, paper, seal, sitting
-from brokk_rl.diagnosis.exam.calibration import Calibration, items
+from brokk_rl.diagnosis.exam.calibration import Calibration, halves, items
 from brokk_rl.diagnosis.exam.making import Half, Workshop
 from brokk_rl.diagnosis.exam.mix import Mix, Question
 from brokk_rl.diagnosis.exam.sitting import Candidate
@@ -50,6 +51,7 @@ class Examination:
         answers: What `score` compares: a name for each candidate, and the run folder with its answers. `calibrate`: answers of the
             diagnosis to one or several exams.
         prices: Of `calibrate`: prices that it begins at.
+        certainty: The same of the weights that say how sure an answer is.
         trials: Of `calibrate`: other prices that it tries.
         oracle: Fit of the simulator whose gap the oracle closes; that of the candidate.
         oracles: Of `score`: run folder of `exam.do=oracle`; `null`: nobody asked it.
@@ -74,6 +76,7 @@ class Examination:
     oracles: str | None
     ledger: str | None
     prices: Prices
+    certainty: Certainty
     trials: int
     mix: Mix
     plants: PlantFamily
@@ -214,7 +217,7 @@ class Exam:
         log.info("the true effects close %.2f of the gap (median of %d cases with one)", np.median(shares or [0.0]), len(shares))
 
     def _calibrate(self) -> None:
-        """Opens the labels of development exams; writes `prices.yaml`, and prints what the answers were and would be."""
+        """Opens the labels of development exams; writes `prices.yaml`, `certainty.yaml`; prints what answers were and would be."""
         settings = self.exam
         cases = items([Path(folder) for folder in settings.answers.values()])
         classes, of_machine = settings.mix.classes, self._of_machine()
@@ -222,17 +225,19 @@ class Exam:
         fit = Calibration(self.machine, kinds, classes, of_machine, settings.trials, seed, settings.workers)
         with Progress(transient=True) as progress:
             task = progress.add_task(f"{settings.trials} prices on {len(cases)} cases", total=settings.trials // 2 * 2)
-            found = fit.fitted(cases, settings.prices, lambda: progress.advance(task))
-            apart = [fit.fitted(cases[half::2], settings.prices, lambda: None) for half in (0, 1)]
-        before, after = (tally(fit.marks(cases, prices)) for prices in (settings.prices, found))
-        crosswise = tally([mark for half in (0, 1) for mark in fit.marks(cases[1 - half :: 2], apart[half])])
-        numbers = {"_target_": f"{Prices.__module__}.{Prices.__name__}", **dataclasses.asdict(found)}  # pyright: ignore[reportArgumentType]
-        write_text(self.session.folder / "prices.yaml", yaml.safe_dump(numbers, sort_keys=False))
+            found = fit.fitted(cases, settings.prices, settings.certainty, lambda: progress.advance(task))
+            parts = halves(cases)
+            apart = [fit.fitted(part, settings.prices, settings.certainty, lambda: None) for part in parts]
+        before, after = (tally(fit.marks(cases, *each)) for each in ((settings.prices, settings.certainty), found))
+        crosswise = tally([mark for half in (0, 1) for mark in fit.marks(parts[1 - half], *apart[half])])
+        for name, one in zip(("prices", "certainty"), found, strict=True):
+            numbers = {"_target_": f"{type(one).__module__}.{type(one).__name__}", **dataclasses.asdict(one)}  # pyright: ignore[reportArgumentType]
+            write_text(self.session.folder / f"{name}.yaml", yaml.safe_dump(numbers, sort_keys=False))
         write_json(
             self.session.folder / "calibration.json", {"cases": len(cases), "before": before, "after": after, "cross": crosswise}
         )
         _show({"before": before, "after": after, "after, on the other half": crosswise})
-        log.info("prices: %s; they stand in conf/prices", self.session.folder / "prices.yaml")
+        log.info("%s: prices.yaml and certainty.yaml; they stand in conf/prices, conf/certainty", self.session.folder)
 
     def _of_machine(self) -> list[str]:
         return [name for name, trouble in self.exam.mix.troubles.items() if trouble.joints == "all"]

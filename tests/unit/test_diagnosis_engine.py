@@ -31,10 +31,7 @@ from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
 PLANT = Lag(dead_time_s=0.31, dead_band_extend=0.07, dead_band_retract=0.1, gain=0.9, time_constant_s=0.08, spread={})
-PRICES = Prices(
-    joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06, temperature=3.0, remainder=30.0, explained=0.4, scatter=1.6,
-    tool=2.0,
-)  # fmt: skip
+PRICES = Prices(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06, tool=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +83,8 @@ def diagnosed(axis: Machine, reference: Sequence[Recording], effects: dict[str, 
     base = simulator.fitted(given, option("fit", "valve"), folder, 0, CPU)
     thresholds, generator = option("thresholds", "default"), np.random.default_rng(0)
     excitations = {"levels": option("excitation", "levels")}
-    work = Diagnosis(given, base, library.load(axis), PRICES, thresholds, excitations, generator)
+    certainty = option("certainty", "default")
+    work = Diagnosis(given, base, library.load(axis), PRICES, certainty, thresholds, excitations, generator)
     outcome = work.run(lambda doing, done: None)
     outcome.save(folder)
     return answer.read(folder / answer.FILE)

@@ -13,6 +13,7 @@ import pytest
 from composed import option
 
 from brokk_rl.diagnosis import library, weighing
+from brokk_rl.diagnosis.certainty import Certainty
 from brokk_rl.diagnosis.engine import Findings, Prices
 from brokk_rl.diagnosis.evidence import Evidence
 from brokk_rl.diagnosis.exam import seal
@@ -28,6 +29,11 @@ SIZES = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 @pytest.fixture
 def prices() -> Prices:
     return option("prices", "default")
+
+
+@pytest.fixture
+def weights() -> Certainty:
+    return option("certainty", "default")
 
 
 def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findings:
@@ -46,7 +52,20 @@ def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findi
 
     evidence = cast(Evidence, SimpleNamespace(z=np.zeros((len(tables), 800)), block=block))
     chosen, still = weighing.chosen_of(tables, price, prices, kinds), np.zeros(len(tables))
-    return Findings(evidence, tables, {"lag": [], "dead_band": []}, price, chosen, None, [], still, still, still + 1.0, 1.0)
+    return Findings(
+        evidence,
+        tables,
+        {"lag": [], "dead_band": []},
+        price,
+        chosen,
+        None,
+        [],
+        still[None],
+        still[None],
+        still + 1.0,
+        still + 1.0,
+        1.0,
+    )
 
 
 def test_what_was_weighed_is_chosen_from_again_as_it_was(machine: Machine, prices: Prices) -> None:
@@ -62,7 +81,7 @@ def label(kind: str, effects: list[dict[str, Any]]) -> dict[str, Any]:
     return {"case": "0000", "kind": kind, "effects": effects, "outside": None, "moved_rad": {"q1": 0.0}}
 
 
-def test_prices_are_found_that_name_what_is_there_and_nothing_else(machine: Machine, prices: Prices) -> None:
+def test_prices_are_found_that_name_what_is_there_and_nothing_else(machine: Machine, prices: Prices, weights: Certainty) -> None:
     cheap = dataclasses.replace(prices, joint=2.0, name=2.0, reference=0.5)
     lag = {"effect": "lag", "joints": ["q1"], "size": 1.0, "parameters": {}, "nothing": {}}
     cases = [
@@ -70,9 +89,9 @@ def test_prices_are_found_that_name_what_is_there_and_nothing_else(machine: Mach
         *(Item(label("one", [lag]), weighing.weighed(found(machine, cheap, 0.4, seed), cheap)) for seed in range(3)),
     ]
     fit = Calibration(machine, library.load(machine), [], [], trials=8, seed=0, workers=1)
-    assert fit.value(cases, cheap) < 0.8
-    best = fit.fitted(cases, cheap, lambda: None)
-    assert fit.value(cases, best) == pytest.approx(1.0)
+    assert fit.value(cases, cheap, weights) < 0.8
+    best = fit.fitted(cases, cheap, weights, lambda: None)
+    assert fit.value(cases, *best) == pytest.approx(1.0)
 
 
 def test_nothing_is_tuned_to_a_sealed_exam(tmp_path: Path) -> None:

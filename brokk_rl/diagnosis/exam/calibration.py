@@ -1,4 +1,4 @@
-"""Prices and probabilities of the diagnosis, from development exams: what was weighed is chosen from again at other prices.
+"""Prices and certainty of the diagnosis, from development exams: what was weighed is chosen from again at other prices.
 
 Nothing is simulated, so hundreds of prices are tried in minutes. Exams of several plants go in at once: what is right for one
 machine only is not found. What is left after a choice is taken from the run that weighed; it hardly depends on prices.
@@ -16,12 +16,14 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.optimize import minimize
 
-from brokk_rl.diagnosis import answer, verdict, weighing
+from brokk_rl.diagnosis import answer, certainty, verdict, weighing
 from brokk_rl.diagnosis.answer import Answer, Selected, Where
+from brokk_rl.diagnosis.certainty import Certainty
 from brokk_rl.diagnosis.engine import Prices
 from brokk_rl.diagnosis.exam import marking, seal
-from brokk_rl.diagnosis.exam.marking import QUIET, Claim, Mark
+from brokk_rl.diagnosis.exam.marking import QUIET, Mark, Number
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
@@ -30,22 +32,33 @@ log = logging.getLogger(__name__)
 
 RANGES = {
     "joint": (2.0, 12.0), "reference": (0.5, 3.0), "name": (2.0, 25.0), "partial": (2.0, 25.0), "share": (0.005, 0.08),
-    "remainder": (8.0, 80.0), "explained": (0.15, 0.75), "scatter": (1.15, 2.4), "tool": (1.5, 3.0),
+    "tool": (1.5, 3.0),
 }  # fmt: skip
 """Prices that are tried, log-uniform."""
 NEAR = 0.25
 """Around the best so far the second half of the trials is drawn: standard deviation of the logarithm."""
 QUIET_WEIGHT = 2.0
 """A false alarm costs as much as so many effects that are missed."""
-TEMPERATURES = np.geomspace(0.5, 30.0, 40)
+PULL = 0.5
+"""Precision of a weight about 0; signs are of about unit size."""
+FORMS = np.linspace(0.0, 0.3, 61)
+COVERED = 0.9
+"""Share of true sizes that 90 % intervals should hold."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """One case: its label, and what was weighed."""
+    """One case: its label, what was weighed, and what was said."""
 
     label: Mapping[str, Any]
     told: Mapping[str, Any]
+    said: Answer | None = None
+
+    @property
+    def family(self) -> str:
+        """What the case is about, in one word."""
+        outside, effects = self.label["outside"], self.label["effects"]
+        return outside["ailment"] if outside else effects[0]["effect"] if effects else "none"
 
 
 def items(folders: Sequence[Path]) -> list[Item]:
@@ -64,8 +77,9 @@ def items(folders: Sequence[Path]) -> list[Item]:
             raise ConfigError(f"exam.answers: {exam} is a sealed exam; prices are fitted to development exams only")
         for label in seal.opened(exam)["cases"]:
             place = folder / label["case"] / answer.FILE
-            told = json.loads(place.read_text()).get("weighed") if place.is_file() else None
-            found += [Item(label, told)] if told else []
+            said = answer.read(place) if place.is_file() else None
+            told = said.more.get("weighed") if said else None
+            found += [Item(label, told, said)] if told else []
     if not found:
         raise RecordingError(
             f"{', '.join(map(str, folders))}: no answer says what was weighed; expected run folders of exam.do=run"
@@ -73,23 +87,46 @@ def items(folders: Sequence[Path]) -> list[Item]:
     return found
 
 
-def answered(item: Item, prices: Prices, kinds: Sequence[Kind], machine: Machine) -> Answer:
-    """Returns what the diagnosis would say at these prices; it has no numbers."""
+def halves(cases: Sequence[Item]) -> tuple[list[Item], list[Item]]:
+    """Returns two halves of the cases; what the cases of one are about is not what those of the other are about."""
+    families = sorted({item.family for item in cases} - {"none"})
+    side = {name: number % 2 for number, name in enumerate(families)}
+    quiet = iter(range(len(cases)))
+    sides = [side[item.family] if item.family in side else next(quiet) % 2 for item in cases]
+    first, second = ([item for item, other in zip(cases, sides, strict=True) if other == half] for half in (0, 1))
+    return first, second
+
+
+@dataclass(frozen=True)
+class Claims:
+    """Signs of what an answer states, as `certainty` has them, and of what the label knows whether it is true."""
+
+    outside: dict[str, float]
+    right: list[tuple[str, dict[str, float]]]
+    none: dict[str, float]
+
+
+def answered(item: Item, prices: Prices, weights: Certainty, kinds: Sequence[Kind], machine: Machine) -> tuple[Answer, Claims]:
+    """Returns what the diagnosis would say at these prices, without numbers, and why it is so sure."""
     found = weighing.findings(item.told, prices, kinds)
-    unknown = verdict.is_unknown(found, prices)
-    selected: list[Selected] = [] if unknown else [verdict.other(one, prices, machine) for one in found.others]
-    for name in () if unknown else found.chosen.names:
+    unknown = verdict.is_unknown(found, prices, weights)
+    selected = [] if unknown else [verdict.other(found, one, weights, machine) for one in found.others]
+    signs = [(one.kind.name, verdict.other_signs(found, weights, one)) for one in found.others]
+    for name in found.chosen.names:
         swaps = verdict.rivals(found, name)
         like = verdict.same_as(swaps, verdict.own_gain(found, name))
-        chance = verdict.probability(verdict.margin(found, prices, name, swaps, like), prices)
+        signs.append((name, verdict.named_signs(found, prices, weights, name, swaps, like)))
         joints = tuple(j for j, subset in zip(machine.joint_names, found.chosen.subsets, strict=True) if name in subset)
-        selected.append(Selected(effect=name, joints=joints, probability=chance, parameters={}, gap_closed=None, same_as=like))
+        chance = certainty.chance(weights.right, signs[-1][1])
+        one = Selected(effect=name, joints=joints, probability=chance, parameters={}, gap_closed=None, same_as=like)
+        selected += [] if unknown else [one]
     told = "unknown" if unknown else "effects" if selected else "none"
-    chance = verdict.unknown_chance(found, prices)
-    ranked = tuple(verdict.ranking(found, selected, prices, machine, chance))
-    return Answer(
+    chance = verdict.unknown_chance(found, prices, weights)
+    ranked = tuple(verdict.ranking(found, selected, prices, weights, machine, chance))
+    said = Answer(
         verdict=told, selected=tuple(selected), ranking=ranked, where=Where({}, (), None), gap=None, next_experiment=None
     )  # fmt: skip
+    return said, Claims(certainty.outside(found), signs, verdict.none_signs(found, prices, weights))
 
 
 def worth(mark: Mark) -> tuple[float, float]:
@@ -125,32 +162,75 @@ class Calibration:
     seed: int
     workers: int
 
-    def marks(self, cases: Sequence[Item], prices: Prices) -> list[Mark]:
-        """Returns the marks of all cases at these prices."""
-        said = [answered(item, prices, self.kinds, self.machine) for item in cases]
-        return [marking.mark(i.label, one, self.classes, self.of_machine) for i, one in zip(cases, said, strict=True)]
+    def marks(self, cases: Sequence[Item], prices: Prices, weights: Certainty) -> list[Mark]:
+        """Returns the marks of all cases at these prices, with these weights."""
+        return [mark for mark, _ in self._marked(cases, prices, weights)]
 
-    def value(self, cases: Sequence[Item], prices: Prices) -> float:
+    def _marked(self, cases: Sequence[Item], prices: Prices, weights: Certainty) -> list[tuple[Mark, Claims]]:
+        said = [answered(item, prices, weights, self.kinds, self.machine) for item in cases]
+        return [
+            (marking.mark(i.label, one, self.classes, self.of_machine), claims)
+            for i, (one, claims) in zip(cases, said, strict=True)
+        ]
+
+    def value(self, cases: Sequence[Item], prices: Prices, weights: Certainty) -> float:
         """Returns the mean worth of the answers."""
-        pairs = np.array([worth(mark) for mark in self.marks(cases, prices)])
+        pairs = np.array([worth(mark) for mark in self.marks(cases, prices, weights)])
         return float(pairs[:, 0].sum() / pairs[:, 1].sum())
 
-    def fitted(self, cases: Sequence[Item], start: Prices, advance: Callable[[], None]) -> Prices:
-        """Returns the prices of the best answers: half the trials anywhere, half around the best; then the temperature."""
-        generator, best = np.random.default_rng(self.seed), (self.value(cases, start), start)
-        with ProcessPoolExecutor(self.workers, initializer=_begin, initargs=(self, cases)) as pool:
+    def fitted(
+        self, cases: Sequence[Item], start: Prices, weights: Certainty, advance: Callable[[], None]
+    ) -> tuple[Prices, Certainty]:
+        """Returns the prices of the best answers: half the trials anywhere, half around the best; then the weights of signs."""
+        weights = self.weighed(cases, start, weights)
+        generator, best = np.random.default_rng(self.seed), (self.value(cases, start, weights), start)
+        with ProcessPoolExecutor(self.workers, initializer=_begin, initargs=(self, cases, weights)) as pool:
             for half in (0, 1):
                 trials = [self._drawn(best[1], half, generator) for _ in range(self.trials // 2)]
                 for prices, value in zip(trials, pool.map(_value, trials), strict=True):
                     advance()
                     if value > best[0]:
                         best = value, prices
-        found = best[1]
-        claims = [(t, self._claims(cases, replace(found, temperature=float(t)))) for t in TEMPERATURES]
-        return replace(found, temperature=float(min(claims, key=lambda pair: surprise(pair[1]))[0]))
+        return best[1], self.weighed(cases, best[1], weights)
 
-    def _claims(self, cases: Sequence[Item], prices: Prices) -> list[Claim]:
-        return [claim for mark in self.marks(cases, prices) for claim in mark.claims]
+    def weighed(self, cases: Sequence[Item], prices: Prices, start: Certainty) -> Certainty:
+        """Returns the weights under which what is true of these cases is most probable, and what forms add to errors."""
+        is_outside = [item.label["kind"] == "outside" for item in cases]
+        outside = logistic([claims.outside for _, claims in self._marked(cases, prices, start)], is_outside)
+        weights = replace(start, outside=outside)
+        named, true = self._named(cases, prices, weights)
+        found = {"right": logistic(named, true) if len(set(true)) > 1 else start.right}
+        silent = [
+            (claims.none, mark.kind in QUIET) for mark, claims in self._marked(cases, prices, weights) if mark.verdict == "none"
+        ]
+        if len({quiet for _, quiet in silent}) > 1:
+            found["none"] = logistic([signs for signs, _ in silent], [quiet for _, quiet in silent])
+        return replace(weights, form=self.forms(cases, weights.form), **found)
+
+    def _named(self, cases: Sequence[Item], prices: Prices, weights: Certainty) -> tuple[list[dict[str, float]], list[bool]]:
+        """Returns the signs of all effects that are named, and whether they are there."""
+        signs, true = [], []
+        for mark, claims in self._marked(cases, prices, weights):
+            if mark.verdict == "effects":
+                stand = {name for _, name in mark.hits}
+                signs += [one for _, one in claims.right]
+                true += [name in stand for name, _ in claims.right]
+        return signs, true
+
+    def forms(self, cases: Sequence[Item], now: Mapping[str, float]) -> dict[str, float]:
+        """Returns the smallest errors of form, by stage, with which 90 % intervals hold nine in ten true sizes.
+
+        What moves the machine (timing, actuation) has one, what measures it (sensing, kinematics) another.
+        """
+        stages, found = {kind.name: kind.stage for kind in self.kinds}, dict(now)
+        for group in (("timing", "actuation"), ("sensing", "kinematics", "perception")):
+            errors = []
+            for item in cases:
+                mark = marking.mark(item.label, item.said, self.classes, self.of_machine)
+                errors += [(one, now[stages[one.effect]]) for one in mark.numbers if stages[one.effect] in group]
+            holds = [form for form in FORMS if errors and np.mean([_holds(one, was, form) for one, was in errors]) >= COVERED]
+            found |= dict.fromkeys(group, round(float(holds[0]), 3)) if holds else {}
+        return found
 
     def _drawn(self, near: Prices, half: int, generator: np.random.Generator) -> Prices:
         drawn = {}
@@ -165,18 +245,34 @@ class Calibration:
 
 
 _work: list[Any] = []
-"""What a process values: a calibration and its cases, sent once."""
+"""What a process values: a calibration, its cases and weights, sent once."""
 
 
-def _begin(calibration: Calibration, cases: Sequence[Item]) -> None:
-    _work[:] = [calibration, cases]
+def _begin(calibration: Calibration, cases: Sequence[Item], weights: Certainty) -> None:
+    _work[:] = [calibration, cases, weights]
 
 
 def _value(prices: Prices) -> float:
-    return _work[0].value(_work[1], prices)
+    calibration, cases, weights = _work
+    return calibration.value(cases, prices, weights)
 
 
-def surprise(claims: Sequence[Claim]) -> float:
-    """Returns the mean negative log likelihood of what is true."""
-    chance = np.clip([one.probability if one.is_true else 1.0 - one.probability for one in claims], 1e-3, 1.0)
-    return float(-np.log(chance).mean()) if claims else 0.0
+def logistic(signs: Sequence[Mapping[str, float]], true: Sequence[bool]) -> dict[str, float]:
+    """Returns the weights of a logistic regression, pulled towards 0 but for the constant."""
+    names, y = list(signs[0]), np.array(true, dtype=float)
+    x = np.array([[one[name] for name in names] for one in signs])
+    pull = np.array([0.0 if name == "constant" else PULL for name in names])
+
+    def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
+        at = x @ w
+        slope = x.T @ (1.0 / (1.0 + np.exp(-at)) - y) + pull * w
+        return float(np.logaddexp(0.0, at).sum() - y @ at + 0.5 * pull @ w**2), slope
+
+    found = minimize(loss, np.zeros(len(names)), jac=True, method="L-BFGS-B")
+    return {name: round(float(value), 3) for name, value in zip(names, found.x, strict=True)}
+
+
+def _holds(number: Number, was: float, form: float) -> bool:
+    """Says whether the 90 % interval would hold the truth if forms added `form` to the error, and not `was`."""
+    own = np.sqrt(max(number.deviation**2 - (was * number.said) ** 2, 0.0))
+    return bool(number.error <= 1.645 * np.hypot(own, form * number.said))

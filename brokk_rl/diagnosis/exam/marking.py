@@ -26,6 +26,8 @@ class Number:
         effect: Of which effect.
         parameter: Its name.
         error: Absolute error over the true distance from the value that changes nothing.
+        deviation: The stated standard deviation, over the same.
+        said: The stated distance from the value that changes nothing, over the same.
         in_95: Whether the 95 % interval holds the truth.
         in_90: The same for the 90 % interval, which is the 95 % interval drawn together as for a normal distribution.
     """
@@ -33,6 +35,8 @@ class Number:
     effect: str
     parameter: str
     error: float
+    deviation: float
+    said: float
     in_95: bool
     in_90: bool
 
@@ -187,10 +191,17 @@ def _numbers(true: Mapping[str, Any], one: Selected) -> list[Number]:
         for joint, value in values.items():
             if joint not in said:
                 continue
-            estimate, size = said[joint], abs(value - true["nothing"][name])
-            low, high = estimate.ci95
+            estimate, nothing = said[joint], true["nothing"][name]
+            size, (low, high) = max(abs(value - nothing), 1e-9), estimate.ci95
             short, long = (estimate.mean + TO_90 * (end - estimate.mean) for end in (low, high))
-            found.append(
-                Number(one.effect, name, abs(estimate.mean - value) / max(size, 1e-9), low <= value <= high, short <= value <= long)
+            number = Number(
+                effect=one.effect,
+                parameter=name,
+                error=abs(estimate.mean - value) / size,
+                deviation=(high - low) / 3.92 / size,
+                said=abs(estimate.mean - nothing) / size,
+                in_95=low <= value <= high,
+                in_90=short <= value <= long,
             )
+            found.append(number)
     return found
