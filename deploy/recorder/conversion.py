@@ -43,14 +43,7 @@ class CaptureLog:
         Raises:
             RecordingError: it cannot be read, was made on another machine, or holds no piece that is long enough.
         """
-        contents = reading.read(path)
-        try:
-            machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
-        except (CheckpointError, KeyError, ValueError) as error:
-            raise RecordingError(f"{path}: {error}") from error
-        names, found = machine.joint_names, []
-        q = {name: _series(contents, f"Position_{name}", path) for name in names}
-        flow = {name: _series(contents, f"Flow_{name}", path) for name in names}
+        (contents, q, flow), found = self._series(path, machine), []
         for begin_s, end_s in _pieces([*q.values(), *flow.values()], self.longest_gap_s):
             if end_s - begin_s >= max(self.shortest_s, 2 * machine.period_s):
                 found.append(self._piece(contents, q, flow, begin_s, end_s, path, machine))
@@ -60,6 +53,31 @@ class CaptureLog:
                 "valve feedback"
             )
         return found
+
+    def between(self, path: Path, machine: Machine, begin_s: float, end_s: float) -> Recording:
+        """Returns what was captured between two times of the monotonic clock.
+
+        Raises:
+            RecordingError: it cannot be read, was made on another machine, or has a gap there.
+        """
+        contents, q, flow = self._series(path, machine)
+        for first_s, last_s in _pieces([*q.values(), *flow.values()], self.longest_gap_s):
+            if first_s <= begin_s + self.longest_gap_s and last_s >= end_s - self.longest_gap_s:
+                return self._piece(contents, q, flow, max(first_s, begin_s), min(last_s, end_s), path, machine)
+        raise RecordingError(
+            f"{path}: a gap of more than {self.longest_gap_s:g} s in the {end_s - begin_s:.1f} s that are asked for"
+        )
+
+    def _series(self, path: Path, machine: Machine) -> tuple[Contents, dict[str, Series], dict[str, Series]]:
+        """Returns the capture, positions, and what the valves got, by joint."""
+        contents = reading.read(path)
+        try:
+            machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
+        except (CheckpointError, KeyError, ValueError) as error:
+            raise RecordingError(f"{path}: {error}") from error
+        names = machine.joint_names
+        q = {name: _series(contents, f"Position_{name}", path) for name in names}
+        return contents, q, {name: _series(contents, f"Flow_{name}", path) for name in names}
 
     def _piece(
         self,

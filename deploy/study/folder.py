@@ -3,6 +3,7 @@
     plan.json                          what was planned
     trials/<P>_<period>_<nn>.json      one trial: who, when, where, how it ended, and the name of its recording
     recordings/<P>_<period>_<nn>.parquet
+    captures/<P>_<period>_<nn>/        what the loop recorded, whole: messages and frames of the bus
     questionnaires/<P>_<period>.json   NASA-TLX after a period
     participants/<P>.json              what is known of a participant: whether they stopped, and why
     reports.json                       where reports were written, for who wants to be forgotten
@@ -13,6 +14,7 @@ Nothing that is there is passed over in silence: what cannot be used, is there t
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -25,6 +27,7 @@ from deploy.study.design import CONDITIONS, PERIODS
 
 PLAN, REPORTS = "plan.json", "reports.json"
 TRIALS, RECORDINGS, QUESTIONNAIRES, PARTICIPANTS = "trials", "recordings", "questionnaires", "participants"
+CAPTURES = "captures"
 OUTCOMES = ("inserted", "time limit", "stopped", "aborted")
 """How a trial can end: by the task, by time, by the participant, by the experimenter or a fault."""
 TRIAL_FIELDS = {"participant": str, "period": int, "condition": str, "number": int, "hole": dict, "limit_s": (int, float)}
@@ -111,6 +114,11 @@ def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
     return _write(path, {"schema": 1, "created": datetime.now().astimezone().isoformat(), **trial})
 
 
+def rewrite(path: Path, changes: dict[str, Any]) -> None:
+    """Changes what is known of a trial, participant or questionnaire that is still going on."""
+    _write(path, _read(path) | changes)
+
+
 def write_questionnaire(folder: Path, participant: str, period: int, answers: dict[str, Any]) -> Path:
     """Writes a questionnaire; answers given again take the place of those before, which are kept within the file."""
     path = folder / QUESTIONNAIRES / f"{participant}_{period}.json"
@@ -149,11 +157,14 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
             f"study.participant={participant}: the study has no such participant; {choices(participant, plan['participants'])}"
         )
     gone = []
-    for part in (TRIALS, RECORDINGS, QUESTIONNAIRES, PARTICIPANTS):
+    for part in (TRIALS, RECORDINGS, CAPTURES, QUESTIONNAIRES, PARTICIPANTS):
         for path in sorted((folder / part).glob("*")):
             if path.stem == participant or path.stem.startswith(f"{participant}_") or _belongs(path, participant):
                 try:
-                    path.unlink()
+                    if path.is_dir():
+                        shutil.rmtree(path)
+                    else:
+                        path.unlink()
                 except OSError as error:
                     raise StorageError(
                         f"cannot delete {path}: {error.strerror}; {len(gone)} files are gone, run it again"

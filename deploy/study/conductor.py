@@ -1,0 +1,216 @@
+"""Leads a participant through a sitting: takes what is said on the page, watches the machine, writes everything down at once.
+
+What was done stands in the study's folder (`deploy.study.folder`) before the next thing begins, so that an interruption at any time
+costs at most the trial that was under way; that one is kept as aborted, and done again.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.errors import BrokkError, ConfigError, choices
+from brokk_rl.machine import Machine
+from deploy.study import folder as folders
+from deploy.study.folder import StudyData
+from deploy.study.form import Form
+from deploy.study.stage import Stage
+from deploy.study.steps import Step, next_step, progress
+from deploy.study.trial import Attempt, Times
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Words:
+    """What a lab says to its participants, by language.
+
+    Attributes:
+        version: Of the text, kept with each consent.
+        consent: What is agreed to, one paragraph each.
+    """
+
+    version: str
+    consent: dict[str, tuple[str, ...]]
+
+
+class Conductor:
+    """See the module.
+
+    Args:
+        folder: The study's.
+        machine: The machine.
+        stage: Where trials take place.
+        words: What the lab says.
+        times: Countdown and the like.
+        facts: What every trial says of itself besides: `simulated`, `twin`.
+        seed: From which the order of pairs comes: of participant and period.
+        clock: Monotonic time, s.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        machine: Machine,
+        stage: Stage,
+        words: Words,
+        times: Times,
+        facts: dict[str, Any],
+        seed: Callable[[str], int],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._folder, self._machine, self._stage, self._words, self._times = folder, machine, stage, words, times
+        self._facts, self._seed, self._clock = facts, seed, clock
+        self._data: StudyData = folders.read(folder)
+        self._who: str | None = None
+        self._step: Step | None = None
+        self._attempt: Attempt | None = None
+        self._form: Form | None = None
+        self.problem = ""
+        """What went wrong last, for who leads the sitting; empty where nothing did."""
+
+    @property
+    def shows_advice(self) -> bool:
+        """Whether a guided trial is under way."""
+        return self._attempt is not None and self._attempt.running and self._attempt.trial.condition == "guided"
+
+    @property
+    def running(self) -> bool:
+        """Whether a trial is under way."""
+        return self._attempt is not None and self._attempt.running
+
+    def choose(self, who: str | None) -> None:
+        """Begins, or goes on with, the sitting of a participant; `None` leaves it.
+
+        Raises:
+            ConfigError: the plan knows no such participant, or they were erased.
+        """
+        plan = self._data.plan
+        if who is not None and (who not in plan["participants"] or who in plan.get("erased", {})):
+            raise ConfigError(f"study.participant={who}: no participant of the plan; {choices(who, plan['participants'])}")
+        if self._attempt is not None:
+            self._attempt.abort("the sitting was left")
+            self._attempt.close()
+        self._who, self._attempt, self._form = who, None, None
+        self._go_on()
+
+    def tick(self) -> None:
+        """Looks at the machine; called some twenty times a second."""
+        if self._attempt is not None:
+            self._attempt.tick()
+
+    def take(self, said: dict[str, Any]) -> str:
+        """Takes what a page says; returns why it was not taken, empty where it was."""
+        do, step = said.get("do"), self._step
+        try:
+            if do == "choose" and isinstance(said.get("who"), str):
+                self.choose(said["who"])
+            elif do == "leave" and not self.running:
+                self.choose(None)
+            elif self._who is None or step is None:
+                return "nobody"
+            elif do == "stop_sitting":
+                self._stop(str(said.get("reason", ""))[:200])
+            elif do == "go_on" and step.kind == "stopped":
+                self._note({"stopped": False, "went_on": _now()})
+            elif do == "consent" and step.kind == "consent":
+                self._consent(said)
+            elif do == "end_practice" and step.kind == "trial" and not step.period and not self.running:
+                self._close_attempt()
+                self._note({"practice_ended": True})
+            elif step.kind == "trial" and self._attempt is not None:
+                return self._in_trial(str(do), self._attempt)
+            elif step.kind == "questionnaire" and self._form is not None:
+                if refused := self._form.take(said):
+                    return refused
+                if self._form.finished:
+                    self._go_on()
+            else:
+                return "not now"
+        except BrokkError as error:
+            self.problem = str(error)
+            log.error("%s", error)
+            return "failed"
+        return ""
+
+    def view(self) -> dict[str, Any]:
+        """Returns what pages show, as plain data."""
+        found: dict[str, Any] = {"kind": "choose", "who": self._who, "problem": self.problem, "simulated": self._facts["simulated"]}
+        if self._who is None or self._step is None:
+            return found | {"participants": progress(self._data)}
+        step = self._step
+        found |= {"kind": step.kind, "period": step.period, "condition": step.condition, "done": step.done, "of": step.of}
+        if step.kind == "consent":
+            return found | {"text": self._words.consent, "version": self._words.version}
+        if self._attempt is not None:
+            return found | self._attempt.view()
+        return found | (self._form.view() if self._form is not None else {})
+
+    def close(self) -> None:
+        """Ends what is under way; what was recorded of it is kept."""
+        if self._attempt is not None:
+            self._attempt.abort("the program ended")
+            self._attempt.close()
+
+    def _in_trial(self, do: str, attempt: Attempt) -> str:
+        if do == "begin":
+            return attempt.begin()
+        if do in ("stop_trial", "abort"):
+            return attempt.stop() if do == "stop_trial" else attempt.abort("by the experimenter")
+        if do == "next" and attempt.over:
+            self._close_attempt()
+            self._go_on()
+            return ""
+        return "not now"
+
+    def _go_on(self) -> None:
+        """Reads the folder again, and begins what comes next."""
+        self._data, self._step, self._form = folders.read(self._folder), None, None
+        self.problem = ""
+        if self._who is None:
+            return
+        step = self._step = next_step(self._data, self._who)
+        log.info("%s: %s %s", self._who, step.kind, step.trial.name if step.trial else step.period or "")
+        if step.trial is not None:
+            hole = self._data.plan["design"]["holes"][step.trial.hole]
+            start = np.array(self._data.plan["design"]["starts"][step.trial.start])
+            self._attempt = Attempt(
+                self._folder, self._data.plan["design"], step.trial, hole, start, self._machine, self._stage, self._times,
+                self._facts, self._clock,
+            )  # fmt: skip
+        elif step.kind == "questionnaire":
+            seed = self._seed(f"pairs {self._who} {step.period}")
+            self._form = Form(self._folder, self._who, step.period, seed, {"simulated": self._facts["simulated"]})
+
+    def _close_attempt(self) -> None:
+        if self._attempt is not None:
+            self._attempt.close()
+        self._attempt = None
+
+    def _consent(self, said: dict[str, Any]) -> None:
+        agreed = said.get("agreed") is True
+        consent = {"agreed": agreed, "version": self._words.version, "language": str(said.get("language", ""))[:5], "at": _now()}
+        self._note({"consent": consent} if agreed else {"consent": consent, "stopped": True, "reason": "no consent"})
+
+    def _stop(self, reason: str) -> None:
+        if self._attempt is not None:
+            self._attempt.stop()
+            self._close_attempt()
+        self._note({"stopped": True, "reason": reason or "no reason given", "stopped_at": _now()})
+
+    def _note(self, facts: dict[str, Any]) -> None:
+        assert self._who is not None
+        known = {key: value for key, value in self._data.participants.get(self._who, {}).items() if key != "participant"}
+        folders.write_participant(self._folder, self._who, known | facts | {"simulated": self._facts["simulated"]})
+        self._go_on()
+
+
+def _now() -> str:
+    return datetime.now().astimezone().isoformat(timespec="seconds")

@@ -1,0 +1,218 @@
+"""One trial of a sitting as it happens: ready, recorded, counted down, under way, saved."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from brokk_rl import record
+from brokk_rl.errors import BrokkError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+from deploy.chain import tool
+from deploy.study import folder as folders
+from deploy.study.design import Hole, Success, Trial
+from deploy.study.measures import insertion
+from deploy.study.stage import Stage
+
+log = logging.getLogger(__name__)
+
+Phase = Literal["ready", "starting", "countdown", "running", "settling", "saving", "over"]
+LOST_S = 1.0
+"""Time without positions after which a trial is aborted."""
+STARTING_S = 10.0
+"""How long a recording may take to begin."""
+
+
+@spec
+class Times:
+    """How a trial begins and ends.
+
+    Attributes:
+        countdown_s: From the press on the page to the beginning.
+        settle_s: For which a recording goes on after the end.
+        start_tolerance: How far each joint may be from the start, rad or m, so that the page calls it there.
+    """
+
+    countdown_s: float
+    settle_s: float
+    start_tolerance: float
+
+
+class Attempt:
+    """A trial that somebody does now; see the module.
+
+    Args:
+        folder: The study's.
+        design: The plan's design, as plain data.
+        trial: What is planned.
+        hole: Its hole, as plain data.
+        start: Joint positions to begin from, `(J,)`.
+        machine: The machine.
+        stage: Where it takes place.
+        times: Countdown and the like.
+        facts: What the trial says of itself besides.
+        clock: Monotonic time, s.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        design: dict[str, Any],
+        trial: Trial,
+        hole: dict[str, Any],
+        start: np.ndarray,
+        machine: Machine,
+        stage: Stage,
+        times: Times,
+        facts: dict[str, Any],
+        clock: Callable[[], float],
+    ) -> None:
+        self.trial = trial
+        self._folder, self._start, self._machine, self._stage, self._times = folder, start, machine, stage, times
+        self._hole = Hole(center_in_base_m=tuple(hole["center_in_base_m"]), radius_m=float(hole["radius_m"]))
+        self._success, self._limit_s = Success(**design["success"]), float(design["limit_s"])
+        self._facts, self._clock = facts, clock
+        self._phase: Phase = "ready"
+        self._since_s = self._began_s = self._seen_s = clock()
+        self._path: Path | None = None
+        self._outcome, self._reason, self._seconds = "", "", 0.0
+        self._saving: Future[None] | None = None
+        self._worker = ThreadPoolExecutor(1)
+        stage.prepare(self._hole, start)
+
+    @property
+    def running(self) -> bool:
+        """Whether it is under way."""
+        return self._phase == "running"
+
+    @property
+    def over(self) -> bool:
+        """Whether it was saved."""
+        return self._phase == "over"
+
+    def begin(self) -> str:
+        """Begins the recording, then the countdown; returns why not, where it cannot."""
+        if self._phase != "ready":
+            return "not now"
+        if self._stage.sight().q is None:
+            return "no positions"
+        hole = {"name": self.trial.hole, **asdict(self._hole)}
+        facts: dict[str, Any] = {**asdict(self.trial), "hole": hole, "limit_s": self._limit_s, **self._facts}
+        # until it is over it stands there as what it would be if everything ended now
+        unfinished = {"outcome": "aborted", "reason": "interrupted: the sitting ended during the trial"}
+        self._path = folders.write_trial(self._folder, self.trial.name, facts | unfinished)
+        self._stage.record(self._captured)
+        self._enter("starting")
+        return ""
+
+    def stop(self) -> str:
+        """Ends it for the participant; one that has not begun is left as it is."""
+        return self._end("stopped", "") if self._phase == "running" else self.abort("stopped before it began")
+
+    def abort(self, reason: str) -> str:
+        """Ends it for a fault: it is kept, does not count, and is done again."""
+        if self._phase in ("starting", "countdown", "running"):
+            return self._end("aborted", reason)
+        return "not now"
+
+    def tick(self) -> None:
+        """Lets it go on."""
+        now_s, sight = self._clock(), self._stage.sight()
+        in_phase_s = now_s - self._since_s
+        self._seen_s = now_s if sight.q is not None else self._seen_s
+        if self._phase in ("countdown", "running") and now_s - self._seen_s > LOST_S:
+            self.abort("positions stopped coming")
+        elif self._phase == "starting" and sight.recording:
+            self._enter("countdown")
+        elif self._phase == "starting" and in_phase_s > STARTING_S:
+            self.abort("the recording did not begin")
+        elif self._phase == "countdown" and in_phase_s >= self._times.countdown_s:
+            self._began_s = now_s
+            if self._path is not None and sight.q is not None:
+                folders.rewrite(self._path, {"start_error": np.round(sight.q - self._start, 4).tolist()})
+            self._enter("running")
+        elif self._phase == "running" and sight.q is not None:
+            inside = insertion(tool(self._machine, sight.q).tip_in_base_m[None], self._hole, self._success) is not None
+            if inside or in_phase_s >= self._limit_s:
+                self._end("inserted" if inside else "time limit", "")
+        elif self._phase == "settling" and in_phase_s >= self._times.settle_s:
+            self._save()
+        elif self._phase == "saving" and self._saving is not None and self._saving.done():
+            self._enter("over")
+
+    def view(self) -> dict[str, Any]:
+        """Returns what pages show of it, as plain data."""
+        now_s, sight = self._clock(), self._stage.sight()
+        away = None if sight.q is None else sight.q - self._start
+        joints = [] if away is None else [
+            {"joint": name, "away": round(float(value), 3), "there": bool(abs(value) <= self._times.start_tolerance)}
+            for name, value in zip(self._machine.joint_names, away, strict=True)
+        ]  # fmt: skip
+        left_s = {"countdown": self._times.countdown_s, "running": self._limit_s}.get(self._phase, 0.0) - (now_s - self._since_s)
+        return {
+            "phase": self._phase, "number": self.trial.number, "hole": self.trial.hole, "start": self.trial.start, "joints": joints,
+            "advised": sight.advised, "left_s": round(max(0.0, left_s), 1), "outcome": self._outcome, "reason": self._reason,
+            "seconds": round(self._seconds, 1),
+        }  # fmt: skip
+
+    def close(self) -> None:
+        """Waits until everything is on the disk."""
+        if self._phase == "settling":
+            self._save()
+        self._worker.shutdown(wait=True)
+
+    @property
+    def _captured(self) -> Path:
+        assert self._path is not None
+        return self._folder.resolve() / folders.CAPTURES / self._path.stem
+
+    def _enter(self, phase: Phase) -> None:
+        self._phase, self._since_s = phase, self._clock()
+
+    def _end(self, outcome: str, reason: str) -> str:
+        ran = self._phase == "running"
+        self._seconds = self._clock() - self._began_s if ran else 0.0
+        self._outcome, self._reason = outcome, reason
+        assert self._path is not None
+        folders.rewrite(self._path, {"outcome": outcome, "reason": reason, "seconds": round(self._seconds, 2)})
+        self._enter("settling")
+        if not ran:
+            self._save()
+        return ""
+
+    def _save(self) -> None:
+        end_s = self._clock()
+        self._stage.record(None)
+        self._saving = self._worker.submit(self._keep, self._began_s if self._seconds else end_s, end_s)
+        self._enter("saving")
+
+    def _keep(self, begin_s: float, end_s: float) -> None:
+        """Makes a recording of what was captured; what cannot be used is said in the trial's file."""
+        assert self._path is not None
+        changes: dict[str, Any] = {"capture": f"{folders.CAPTURES}/{self._path.stem}"}
+        try:
+            if end_s - begin_s > 2 * self._machine.period_s:
+                found = self._stage.keep(self._captured, begin_s, end_s)
+                name = f"{folders.RECORDINGS}/{self._path.stem}.parquet"
+                record.write(self._told(found), self._folder / name)
+                changes["recording"] = name
+        except (BrokkError, OSError) as error:
+            log.error("%s: %s", self._path.stem, error)
+            changes["recording_problem"] = str(error)
+        folders.rewrite(self._path, changes)
+
+    def _told(self, found: record.Recording) -> record.Recording:
+        """Returns the recording with the hole, and without advice that was not shown."""
+        guided = self.trial.condition == "guided"
+        extra = {name: values for name, values in found.extra.items() if guided or not name.startswith("advice_")}
+        count = len(found.t_s)
+        at = zip("xyz", self._hole.center_in_base_m, strict=True)
+        extra |= {f"target_{axis}_m": np.full(count, value, np.float32) for axis, value in at}
+        return replace(found, extra=extra)
