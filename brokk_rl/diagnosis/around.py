@@ -85,7 +85,7 @@ def grown(
     A saturation pays only when dead band and speed move along with it: adding up does not show that, a joint fit does. `price` is
     that of a joint with an effect, in the part of the recordings on which this is tried.
     """
-    part = _thinned(evidence)
+    part = thinned(evidence, EACH)
     least = _losses(part, repaired.rays, repaired.sizes)
     found, most = None, 0.0
     for name in _promising(tables, chosen, ways):
@@ -157,9 +157,9 @@ def _repaired(
     return repair(evidence, subsets, ways, start)
 
 
-def _thinned(evidence: Evidence) -> Evidence:
-    """Returns the simulator held against one of `EACH` parts of the recordings."""
-    rows = np.concatenate(evidence.groups[::EACH])
+def thinned(evidence: Evidence, each: int) -> Evidence:
+    """Returns the simulator held against one of `each` parts of the recordings."""
+    rows = np.concatenate(evidence.groups[::each])
     candidates = evidence.candidates
     cut = replace(candidates.cut, **{name: getattr(candidates.cut, name)[rows] for name in ("u", "q", "run")})
     some = {name: value[rows] for name in ("claims", "mean", "bias") if (value := getattr(evidence, name, None)) is not None}

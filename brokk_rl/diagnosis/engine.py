@@ -6,7 +6,7 @@ Axes: `J` joints, `E` entries (increments of all windows, over the simulator's n
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,7 +41,7 @@ class Prices:
     """What an effect must earn, in units of log likelihood on recordings that it was not fitted to.
 
     Attributes:
-        joint: For each joint that has it.
+        joint: For each joint that has it, unless one cause is behind it on all joints.
         reference: Times what it earns on reference recordings.
         name: For the effect as such.
         partial: For each joint that lacks an effect with one cause for all joints.
@@ -127,7 +127,7 @@ class Search:
 
         def price(j: int, subset: frozenset[str]) -> float:
             known_there = max(prices.reference * known.earned(j, subset), known.repeated(j, subset))
-            return prices.joint * len(subset) + known_there
+            return prices.joint * len(subset - self.shared) + known_there
 
         scatter = np.ones(self.case.machine.num_joints)
         tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)
@@ -159,6 +159,11 @@ class Search:
             self._strays(evidence, repaired), on_tool.left,
         )  # fmt: skip
 
+    @property
+    def shared(self) -> frozenset[str]:
+        """Effects with one cause for all joints."""
+        return shared(self.kinds)
+
     def _simulated(self, evidence: Evidence, tracked: bool) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
         """Returns the rays of each effect that free runs can show, and what it does to each joint."""
         grown: dict[str, list[Ray]] = {}
@@ -184,8 +189,7 @@ class Search:
         tables = self._tables(evidence, grown, shapes, scatter, z)
         self.tell("the same on the reference", 0.7)
         prices = self.prices
-        shared = frozenset(kind.name for kind in self.kinds if getattr(kind.target, "shared", False))
-        chosen = choose(tables, price, prices.name, prices.share, shared, prices.partial, prices.joint)
+        chosen = choose(tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint)
         start = [table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)]
         return tables, chosen, repair(evidence, chosen.subsets, grown, start) if chosen.names else None
 
@@ -198,7 +202,7 @@ class Search:
         z: np.ndarray | None,
     ) -> list[Table]:
         """Returns what sets earn on each joint."""
-        tables, flat = [], dict.fromkeys(grown, self.prices.joint)
+        tables, flat = [], {name: self.prices.joint * (name not in self.shared) for name in grown}
         for j, (mine, joint) in enumerate(zip(shapes, plain_joints(evidence, scatter, z), strict=True)):
             self.tell(f"trying sets on joint {j + 1}", 0.55 + 0.1 * j / len(shapes))
             by = 1.0 / np.sqrt(scatter[j])
@@ -256,6 +260,11 @@ class Search:
         own = remainder.strayed(evidence, evidence.error_of(repaired.after - mean) if repaired else evidence.error)
         nulls = [remainder.strayed(one.evidence, one.evidence.error) for one in self.base.nulls]
         return np.sqrt(own / np.maximum(np.mean(nulls, 0), 1e-9)) if nulls else np.ones_like(own)
+
+
+def shared(kinds: Iterable[Kind]) -> frozenset[str]:
+    """Returns the effects with one cause for all joints."""
+    return frozenset(kind.name for kind in kinds if getattr(kind.target, "shared", False))
 
 
 def _promised(tables: Sequence[Table], chosen: Chosen) -> float:

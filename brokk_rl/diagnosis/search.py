@@ -142,13 +142,13 @@ def choose(
         price: What a subset costs on a joint.
         name_price: What each effect costs once, however many joints have it.
         share: Part of what a joint's subset earns that each of its effects must add.
-        shared: Effects with one cause for all joints.
+        shared: Effects with one cause for all joints; they cost once, as `name_price`.
         partial: What such an effect costs for each joint that could show it and does not.
-        least: No effect costs less on a joint; what earns less is not priced at all.
+        least: No effect that is not shared costs less on a joint; what earns less is not priced at all.
     """
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
-        priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising(table, least, share)}
+        priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising(table, least, share, shared)}
         worth.append({subset: value for subset, value in priced.items() if value > 0})
     felt = [shared & table.shapes.keys() for table in tables]
     best = _best(worth, felt, name_price, partial)
@@ -200,19 +200,27 @@ def _simpler(
     return None
 
 
-def promising(table: Table, least: float, share: float) -> list[Subset]:
-    """Returns the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most."""
-    paying = [s for s in list(table.scored) if s and table.scored[s].total > least * len(s) and _each_adds(s, table, share)]
+def promising(table: Table, least: float, share: float, shared: Subset = frozenset()) -> list[Subset]:
+    """Returns the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most.
+
+    An effect that is `shared` by all joints may earn little on each.
+    """
+
+    def pays(subset: Subset) -> bool:
+        own = subset - shared
+        return table.scored[subset].total > least * len(own) and _each_adds(subset, own, table, share)
+
+    paying = [subset for subset in list(table.scored) if subset and pays(subset)]
     paying.sort(key=lambda s: table.scored[s].total, reverse=True)
     return [s for place, s in enumerate(paying) if place < TRIED or len(s) == 1]
 
 
-def _each_adds(subset: Subset, table: Table, share: float) -> bool:
-    """Says whether each effect of a subset has a size worth naming and adds its share: else it mends the form of another."""
+def _each_adds(subset: Subset, own: Subset, table: Table, share: float) -> bool:
+    """Says whether each of the effects `own` has a size worth naming and adds its share: else it mends the form of another."""
     total, sizes = table.scored[subset].total, table.scored[subset].sizes
-    if any(np.abs(sizes[name]).max() < LEAST for name in subset):
+    if any(np.abs(sizes[name]).max() < LEAST for name in own):
         return False
-    return len(subset) == 1 or all(total - table.score(subset - {name}).total >= share * total for name in subset)
+    return len(subset) == 1 or all(total - table.score(subset - {name}).total >= share * total for name in own)
 
 
 def _sum(worth: Sequence[Mapping[Subset, float]], name: str) -> float:

@@ -19,7 +19,7 @@ from brokk_rl.diagnosis.sizes import Plain, Shape, fitted, plain, predicted
 SHAPES = (0.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
 SMALL = GRID[:4]
-"""Sizes at which effects are simulated on the reference: those of the field, as what begins at a threshold shows at no smaller one."""
+"""Sizes at which effects are simulated on the reference: small ones of the field's, as many effects begin at a threshold."""
 THERE = 3.0
 """Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be there already."""
 FELT = 1e-3

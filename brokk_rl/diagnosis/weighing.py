@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from brokk_rl.diagnosis.engine import Findings, Prices
+from brokk_rl.diagnosis.engine import Findings, Prices, shared
 from brokk_rl.diagnosis.evidence import Evidence
 from brokk_rl.diagnosis.found import Found
 from brokk_rl.diagnosis.library import Kind
@@ -21,13 +21,13 @@ from brokk_rl.diagnosis.sizes import plain
 
 def weighed(findings: Findings, prices: Prices) -> dict[str, Any]:
     """Returns what was weighed."""
-    joints = []
+    joints, common = [], shared(ways[0].kind for ways in findings.rays.values() if ways)
     for j, table in enumerate(findings.tables):
-        priced = {*promising(table, prices.joint, prices.share)}
+        priced = {*promising(table, prices.joint, prices.share, common)}
         rows = []
         for subset in sorted(table.scored, key=sorted):
             if subset in priced:
-                null = findings.price(j, subset) - prices.joint * len(subset)
+                null = findings.price(j, subset) - prices.joint * len(subset - common)
                 rows.append(_row(table, subset) | {"null": round(null / max(prices.reference, 1e-9), 2)})
             elif subset and (len(subset) < 3 or any(subset < larger for larger in priced)):
                 rows.append(_row(table, subset) | {"gain": round(table.scored[subset].total, 2)})
@@ -63,7 +63,7 @@ def findings(told: Mapping[str, Any], prices: Prices, kinds: Sequence[Kind]) -> 
         nulls.append({frozenset(row["effects"]): row["null"] for row in joint["subsets"] if "null" in row})
 
     def price(j: int, subset: Subset) -> float:
-        return prices.joint * len(subset) + prices.reference * nulls[j].get(subset, 0.0)
+        return prices.joint * len(subset - shared(kinds)) + prices.reference * nulls[j].get(subset, 0.0)
 
     chosen = chosen_of(tables, price, prices, kinds)
     by_name = {kind.name: kind for kind in kinds}
@@ -82,5 +82,4 @@ def findings(told: Mapping[str, Any], prices: Prices, kinds: Sequence[Kind]) -> 
 
 def chosen_of(tables: Sequence[Table], price: Any, prices: Prices, kinds: Sequence[Kind]) -> Chosen:
     """Returns the set that is worth most at these prices."""
-    shared = frozenset(kind.name for kind in kinds if getattr(kind.target, "shared", False))
-    return choose(tables, price, prices.name, prices.share, shared, prices.partial, prices.joint)
+    return choose(tables, price, prices.name, prices.share, shared(kinds), prices.partial, prices.joint)
