@@ -16,7 +16,7 @@ from brokk_rl.diagnosis.engine import Findings
 from brokk_rl.errors import ConfigError, choices
 from brokk_rl.spec import spec
 
-OUTSIDE = ("constant", "clue", "share", "scatter", "strays", "gained", "frames", "tool")
+OUTSIDE = ("constant", "clue", "form", "scatter", "strays", "tool")
 RIGHT = ("constant", "margin", "adds", "size", "names", "outside")
 NONE = ("constant", "nearest", "outside")
 STAGES = ("timing", "actuation", "sensing", "kinematics", "perception")
@@ -24,6 +24,8 @@ BY_CHANCE = 1.5
 """Times that a clue must earn what it earns on the reference before it counts."""
 NATS = 10.0
 """Evidence below is little."""
+MUCH = 50.0
+"""What effects explain is much beyond: then a part that they leave says less, as no form is exactly that of the library."""
 
 
 @spec
@@ -67,28 +69,30 @@ def odds(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
 
 
 def predicted(findings: Findings) -> np.ndarray:
-    """Returns what the best clue earns on what is left, beyond what it may on the reference, `(J,)`."""
-    return np.maximum(findings.left - BY_CHANCE * findings.left_null, 0.0).max(0)
+    """Returns what clues earn on what is left, beyond what they may on the reference, `(clues, J)`."""
+    return np.maximum(findings.left - BY_CHANCE * findings.left_null, 0.0)
 
 
 def outside(findings: Findings) -> dict[str, float]:
     """Returns the signs that something is there which no effect of the library is."""
-    left, stages = predicted(findings), {one.kind.stage for one in findings.others}
+    stages, left = {one.kind.stage for one in findings.others}, predicted(findings)
     subsets = zip(findings.tables, findings.chosen.subsets, strict=True)
     gained = np.array([table.score(subset).total if subset else 0.0 for table, subset in subsets])
-    scatter = float(np.log(np.maximum(findings.scatter, 1.0)).max())
+    explained = 1.0 + float(np.log1p(gained.sum() / MUCH))
     late = "timing" in stages  # frames that come late scatter errors, whatever else is there
     seen = bool(stages & {"kinematics", "sensing"})
     return {
         "constant": 1.0,
-        "clue": float(np.log1p(left.max() / NATS)),
-        "share": float((left / (left + gained + NATS)).max()),
-        "scatter": 0.0 if late else scatter,
-        "strays": float(np.log(np.maximum(findings.strays, 1.0)).max()),
-        "gained": float(np.log1p(gained.sum() / NATS)),
-        "frames": scatter if late else 0.0,
-        "tool": 0.0 if seen else float(np.log(max(findings.tool_left, 1.0))),
+        "clue": float(np.log1p(left[1:].max(initial=0.0) / NATS)),
+        "form": float(np.log1p((left[:1] / (1.0 + gained / MUCH)).max(initial=0.0) / NATS)),
+        "scatter": 0.0 if late else _log(findings.scatter) / explained,
+        "strays": _log(findings.strays) / explained,
+        "tool": 0.0 if seen else _log(np.array(findings.tool_left)),
     }
+
+
+def _log(ratios: np.ndarray) -> float:
+    return float(np.log(np.maximum(ratios, 1.0)).max())
 
 
 def right(margin: float, adds: float, size: float, names: int, outside: float) -> dict[str, float]:

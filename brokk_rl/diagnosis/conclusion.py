@@ -216,8 +216,12 @@ class Diagnosis:
             return text + (f"; an unknown remainder on {', '.join(remainder['joints'])}" if remainder else "")
         if told == "unknown":
             joints = np.flatnonzero(verdict.unexplained(findings))
-            where = ", ".join(self.case.machine.joint_names[j] for j in joints)
-            return f"the gap of {where} can be predicted from commands and positions, but by no effect of the library"
+            where = ", ".join(self.case.machine.joint_names[j] for j in joints) or "some joints"
+            best = certainty.predicted(findings).max(1)
+            clues = [clue for clue, earned in zip(CLUES, best, strict=True) if earned > max(verdict.LEFT, 0.5 * best.max())]
+            if not clues:
+                return f"the gap of {where} is real, and no effect of the library explains it"
+            return f"the gap of {where} can be predicted ({'; '.join(clues)}), but by no effect of the library"
         return "no effect earns more on the field recordings than it would by chance"
 
     def _cannot_tell(self, why: str) -> Outcome:

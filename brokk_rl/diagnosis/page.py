@@ -98,11 +98,11 @@ def _causes(page: Page, outcome: Outcome, machine: Machine) -> None:
 
     if isinstance(left := answer.more.get("remainder"), Mapping) and left:
         rows = [
-            [joint, *(None if one.get(key) is None else f"{one[key]:.1f}" for key in ("earned", "null"))]
+            [joint, one.get("clue"), *(None if one.get(key) is None else f"{one[key]:.1f}" for key in ("earned", "null"))]
             for joint, one in left.items()
         ]
-        caption = "What a flexible model still predicts of the error that is left, and what it would by chance"
-        page.table(["joint", "earned", "by chance"], rows, caption)
+        caption = "From what a flexible model still predicts the error that is left, log likelihood, and what it earns by chance"
+        page.table(["joint", "best from", "earned", "by chance"], rows, caption)
 
 
 def _how_far(page: Page, outcome: Outcome, machine: Machine) -> None:

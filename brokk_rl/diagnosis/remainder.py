@@ -1,8 +1,9 @@
 """Whether a flexible model still predicts what is left, and from what: then something is there, and the library has no name for it.
 
-Each clue is a small ridge regression of increments on one thing that a machine could depend on: its speed, where it stands, how it
-changes speed, the other joints, the time it has run, the work it did just before. Small models find what a large one drowns. They
-are judged as effects are, on parts of the recordings that they were not fitted to, and by what they earn on reference recordings.
+Each clue is a small ridge regression of increments on one thing that a machine could depend on: where it stands, the other joints,
+the time it has run, the work it did just before. Small models find what a large one drowns. `FORM` comes first, and the others
+explain what it leaves: how speed follows commands, starts and stops is where real forms of known effects differ from the library's
+as well. Like an effect, a clue earns the logarithm of a Bayes factor, and is judged by what it earns on reference recordings.
 Axes: `W` windows, `I` increments, `J` joints, `E` entries, `F` features.
 """
 
@@ -16,12 +17,10 @@ import numpy as np
 
 from brokk_rl.diagnosis.discrepancy import WARM_S, ridge
 from brokk_rl.diagnosis.evidence import Evidence
-from brokk_rl.diagnosis.noise import SPAN, loss
+from brokk_rl.diagnosis.noise import SPAN, loss, weight
 
-RIDGES = (10.0, 100.0, 1000.0, 10000.0)
-"""Pulls towards nothing, in features of unit size over the noise; that which predicts best is used."""
-PARTS = 4
-"""Parts of the recordings, each predicted from the others."""
+RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+"""Pulls towards nothing, in features of unit size over the noise; that which makes the errors most likely is used."""
 PAST_S = (2.0, 4.0, 8.0, 16.0)
 """Over how long work before may matter."""
 FAR = 9.0
@@ -75,8 +74,11 @@ class Motion:
         return [*slow, (warm - warm.mean()) / max(float(warm.std()), 1e-9)]
 
 
-def _speed(m: Motion) -> list[np.ndarray]:
-    return [m.own * hat * side for hat in _hats(np.abs(m.share[..., m.j]), 1.0, 8) for side in m.sides]
+def _form(m: Motion) -> list[np.ndarray]:
+    """Speed against command; starts and stops, just before and after."""
+    turn, faster = np.diff(m.own, axis=1, prepend=m.own[:, :1]), np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0
+    changes = [_late(turn * when * side, by) for by in (-1, 0, 1, 2, 3) for when in (faster, ~faster) for side in m.sides]
+    return [m.own * hat * side for hat in _hats(np.abs(m.share[..., m.j]), 1.0, 8) for side in m.sides] + changes
 
 
 def _position(m: Motion) -> list[np.ndarray]:
@@ -86,12 +88,6 @@ def _position(m: Motion) -> list[np.ndarray]:
 def _sensor(m: Motion) -> list[np.ndarray]:
     """An encoder whose error depends on where it stands."""
     return [np.diff(wave(2 * np.pi * turns * m.place), axis=0)[0] for turns in (0.5, 1, 1.5, 2, 3, 4) for wave in (np.sin, np.cos)]
-
-
-def _changes(m: Motion) -> list[np.ndarray]:
-    """Starts and stops, just before and after."""
-    turn, faster = np.diff(m.own, axis=1, prepend=m.own[:, :1]), np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0
-    return [_late(turn * when * side, by) for by in (-1, 0, 1, 2, 3) for when in (faster, ~faster) for side in m.sides]
 
 
 def _joints(m: Motion) -> list[np.ndarray]:
@@ -124,27 +120,29 @@ def _past(m: Motion) -> list[np.ndarray]:
     return columns
 
 
+FORM = "how speed follows commands"
 CLUES: Mapping[str, Callable[[Motion], list[np.ndarray]]] = {
-    "its speed": _speed,
+    FORM: _form,
     "its position": _position,
     "the angle that the sensor reads": _sensor,
-    "starts and stops": _changes,
     "the other joints": _joints,
     "running time": _time,
     "timing over the running time": _delay_over_time,
     "what it did before": _past,
 }
+"""By what they are about, `FORM` first."""
 
 
 def predictable(evidence: Evidence, z: np.ndarray) -> np.ndarray:
-    """Returns what each clue earns on errors over the noise `z` `(J, E)`, on parts that it was not fitted to, `(clues, J)`."""
-    part, found = evidence.block % PARTS, np.zeros((len(CLUES), len(z)))
-    for row, columns in zip(found, CLUES.values(), strict=True):
-        for j, errors in enumerate(z):
-            x = evidence.whitened_joint(np.stack(columns(Motion(evidence, j)), -1), j)
+    """Returns what each clue earns on errors over the noise `z` `(J, E)`, `(clues, J)`."""
+    found = np.zeros((len(CLUES), len(z)))
+    for j, errors in enumerate(z):
+        motion = Motion(evidence, j)
+        for row, columns in zip(found, CLUES.values(), strict=True):
+            x = evidence.whitened_joint(np.stack(columns(motion), -1), j)
             size = np.sqrt(np.mean(np.square(x), 0))
-            x = x / np.where(size > 1e-9, size, np.inf)
-            row[j] = max(0.0, *(_earned(x, errors, part, pull) for pull in RIDGES))
+            row[j], left = _earned(x / np.where(size > 1e-9, size, np.inf), errors)
+            errors = left if columns is _form else errors
     return found
 
 
@@ -172,12 +170,16 @@ def strayed(evidence: Evidence, error: np.ndarray) -> np.ndarray:
     return over.sum(0) / np.maximum(evidence.claims.sum(0), 1)
 
 
-def _earned(x: np.ndarray, z: np.ndarray, part: np.ndarray, pull: float) -> float:
-    gain = 0.0
-    for one in np.unique(part):
-        held = part == one
-        gain += float(loss(z[held]) - loss(z[held] - x[held] @ ridge(x[~held], z[~held], pull))) if not held.all() else 0.0
-    return gain
+def _earned(x: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
+    """Returns by how much features `(E, F)` make errors `(E,)` more likely, by Laplace's approximation, and what they leave."""
+    best, least = 0.0, z
+    for pull in RIDGES:
+        beta = ridge(x, z, pull)
+        left = z - x @ beta
+        told = (x * weight(left)[:, None]).T @ x / pull + np.eye(x.shape[1])
+        gain = float(loss(z) - loss(left)) - 0.5 * pull * float(beta @ beta) - 0.5 * float(np.linalg.slogdet(told)[1])
+        best, least = (gain, left) if gain > best else (best, least)
+    return best, least
 
 
 def _hats(values: np.ndarray, high: float, count: int) -> list[np.ndarray]:

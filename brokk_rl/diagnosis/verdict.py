@@ -139,7 +139,7 @@ def chosen_kinds(findings: Findings, kinds: Mapping[str, Kind]) -> list[Kind]:
 def unexplained(findings: Findings) -> np.ndarray:
     """Returns which joints have something left, `(J,)` bool: predicted by a flexible model, or scattered too much."""
     late = any(one.kind.stage == "timing" for one in findings.others)
-    return (certainty.predicted(findings) > LEFT) | ((findings.scatter > SCATTERED) & (not late))
+    return (certainty.predicted(findings).max(0) > LEFT) | ((findings.scatter > SCATTERED) & (not late))
 
 
 def unknown_chance(findings: Findings, prices: Prices, weights: Certainty) -> float:
