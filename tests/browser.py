@@ -66,10 +66,10 @@ class Scripted:
 
 
 @contextmanager
-def served(feed: Any, port: int = 0, machine: Machine | None = None, **changes: Any) -> Iterator[int]:
-    """Serves the page of `conf/page/local.yaml` with `changes`; yields the port."""
+def served(feed: Any, port: int = 0, machine: Machine | None = None, annex: Any = None, **changes: Any) -> Iterator[int]:
+    """Serves the page of `conf/page/local.yaml` with `changes`, and what `annex` has; yields the port."""
     page: OperatorPage = replace(option("page", "local"), port=port, token=TOKEN, **changes)
-    server = Server(page, machine or option("machine", "brokk170"), feed, TOKEN)
+    server = Server(page, machine or option("machine", "brokk170"), feed, TOKEN, annex)
     ready, ending, found, failed = threading.Event(), threading.Event(), list[int](), list[BaseException]()
 
     def serve() -> None:

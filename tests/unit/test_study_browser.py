@@ -1,0 +1,231 @@
+"""The study's pages in a real browser: NASA-TLX by click and by key, in both languages, and gone on with after either side crashed."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import TOKEN, chromium, served
+from sitting import Arm, conductor, feed, in_trial, machine, plan
+
+from deploy.study import tlx
+from deploy.study.conductor import Conductor
+from deploy.study.room import StudyFeed, StudyPages
+
+MACHINE = machine()
+SIZE = {"width": 1280, "height": 800}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def lead(tmp_path: Path) -> Conductor:
+    plan(tmp_path, MACHINE)
+    return conductor(tmp_path, Arm(MACHINE))
+
+
+@pytest.fixture
+def port(lead: Conductor) -> Iterator[int]:
+    with served(StudyFeed(feed(), lead), annex=StudyPages(lead)) as found:
+        yield found
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Callable[..., Any]]:
+    """Opens pages; what the browser complains about fails the test."""
+    contexts, complaints = [], []
+
+    def open_page(port: int, query: str = "") -> Any:
+        contexts.append(browser.new_context(viewport=SIZE, locale="en-GB", has_touch=True))
+        page = contexts[-1].new_page()
+        page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("requestfinished", lambda request: None if f":{port}/" in request.url else complaints.append(request.url))
+        page.goto(f"http://localhost:{port}/{query}#token={TOKEN}")
+        until(page, "() => window.measured?.drawn > 0 && Boolean(window.sitting())")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def until(page: Any, claim: str, seconds: float = 20.0) -> None:
+    """Waits for something on a page; Playwright's own way needs `eval`, which the page forbids."""
+    end_s = time.monotonic() + seconds
+    while not page.evaluate(claim):
+        assert time.monotonic() < end_s, f"it did not come true: {claim}; {page.evaluate('window.sitting()')}"
+        time.sleep(0.02)
+
+
+def at(page: Any, screen: int) -> None:
+    until(page, f"() => window.sitting().at === {screen}")
+
+
+def to_questionnaire(lead: Conductor) -> None:
+    """Does everything before the first questionnaire, without the page."""
+    lead.choose("P01")
+    lead.take({"do": "consent", "agreed": True})
+    for _ in range(2):
+        in_trial(lead, lead._stage)  # type: ignore[arg-type]
+        lead.take({"do": "next"})
+
+
+def answers(place: Path) -> dict[str, Any]:
+    return json.loads((place / "questionnaires" / "P01_1.json").read_text())
+
+
+def test_a_sitting_is_walked_through_by_touch(tmp_path: Path, lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port)
+    page.locator("#study .people button", has_text="P01").tap()
+    until(page, "() => window.sitting().kind === 'consent'")
+    assert "You may stop at any time." in page.locator("#study .screen").inner_text()
+    page.locator("#study .primary").tap()
+    until(page, "() => window.sitting().kind === 'trial'")
+    condition = lead.view()["condition"]
+    assert page.locator("#study h1").inner_text() == {"guided": "With guidance", "unguided": "Without guidance"}[condition]
+    assert page.locator("#study .joints .there").count() == 5
+    page.locator("#begin").tap()
+    until(page, "() => window.sitting().phase === 'starting' || window.sitting().phase === 'countdown'")
+    arm: Any = lead._stage
+    arm.now_s += 5.0
+    until(page, "() => window.sitting().phase === 'running'")
+    # the operator's page is seen then, and its levers follow the condition
+    assert page.locator("#left").is_visible() and page.locator("#study").get_attribute("class") == "bar"
+    assert not page.locator("#record").is_visible() and page.locator("#stop").is_visible()
+    until(page, f"() => document.body.classList.contains('lost') || {str(condition == 'guided').lower()} === "
+                "(document.querySelector('#advice').textContent !== 'Guidance is off')")  # fmt: skip
+    arm.now_s += 3.0
+    arm.q = MACHINE.home
+    until(page, "() => window.sitting().phase === 'settling'")
+    arm.now_s += 1.0
+    until(page, "() => window.sitting().phase === 'over'")
+    assert page.locator("#study h1").inner_text().startswith("Inserted: ")
+    page.keyboard.press("Enter")
+    until(page, "() => window.sitting().done === 1")
+    assert json.loads((tmp_path / "trials" / "P01_1_01.json").read_text())["outcome"] == "inserted"
+
+
+def test_every_answer_can_be_given_with_gloves(lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
+    to_questionnaire(lead)
+    page = opened(port)
+    at(page, 0)
+    box = page.locator("#study .scale button").first.bounding_box()
+    assert box["width"] * box["height"] > 55 * 100, "a fingertip in a glove: 15 by 26 mm"
+    for button in page.locator("#study .answers button").all():
+        assert min(button.bounding_box()["width"], button.bounding_box()["height"]) >= 64
+
+
+def test_the_whole_questionnaire_by_click(tmp_path: Path, lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
+    to_questionnaire(lead)
+    page = opened(port)
+    given = dict(zip(tlx.SCALES, (0, 25, 45, 70, 95, 100), strict=True))
+    for screen, (scale, value) in enumerate(given.items()):
+        at(page, screen)
+        page.locator(f"#study [data-value='{value}']").click()
+        until(page, f"() => window.sitting().ratings.{scale} === {value}")
+        page.locator("#study .primary").click()
+    weights = dict.fromkeys(tlx.SCALES, 0)
+    for screen in range(6, 21):
+        at(page, screen)
+        button = page.locator("#study .pair button").nth(screen % 2)
+        weights[button.get_attribute("data-scale")] += 1
+        button.click()
+    at(page, 21)
+    assert page.locator("#study h1").inner_text() == "All questions are answered"
+    page.locator("#study .primary").click()
+    until(page, "() => window.sitting().kind === 'trial'")
+    found = answers(tmp_path)
+    assert found["ratings"] == given and found["finished"] and tlx.check(found) == []
+    assert tlx.weighted(found) == pytest.approx(sum(weights[scale] * given[scale] for scale in given) / 15)
+
+
+def test_the_whole_questionnaire_by_key_in_german(tmp_path: Path, lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
+    to_questionnaire(lead)
+    page = opened(port, "?lang=de")
+    at(page, 0)
+    assert page.locator("#study h1").inner_text() == "Geistige Anforderung"
+    assert page.evaluate("document.documentElement.lang") == "de"
+    for screen in range(6):
+        at(page, screen)
+        for key in ("ArrowRight", *["ArrowRight"] * screen, "ArrowLeft"):
+            page.keyboard.press(key)
+        until(page, f"() => window.sitting().ratings[window.sitting().scales[{screen}]] === {45 + 5 * screen}")
+        page.keyboard.press("Enter")
+    for screen in range(6, 21):
+        at(page, screen)
+        page.keyboard.press("ArrowLeft")
+    at(page, 21)
+    page.keyboard.press("Backspace")
+    at(page, 20)
+    page.keyboard.press("Enter")
+    at(page, 21)
+    assert page.locator("#study h1").inner_text() == "Alle Fragen sind beantwortet"
+    page.keyboard.press("Enter")
+    until(page, "() => window.sitting().kind === 'trial'")
+    found = answers(tmp_path)
+    assert list(found["ratings"].values()) == [45, 50, 55, 60, 65, 70] and tlx.raw(found) == 57.5
+    assert [answer["chosen"] for answer in found["pairs"]] == [pair[0] for pair in found["shown_pairs"]]
+
+
+def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
+    tmp_path: Path, lead: Conductor, opened: Callable[..., Any]
+) -> None:
+    to_questionnaire(lead)
+    with served(StudyFeed(feed(), lead), annex=StudyPages(lead)) as port:
+        page = opened(port)
+        at(page, 0)
+        page.keyboard.press("End")
+        until(page, "() => window.sitting().ratings.mental === 100")
+        page.keyboard.press("Enter")
+        at(page, 1)
+        page.context.close()  # no goodbye
+        page = opened(port)
+        at(page, 1)
+        page.keyboard.press("Home")
+        until(page, "() => window.sitting().ratings.physical === 0")
+    again = conductor(tmp_path, Arm(MACHINE))  # another process would know no more than this
+    again.choose("P01")
+    with served(StudyFeed(feed(), again), port=port, annex=StudyPages(again)):
+        until(page, "() => window.sitting().at === 2")  # the page comes back by itself
+        page.locator("#study .language").click()
+        until(page, "() => document.querySelector('#study h1').textContent === 'Zeitliche Anforderung'")
+        for screen in range(2, 21):
+            at(page, screen)
+            page.locator("#study .answers button").last.click()  # left open
+        at(page, 21)
+        assert page.locator("#study h1").inner_text() == "19 Fragen sind offen"
+        page.locator("#study .answers button").last.click()
+        until(page, "() => window.sitting().kind === 'trial'")
+    found = answers(tmp_path)
+    assert found["ratings"] == {"mental": 100, "physical": 0} and found["pairs"] == [] and found["finished"]
+
+
+def test_nobody_leads_a_sitting_without_the_key(port: int, lead: Conductor, browser: Any) -> None:
+    page = browser.new_context().new_page()
+    page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))
+    for token in ("", "#token=wrong horse"):
+        page.goto(f"http://localhost:{port}/{token}")
+        until(page, "() => document.querySelector('#study h1')?.textContent === 'Open this page by the link with the key'")
+    assert lead.view()["kind"] == "choose"
+    page.context.close()
+
+
+def test_stopping_takes_two_presses_and_is_kept(tmp_path: Path, lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
+    to_questionnaire(lead)
+    page = opened(port)
+    page.locator("#study .leave").click()
+    assert lead.view()["kind"] == "questionnaire"
+    page.locator("#study .leave", has_text="Really stop").click()
+    until(page, "() => window.sitting().kind === 'stopped'")
+    assert json.loads((tmp_path / "participants" / "P01.json").read_text())["stopped"] is True
+    assert len(list((tmp_path / "trials").iterdir())) == 2 and len(list((tmp_path / "recordings").iterdir())) == 2
