@@ -32,7 +32,7 @@ from deploy.loop.process import Child
 from deploy.loop.records import Exchange
 from deploy.loop.station import Setting
 from deploy.loop.supervisor import BUS_PRIORITY, PATIENCE_S, POLICY_PRIORITY
-from deploy.loop.target import TargetSource
+from deploy.loop.target import Aim, TargetSource
 from deploy.motion import Motion, judge
 from deploy.policy.adviser import REASONS, Advised, Counsel
 from deploy.policy.bundle import Bundle
@@ -110,7 +110,7 @@ class Bringup:
         targets = {
             "bus": ("deploy.loop.station:run", Setting(self.wire, self.dbc, machine, self.limits), BUS_PRIORITY),
             "policy": ("deploy.policy.adviser:run", counsel, POLICY_PRIORITY),
-            "log": ("deploy.recorder.capture:run", Capture(session.folder, self.dbc, machine, {"source": "bring-up"}), None),
+            "log": ("deploy.recorder.capture:run", Capture(session.folder, self.dbc, machine, {"source": "bring-up"}, 0.0), None),
         }
         children = [
             Child(name, target, (what, exchange), exchange.files, priority if self.realtime else None)
@@ -211,7 +211,7 @@ class _Checks:
 
     def _shadow(self) -> Finding:
         self._say("shadow run: the policy runs along, nothing is shown")
-        self._bringup.target.build().refresh(self._exchange.target)
+        Aim(self._bringup.target.build(), self._exchange.target, self._exchange.holes).refresh()
         reasons: list[str] = []
         end_s, number = time.monotonic() + self._bringup.shadow_s, -1
         while time.monotonic() < end_s:

@@ -3,7 +3,7 @@
 `J` joints; times are monotonic, in s; 0 where nothing has come.
 
 `STATE` is written by the bus process, `ADVICE` by the policy, `REQUEST` by whoever commands valves on purpose, `TARGET` by what
-knows the borehole, `CONTROLS` by the operator's side.
+knows the borehole, `CONTROLS` by the operator's side, `FRAME` and `HOLES` by perception.
 """
 
 from __future__ import annotations
@@ -78,6 +78,38 @@ def request_fields(num_joints: int) -> np.dtype:
     return np.dtype([("t_s", float), ("u", float, (num_joints,))])
 
 
+def frame_fields(num_px: int) -> np.dtype:
+    """Returns the fields of a camera's frame of `num_px` pixels at most; see `brokk_rl.signals.Frame`."""
+    return np.dtype(
+        [
+            ("t_s", float),
+            ("width", np.uint16),
+            ("height", np.uint16),
+            ("color", np.uint8, (num_px, 3)),  # RGB, row by row
+            ("depth_m", np.float32, (num_px,)),  # NaN where unknown
+            ("camera_matrix", float, (3, 3)),
+            ("base_from_camera", float, (4, 4)),  # NaN where nobody knows it
+        ]
+    )
+
+
+MOST_HOLES = 8
+HOLE = np.dtype(
+    [
+        ("name", np.uint16),
+        ("center_in_base_m", float, (3,)),
+        ("axis_in_base", float, (3,)),
+        ("radius_m", float),
+        ("std_m", float),
+        ("score", float),  # that it is one, in [0, 1]
+        ("t_s", float),  # when it was seen last
+    ]
+)
+"""A borehole that perception knows."""
+
+HOLES = np.dtype([("t_s", float), ("count", np.uint8), ("holes", HOLE, (MOST_HOLES,))])
+"""All that it knows."""
+
 TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,)), ("std_m", float)])
 """The borehole: when it was found, the centre of its rim, and the standard deviation of that."""
 
@@ -95,9 +127,12 @@ class Exchange:
         request: Commands to be sent; `None` where nothing ever is.
         target: The borehole.
         controls: From the operator's side.
+        frame: Newest frame of the camera; `None` without one.
+        holes: Boreholes that perception knows.
         bus_log: From the bus process to the log.
         policy_log: From the policy to the log.
         page_log: From the operator's page to the log.
+        sight_log: From perception to the log.
         wishes: From the operator's page to the supervisor, a JSON text each.
         reports: What each process says of its timing when it ends; one after the other.
     """
@@ -107,24 +142,36 @@ class Exchange:
     request: Slot | None
     target: Slot
     controls: Slot
+    frame: Slot | None
+    holes: Slot
     bus_log: Pipe
     policy_log: Pipe
     page_log: Pipe
+    sight_log: Pipe
     wishes: Pipe
     reports: Pipe
 
     @classmethod
-    def new(cls, num_joints: int, commands: bool) -> Exchange:
-        """Returns a fresh one; without `commands` there is no way from anybody to the valves."""
+    def new(cls, num_joints: int, commands: bool, frame_px: int = 0) -> Exchange:
+        """Returns a fresh one.
+
+        Args:
+            num_joints: Of the machine.
+            commands: Without, there is no way from anybody to the valves.
+            frame_px: Pixels of a camera's frame; 0: no camera.
+        """
         return cls(
             state=Slot("state", state_fields(num_joints)),
             advice=Slot("advice", advice_fields(num_joints)),
             request=Slot("request", request_fields(num_joints)) if commands else None,
             target=Slot("target", TARGET),
             controls=Slot("controls", CONTROLS),
+            frame=Slot("frame", frame_fields(frame_px)) if frame_px else None,
+            holes=Slot("holes", HOLES),
             bus_log=Pipe("bus_log", PIPE_BYTES),
             policy_log=Pipe("policy_log", PIPE_BYTES),
             page_log=Pipe("page_log", PIPE_BYTES),
+            sight_log=Pipe("sight_log", 1 << 20),
             wishes=Pipe("wishes", 1 << 12),
             reports=Pipe("reports", 1 << 16),
         )
@@ -132,7 +179,7 @@ class Exchange:
     @property
     def logs(self) -> tuple[Pipe, ...]:
         """All that goes to the log."""
-        return self.bus_log, self.policy_log, self.page_log
+        return self.bus_log, self.policy_log, self.page_log, self.sight_log
 
     @property
     def files(self) -> list[int]:

@@ -26,11 +26,12 @@ from deploy.bus.description import Description
 from deploy.bus.wire import Replay, Wire
 from deploy.guidance import Guidance, LeverMap
 from deploy.limits import Limits
+from deploy.loop.eyes import Camera
 from deploy.loop.outlet import view
 from deploy.loop.process import Child
 from deploy.loop.records import Exchange
 from deploy.loop.station import Setting
-from deploy.loop.target import Target, TargetSource
+from deploy.loop.target import Aim, Seen, TargetSource
 from deploy.loop.terminal import table
 from deploy.loop.wanted import Recorder, Wanted
 from deploy.page.from_loop import Beside
@@ -45,6 +46,8 @@ PROCESSES, TIMING = "processes.json", "timing.json"
 WATCH_S = 0.05
 PATIENCE_S = 3.0
 BUS_PRIORITY, POLICY_PRIORITY = 55, 50
+OPTIONAL = {"page": "nothing is shown any more", "camera": "nothing new is seen any more"}
+"""Processes without which the loop goes on, and what is lost with them."""
 
 
 @spec
@@ -67,6 +70,7 @@ class Loop:
         seconds: When to stop; `null`: when told to.
         show: Whether to show levers and state in the terminal.
         page: The operator's page; `null`: none.
+        camera: What is seen of the boreholes; `null`: there is no camera.
     """
 
     wire: Wire | Replay
@@ -84,12 +88,15 @@ class Loop:
     seconds: float | None
     show: bool
     page: OperatorPage | None
+    camera: Camera | None
 
     def check(self) -> None:
         if self.armed and not self.commands:
             raise ConfigError("deploy.armed: nothing is ever sent in this mode; deploy=auto sends the policy's commands")
         if self.seconds is not None and self.seconds <= 0:
             raise ConfigError(f"deploy.seconds: expected more than 0, or null, got {self.seconds}")
+        if isinstance(self.target, Seen) and (self.camera is None or self.camera.finder is None):
+            raise ConfigError("target=seen: there is no camera that looks for boreholes; choose camera=… as well")
 
     def run(self, machine: Machine, session: Session, companions: Sequence[Companion]) -> None:
         """Runs until the time is over or a person stops it; leaves `processes.json` and `timing.json`.
@@ -107,7 +114,7 @@ class Loop:
         Description(self.dbc, machine)  # refused here, before anything runs
         full_rad = float(LeverMap(self.guidance.levers or machine.levers, machine).full_rad.max())
         Bundle(self.policy, machine)
-        exchange = Exchange.new(machine.num_joints, self.commands)
+        exchange = Exchange.new(machine.num_joints, self.commands, self.camera.num_px if self.camera else 0)
         children, recorder = _Children(exchange), self._recorder(exchange, machine, session.folder)
         try:
             for companion in companions:
@@ -115,7 +122,8 @@ class Loop:
             self._start(children, machine, session)
             recorder.refresh()
             write_json(session.folder / PROCESSES, children.pids | recorder.pids)
-            self._watch(children, exchange, full_rad, Wanted(exchange, recorder, self.armed, self.commands))
+            aim = Aim(self.target.build(), exchange.target, exchange.holes)
+            self._watch(children, exchange, full_rad, Wanted(exchange, recorder, aim, self.armed, self.commands))
         except KeyboardInterrupt:
             log.info("stopping")
         finally:
@@ -130,14 +138,19 @@ class Loop:
         children.start("bus", "deploy.loop.station:run", (setting,), BUS_PRIORITY if self.realtime else None)
         children.start("policy", "deploy.policy.adviser:run", (counsel,), POLICY_PRIORITY if self.realtime else None)
         if self.page is not None:
-            beside = Beside(self.page, machine, self.guidance, session, self.limits.joints_s, self.limits.levers_s, self.target_s)
+            camera_s = self.camera.stale_s if self.camera else None
+            beside = Beside(
+                self.page, machine, self.guidance, session, self.limits.joints_s, self.limits.levers_s, self.target_s, camera_s
+            )
             children.start("page", "deploy.page.from_loop:run", (beside,), None)
+        if self.camera is not None:
+            children.start("camera", "deploy.loop.eyes:run", (self.camera,), None)
 
     def _recorder(self, exchange: Exchange, machine: Machine, folder: Path) -> Recorder:
         facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
 
         def start(folder: Path) -> Child:
-            capture = Capture(folder, self.dbc, machine, facts)
+            capture = Capture(folder, self.dbc, machine, facts, self.camera.record_hz if self.camera else 0.0)
             return Child("log", "deploy.recorder.capture:run", (capture, exchange), exchange.files)
 
         recorder = Recorder(exchange, folder, start)
@@ -145,24 +158,16 @@ class Loop:
         return recorder
 
     def _watch(self, children: _Children, exchange: Exchange, full_rad: float, wanted: Wanted) -> None:
-        """Shows, refreshes the borehole and looks after the children until it is time to stop."""
-        target, end_s = self.target.build(), None if self.seconds is None else time.monotonic() + self.seconds
+        """Shows, does what is wanted and looks after the children until it is time to stop."""
+        end_s = None if self.seconds is None else time.monotonic() + self.seconds
         with contextlib.ExitStack() as stack:
             live = stack.enter_context(Live(console=Console(stderr=True), refresh_per_second=10)) if self.show else None
             while end_s is None or time.monotonic() < end_s:
-                self._refresh(target, exchange)
                 wanted.refresh()
                 children.check()
                 if live is not None:
                     live.update(table(view(exchange), full_rad))
                 time.sleep(WATCH_S)
-
-    def _refresh(self, target: Target, exchange: Exchange) -> None:
-        """Takes over news of the borehole; a file that makes no sense costs an alarm, not the run."""
-        try:
-            target.refresh(exchange.target)
-        except ConfigError as error:
-            log.error("%s", error)
 
 
 @dataclass(frozen=True)
@@ -199,8 +204,8 @@ class _Children:
             if child.code is None:
                 continue
             self.running.remove(child)
-            if child.name == "page":
-                log.error("ALARM: the operator's page has died (exit code %s); nothing is shown any more", child.code)
+            if child.name in OPTIONAL:
+                log.error("ALARM: the %s has ended (exit code %s); %s", child.name, child.code, OPTIONAL[child.name])
             else:
                 raise LinkError(f"the {child.name} process has died (exit code {child.code}); what it said stands above")
 

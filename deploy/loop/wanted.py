@@ -1,4 +1,4 @@
-"""What the person at the page wants: sending armed or not, recorded or not. The supervisor does it, a few times a second."""
+"""What the person at the page wants: sending armed, recording, which borehole. The supervisor does it, a few times a second."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
+from brokk_rl.errors import ConfigError
 from deploy.loop.process import Child
 from deploy.loop.records import Exchange
+from deploy.loop.target import Aim, Place
 
 log = logging.getLogger(__name__)
 
@@ -78,12 +82,14 @@ class Wanted:
     Args:
         exchange: Where to read and write.
         recorder: Of this run.
+        aim: Which borehole the advice is for.
         armed: Whether sending is armed from the beginning.
         commands: Whether anything is ever sent.
     """
 
-    def __init__(self, exchange: Exchange, recorder: Recorder, armed: bool, commands: bool) -> None:
-        self._exchange, self._recorder, self._armed, self._commands = exchange, recorder, armed, commands
+    def __init__(self, exchange: Exchange, recorder: Recorder, aim: Aim, armed: bool, commands: bool) -> None:
+        self._exchange, self._recorder, self._aim = exchange, recorder, aim
+        self._armed, self._commands = armed, commands
 
     def refresh(self) -> None:
         """Takes what has come, and says how things stand."""
@@ -92,9 +98,15 @@ class Wanted:
             if wish["kind"] == "record":
                 self._recorder.wanted = wish["value"] == "on"
                 self._recorder.into = Path(wish["into"]) if "into" in wish else self._recorder.into
+            elif "center_in_base_m" in wish:
+                self._aim.choose(Place(np.array(wish["center_in_base_m"]), wish["std_m"], wish["t_s"]))
             else:
                 self._armed = self._commands and wish["kind"] == "start"
             log.info("wished: %s %s", wish["kind"], wish["value"])
+        try:
+            self._aim.refresh()
+        except ConfigError as error:  # a file that makes no sense costs an alarm, not the run
+            log.error("%s", error)
         self._recorder.refresh()
         controls = self._exchange.controls.new()
         controls["t_s"], controls["armed"] = time.monotonic(), self._armed

@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import hmac
 import json
+import re
 from typing import Literal
 
 from deploy.page.shown import KINDS, Shown, Wish
 
-Refusal = Literal["token", "malformed", "deadman", "target", "busy"]
-"""Why a wish was refused: wrong token; no such wish; the dead-man is not held; no such target; the loop does not take it."""
+Refusal = Literal["token", "malformed", "deadman", "target", "nowhere", "busy"]
+"""Why a wish was refused: wrong token; no such wish; the dead-man is not held; no such target; nothing is measured where the person
+points; the loop does not take it."""
 LOCAL = ("localhost", "127.0.0.1", "[::1]")
+POINT = re.compile(r"0?\.\d{1,6},0?\.\d{1,6}")
+"""A place in the picture: parts of its width and height, at neither edge."""
 LONGEST = 256
 """Bytes of a wish."""
 
@@ -47,7 +51,7 @@ def read_wish(text: str | bytes) -> Wish | None:
     kind, value = found["kind"], found["value"]
     if kind not in KINDS or not isinstance(value, str):
         return None
-    fits = {"record": value in ("on", "off"), "target": bool(value)}.get(kind, value == "")
+    fits = {"record": value in ("on", "off"), "target": bool(value), "point": bool(POINT.fullmatch(value))}.get(kind, value == "")
     return Wish(kind, value) if fits else None
 
 

@@ -17,7 +17,9 @@ from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from deploy.chain import tool
+from deploy.loop.target import NEAR_M
 from deploy.page.demo_camera import Camera
+from deploy.page.pointing import borehole_at
 from deploy.page.scene import approach
 from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Wish
 
@@ -118,11 +120,24 @@ class DemoFeed:
         """See `Feed`."""
         if wish.kind == "target":
             self._chosen = wish.value
+        elif wish.kind == "point":
+            return self._point(*(float(part) for part in wish.value.split(",")))
         elif wish.kind == "record":
             self._recording, self._recorded_s = wish.value == "on", self._clock()
         else:
             self._guiding = wish.kind == "start"
         return True
+
+    def _point(self, x: float, y: float) -> bool:
+        """Chooses the borehole that a person points at, if there is one."""
+        frame = self.frame(-1.0)
+        found = frame and borehole_at(frame, x, y, TARGETS[0].radius_m)
+        if not found:
+            return False
+        apart_m = {one.name: float(np.linalg.norm(np.array(one.center_in_base_m) - found[0])) for one in TARGETS}
+        nearest = min(apart_m, key=lambda name: apart_m[name])
+        self._chosen = nearest if apart_m[nearest] <= NEAR_M else self._chosen
+        return apart_m[nearest] <= NEAR_M
 
     def drawn(self, drawn: Drawn) -> None:
         """See `Feed`; nobody is interested."""

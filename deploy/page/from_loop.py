@@ -21,9 +21,12 @@ from brokk_rl.signals import Frame
 from deploy.chain import tool
 from deploy.guidance import AXES, Guidance
 from deploy.loop import outlet
+from deploy.loop.eyes import frame_of
 from deploy.loop.process import Stop
 from deploy.loop.records import Exchange
 from deploy.loop.station import TEXT
+from deploy.loop.target import Place, holes_of, nearest, place_of
+from deploy.page.pointing import borehole_at
 from deploy.page.scene import approach
 from deploy.page.settings import LINK, OperatorPage
 from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Vector, Wish
@@ -33,7 +36,8 @@ log = logging.getLogger(__name__)
 ADVICE_PERIODS = 3
 """Control periods without a new advice from which the last one is stale."""
 UP: Vector = (0.0, 0.0, 1.0)
-NAME = "1"
+GIVEN = "+"
+"""Name of a borehole that perception does not know: one from a file, from the configuration, or pointed at."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,7 @@ class Beside:
         positions_s: Age from which positions are stale.
         levers_s: Age from which the operator's levers are.
         borehole_s: Age from which the borehole is.
+        camera_s: Age from which the camera's picture is; `None`: there is no camera.
     """
 
     page: OperatorPage
@@ -57,6 +62,7 @@ class Beside:
     positions_s: float
     levers_s: float
     borehole_s: float
+    camera_s: float | None = None
 
 
 def run(stop: Stop, beside: Beside, exchange: Exchange) -> None:
@@ -93,7 +99,8 @@ class LoopFeed:
         """See `Feed`."""
         seen, beside = outlet.view(self._exchange), self._beside
         target, controls = self._exchange.target.read(), self._exchange.controls.read()
-        found = None if target is None else self._target(target)
+        found = self._targets(target)
+        aimed = next((one for one in found if one.chosen), None)
         machine, proposed, safety = seen.machine, seen.advice, seen.safety
         recording = controls is not None and bool(controls["recording"])
         ages_s = {
@@ -102,6 +109,9 @@ class LoopFeed:
             "advice": (proposed and proposed.age_s, ADVICE_PERIODS * beside.machine.period_s),
             "borehole": (None if target is None else seen.t_s - float(target["t_s"]), beside.borehole_s),
         }
+        if beside.camera_s is not None:
+            taken_s = self._frame_t_s()
+            ages_s["camera"] = (None if taken_s is None else seen.t_s - taken_s, beside.camera_s)
         return Shown(
             t_s=seen.t_s,
             alive=seen.alive,
@@ -116,21 +126,30 @@ class LoopFeed:
                 seen.t_s - float(controls["recording_t_s"]) if recording and controls is not None else 0.0,
                 safety.log_dropped if safety else 0,
             ),
-            targets=() if found is None else (found,),
-            path_in_base_m=() if found is None or machine is None else self._path(machine.q, found),
+            targets=found,
+            path_in_base_m=() if aimed is None or machine is None else self._path(machine.q, aimed),
             block_in_base_m=None,
         )
 
     def frame(self, after_s: float) -> Frame | None:
-        """See `Feed`; the loop has no camera of its own yet."""
-        return None
+        """See `Feed`."""
+        slot, taken_s = self._exchange.frame, self._frame_t_s()
+        if slot is None or taken_s is None or taken_s <= after_s or (record := slot.read()) is None:
+            return None
+        return frame_of(record)
 
     def wish(self, wish: Wish) -> bool:
         """See `Feed`."""
-        if wish.kind == "target":
-            return wish.value == NAME  # there is one, and it is chosen
-        taken = self._exchange.wishes.put(json.dumps({"kind": wish.kind, "value": wish.value}).encode())
-        self._say("wish", {"kind": wish.kind, "value": wish.value, "taken": taken})
+        facts: dict[str, Any] = {}
+        if wish.kind in ("target", "point"):
+            if any(one.chosen and one.name == wish.value for one in self.shown().targets):
+                return True
+            place = self._named(wish.value) if wish.kind == "target" else self._pointed(wish.value)
+            if place is None:
+                return False
+            facts = {"center_in_base_m": place.center_in_base_m.tolist(), "std_m": place.std_m, "t_s": place.t_s}
+        taken = self._exchange.wishes.put(json.dumps({"kind": wish.kind, "value": wish.value, **facts}).encode())
+        self._say("wish", {"kind": wish.kind, "value": wish.value, "taken": taken, **facts})
         if wish.kind in ("start", "stop"):
             self._guiding = wish.kind == "start"
             return taken or wish.kind == "stop"
@@ -153,16 +172,50 @@ class LoopFeed:
             due_s = max(self._beside.machine.period_s, most_rad / self._beside.guidance.max_rate_rad_s)
         return Advice(proposed.valid, proposed.reason, proposed.number, Levers(**parts, button_right=angles.button_right), due_s)
 
-    def _target(self, record: Any) -> Target:
-        x, y, z = (float(value) for value in record["center_in_base_m"])
-        std_m = float(record["std_m"])
-        return Target(NAME, (x, y, z), UP, self._beside.page.borehole_radius_m, std_m or None, None, True)
+    def _frame_t_s(self) -> float | None:
+        return self._exchange.frame and self._exchange.frame.peek("t_s")
+
+    def _targets(self, aim: Any | None) -> tuple[Target, ...]:
+        """Returns the boreholes that perception knows, and the one that the advice is for, whoever named it."""
+        holes = holes_of(self._exchange.holes)
+        chosen = None if aim is None else nearest(holes, np.array(aim["center_in_base_m"]))
+        found = [
+            Target(
+                str(int(hole["name"])), _vector(hole["center_in_base_m"]), _vector(hole["axis_in_base"]), float(hole["radius_m"]),
+                float(hole["std_m"]), float(hole["score"]), hole is chosen,
+            )
+            for hole in holes
+        ]  # fmt: skip
+        if aim is not None and chosen is None:
+            radius_m = self._beside.page.borehole_radius_m
+            found.append(Target(GIVEN, _vector(aim["center_in_base_m"]), UP, radius_m, float(aim["std_m"]) or None, None, True))
+        return tuple(found)
+
+    def _named(self, name: str) -> Place | None:
+        """Returns where the borehole of that name is."""
+        one = next((hole for hole in holes_of(self._exchange.holes) if str(int(hole["name"])) == name), None)
+        return None if one is None else place_of(one)
+
+    def _pointed(self, value: str) -> Place | None:
+        """Returns the borehole that a person points at: one that perception knows, else what is measured there."""
+        frame = self.frame(-1.0)
+        x, y = (float(part) for part in value.split(","))
+        found = frame and borehole_at(frame, x, y, self._beside.page.borehole_radius_m)
+        if not frame or not found:
+            return None
+        known = nearest(holes_of(self._exchange.holes), found[0])
+        return Place(*found, frame.t_s) if known is None else place_of(known)
 
     def _path(self, q: tuple[float, ...], target: Target) -> tuple[Vector, ...]:
         if not self._guiding or not self._beside.machine.has_bodies:
             return ()
         tip_m = tool(self._beside.machine, np.array(q)).tip_in_base_m
         return approach(tip_m, np.array(target.center_in_base_m), np.array(target.axis_in_base))
+
+
+def _vector(values: Any) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 def _full(machine: Machine, levers: tuple[Any, ...]) -> dict[str, float]:

@@ -243,7 +243,7 @@ class Server:
             return {"refused": "malformed", "kind": ""}
         reason = access.refusal(wish, self._feed.shown())
         if reason is None and not self._feed.wish(wish):
-            reason = "busy"
+            reason = "nowhere" if wish.kind == "point" else "busy"
         log.info("%s %s: %s", wish.kind, wish.value, reason or "done")
         return {"refused": reason, "kind": wish.kind} if reason else {"done": wish.kind, "kind": wish.kind}
 

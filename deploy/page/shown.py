@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, get_args
 from brokk_rl.signals import Frame
 
 Vector = tuple[float, float, float]
-Kind = Literal["start", "stop", "record", "target"]
+Kind = Literal["start", "stop", "record", "target", "point"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 """What can be wished for."""
 
@@ -175,8 +175,9 @@ class Wish:
     """What a person wants done, checked already: token, origin, dead-man.
 
     Attributes:
-        kind: `start` and `stop` guiding, `record` on or off, choose a `target`.
-        value: `on` or `off` for `record`, the name of the `target`, else empty.
+        kind: `start` and `stop` guiding, `record` on or off, choose a `target`, `point` at a borehole in the picture.
+        value: `on` or `off` for `record`, the name of the `target`, `x,y` of the point as parts of the picture from its upper left
+            corner, else empty.
     """
 
     kind: Kind

@@ -1,12 +1,13 @@
 """The log process: writes what bus and policy hand over, and puts it safely on the disk twice a second.
 
-MCAP holds every decoded message as a JSON topic of its name, and `advice`, `guard`, `fault`, `bus`, `timing`; BLF holds the frames
-as they were, for any tool that reads it. Times are monotonic ones plus one constant, so that a step of the wall clock shows
-nowhere.
+MCAP holds every decoded message as a JSON topic of its name, `advice`, `guard`, `fault`, `bus`, `holes`, and pictures of the camera
+as topic `camera` (`foxglove.CompressedImage`); BLF holds the frames as they were, for any tool that reads it. Times are monotonic
+ones plus one constant, so that a step of the wall clock shows nowhere.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import logging
@@ -25,9 +26,12 @@ from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from deploy.bus.description import Description, Layout, located
 from deploy.bus.protection import Fault
+from deploy.loop.exchange import Slot
+from deploy.loop.eyes import frame_of
 from deploy.loop.process import Stop
 from deploy.loop.records import Exchange, wall_offset_ns
 from deploy.loop.station import FRAME, FRAMES
+from deploy.picture import jpeg
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +39,10 @@ POLL_S = 0.05
 FLUSH_S = 0.5
 """What even a power failure costs at most."""
 MCAP, BLF = "capture.mcap", "frames.blf"
+PICTURES, JPEG_QUALITY = "camera", 80
+TIME = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
+BINARY = {"type": "string", "contentEncoding": "base64"}
+"""Of Foxglove's schema of a picture: its viewer shows them."""
 FACTS = "brokk"
 """Name of the metadata record."""
 
@@ -48,12 +56,14 @@ class Capture:
         dbc: The bus description.
         machine: The machine.
         facts: Further metadata: `source`, `policy`, …
+        pictures_hz: Pictures of the camera a second; 0: none.
     """
 
     folder: Path
     dbc: str
     machine: Machine
     facts: dict[str, str]
+    pictures_hz: float
 
 
 def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
@@ -64,13 +74,15 @@ def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
     """
     try:
         with Log(capture) as target:
-            asked = False
+            asked, pictures = False, Pictures(exchange.frame, capture.pictures_hz)
             while not asked:
                 time.sleep(POLL_S)
                 asked = stop()
                 for pipe in exchange.logs:
                     for data in pipe.take():
                         target.add(data)
+                if (picture := pictures.due()) is not None:
+                    target.add_picture(*picture)
                 target.flush_when_due()
     except OSError as error:
         raise StorageError(f"log: {error.strerror or error} ({capture.folder}); nothing more is recorded") from error
@@ -120,6 +132,13 @@ class Log:
         else:
             values = json.loads(data[1:])
             self._write(values.pop("topic"), values.pop("t_s"), values)
+
+    def add_picture(self, t_s: float, data: bytes) -> None:
+        """Takes a JPEG of the camera."""
+        wall_ns = int(t_s * 1e9) + self._offset_ns
+        stamp = {"sec": wall_ns // 10**9, "nsec": wall_ns % 10**9}
+        values = {"timestamp": stamp, "frame_id": "camera", "format": "jpeg", "data": base64.b64encode(data).decode()}
+        self._write(PICTURES, t_s, values)
 
     def flush_when_due(self) -> None:
         """Puts everything on the disk, twice a second."""
@@ -175,8 +194,37 @@ class Log:
         properties: dict[str, Any] = {"t_s": {"type": "number", "description": "monotonic time in s"}}
         for signal in self._description.signals(layout.name) if layout else ():
             properties[signal] = {"type": "number", "description": self._description.unit(layout.name, signal) if layout else ""}
-        schema = {"title": topic, "type": "object", "properties": properties}
-        return self._mcap.register_schema(topic, "jsonschema", json.dumps(schema).encode())
+        title = topic
+        if topic == PICTURES:
+            title = "foxglove.CompressedImage"
+            properties |= {"timestamp": TIME, "data": BINARY} | {key: {"type": "string"} for key in ("frame_id", "format")}
+        schema = {"title": title, "type": "object", "properties": properties}
+        return self._mcap.register_schema(title, "jsonschema", json.dumps(schema).encode())
+
+
+class Pictures:
+    """Takes pictures for the record, no more often than asked for.
+
+    Args:
+        slot: The camera's newest frame; `None`: there is none.
+        rate_hz: Pictures a second; 0: none.
+    """
+
+    def __init__(self, slot: Slot | None, rate_hz: float) -> None:
+        self._slot = slot if rate_hz > 0 else None
+        self._apart_s, self._taken, self._next_s = 1.0 / rate_hz if rate_hz else 0.0, 0, 0.0
+
+    def due(self) -> tuple[float, bytes] | None:
+        """Returns when the newest picture was taken, and it as a JPEG, if it is its turn."""
+        now_s = time.monotonic()
+        if self._slot is None or now_s < self._next_s or self._slot.number == self._taken:
+            return None
+        self._taken, self._next_s = self._slot.number, now_s + 0.9 * self._apart_s  # a camera's period is not exact
+        record = self._slot.read()
+        if record is None:
+            return None
+        frame = frame_of(record)
+        return frame.t_s, jpeg(frame.color, JPEG_QUALITY)
 
 
 def _frames(data: bytes) -> Iterator[tuple[float, int, bool, bytes]]:

@@ -302,24 +302,19 @@ def test_an_answer_that_makes_no_sense_is_not_shown(adviser: Adviser, machine: M
 
 
 def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_path: Path) -> None:
-    path, slot = (
-        tmp_path / "target.json",
-        Slot("target", np.dtype([("t_s", float), ("center_in_base_m", float, (3,)), ("std_m", float)])),
-    )
+    path = tmp_path / "target.json"
     target = File(path=str(path)).build()
-    target.refresh(slot)
-    assert slot.read() is None
+    assert target.news([]) is None
     path.write_text('{"center_in_base_m": [2.5, 0.1, 0.7]}')
     os.utime(path, ns=(time.time_ns() - 5 * 10**9,) * 2)
-    target.refresh(slot)
-    first = slot.read()
-    assert first is not None and first["center_in_base_m"].tolist() == [2.5, 0.1, 0.7]
-    assert time.monotonic() - first["t_s"] == pytest.approx(5.0, abs=0.5)
+    first = target.news([])
+    assert first is not None and first.center_in_base_m.tolist() == [2.5, 0.1, 0.7] and first.t_s is not None
+    assert time.monotonic() - first.t_s == pytest.approx(5.0, abs=0.5)
+    assert target.news([]) is None
     path.write_text('{"center": 1}')
     with pytest.raises(ConfigError, match="center_in_base_m"):
-        target.refresh(slot)
-    target.refresh(slot)  # said once
-    slot.memory.close()
+        target.news([])
+    assert target.news([]) is None  # said once
 
 
 def test_the_machines_computer_needs_no_torch_no_simulator_and_no_trainer() -> None:

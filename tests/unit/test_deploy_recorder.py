@@ -29,7 +29,7 @@ READER = CaptureLog(longest_gap_s=0.15, shortest_s=1.0)
 
 def write(folder: Path, machine: Machine, seconds: float = 3.0, gap_s: float = 0.0, close: bool = True) -> Log:
     """Writes a capture of a machine whose first joint follows a known path: q1 = 0.1 t, flow a step of 0.5 at 1.025 s."""
-    bus, log = Description(DBC, machine), Log(Capture(folder, DBC, machine, {"source": "test"}))
+    bus, log = Description(DBC, machine), Log(Capture(folder, DBC, machine, {"source": "test"}, 0.0))
     begun_s, counter = time.monotonic(), 0
     for k in range(round(seconds * 100)):
         t_s = k * 0.01
@@ -109,7 +109,7 @@ def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(machine: Machine, t
 
 def test_frames_that_were_refused_are_kept_and_said(machine: Machine, tmp_path: Path) -> None:
     bus = Description(DBC, machine)
-    with Log(Capture(tmp_path, DBC, machine, {})) as log:
+    with Log(Capture(tmp_path, DBC, machine, {}, 0.0)) as log:
         payload = bytearray(bus.encode("JointPos1", {}, 1))
         payload[0] ^= 1
         log.add(FRAMES + FRAME.pack(time.monotonic(), bus.layouts["JointPos1"].frame_id, 0, 8) + payload)
@@ -120,7 +120,7 @@ def test_frames_that_were_refused_are_kept_and_said(machine: Machine, tmp_path: 
 def test_a_step_of_the_wall_clock_shows_nowhere(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real, shift_ns = time.time_ns, 0
     monkeypatch.setattr("time.time_ns", lambda: real() + shift_ns)
-    with Log(Capture(tmp_path, DBC, machine, {})) as log:
+    with Log(Capture(tmp_path, DBC, machine, {}, 0.0)) as log:
         for shift_ns in (0, 3600 * 10**9, -3600 * 10**9):  # noqa: B007
             log.add(TEXT + json.dumps({"topic": "advice", "t_s": time.monotonic(), "reason": "valid", "u": [0.0] * 5}).encode())
     with (tmp_path / MCAP).open("rb") as file:

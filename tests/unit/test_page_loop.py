@@ -16,6 +16,7 @@ from brokk_rl.session import Session
 from deploy.guard import State
 from deploy.loop.records import Exchange
 from deploy.loop.station import TEXT, TRIPS
+from deploy.loop.target import Aim, File
 from deploy.loop.wanted import Recorder, Wanted
 from deploy.page.from_loop import Beside, LoopFeed
 from deploy.page.shown import Drawn, Levers, Wish
@@ -148,7 +149,8 @@ def wanted(exchange: Exchange, tmp_path: Path, commands: bool = True) -> tuple[W
         started.append(Process(folder))
         return started[-1]
 
-    return Wanted(exchange, Recorder(exchange, tmp_path, start), armed=False, commands=commands), started
+    aim = Aim(File(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes)
+    return Wanted(exchange, Recorder(exchange, tmp_path, start), aim, armed=False, commands=commands), started
 
 
 def controls(exchange: Exchange) -> Any:

@@ -165,6 +165,10 @@ function wish(kind, value = "") {
 $("start").onclick = () => wish("start");
 $("stop").onclick = () => wish("stop");
 $("record").onclick = () => wish("record", newest?.shown.recording.on ? "off" : "on");
+$("picture").onclick = event => {  // a place in the picture, whatever size it is shown in
+  const { width, height } = $("picture").getBoundingClientRect(), inside = part => Math.min(0.9999, Math.max(0.0001, part)).toFixed(4);
+  wish("point", `${inside(event.offsetX / width)},${inside(event.offsetY / height)}`);
+};
 $("language").onclick = () => {
   language = LANGUAGES[(LANGUAGES.indexOf(language) + 1) % LANGUAGES.length];
   sessionStorage.setItem("language", language);
@@ -185,7 +189,7 @@ function speak() {
   for (const id of ["start", "stop", "record"]) put($(id).querySelector("b"), say(id));
   put($("language"), language === "en" ? "DE" : "EN");
   $("language").setAttribute("aria-label", language === "en" ? "Deutsch" : "English");
-  put($("camera").querySelector("figcaption"), say("camera"));
+  put($("camera").querySelector("figcaption"), `${say("camera")} – ${say("point")}`);
   for (const side of ["left", "right"]) $(side).setAttribute("aria-label", say(side));
   $("scene").setAttribute("aria-label", say("scene"));
   const [advised, own] = $("legend").querySelectorAll("span");

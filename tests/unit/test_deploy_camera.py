@@ -1,0 +1,258 @@
+"""The camera beside the loop: what is handed on, which boreholes are known, whose target counts, and what a click means."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from composed import option
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.session import Session
+from brokk_rl.sight import HolePose
+from brokk_rl.signals import Frame
+from deploy.loop import eyes
+from deploy.loop.eyes import Camera, KnownHoles, frame_of
+from deploy.loop.records import Exchange
+from deploy.loop.target import Aim, File, Given, Seen
+from deploy.loop.wanted import Recorder, Wanted
+from deploy.page.demo import BLOCK_M, TARGETS
+from deploy.page.demo_camera import Camera as DemoCamera
+from deploy.page.from_loop import GIVEN, Beside, LoopFeed
+from deploy.page.pointing import borehole_at
+from deploy.page.shown import Wish
+from deploy.recorder import reading
+from deploy.recorder.capture import Capture, Log, Pictures
+
+MACHINE = option("machine", "brokk170")
+FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).frame(0, 12.0)
+PIXELS = 640 * 360
+
+
+def pose(x: float, y: float, std_m: float = 0.004, score: float = 0.9) -> HolePose:
+    center_m, cov = np.array([x, y, 0.75]), std_m**2 * np.eye(3)
+    return HolePose(center_m, np.array([0.0, 0.0, 1.0]), 0.05, cov, 1e-4 * np.eye(3), "base", score, 0.0)
+
+
+def seen_at(frame: Frame, center_m: Any) -> tuple[float, float]:
+    """Returns where in the picture a point of the base frame is, as parts of width and height."""
+    assert frame.base_from_camera is not None
+    from_base = np.linalg.inv(frame.base_from_camera)
+    u, v, w = frame.camera_matrix @ (from_base[:3, :3] @ center_m + from_base[:3, 3])
+    height, width = frame.depth_m.shape
+    return (u / w + 0.5) / width, (v / w + 0.5) / height
+
+
+@pytest.fixture
+def exchange() -> Iterator[Exchange]:
+    found = Exchange.new(MACHINE.num_joints, commands=False, frame_px=PIXELS)
+    yield found
+    found.close()
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda one: one.name)
+def test_a_click_into_a_borehole_gives_its_centre_though_its_mouth_has_no_depth(target: Any) -> None:
+    found = borehole_at(FRAME, *seen_at(FRAME, np.array(target.center_in_base_m)), target.radius_m)
+    assert found is not None
+    off_m = np.linalg.norm(found[0] - np.array(target.center_in_base_m))
+    assert off_m < 0.012 and 0.005 < found[1] < 0.05
+
+
+def test_a_click_at_the_sky_or_without_a_calibrated_camera_gives_none() -> None:
+    assert borehole_at(FRAME, 0.5, 0.01, 0.05) is None
+    x, y = seen_at(FRAME, np.array(TARGETS[0].center_in_base_m))
+    assert borehole_at(replace(FRAME, base_from_camera=None), x, y, 0.05) is None
+
+
+def test_a_frame_is_handed_on_whole_or_shrunk_with_its_camera(exchange: Exchange) -> None:
+    assert exchange.frame is not None and exchange.frame.peek("t_s") is None
+    eyes._publish(exchange.frame, FRAME, PIXELS, 5.0)
+    assert exchange.frame.peek("t_s") == 5.0 and exchange.frame.number == 1
+    whole = frame_of(exchange.frame.read())
+    assert np.array_equal(whole.color, FRAME.color) and np.array_equal(whole.depth_m, FRAME.depth_m, equal_nan=True)
+    eyes._publish(exchange.frame, FRAME, PIXELS // 4, 6.0)
+    small = frame_of(exchange.frame.read())
+    assert small.color.shape == (180, 320, 3) and exchange.frame.number == 2
+    center_m = np.array(TARGETS[0].center_in_base_m)
+    assert seen_at(small, center_m) == pytest.approx(seen_at(FRAME, center_m), abs=0.003)
+
+
+def test_boreholes_keep_their_names_are_averaged_by_variance_and_forgotten() -> None:
+    known = KnownHoles(10.0)
+    known.take([pose(2.6, 0.0, 0.004), pose(2.2, 0.4)], 1.0)
+    known.take([pose(2.2, 0.4), pose(2.61, 0.0, 0.008)], 2.0)
+    first, second = known.plain()
+    assert (first["name"], second["name"]) == (1, 2)
+    assert first["center_in_base_m"][0] == pytest.approx(2.6 + 0.01 / 5, abs=1e-4)  # four times the variance, a fifth of the weight
+    assert first["std_m"] == pytest.approx(0.004 * np.sqrt(0.8), abs=1e-5)
+    known.take([pose(2.6, 0.0)], 11.9)
+    assert [one["name"] for one in known.plain()] == [1, 2]
+    known.take([pose(2.9, -0.4)], 12.5)
+    assert [one["name"] for one in known.plain()] == [1, 3], "the second was not seen for more than 10 s"
+
+
+def test_a_base_that_moved_is_noticed_within_a_few_sightings() -> None:
+    known = KnownHoles(10.0)
+    for number in range(200):
+        known.take([pose(2.6, 0.0)], 0.1 * number)
+    for number in range(30):
+        known.take([pose(2.65, 0.0)], 20.0 + 0.1 * number)
+    assert known.plain()[0]["center_in_base_m"][0] > 2.645
+
+
+def show(exchange: Exchange, *poses: HolePose, now_s: float | None = None) -> None:
+    known = KnownHoles(10.0)
+    known.take(list(poses), time.monotonic() if now_s is None else now_s)
+    known.write(exchange.holes, time.monotonic())
+
+
+def aimed(exchange: Exchange) -> list[float]:
+    record = exchange.target.read()
+    assert record is not None
+    return [round(float(value), 4) for value in record["center_in_base_m"]]
+
+
+def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(exchange: Exchange, tmp_path: Path) -> None:
+    path = tmp_path / "target.json"
+    aim = Aim(File(path=str(path)).build(), exchange.target, exchange.holes)
+    aim.refresh()
+    assert exchange.target.read() is None
+    path.write_text('{"center_in_base_m": [2.6, 0.0, 0.75]}')
+    aim.refresh()
+    assert aimed(exchange) == [2.6, 0.0, 0.75]
+    show(exchange, pose(2.21, 0.4), pose(2.62, 0.01))
+    aim.refresh()
+    assert aimed(exchange) == [2.62, 0.01, 0.75], "the same borehole, as the camera sees it"
+    aim.choose(eyes_place(exchange, 0))
+    show(exchange, pose(2.2, 0.4))
+    aim.refresh()
+    assert aimed(exchange) == [2.2, 0.4, 0.75]
+    path.write_text('{"center_in_base_m": [3.0, 0.0, 0.750]}')
+    aim.refresh()
+    assert aimed(exchange) == [3.0, 0.0, 0.75], "the file spoke last"
+    path.write_text("[")
+    with pytest.raises(ConfigError, match="center_in_base_m"):
+        aim.refresh()
+
+
+def eyes_place(exchange: Exchange, row: int) -> Any:
+    from deploy.loop.target import holes_of, place_of
+
+    return place_of(holes_of(exchange.holes)[row])
+
+
+def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(exchange: Exchange) -> None:
+    aim = Aim(Given(center_in_base_m=(2.6, 0.0, 0.4)).build(), exchange.target, exchange.holes)
+    aim.refresh()
+    first = exchange.target.peek("t_s")
+    aim.refresh()
+    assert exchange.target.peek("t_s") > first
+    aim = Aim(Seen(score=0.5).build(), exchange.target, exchange.holes)
+    show(exchange, pose(2.6, 0.0, score=0.4))
+    aim.refresh()
+    assert aimed(exchange) == [2.6, 0.0, 0.4]
+    show(exchange, pose(2.2, 0.4, score=0.7), pose(2.9, 0.4, score=0.8))
+    aim.refresh()
+    show(exchange, pose(2.2, 0.4, score=0.95), pose(2.9, 0.4, score=0.6))
+    aim.refresh()
+    assert aimed(exchange) == [2.9, 0.4, 0.75], "it does not leap to another that looks surer for a moment"
+
+
+@pytest.fixture
+def feed(exchange: Exchange, tmp_path: Path) -> LoopFeed:
+    session = Session(out=str(tmp_path), seed=1, device="cpu")
+    return LoopFeed(
+        Beside(option("page", "local"), MACHINE, option("guidance", "machine"), session, 0.15, 0.15, 600.0, 1.0), exchange
+    )
+
+
+def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(exchange: Exchange, feed: LoopFeed, tmp_path: Path) -> None:
+    aim = Aim(File(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes)
+    wanted = Wanted(exchange, Recorder(exchange, tmp_path, lambda folder: None), aim, armed=False, commands=False)  # type: ignore[arg-type,return-value]
+    center_m = np.array(TARGETS[1].center_in_base_m)
+    point = Wish("point", "{:.4f},{:.4f}".format(*seen_at(FRAME, center_m)))
+    assert not feed.wish(point), "there is no picture yet"
+    assert exchange.frame is not None
+    eyes._publish(exchange.frame, FRAME, PIXELS, time.monotonic())
+    assert feed.wish(point)
+    wanted.refresh()
+    assert np.linalg.norm(np.array(aimed(exchange)) - center_m) < 0.012
+    shown = feed.shown()
+    assert [(one.name, one.chosen) for one in shown.targets] == [(GIVEN, True)]
+    assert next(one for one in shown.streams if one.name == "camera").age_s is not None
+    show(exchange, pose(2.95, -0.4), pose(2.25, 0.41))
+    wanted.refresh()
+    assert [(one.name, one.chosen) for one in feed.shown().targets] == [("1", False), ("2", True)], "perception knows it by now"
+    assert feed.wish(Wish("target", "1")) and not feed.wish(Wish("target", "9"))
+    wanted.refresh()
+    assert aimed(exchange) == [2.95, -0.4, 0.75]
+
+
+class Blinking:
+    """A source whose second frame cannot be used."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    num_frames = 3
+
+    def __enter__(self) -> Blinking:
+        return self
+
+    def __exit__(self, *exc: Any) -> None: ...
+
+    def build(self) -> Blinking:
+        return self
+
+    def read_latest(self) -> Frame | None:
+        self.count += 1
+        if self.count == 2:
+            raise FrameError("the lens is dirty")
+        return FRAME if self.count < 4 else None
+
+    def find(self, frame: Frame) -> None: ...
+
+    def look(self, frame: Frame) -> Any:
+        from brokk_rl.sight import Sighting
+
+        return Sighting([pose(2.6, 0.0)], [], [], None)
+
+
+def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recorded(exchange: Exchange) -> None:
+    source: Any = Blinking()
+    eyes.run(lambda: False, camera(source), exchange)
+    assert exchange.frame is not None and exchange.frame.number == 2
+    said = [json.loads(data[1:]) for data in exchange.sight_log.take()]
+    assert [one["topic"] for one in said] == ["holes"] * 2 and said[1]["holes"][0]["center_in_base_m"] == [2.6, 0.0, 0.75]
+
+
+def camera(source: Any) -> Camera:
+    return Camera(
+        source=source, finder=source, rate_hz=100.0, num_px=PIXELS, forget_s=10.0, stale_s=1.0, record_hz=1.0
+    )  # fmt: skip
+
+
+def test_pictures_are_recorded_as_often_as_asked_and_come_back(exchange: Exchange, tmp_path: Path) -> None:
+    import cv2
+
+    assert exchange.frame is not None
+    pictures = Pictures(exchange.frame, 2.0)
+    assert pictures.due() is None
+    with Log(Capture(tmp_path, "deploy:dbc/example_gateway.dbc", MACHINE, {}, 2.0)) as log:
+        for number in range(3):
+            eyes._publish(exchange.frame, FRAME, PIXELS, 100.0 + number)
+            if (picture := pictures.due()) is not None:
+                log.add_picture(*picture)
+    import base64
+
+    found = reading.read(tmp_path / "capture.mcap").messages["camera"]
+    assert [t_s for t_s, _ in found] == [100.0], "the other two came within half a second"
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(found[0][1]["data"]), np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(picture[..., ::-1].astype(int) - FRAME.color).mean() < 6
+    assert Pictures(exchange.frame, 0.0).due() is None and Pictures(None, 2.0).due() is None
