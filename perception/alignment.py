@@ -137,8 +137,7 @@ def aligned(
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(both.camera_matrix).T
     pixel = np.rint(v).astype(int).clip(0, allowed.shape[0] - 1), np.rint(u).astype(int).clip(0, allowed.shape[1] - 1)
     depth = frame.depth_m[pixel]
-    homogeneous = np.stack([u, v, np.ones_like(u)], -1)
-    radii = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", homogeneous, conic.form(ellipse), homogeneous) + 1.0, 0.0))
+    radii = conic.radii(ellipse, u, v)
     with np.errstate(invalid="ignore"):
         off = np.abs(1.0 / depth - rays @ face.m)
         on = allowed[pixel] & (off < 3.0 * face.sigma) & (radii > inner) & (radii < face.extent)
@@ -216,9 +215,8 @@ def disagreement(
     if not row.size:
         return float("nan")
     u, v = both.pixel(column, row)
-    place = np.stack([u, v, np.ones_like(u)], -1)
-    rays = place @ np.linalg.inv(both.camera_matrix).T
-    radii = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", place, conic.form(ellipse), place) + 1.0, 0.0))
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(both.camera_matrix).T
+    radii = conic.radii(ellipse, u, v)
     depth = depth_m[np.rint(v).astype(int).clip(0, len(depth_m) - 1), np.rint(u).astype(int).clip(0, depth_m.shape[1] - 1)]
     with np.errstate(invalid="ignore"):
         before = (1.0 / depth - rays @ face.m > 4 * face.sigma).astype(np.uint8)

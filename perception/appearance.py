@@ -47,7 +47,7 @@ def interior(
     part = gray[top:bottom, left:right].astype(np.float32)
     rows, columns = np.mgrid[top:bottom, left:right]
     place = np.stack([columns, rows, np.ones_like(rows)], -1).astype(float)
-    radii = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", place, conic.form(ellipse), place) + 1.0, 0.0))
+    radii = conic.radii(ellipse, columns, rows)
     inside, ring = radii < INSIDE, (radii > RING[0]) & (radii < RING[1])
     if inside.sum() < 8 or ring.sum() < 8:
         return Interior(np.nan, np.nan, np.nan, np.nan)

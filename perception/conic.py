@@ -23,12 +23,11 @@ def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     moved = np.where(weights[..., None] > 0, points - center[:, None], 0.0)
     scale = np.sqrt(np.einsum("cpk,cpk,cp->c", moved, moved, weights) / total) + 1e-12
     x, y = np.moveaxis(moved / scale[:, None, None], -1, 0)
-    square = np.stack([x * x, x * y, y * y], -1)
-    line = np.stack([x, y, np.ones_like(x)], -1)
-    heavy = square * weights[..., None]
-    s1 = np.einsum("cpi,cpj->cij", heavy, square)
-    s2 = np.einsum("cpi,cpj->cij", heavy, line)
-    s3 = np.einsum("cpi,cpj->cij", line * weights[..., None], line)
+    powers = np.empty((*x.shape, 6))
+    for k, power in enumerate((x * x, x * y, y * y, x, y, 1.0)):
+        powers[..., k] = power
+    scatter = (powers * weights[..., None]).transpose(0, 2, 1) @ powers
+    s1, s2, s3 = scatter[:, :3, :3], scatter[:, :3, 3:], scatter[:, 3:, 3:]
     known = ((weights > 0).sum(1) >= 6) & np.isfinite(s1).all((1, 2)) & (np.linalg.det(s3) > 1e-9)
     result = np.full((len(points), 5), np.nan)
     if not known.any():
@@ -116,6 +115,13 @@ def sample(ellipses: np.ndarray, angles_rad: np.ndarray) -> tuple[np.ndarray, np
     length = np.hypot(nu, nv)
     outward = np.stack([c * nu - s * nv, s * nu + c * nv], -1) / np.maximum(length, 1e-12)[..., None]
     return points, outward, length
+
+
+def radii(ellipse: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Returns how far places lie from an ellipse's centre in its own radii: 1 on it; shapes of `x` and `y`, which may differ."""
+    c, s = np.cos(ellipse[4]), np.sin(ellipse[4])
+    dx, dy = x - ellipse[0], y - ellipse[1]
+    return np.hypot((c * dx + s * dy) / ellipse[2], (c * dy - s * dx) / ellipse[3])
 
 
 def perimeter(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from perception.ellipse_support import ANGLES, NUM_SAMPLES, Candidates
 if TYPE_CHECKING:
     from perception.ellipse import ContourArcs
 
-NUM_SEEDS = 64
+NUM_SEEDS = 40
 """Points that stand for an arc in its first fit."""
 NOTHING = np.empty((0, 5))
 LEAST_ARC = 0.2
@@ -150,7 +150,7 @@ class ArcDetector:
             if not len(candidates.ellipses):
                 break
             e = candidates.ellipses
-            support, off, along = self._gather(candidates, edges, ANGLES)
+            support, off, along = self._gather(candidates, edges, ANGLES[:: 1 if scale_px == rounds_px[-1] else 2])
             size = np.sqrt(e[:, 2] * e[:, 3])
             slope = conic.slopes(e, edges.points[support]) * size[:, None]
             robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / 0.05) ** 2) ** 2

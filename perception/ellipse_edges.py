@@ -89,15 +89,15 @@ def find(
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma_px)
     gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0))
     magnitude = cv2.magnitude(gx, gy)
-    looked = magnitude[::2, ::2] if roi is None else magnitude[roi]
+    looked = magnitude[::2, ::2].ravel() if roi is None else magnitude[::2, ::2][roi[::2, ::2]]
     if not looked.size:
         return _none(gray.shape)
     median, upper = np.percentile(looked, (50.0, percentile))
     upper = max(float(upper), noise * float(median) / 1.18, 1.0)  # the median of a Rayleigh distribution is 1.18 sigma
-    whole = [np.clip(g * SCALE, -32000, 32000).astype(np.int16) for g in (gx, gy)]
+    whole = [cv2.addWeighted(g, SCALE, g, 0.0, 0.0, dtype=cv2.CV_16S) for g in (gx, gy)]
     canny = cv2.Canny(whole[0], whole[1], low * upper * SCALE, upper * SCALE, L2gradient=True)
     if roi is not None:
-        canny[~roi] = 0
+        canny = cv2.bitwise_and(canny, canny, mask=roi.view(np.uint8))
     canny[[0, -1]] = canny[:, [0, -1]] = 0
     contours = [c for c in cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0] if len(c) >= least]
     if not contours:

@@ -114,8 +114,7 @@ def support(
     step = max(1, int(np.sqrt(area / most)))
     rows, columns = np.mgrid[top:bottom:step, left:right:step]
     depth = depth_m[top:bottom:step, left:right:step]
-    value = np.einsum("...i,ij,...j->...", *_homogeneous(columns, rows, conic.form(ellipse)))
-    radii = np.sqrt(np.maximum(value + 1.0, 0.0))
+    radii = conic.radii(ellipse, columns, rows)
     good = (allowed[top:bottom:step, left:right:step] | (radii < certain)) & np.isfinite(depth) & (depth > 0)
     size = ellipse[2] / float(np.sqrt(camera_matrix[0, 0] * camera_matrix[1, 1]))
     lean = np.sqrt(max((ellipse[2] / ellipse[3]) ** 2 - 1.0, 0.0)) + LEAN
@@ -168,17 +167,15 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
 
 def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40) -> np.ndarray:
     """Returns the plane through three points that most points lie nearest to (least median of squares)."""
-    best, least = np.linalg.lstsq(rays, inverse, rcond=None)[0], np.inf
     judge = generator.integers(len(rays), size=min(len(rays), 400))
-    for triple in generator.integers(len(rays), size=(trials, 3)):
-        matrix = rays[triple]
-        if abs(np.linalg.det(matrix)) < 1e-9:
-            continue
-        m = np.linalg.solve(matrix, inverse[triple])
-        spread = float(np.median(np.abs(inverse[judge] - rays[judge] @ m)))
-        if spread < least:
-            best, least = m, spread
-    return best
+    triples = generator.integers(len(rays), size=(trials, 3))
+    triples = triples[np.abs(np.linalg.det(rays[triples])) > 1e-9]
+    if not len(triples):
+        return np.linalg.lstsq(rays, inverse, rcond=None)[0]
+    planes = np.linalg.solve(rays[triples], inverse[triples][..., None])[..., 0]
+    off = np.abs(inverse[judge, None] - rays[judge] @ planes.T)
+    middle = len(judge) // 2
+    return planes[np.argmin(np.partition(off, middle, axis=0)[middle])]
 
 
 def sandwich(slopes: np.ndarray, weight: np.ndarray, residual: np.ndarray, cell: np.ndarray) -> np.ndarray:
@@ -197,8 +194,3 @@ def sandwich(slopes: np.ndarray, weight: np.ndarray, residual: np.ndarray, cell:
     sums = np.column_stack([np.bincount(cell, push[:, k]) for k in range(3)])
     num = max(int(cell.max()) + 1, 4)
     return bread @ (sums.T @ sums) @ bread * num / (num - 3)
-
-
-def _homogeneous(columns: np.ndarray, rows: np.ndarray, form: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    place = np.stack([columns, rows, np.ones_like(rows)], -1).astype(float)
-    return place, form, place

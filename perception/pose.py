@@ -232,6 +232,5 @@ def inner_mean(picture: np.ndarray, row: np.ndarray) -> float:
     top, left = max(0, int(y - a)), max(0, int(x - a))
     part = picture[top : int(y + a) + 2, left : int(x + a) + 2]
     rows, columns = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
-    place = np.stack([columns, rows, np.ones_like(rows)], -1).astype(float)
-    inside = np.einsum("...i,ij,...j->...", place, conic.form(row), place) < 0.64 - 1.0
+    inside = conic.radii(row, columns, rows) < 0.8
     return float(part[inside].mean()) if inside.any() else 0.0

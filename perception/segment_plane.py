@@ -140,11 +140,13 @@ class PlaneSegmenter:
 
     def _refined(self, plane: np.ndarray, grid: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Returns the least-squares plane of the pixels that agree with `plane`."""
+        grid, inverse, known = grid[::2, ::2], inverse[::2, ::2], known[::2, ::2]
         for _ in range(2):
             inside = known & (np.abs(grid @ plane - inverse) < self._tolerance)
             if inside.sum() < 3:
                 break
-            plane = np.linalg.lstsq(grid[inside], inverse[inside], rcond=None)[0]
+            sight = grid[inside]
+            plane = np.linalg.solve(sight.T @ sight, sight.T @ inverse[inside])
         return plane
 
     def _faces(self, plane: np.ndarray, grid: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -241,7 +243,8 @@ def _filled(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
 
 def _extents(piece: np.ndarray, plane: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Returns the two extents in m that a rectangle with the piece's second moments would have."""
-    sight = grid[piece > 0]
+    sight = grid[::2, ::2][piece[::2, ::2] > 0]
     points = sight / np.maximum(sight @ plane, 1e-6)[:, None]
-    spread = np.linalg.eigvalsh(np.cov(points.T))[1:]  # the smallest is the plane's own thickness
+    away = points - points.mean(0)
+    spread = np.linalg.eigvalsh(away.T @ away / len(away))[1:]  # the smallest is the plane's own thickness
     return np.sqrt(12.0 * np.maximum(spread, 0.0))

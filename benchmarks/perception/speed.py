@@ -1,0 +1,84 @@
+"""How long a 1080p frame takes from picture and depth to holes, on some threads, without the network.
+
+    taskset -c 0,1 python benchmarks/perception/speed.py <out.json> --count 6 --threads 2
+
+Renders scenes of several conditions at 1 to 4 m, looks at each several times and takes the shortest: what else runs on the machine
+makes the others longer. Writes the milliseconds of each stage, and the processor's name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import hydra
+import numpy as np
+from hydra.utils import instantiate
+from rich.console import Console
+from rich.progress import track
+
+from brokk_rl.signals import Frame
+from perception.render.drawing import compose
+
+CONDITIONS, DISTANCES_M, TIMES = ("clean", "haze", "hidden"), (1.0, 2.0, 3.0, 4.0), 7
+STAGES = ("segment", "ellipse", "pose", "total")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--option", default="plane_conic")
+    parser.add_argument("--count", type=int, default=6, help="scenes of each condition and distance")
+    parser.add_argument("--threads", type=int, default=2)
+    given = parser.parse_args()
+    cv2.setNumThreads(given.threads)
+    observer = configured("perception", "mode=perceive", "perceive.input=.", f"perception={given.option}").build()
+    shortest = []
+    kinds = [(condition, distance_m) for condition in CONDITIONS for distance_m in DISTANCES_M]
+    for number, (condition, distance_m) in enumerate(track(kinds * given.count, transient=True)):
+        frame = rendered(condition, distance_m, number)
+        looks = []
+        for _ in range(TIMES):
+            start = time.perf_counter()
+            ms = observer.look(frame).ms
+            looks.append([ms.get(stage, 0.0) for stage in STAGES[:-1]] + [1000.0 * (time.perf_counter() - start)])
+        shortest.append(min(looks, key=lambda look: look[-1]))
+    table = {stage: {"median": float(np.median(ms)), "p95": float(np.percentile(ms, 95))}
+             for stage, ms in zip(STAGES, np.array(shortest).T, strict=True)}  # fmt: skip
+    told = {"option": given.option, "frames": len(shortest), "threads": given.threads, "processor": processor(),
+            "opencv": cv2.__version__, "ms": table}  # fmt: skip
+    given.out.write_text(json.dumps(told, indent=1) + "\n")
+    Console().print(told)
+
+
+def rendered(condition: str, distance_m: float, number: int) -> Frame:
+    """Returns a frame of a scene that is drawn for it."""
+    studio = configured("studio", "mode=render", f"scene={condition}", f"scene.sight.distance_m=[{distance_m},{distance_m}]")
+    generator = np.random.default_rng((7, number))
+    shot = studio.shot(compose(studio.scene, studio.rig, generator), generator)
+    return Frame(
+        color=shot.color, depth_m=shot.depth_m, camera_matrix=studio.rig.left.matrix, base_from_camera=studio.rig.base_from_camera,
+        t_s=0.0, right=shot.right, baseline_m=studio.rig.baseline_m,
+    )  # fmt: skip
+
+
+def configured(key: str, *overrides: str) -> Any:
+    """Returns one part of a mode's configuration, instantiated."""
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        return instantiate(hydra.compose("config", list(overrides))[key], _convert_="all")
+
+
+def processor() -> str:
+    """Returns what the processor calls itself."""
+    told = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    names = [line.split(":")[1].strip() for line in told.splitlines() if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+if __name__ == "__main__":
+    main()
