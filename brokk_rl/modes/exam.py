@@ -6,6 +6,9 @@ import dataclasses
 import json
 import logging
 import secrets
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -44,9 +47,10 @@ class Examination:
 
     Attributes:
         do: `make` cases into the run folder, `run` a candidate on them, ask the `oracle`, `score` the answers of one or several,
-            `calibrate` prices by the answers to development exams.
+            run and score all `baselines`, `calibrate` prices by the answers to development exams.
         folder: The exam that all but `make` are about: the folder that `make` left.
         candidate: Who answers.
+        baselines: Who answers for comparison, by name.
         workers: Cases answered, recorded or weighed at once.
         answers: What `score` compares: a name for each candidate, and the run folder with its answers. `calibrate`: answers of the
             diagnosis to one or several exams.
@@ -67,9 +71,10 @@ class Examination:
         salt: That salt, to make the cases of an opened exam again; `null` draws one.
     """
 
-    do: Literal["make", "run", "oracle", "score", "calibrate"]
+    do: Literal["make", "run", "oracle", "baselines", "score", "calibrate"]
     folder: str | None
     candidate: Candidate
+    baselines: dict[str, Candidate]
     workers: int
     answers: dict[str, str]
     oracle: ActuatorFit
@@ -112,7 +117,7 @@ class Exam:
         machine: The machine of all cases.
         excitation: What is played, by name; `exam.reference` and `exam.field` say in which file.
         exam: What to do.
-        resume: Run folder of an interrupted `exam.do=run` or `oracle` to go on with; the same as `session.out`.
+        resume: Run folder of an interrupted `exam.do=run`, `oracle` or `baselines` to go on with; the same as `session.out`.
     """
 
     session: Session
@@ -124,9 +129,9 @@ class Exam:
     def check(self) -> None:
         if self.resume is None:
             return
-        if Path(self.resume).resolve() != self.session.folder.resolve() or self.exam.do not in ("run", "oracle"):
+        if Path(self.resume).resolve() != self.session.folder.resolve() or self.exam.do not in ("run", "oracle", "baselines"):
             raise ConfigError(
-                f"resume={self.resume}: an interrupted exam.do=run or oracle goes on in its folder; add session.out={self.resume} "
+                f"resume={self.resume}: exam.do=run, oracle or baselines goes on in its own folder; add session.out={self.resume} "
                 "and give exam.do as before"
             )
 
@@ -204,17 +209,29 @@ class Exam:
         place, found = self.session.folder / ORACLE, {}
         if place.is_file():
             found = json.loads(place.read_text())  # of a run that was interrupted
-        with Progress(transient=True) as progress:
-            task = progress.add_task(f"{len(labels)} cases", total=len(labels))
-            for label in labels:
-                if label["case"] not in found:
-                    effects = {one["effect"]: one["joints"] for one in label["effects"]}
-                    case = self._folder / paper.CASES / label["case"]
-                    found[label["case"]] = oracle.closed_by(case, effects, self.exam.oracle, self.machine)
-                    write_json(place, found)
+        todo = [label for label in labels if label["case"] not in found]
+        job = partial(_closed_by, self._folder, self.exam.oracle, self.machine)
+        with Progress(transient=True) as progress, ProcessPoolExecutor(self.exam.workers) as pool:
+            task = progress.add_task(f"{len(labels)} cases", total=len(labels), completed=len(labels) - len(todo))
+            for label, share in zip(todo, pool.map(job, todo), strict=True):
+                found[label["case"]] = share
+                write_json(place, found)
                 progress.advance(task)
         shares = [share for share in found.values() if share is not None]
         log.info("the true effects close %.2f of the gap (median of %d cases with one)", np.median(shares or [0.0]), len(shares))
+
+    def _baselines(self) -> None:
+        """Has every baseline answer every case, each into `<name>/`, then scores them beside `exam.answers`."""
+        cases, settings = self._cases(), self.exam
+        usable = {name: one for name, one in settings.baselines.items() if getattr(one, "exam", "") is not None}
+        for name in settings.baselines.keys() - usable.keys():
+            log.warning("%s is left out: it learns from another exam, exam.baselines.%s.exam=<development exam>", name, name)
+        with Progress(transient=True) as progress:
+            for name, candidate in usable.items():
+                task = progress.add_task(name, total=len(cases))
+                folder = self.session.folder / name
+                sitting.sit(candidate, cases, folder, self.machine, settings.workers, partial(progress.advance, task))
+        self._scored(settings.answers | {name: str(self.session.folder / name) for name in usable})
 
     def _calibrate(self) -> None:
         """Opens the labels of development exams; writes `prices.yaml`, `certainty.yaml`; prints what answers were and would be."""
@@ -243,10 +260,13 @@ class Exam:
         return [name for name, trouble in self.exam.mix.troubles.items() if trouble.joints == "all"]
 
     def _score(self) -> None:
+        self._scored(self.exam.answers)
+
+    def _scored(self, answers: Mapping[str, str]) -> None:
         """Opens the labels; writes `marks.json`, `exam.html` and pictures, appends to the ledger, and prints the table."""
         labels = seal.opened(self._folder)
         facts = json.loads((self._folder / "exam.json").read_text())
-        tables = {name: self._table(Path(folder), labels["cases"]) for name, folder in self.exam.answers.items()}
+        tables = {name: self._table(Path(folder), labels["cases"]) for name, folder in answers.items()}
         write_json(self.session.folder / "marks.json", {"exam": facts, "candidates": tables})
         page.write(self.session.folder, facts, tables)
         if self.exam.ledger is not None:
@@ -267,6 +287,11 @@ class Exam:
         if all(mark.verdict == "failed" for mark in marks):
             raise RecordingError(f"exam.answers: {folder} holds no answer to any case of {self._folder}")
         return tally(marks)
+
+
+def _closed_by(folder: Path, fit: ActuatorFit, machine: Machine, label: Mapping[str, Any]) -> float | None:
+    effects = {one["effect"]: one["joints"] for one in label["effects"]}
+    return oracle.closed_by(folder / paper.CASES / label["case"], effects, fit, machine)
 
 
 def _show(tables: dict[str, dict[str, Any]]) -> None:

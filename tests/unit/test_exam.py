@@ -131,6 +131,14 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(exam: Path, brokk:
     assert line["candidate"] == "none" and line["labels_sha256"] == (exam / seal.HASH).read_text().split()[0]
 
 
+def test_baselines_sit_and_are_scored_by_one_command(exam: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+    about = ("mode=exam", "exam.do=baselines", f"exam.folder={exam}", "~exam.baselines.greedy", "~exam.baselines.bic")
+    done = brokk(*about, f"exam.baselines.trees.exam={exam}", "exam.baselines.trees.trees=20", f"session.out={tmp_path / 'b'}")
+    assert done.code == 0, done.err
+    marks = json.loads((tmp_path / "b" / "marks.json").read_text())["candidates"]
+    assert set(marks) == {"most_frequent", "trees"} and not any(table["failed"] for table in marks.values())
+
+
 def test_seeds_of_exams_need_to_be_sealed_and_those_of_development_not(brokk: Callable[..., Any], tmp_path: Path) -> None:
     for seed, sealed in ((1000, "false"), (1, "true")):
         done = brokk(*SMALL, f"session.seed={seed}", f"exam.sealed={sealed}", f"session.out={tmp_path / 'x'}")

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Protocol
 
@@ -99,7 +99,8 @@ def sit(
     todo = [case for case in cases if not (folder / case.name / FILE).is_file()]
     for _ in range(len(cases) - len(todo)):
         advance()
-    with ThreadPoolExecutor(workers) as pool:
+    is_alone = workers == 1 or isinstance(candidate, Command)  # a program has processes of its own
+    with ThreadPoolExecutor(workers) if is_alone else ProcessPoolExecutor(workers) as pool:
         pending = [pool.submit(_one, candidate, case, folder / case.name, machine) for case in todo]
         try:
             for done in as_completed(pending):

@@ -24,13 +24,13 @@ class Trees:
     """Classifies each joint of a case by its residual features; what is most probable on any joint is the answer.
 
     Attributes:
-        exam: Folder of the development exam it learns from, another than the one it sits.
+        exam: Folder of the development exam it learns from, another than the one it sits; it cannot do without.
         trees: Number of trees.
         least: Probability from which an effect is named.
         seed: Of the forest.
     """
 
-    exam: str
+    exam: str | None
     trees: int
     least: float
     seed: int
@@ -39,8 +39,10 @@ class Trees:
         """Writes the answer.
 
         Raises:
-            ConfigError: scikit-learn is missing, or the exam to learn from is sealed.
+            ConfigError: scikit-learn is missing, or the exam to learn from is not given or sealed.
         """
+        if self.exam is None:
+            raise ConfigError("exam_candidate=trees: expected exam.candidate.exam=<folder of a development exam>, to learn from")
         forest = _learned(Path(self.exam), self.trees, self.seed, _Key(machine))
         chances = forest.predict_proba(features.of_case(case, machine))  # (J, classes)
         out.mkdir(parents=True, exist_ok=True)
