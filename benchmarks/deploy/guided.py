@@ -1,7 +1,7 @@
-"""Insertion on the twin, guided and alone: python benchmarks/deploy/guided.py <folder> <trials> <at once> <person bundle>.
+"""Insertion on the twin, guided and alone: python benchmarks/deploy/guided.py <folder> <trials> <at once>.
 
 Each trial is `preset=bench` with real processes, in real time. `guided`: the default mode, nothing is sent, a simulated person
-moves the levers as they are shown. `alone`: the shipped policy commands the valves itself. Success is the strict one, from the
+moves the levers as the policy trained behind a person shows them. `alone`: the other shipped policy commands the valves itself. Success is the strict one, from the
 captured positions.
 """
 
@@ -27,7 +27,7 @@ PORT = 43300
 BROKK = (sys.executable, "-P", "-m", "brokk_rl")
 
 
-def main(folder: Path, trials: int, at_once: int, bundle: str) -> None:
+def main(folder: Path, trials: int, at_once: int) -> None:
     with hydra.initialize_config_module("conf", version_base="1.3"):
         cfg = hydra.compose("config", overrides=["mode=evaluate"])
     machine, task = instantiate(cfg.machine, _convert_="all"), instantiate(cfg.task, _convert_="all")
@@ -38,7 +38,7 @@ def main(folder: Path, trials: int, at_once: int, bundle: str) -> None:
         kind, n = job
         hole, q = starts["scene"][n, :3].tolist(), starts["q"][n].tolist()
         out = folder / f"{kind}_{n:03d}"
-        choice = ["bench=guided", f"deploy.policy={bundle}"] if kind == "guided" else ["deploy=auto"]
+        choice = ["bench=guided"] if kind == "guided" else ["deploy=auto"]
         command = [
             *BROKK, "preset=bench", *choice, f"link.start={q}", f"link.hole_in_base_m={hole}",
             f"target.center_in_base_m={hole}", f"bus.port={PORT + jobs.index(job)}", f"deploy.seconds={SECONDS[kind]}",
@@ -86,4 +86,4 @@ def judged(out: Path, machine: object, task: object, hole: np.ndarray) -> dict[s
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])
+    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
