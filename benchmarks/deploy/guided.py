@@ -1,8 +1,8 @@
 """Insertion on the twin, guided and alone: python benchmarks/deploy/guided.py <folder> <trials> <at once>.
 
 Each trial is `preset=bench` with real processes, in real time. `guided`: the default mode, nothing is sent, a simulated person
-moves the levers as the policy trained behind a person shows them. `alone`: the other shipped policy commands the valves itself. Success is the strict one, from the
-captured positions.
+moves the levers as the policy trained behind a person shows them. `alone`: the other shipped policy commands the valves itself.
+Success is the strict one, from the captured positions.
 """
 
 from __future__ import annotations
