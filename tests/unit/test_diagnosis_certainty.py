@@ -1,0 +1,103 @@
+"""What is left is traced to what it depends on; probabilities and intervals are as wide as answers were wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from composed import option
+
+from brokk_rl.diagnosis import certainty, remainder
+from brokk_rl.diagnosis.certainty import Certainty
+from brokk_rl.diagnosis.evidence import Evidence
+from brokk_rl.diagnosis.exam.calibration import Item, halves, logistic
+from brokk_rl.diagnosis.noise import Noise
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+
+
+@pytest.fixture
+def weights() -> Certainty:
+    return option("certainty", "default")
+
+
+def moving(machine: Machine, random: np.random.Generator, windows: int = 60, steps: int = 20) -> Evidence:
+    """Returns a simulator's motion in levels, whose errors have a noise of 1."""
+    full = machine.max_speed * machine.period_s * remainder.SPAN
+    way = np.repeat(random.uniform(-0.4, 0.4, (windows, steps // 5, machine.num_joints)), 5, 1) * full
+    middle, travel = (machine.lower + machine.upper) / 2, machine.upper - machine.lower
+    start = middle + random.uniform(-0.4, 0.4, (windows, machine.num_joints)) * travel
+    candidates = SimpleNamespace(machine=machine, running_s=np.linspace(0.0, 1800.0, windows))
+    white = {"whitened_joint": lambda columns, j: columns.reshape(-1, columns.shape[-1])}
+    return cast(Evidence, SimpleNamespace(way=way, start=start, candidates=candidates, **white))
+
+
+@pytest.mark.parametrize(
+    ("clue", "error"),
+    [
+        ("its position", lambda m: m.own * m.sides[0] * np.maximum(0.0, m.place.mean(0) - 0.6)),
+        ("the angle that the sensor reads", lambda m: np.diff(np.sin(6 * np.pi * m.place), axis=0)[0]),
+        ("the other joints", lambda m: np.maximum(m.share[..., 3], 0.0)),
+        ("running time", lambda m: m.own * m.time[-1]),
+        ("what it did before", lambda m: m.own * remainder._faded(np.minimum(m.work, 1.0), 0.94)),
+        (remainder.FORM, lambda m: np.sign(m.own) * np.maximum(np.abs(m.share[..., m.j]) - 0.2, 0.0)),
+    ],
+)
+def test_what_is_left_is_traced_to_what_it_depends_on(machine: Machine, clue: str, error: remainder.Callable) -> None:
+    random = np.random.default_rng(0)
+    evidence = moving(machine, random)
+    motion = remainder.Motion(evidence, 2)
+    column, own = error(motion).ravel(), motion.own.ravel()
+    column = column if clue == remainder.FORM else column - own * (own @ column) / (own @ own)  # another gain is form
+    z = random.standard_normal((machine.num_joints, column.size))
+    z[2] += 0.5 * column / column.std()
+    earned = remainder.predictable(evidence, z)
+    best = list(remainder.CLUES)[int(earned[:, 2].argmax())]
+    assert best == clue and earned[:, 2].max() > 30.0
+    assert np.delete(earned, 2, 1).max() < 6.0, "chance earns little on the other joints"
+
+
+def test_free_runs_stray_as_far_as_their_noise_says() -> None:
+    random, noise = np.random.default_rng(1), Noise(sensor=1e-3, change=0.03, wander=0.05, memory=12.0)
+    way = np.repeat(random.uniform(-0.05, 0.05, (1, 4)), 5, 1)
+    root = np.linalg.cholesky(noise.covariance(way)[0])
+    drawn = np.cumsum(random.standard_normal((20_000, way.shape[1])) @ root.T, 1)
+    np.testing.assert_allclose(noise.strayed(way)[0], drawn.var(0), rtol=0.06)
+
+
+def test_the_error_of_a_form_is_added_to_that_of_a_size() -> None:
+    low, size, high = certainty.widened(np.array([0.5 - 1.96 * 0.03, 0.5, 0.5 + 1.96 * 0.03]), 0.08)
+    assert size == 0.5 and high - size == pytest.approx(1.96 * 0.05) and size - low == pytest.approx(1.96 * 0.05)  # 3, 4, 5
+
+
+def test_weights_of_signs_are_those_that_made_the_truth() -> None:
+    random = np.random.default_rng(2)
+    signs = [{"constant": 1.0, "margin": m, "names": n} for m, n in random.standard_normal((6000, 2))]
+    true = [random.random() < certainty.chance({"constant": -1.0, "margin": 2.0, "names": 0.0}, one) for one in signs]
+    found = logistic(signs, true)
+    assert found == pytest.approx({"constant": -1.0, "margin": 2.0, "names": 0.0}, abs=0.15)
+
+
+def test_no_answer_is_surer_than_answers_can_tell(weights: Certainty) -> None:
+    sure = certainty.right(margin=1e6, adds=1.0, size=1.0, names=1, outside=-6.0)
+    assert certainty.chance({**weights.right, "margin": 5.0}, sure) == pytest.approx(1.0 / (1.0 + np.exp(-6.0)))
+
+
+def test_a_missing_or_unknown_sign_is_named(weights: Certainty) -> None:
+    with pytest.raises(ConfigError, match="expected a number for nearest"):
+        dataclasses.replace(weights, none={"constant": 0.0, "outside": 0.0})
+    with pytest.raises(ConfigError, match="'margins' is no sign"):
+        dataclasses.replace(weights, right={**weights.right, "margins": 0.0})
+
+
+def test_halves_to_fit_and_to_judge_share_no_family() -> None:
+    def item(effects: list[str], outside: str | None) -> Item:
+        return Item({"effects": [{"effect": e} for e in effects], "outside": {"ailment": outside} if outside else None}, {})
+
+    cases = [item(["lag"], None), item([], "fading"), item(["backlash", "lag"], None), item([], None), item([], None)] * 3
+    first, second = halves(cases)
+    assert len(first) + len(second) == len(cases)
+    assert {one.family for one in first} & {one.family for one in second} <= {"none"}
