@@ -136,6 +136,7 @@ def test_baselines_sit_and_are_scored_by_one_command(exam: Path, brokk: Callable
     done = brokk(*about, f"exam.baselines.trees.exam={exam}", "exam.baselines.trees.trees=20", f"session.out={tmp_path / 'b'}")
     assert done.code == 0, done.err
     marks = json.loads((tmp_path / "b" / "marks.json").read_text())["candidates"]
+    assert (tmp_path / "b" / "exam.md").read_text().startswith("|  | most_frequent | trees |\n| --- | --- | --- |\n| one effect: ")
     assert set(marks) == {"most_frequent", "trees"} and not any(table["failed"] for table in marks.values())
 
 

@@ -10,8 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from brokk_rl.report import DPI, MISSING, Cell, Page
+from brokk_rl.session import write_text
 
 PAGE = "exam.html"
+TABLE = "exam.md"
 ROWS = {
     "top1": ("one effect: named first, over classes", True),
     "top1_strictly": ("one effect: named first, strictly", True),
@@ -57,8 +59,17 @@ def rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
     return found
 
 
+def markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
+    """Returns the table of all candidates as Markdown, to be pasted where figures stand."""
+    lines = [["", *tables], ["---"] * (1 + len(tables))]
+    for words, *cells in rows(tables):
+        told = (cell if isinstance(cell, Cell) else Cell(cell) for cell in cells)
+        lines.append([str(words).strip(), *(f"{one.value} ({one.note})" if one.note else str(one.value) for one in told)])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
 def write(folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]) -> None:
-    """Writes `exam.html` and three pictures of each candidate: `confusion_<name>.png`, `reliability_…`, `size_…`."""
+    """Writes `exam.html`, its table as `exam.md`, and pictures of each candidate: `confusion_<name>.png`, `reliability_…`, `size_…`."""
     first = next(iter(tables.values()))
     kinds = ", ".join(f"{count} {kind}" for kind, count in first["cases"].items() if count)
     page = Page(
@@ -86,6 +97,7 @@ def write(folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[st
             page.table(["outside", "said"], said)
     page.facts({"labels, SHA-256": exam["labels_sha256"]})
     page.write(folder / PAGE)
+    write_text(folder / TABLE, markdown(tables))
 
 
 CAPTIONS = {
