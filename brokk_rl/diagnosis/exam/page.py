@@ -69,7 +69,7 @@ def markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def write(folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]) -> None:
-    """Writes `exam.html`, its table as `exam.md`, and pictures of each candidate: `confusion_<name>.png`, `reliability_…`, `size_…`."""
+    """Writes `exam.html`, its table `exam.md`, pictures of each candidate: `confusion_<name>.png`, `reliability_…`, `size_…`."""
     first = next(iter(tables.values()))
     kinds = ", ".join(f"{count} {kind}" for kind, count in first["cases"].items() if count)
     page = Page(
