@@ -85,7 +85,7 @@ def conductor(place: Path, arm: Arm) -> Conductor:
     """Returns who leads sittings of the study in `place`."""
     times = Times(countdown_s=1.0, settle_s=0.5, start_tolerance=0.05)
     words = Words("v1", TEXT)
-    return Conductor(place, arm.machine, arm, words, times, FACTS, lambda name: 7, arm.clock)
+    return Conductor(place, arm.machine, arm, words, times, FACTS, lambda name: 7, clock=arm.clock)
 
 
 def in_trial(lead: Conductor, arm: Arm, seconds: float = 3.0) -> None:

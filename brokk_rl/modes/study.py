@@ -1,4 +1,4 @@
-"""`brokk mode=study`: does guidance help people? Plans the study, simulates it, reports it, forgets who wants to be forgotten."""
+"""`brokk mode=study`: does guidance help people? Plans the study, leads people through it, simulates and reports it, forgets."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Steps(Protocol):
 
 @spec
 class Study:
-    """Studies whether guidance helps people: `study.do=plan`, `simulate` (operators are simulated), `report` or `erase`.
+    """Studies whether guidance helps people: `study.do=plan`, `run`, `simulate` (operators are simulated), `report` or `erase`.
 
     Attributes:
         session: Folder, seed, device.
@@ -39,5 +39,5 @@ class Study:
     unguided: Operator
 
     def run(self) -> float | None:
-        """Leaves `plan.{json,html}` or `report.html` with its pictures and tables in the run folder."""
+        """Leaves `plan.{json,html}`, or `report.html` with pictures and tables, in the run folder; sittings into `study.folder`."""
         return self.study.run(self.machine, self.session, self.ground, self.guided, self.unguided)

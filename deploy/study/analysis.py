@@ -126,8 +126,11 @@ def _measured(
     empty = MeasuredTrial(trial, dict.fromkeys((each.name for each in MEASURES), math.nan), np.zeros((0, 3)), counts)
     where = trial.get("hole")
     if not trial.get("recording") or not isinstance(where, dict):
-        remarks.append(Remark(name, "names no recording; only its outcome is known"))
+        why = f" ({trial['recording_problem']})" if trial.get("recording_problem") else ""
+        remarks.append(Remark(name, f"names no recording{why}; only its outcome is known"))
         return _outcome_only(empty)
+    if trial.get("recording_problem"):
+        remarks.append(Remark(name, f"{trial['recording_problem']}; it counts"))
     try:
         recording: Recording = record.read(folder / trial["recording"], machine)
         hole = Hole(center_in_base_m=tuple(where["center_in_base_m"]), radius_m=float(where["radius_m"]))

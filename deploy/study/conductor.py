@@ -52,6 +52,7 @@ class Conductor:
         times: Countdown and the like.
         facts: What every trial says of itself besides: `simulated`, `twin`.
         seed: From which the order of pairs comes: of participant and period.
+        operators: Who is simulated, by condition; empty where people take part.
         clock: Monotonic time, s.
     """
 
@@ -64,10 +65,11 @@ class Conductor:
         times: Times,
         facts: dict[str, Any],
         seed: Callable[[str], int],
+        operators: dict[str, str] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder, self._machine, self._stage, self._words, self._times = folder, machine, stage, words, times
-        self._facts, self._seed, self._clock = facts, seed, clock
+        self._facts, self._seed, self._operators, self._clock = facts, seed, operators or {}, clock
         self._data: StudyData = folders.read(folder)
         self._who: str | None = None
         self._step: Step | None = None
@@ -181,9 +183,10 @@ class Conductor:
         if step.trial is not None:
             hole = self._data.plan["design"]["holes"][step.trial.hole]
             start = np.array(self._data.plan["design"]["starts"][step.trial.start])
+            facts = self._facts | ({"operator": self._operators[step.condition]} if self._operators else {})
             self._attempt = Attempt(
                 self._folder, self._data.plan["design"], step.trial, hole, start, self._machine, self._stage, self._times,
-                self._facts, self._clock,
+                facts, self._clock,
             )  # fmt: skip
         elif step.kind == "questionnaire":
             seed = self._seed(f"pairs {self._who} {step.period}")

@@ -46,6 +46,7 @@ class Sitters:
         words: What the lab says to participants.
         times: Countdown and the like.
         facts: What every trial says of itself besides.
+        operators: Who is simulated, by condition; empty where people take part.
         target: File that says to the loop where the hole is.
         port: Where the twin can be put elsewhere; `None` on a machine.
     """
@@ -56,6 +57,7 @@ class Sitters:
     words: Words
     times: Times
     facts: dict[str, Any]
+    operators: dict[str, str]
     target: Path
     port: int | None
 
@@ -69,7 +71,9 @@ def run(stop: Stop, sitters: Sitters, exchange: Exchange) -> None:
     beside = sitters.beside
     stage = LoopStage(exchange, beside.machine, sitters.target, sitters.port)
     seed = beside.session.stream
-    conductor = Conductor(sitters.folder, beside.machine, stage, sitters.words, sitters.times, sitters.facts, seed)
+    conductor = Conductor(
+        sitters.folder, beside.machine, stage, sitters.words, sitters.times, sitters.facts, seed, sitters.operators
+    )
     if sitters.participant:
         conductor.choose(sitters.participant)
     link = beside.session.folder / LINK

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -26,7 +26,10 @@ FRESH_S = 0.3
 """Age of positions and advice from which they are not there."""
 CLOSING_S = 15.0
 """How long a capture may take to be closed before what is there is read."""
-LONGEST_GAP_S = 0.2
+GAP_S, LONGEST_GAP_S = 0.2, 1.0
+"""Silence of the bus in a trial from which it is said, and the longest that is filled in between its ends."""
+FILLED = "filled"
+"""Metadata of a recording that says so."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class Stage(Protocol):
 
     def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
         """Returns what was recorded in `folder` between two times, once the recording has been closed.
+
+        Where the bus was silent for a moment, positions go straight from one end of it to the other; the metadata `filled` says so.
 
         Raises:
             RecordingError: it cannot be used.
@@ -112,4 +117,8 @@ class LoopStage:
         path, patience_s = folder / MCAP, time.monotonic() + CLOSING_S
         while not (path.exists() and reading.is_whole(path)) and time.monotonic() < patience_s:
             time.sleep(0.2)
-        return CaptureLog(longest_gap_s=LONGEST_GAP_S, shortest_s=0.0).between(path, self._machine, begin_s, end_s)
+        try:
+            return CaptureLog(longest_gap_s=GAP_S, shortest_s=0.0).between(path, self._machine, begin_s, end_s)
+        except RecordingError:
+            found = CaptureLog(longest_gap_s=LONGEST_GAP_S, shortest_s=0.0).between(path, self._machine, begin_s, end_s)
+        return replace(found, metadata={**found.metadata, FILLED: f"silences of up to {LONGEST_GAP_S:g} s are filled in"})

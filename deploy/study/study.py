@@ -1,4 +1,4 @@
-"""The steps of a study, each one command: plan, simulate, report, erase."""
+"""The steps of a study, each one command: plan, run, simulate, report, erase."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from deploy.study.analysis import analyse
 from deploy.study.design import Design
 from deploy.study.practice import Practice, share_significant
 from deploy.study.simulation import NOTICE, Nowhere, simulate
+from deploy.study.sitting import Sitting
 
 log = logging.getLogger(__name__)
 
@@ -33,20 +34,22 @@ class Steps:
     """A study of guidance against no guidance.
 
     Attributes:
-        do: `plan`, `simulate`, `report` or `erase`.
+        do: `plan`, `run`, `simulate`, `report` or `erase`.
         folder: The study's folder; `null`: the run folder, where `plan` and `simulate` begin one.
-        participant: Whom to erase.
+        participant: Whom to erase, or whose sitting to begin with.
         design: What is planned with.
         practice: A fast model of people, from which the plan's errors are worked out.
         num_studies: How many studies are drawn from it.
+        sitting: How participants are led through it.
     """
 
-    do: Literal["plan", "simulate", "report", "erase"]
+    do: Literal["plan", "run", "simulate", "report", "erase"]
     folder: str | None
     participant: str | None
     design: Design
     practice: Practice
     num_studies: int
+    sitting: Sitting
 
     def run(self, machine: Machine, session: Session, ground: TrialGround, guided: Operator, unguided: Operator) -> None:
         """Does the step `do`; see `brokk_rl.modes.study.Steps`."""
@@ -54,9 +57,13 @@ class Steps:
             self._plan(machine, session)
         elif self.do == "erase":
             self._erase(session)
+        elif self.do == "run":
+            if self.folder is None:
+                raise ConfigError("study.do=run needs study.folder=<folder>: the study that study.do=plan has planned")
+            self.sitting.run(machine, session, Path(self.folder), self.participant)
         elif self.do == "simulate":
             if isinstance(ground, Nowhere):
-                raise ConfigError("study.do=simulate needs a simulator: ground=simulated")
+                raise ConfigError("study.do=simulate needs a simulator: ground=twin or ground=simulated")
             planned = self._plan(machine, session, is_simulated=True)
             simulate(self._home(session), self.design, planned, machine, session, ground, guided, unguided)
             self._report(machine, session)

@@ -19,7 +19,7 @@ from deploy.chain import tool
 from deploy.study import folder as folders
 from deploy.study.design import Hole, Success, Trial
 from deploy.study.measures import insertion
-from deploy.study.stage import Stage
+from deploy.study.stage import FILLED, Stage
 
 log = logging.getLogger(__name__)
 
@@ -203,6 +203,8 @@ class Attempt:
                 name = f"{folders.RECORDINGS}/{self._path.stem}.parquet"
                 record.write(self._told(found), self._folder / name)
                 changes["recording"] = name
+                if FILLED in found.metadata:
+                    changes["recording_problem"] = found.metadata[FILLED]
         except (BrokkError, OSError) as error:
             log.error("%s: %s", self._path.stem, error)
             changes["recording_problem"] = str(error)

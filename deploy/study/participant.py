@@ -1,0 +1,249 @@
+"""A simulated participant at the twin, in real time: a browser's connections, a remote on the bus, a person's hands between them.
+
+The participant sees what the page is sent and nothing else, presses what a person would press, and moves the remote's levers as the
+simulated operators of `conf/operator` do. Everything that comes of it is marked as simulated.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import math
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from websockets.asyncio.client import ClientConnection, connect
+
+from brokk_rl.contracts import Connection, Operator, OperatorModel, OperatorView
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from deploy.bus.description import Description
+from deploy.bus.wire import Wire
+from deploy.guidance import AXES, Guidance, LeverMap
+from deploy.loop.process import Pace, Stop
+from deploy.loop.records import Exchange
+from deploy.loop.supervisor import Companion
+from deploy.page.settings import LINK
+from deploy.study.simulation import answered
+from deploy.twin.gateway import axis_full_rad
+from deploy.twin.remote import Remote
+from deploy.twin.twin import TWIN_PRIORITY, Twin
+
+log = logging.getLogger(__name__)
+
+STARTING_S = 60.0
+"""How long the page may take to be there."""
+AGAIN_S = 2.0
+"""Time after which what was pressed without effect is pressed again."""
+
+
+@spec
+class Participant:
+    """The twin, and a simulated participant who does sittings at it from consent to questionnaire.
+
+    Attributes:
+        twin: The twin.
+        plant: The simulated machine behind it.
+        guidance: How the levers are shown.
+        guided: Whose hands and eyes these are in trials with advice.
+        unguided: In trials without.
+        sittings: How many participants of the plan come one after the other; `null`: all that have not finished.
+    """
+
+    twin: Twin
+    plant: Connection
+    guidance: Guidance
+    guided: Operator
+    unguided: Operator
+    sittings: int | None
+
+    @property
+    def operators(self) -> dict[str, str]:
+        """Who is at the levers, by condition."""
+        return {"guided": type(self.guided).__name__.lower(), "unguided": type(self.unguided).__name__.lower()}
+
+    def companions(self, machine: Machine, session: Session) -> list[Companion]:
+        """Returns the processes to run beside the loop."""
+        person = Person(self, machine, session.folder.resolve() / LINK, session.stream("study operators"))
+        return [
+            Companion("twin", "deploy.twin.twin:run", (self.twin, machine, self.plant, session), TWIN_PRIORITY),
+            Companion("participant", "deploy.study.participant:take_part", (person,), TWIN_PRIORITY),
+        ]
+
+
+@dataclass(frozen=True)
+class Person:
+    """What a participant's process is to do.
+
+    Attributes:
+        bench: Who it is.
+        machine: The machine.
+        link: File with the page's address.
+        seed: Who the persons of the plan are.
+    """
+
+    bench: Participant
+    machine: Machine
+    link: Path
+    seed: int
+
+
+def take_part(stop: Stop, person: Person, exchange: Exchange) -> None:
+    """Takes part until it is asked to stop; asks its parent to stop once all sittings are done."""
+    asyncio.run(_Taking(person).run(stop))
+
+
+class _Taking:
+    def __init__(self, person: Person) -> None:
+        bench, machine = person.bench, person.machine
+        self._person, self._bench, self._machine = person, bench, machine
+        levers = bench.guidance.levers or machine.levers
+        self._shown_map, self._own = LeverMap(levers, machine), LeverMap(machine.levers, machine)
+        self._shown_full = [
+            max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0) for axis in AXES
+        ]
+        self._shown: dict[str, Any] = {}
+        self._study: dict[str, Any] = {}
+        self._model: OperatorModel | None = None
+        self._left = math.inf if bench.sittings is None else bench.sittings
+        self._began_s, self._took_s = 0.0, list[float]()
+        self._finished = False
+
+    async def run(self, stop: Stop) -> None:
+        host, token = await self._address(stop)
+        async with (
+            connect(f"ws://{host}/state", proxy=None, close_timeout=0.5) as state,
+            connect(f"ws://{host}/study", origin=f"http://{host}", proxy=None, close_timeout=0.5) as study,  # type: ignore[arg-type]
+        ):
+            await study.send(json.dumps({"token": token}))
+            tasks = [asyncio.create_task(self._look(state)), asyncio.create_task(self._press(study))]
+            try:
+                await self._hold(stop, self._bench.twin.wire, tasks)
+            finally:
+                for task in tasks:
+                    task.cancel()
+
+    async def _address(self, stop: Stop) -> tuple[str, str]:
+        end_s = time.monotonic() + STARTING_S
+        while not self._person.link.exists() and not stop():
+            if time.monotonic() > end_s:
+                raise TimeoutError(f"no page after {STARTING_S:g} s ({self._person.link})")
+            await asyncio.sleep(0.2)
+        host, _, token = self._person.link.read_text().strip().removeprefix("http://").partition("/#token=")
+        return host, token
+
+    async def _look(self, state: ClientConnection) -> None:
+        """Sees what the page is sent, and says that it is drawn."""
+        async for text in state:
+            said, now_ms = json.loads(text), 1000 * time.monotonic()
+            self._shown = said["shown"]
+            await state.send(json.dumps([said["number"], now_ms, now_ms, now_ms]))
+
+    async def _press(self, study: ClientConnection) -> None:
+        """Presses what a person would press next."""
+        pressed, pressed_s = list[Any](), 0.0
+        async for text in study:
+            said = json.loads(text)
+            if "study" not in said:
+                continue
+            shown = self._study = said["study"]
+            if shown.get("phase") == "ready" and not self._ready(shown):
+                continue
+            screen = [shown.get(key) for key in ("kind", "who", "period", "phase", "number", "done")]
+            if screen != pressed or time.monotonic() - pressed_s > AGAIN_S:  # each screen is answered once, or once more if need be
+                pressed, pressed_s = screen, time.monotonic()
+                for one in self._presses(shown):
+                    await study.send(json.dumps(one))
+
+    def _presses(self, study: dict[str, Any]) -> list[dict[str, Any]]:
+        kind, phase = study["kind"], study.get("phase")
+        if kind == "choose":
+            waiting = [one["name"] for one in study["participants"] if one["state"] in ("new", "begun")]
+            if waiting and self._left > 0:
+                return [{"do": "choose", "who": waiting[0]}]
+            self._end()
+        elif kind in ("done", "stopped"):
+            self._left -= 1
+            return [{"do": "leave"}]
+        elif kind == "consent":
+            return [{"do": "consent", "agreed": True, "language": "en"}]
+        elif kind == "trial" and phase == "ready":
+            return [{"do": "begin"}]
+        elif kind == "trial" and phase == "over":
+            self._took_s.append(float(study["seconds"]))
+            return [{"do": "next"}]
+        elif kind == "questionnaire" and study["at"] < study["last"]:
+            return self._answers(study)
+        return []
+
+    def _ready(self, study: dict[str, Any]) -> bool:
+        there = bool(study["joints"]) and all(joint["there"] for joint in study["joints"])
+        return there and (study["condition"] == "unguided" or study["advised"] == "valid")
+
+    def _answers(self, study: dict[str, Any]) -> list[dict[str, Any]]:
+        """Returns a whole questionnaire, made up from how long the trials took."""
+        generator = np.random.default_rng((self._person.seed, self._number, study["period"]))
+        made = answered(float(np.mean(self._took_s or [0.0])) / 100.0, 0.0, generator)
+        chosen = {frozenset(answer["pair"]): answer["chosen"] for answer in made["pairs"]}
+        self._took_s.clear()
+        found = [{"do": "rate", "scale": scale, "value": value} for scale, value in made["ratings"].items()]
+        found += [{"do": "pair", "pair": i, "chosen": chosen[frozenset(pair)]} for i, pair in enumerate(study["pairs"])]
+        return [*found, {"do": "to", "to": study["last"]}, {"do": "finish"}]
+
+    @property
+    def _number(self) -> int:
+        """Number of the participant whose sitting it is."""
+        return int("".join(filter(str.isdigit, self._study.get("who") or "0")))
+
+    async def _hold(self, stop: Stop, wire: Wire, tasks: list[asyncio.Task[None]]) -> None:
+        """Holds the remote, dead-man pressed."""
+        remote = Remote(Description(self._bench.twin.dbc, self._machine))
+        remote.deadman = True
+        every, pace, cycle, full_rad = (
+            round(self._machine.period_s / remote.period_s),
+            Pace(remote.period_s),
+            0,
+            axis_full_rad(self._machine),
+        )
+        with wire.open([]) as bus:
+            while not stop() and not any(task.done() for task in tasks):
+                await asyncio.sleep(max(0.0, pace.next_s - time.monotonic()))
+                pace.begin()
+                if cycle % every == 0:
+                    angles_rad, remote.button_right = self._own.levers(self._given())
+                    remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
+                cycle += 1
+                bus.send(remote.frame())
+
+    def _given(self) -> np.ndarray:
+        """Returns what the hands give in the coming period, `(J,)`; nothing but in a trial."""
+        shown, study, num = self._shown, self._study, self._machine.num_joints
+        if study.get("phase") != "running" or shown.get("q") is None or not shown.get("targets"):
+            self._model = None
+            return np.zeros(num)
+        if self._model is None:
+            operator = self._bench.guided if study["condition"] == "guided" else self._bench.unguided
+            self._model = operator.build(self._machine, np.array([self._number - 1]), self._person.seed)
+        rim = np.array(shown["targets"][0]["center_in_base_m"])
+        view = OperatorView(q=np.array(shown["q"])[None], rim_in_base_m=rim[None], advice=self._advice(shown)[None])
+        return self._model.step(view)[0]
+
+    def _advice(self, shown: dict[str, Any]) -> np.ndarray:
+        advice = shown.get("advice")
+        if advice is None:
+            return np.full(self._machine.num_joints, np.nan)
+        parts = np.array([advice["levers"][f"{side}_{axis}"] for side, axis in AXES])
+        return self._shown_map.command(parts * np.array(self._shown_full), advice["levers"]["button_right"])
+
+    def _end(self) -> None:
+        if not self._finished:
+            log.info("all sittings are done")
+            os.kill(os.getppid(), signal.SIGINT)  # as the experimenter would
+        self._finished = True

@@ -1,0 +1,96 @@
+"""`study.do=run`: the loop with the study's room beside it, on the machine or with a twin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from deploy.loop.supervisor import Companion, Loop
+from deploy.loop.target import File
+from deploy.page.from_loop import Beside
+from deploy.page.settings import OperatorPage
+from deploy.study import folder as folders
+from deploy.study.conductor import Words
+from deploy.study.participant import Participant
+from deploy.study.room import Sitters
+from deploy.study.trial import Times
+from deploy.twin.bench import Bench
+
+TARGET = "target.json"
+"""File in the run folder that says to the loop where the hole is."""
+
+
+@spec
+class Consent:
+    """What participants agree to; a lab puts its own in its place.
+
+    Attributes:
+        version: Kept with each consent.
+        text: Paragraphs by language, `en` and `de`.
+    """
+
+    version: str
+    text: dict[str, tuple[str, ...]]
+
+    def check(self) -> None:
+        if missing := {"en", "de"} - set(self.text):
+            raise ConfigError(f"study.sitting.consent.text: no text in {', '.join(sorted(missing))}")
+
+
+@spec
+class Sitting:
+    """How participants are led through a study.
+
+    Attributes:
+        loop: The loop on the machine's computer; listens, shows, records.
+        bench: The twin, and a simulated participant, in place of machine and person; `null` on a machine.
+        page: The operator's page.
+        consent: What is agreed to.
+        times: How a trial begins and ends.
+    """
+
+    loop: Loop
+    bench: Bench | Participant | None
+    page: OperatorPage
+    consent: Consent
+    times: Times
+
+    def check(self) -> None:
+        if self.loop.commands:
+            raise ConfigError("study.do=run: in a study people move the machine; deploy=listen, not deploy=auto")
+        if isinstance(self.bench, Bench) and self.bench.operator is not None:
+            raise ConfigError("study.do=run: that operator follows advice that is not shown; bench=participant, or bench=twin")
+
+    def run(self, machine: Machine, session: Session, folder: Path, participant: str | None) -> None:
+        """Leads sittings until a person stops the program.
+
+        Raises:
+            ConfigError: the folder holds no study of this machine, or the plan has no such participant.
+        """
+        data = folders.read(folder)
+        machine.check_fingerprint(data.plan["fingerprint"], f"the study in {folder}")
+        if participant is not None and participant not in data.plan["participants"]:
+            raise ConfigError(f"study.participant={participant}: the plan has {', '.join(data.plan['participants'])}")
+        target = session.folder / TARGET
+        loop = replace(self.loop, page=None, record=False, show=False, target=File(path=str(target)))
+        limits, operators = loop.limits, self.bench.operators if isinstance(self.bench, Participant) else {}
+        room = Sitters(
+            beside=Beside(
+                self.page, machine, loop.guidance, session, limits.joints_s, limits.levers_s, loop.target_s,
+                loop.camera.stale_s if loop.camera else None,
+            ),
+            folder=folder.resolve(),
+            participant=participant,
+            words=Words(self.consent.version, self.consent.text),
+            times=self.times,
+            facts={"simulated": bool(operators), "twin": self.bench is not None, "run": session.folder.name},
+            operators=operators,
+            target=target,
+            port=self.bench.twin.fault_port if self.bench else None,
+        )  # fmt: skip
+        beside = self.bench.companions(machine, session) if self.bench else []
+        loop.run(machine, session, [*beside, Companion("study", "deploy.study.room:run", (room,), None)])
