@@ -69,6 +69,7 @@ class Station:
         self._description = Description(setting.dbc, setting.machine)
         self._receiver = Receiver(self._description, setting.machine, setting.limits)
         self._guard = Guard(setting.limits, self._receiver.body)
+        self._gap_s = setting.limits.gap_s
         self._bus: OpenWire | OpenReplay | None = None
         self._was_down, self._reopen_s = False, 0.0
         self._log: list[bytes] = []
@@ -87,6 +88,10 @@ class Station:
 
     def _receive(self) -> None:
         """Takes frames until the deadline."""
+        if self._bus is not None and (stood_s := time.monotonic() - self._pace.next_s) > self._gap_s:
+            log.warning("time stood still for %.1f s; what was said meanwhile is dropped", stood_s)
+            self._bus.close()
+            self._bus = None
         if self._bus is None and time.monotonic() >= self._reopen_s:
             self._open()
         if self._bus is None:

@@ -90,10 +90,6 @@ class Faults:
         """Returns how long ago a fault was asked for."""
         return now_s - self._since_s.get(fault, now_s)
 
-    def counter(self, message: str, counter: int, now_s: float) -> int:
-        """Returns the counter to send."""
-        return 7 if self.on("freeze_counter", message, now_s) else counter
-
     def pass_on(self, layout: Layout, frame: Wired, now_s: float) -> list[Wired]:
         """Returns what is to be sent now in place of `frame`."""
         name = layout.name

@@ -40,11 +40,11 @@ class Remote:
         self.on = True
         self._counter = 0
 
-    def frame(self) -> Wired:
-        """Returns the next message."""
+    def frame(self, frozen: int | None = None) -> Wired:
+        """Returns the next message; `frozen` is a counter that stands still, a fault."""
         values: dict[str, float] = {f"Lever_{axis}": value for axis, value in zip(LEVER_AXES, self.levers, strict=True)}
         values |= {"ButtonRight": self.button_right, "DeadMan": self.deadman, "RemoteOn": self.on}
-        self._counter += 1
+        self._counter = self._counter + 1 if frozen is None else frozen
         return Wired(
             self._layout.frame_id, self._description.encode(self._layout.name, values, self._counter), self._layout.extended
         )

@@ -34,6 +34,8 @@ PRESS_S = 1.0
 HEADER = "gateway.h"
 TWIN_PRIORITY = 45
 """Below bus and policy: the loop must not look better or worse for the company it has on a desk."""
+FROZEN = 7
+"""Counter that stands still."""
 FLOOD = 30
 """Frames a cycle of a babbling node."""
 
@@ -202,7 +204,7 @@ class Running:
         remote.deadman = held
         remote.on = not faults.on("remote_off", "", now_s)
         remote.levers = (0.5 if faults.on("lever", "", now_s) else 0.0, 0.0, 0.0, 0.0)
-        frame = remote.frame()
+        frame = remote.frame(FROZEN if faults.on("freeze_counter", layout.name, now_s) else None)
         self._gateway.take(frame, now_s)
         for one in faults.pass_on(layout, frame, now_s):
             self._bus.send(one)
@@ -214,7 +216,7 @@ class Running:
             return
         self._due_s[name] = max(due_s, now_s - layout.period_s) + layout.period_s
         counter = self._counters[name] = self._counters.get(name, -1) + 1
-        data = self._description.encode(name, values, self._faults.counter(name, counter, now_s))
+        data = self._description.encode(name, values, FROZEN if self._faults.on("freeze_counter", name, now_s) else counter)
         for one in self._faults.pass_on(layout, Wired(layout.frame_id, data, layout.extended), now_s):
             self._bus.send(one)
 

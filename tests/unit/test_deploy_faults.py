@@ -1,0 +1,201 @@
+"""The fault catalogue against every mode: what must stop the machine, what takes the advice away, and what nobody notices.
+
+On a stage with a clock of its own; `test_deploy_processes.py` and `benchmarks/deploy/reactions.py` do the same with real processes.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from stage import DBC, Mode, Stage
+
+from brokk_rl.errors import StorageError
+from brokk_rl.machine import Machine
+from deploy.loop.records import Exchange
+from deploy.recorder import reading
+from deploy.recorder.capture import MCAP, Capture, Log
+from deploy.recorder.capture import run as record
+
+MODES = get_args(Mode)
+COMMANDING = ("collect", "auto")
+
+
+@pytest.fixture(scope="module")
+def stages(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stage]]:
+    found = {mode: Stage(machine, mode, tmp_path_factory.mktemp(mode)) for mode in MODES}
+    yield found
+    for stage in found.values():
+        stage.close()
+
+
+MESSAGES = ("JointPos1", "JointPos2", "LeverState", "MachineStatus", "ValveFeedback")
+LOST, UNTRUSTED, UNLIKELY, AT_ONCE = 0.15, 0.1, 0.04, 0.02
+STOPS: list[tuple[str, str, float]] = [
+    *((fault, message, LOST) for fault in ("drop", "wrong_id") for message in MESSAGES[:4]),
+    *((fault, message, UNTRUSTED) for fault in ("corrupt", "short", "masquerade", "freeze_counter") for message in MESSAGES),
+    ("delay", "JointPos1", LOST), ("delay", "JointPos2", LOST), ("delay", "LeverState", LOST), ("silent", "", LOST),
+    ("jump", "", UNLIKELY), ("out_of_range", "", UNLIKELY), ("sign", "", UNLIKELY), ("invalid", "", AT_ONCE),
+    ("estop", "", AT_ONCE), ("deadman_released", "", AT_ONCE), ("remote_off", "", AT_ONCE), ("second_sender", "", AT_ONCE),
+]  # fmt: skip
+"""Faults that end a motion, and within which time."""
+HARMLESS = [(fault, message) for fault in ("drop_some", "duplicate", "reorder") for message in MESSAGES] + [("flood", "")]
+"""Faults that are borne, or end in zero; what is wrong is never used."""
+OPERATORS = {"deadman_released", "estop", "remote_off", "second_sender", "lever"}
+"""Faults that say nothing against the positions: an advice goes on."""
+
+
+def against(rows: list[Any], *modes: str) -> list[Any]:
+    """Returns all rows against all modes; those of the first mode, each fault with one message, are for the normal suite."""
+    found, seen = [], set()
+    for mode in modes:
+        for row in rows:
+            found.append(pytest.param(mode, *row, marks=[pytest.mark.slow] * (row[0] in seen)))
+            seen.add(row[0])
+    return found
+
+
+@pytest.mark.parametrize(("mode", "fault", "message", "limit_s"), against(STOPS, *COMMANDING))
+def test_what_must_stop_the_machine_stops_it_in_time_and_for_good(
+    stages: dict[str, Stage], mode: str, fault: str, message: str, limit_s: float
+) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    stage.fault(fault, message)
+    assert stage.stops_within_s() <= limit_s + 0.011  # the twin takes a fault up in its next cycle
+    safety = stage.view.safety
+    assert safety is not None and (safety.state == "LATCHED" or fault == "deadman_released") and not any(safety.sent)
+    stage.fault("none")
+    stage.go(0.3)
+    if fault != "deadman_released":
+        assert not stage.moves, "nothing moves again before somebody has released the dead-man and pressed it"
+
+
+@pytest.mark.parametrize(("mode", "fault", "message", "limit_s"), against(STOPS, "listen"))
+def test_what_speaks_against_the_positions_takes_the_advice_away_and_nothing_is_ever_sent(
+    stages: dict[str, Stage], mode: str, fault: str, message: str, limit_s: float
+) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    stage.fault(fault, message)
+    stage.go(limit_s + 0.061)  # the policy's period
+    elsewhere = message in ("LeverState", "MachineStatus", "ValveFeedback") and fault in ("drop", "wrong_id", "delay")
+    assert stage.advised == (fault in OPERATORS or elsewhere)
+    assert not stage.air.sent
+
+
+@pytest.mark.parametrize(("mode", "fault", "message"), against(HARMLESS, *MODES))
+def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero(
+    stages: dict[str, Stage], mode: str, fault: str, message: str
+) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    stage.fault(fault, message)
+    stage.go(0.5)
+    seen = stage.view
+    assert seen.safety is not None and seen.safety.plausible
+    assert stage.moves or seen.safety.state in ("LATCHED", "SILENT")
+    assert mode != "listen" or not stage.air.sent
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_operators_lever_always_wins(stages: dict[str, Stage], mode: str) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    stage.fault("lever")
+    stage.go(0.1)
+    safety = stage.view.safety
+    assert stage.twin._flow[3] > 0.4 and safety is not None and not any(safety.sent)
+    assert safety.state == ("SILENT" if mode == "listen" else "LATCHED")
+
+
+@pytest.mark.parametrize("mode", COMMANDING)
+@pytest.mark.parametrize("seconds", [0.3, 5.0, 3600.0 / 20])
+def test_a_process_that_stood_still_moves_nothing_when_it_wakes_up(stages: dict[str, Stage], mode: str, seconds: float) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    begun_ms = stage.ms
+    stage.pause(seconds)
+    assert stage.stopped_ms is not None and (stage.stopped_ms - begun_ms) / 1e3 <= 0.1, "the gateway waits for nobody"
+    stage.go(0.5)
+    safety = stage.view.safety
+    assert not stage.moves and safety is not None and safety.state in ("LATCHED", "READY")
+
+
+@pytest.mark.parametrize("mode", COMMANDING)
+def test_a_bus_that_goes_down_is_zero_and_begins_anew(stages: dict[str, Stage], mode: str) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    stage.air.broken = True
+    assert stage.stops_within_s() <= 0.1
+    safety = stage.view.safety
+    assert safety is not None and not safety.bus_up and safety.state == "LATCHED"
+    stage.air.broken = False
+    stage.go(0.6)
+    assert not stage.moves and stage.view.safety is not None and stage.view.safety.bus_up
+
+
+def test_a_policy_that_dies_is_slow_or_talks_nonsense_stops_the_machine(stages: dict[str, Stage]) -> None:
+    stage = stages["collect"]
+    for change, limit_s in (
+        ({"request_s": 60.0}, 0.17), ({"request_s": 0.4}, 0.22), ({"wanted": (float("nan"), 0, 0, 0, 0)}, 0.07),
+        ({"wanted": (0.3, 0, 1.2, 0, 0)}, 0.07), ({"wanted": (0.3, 0.3, 0, 0, 0)}, 0.07),
+    ):  # fmt: skip
+        stage.get_going()
+        for name, value in change.items():
+            setattr(stage, name, value)
+        assert stage.stops_within_s() <= limit_s
+        assert stage.view.safety is not None and stage.view.safety.state == "LATCHED"
+
+
+@pytest.mark.parametrize("mode", COMMANDING)
+def test_a_bus_on_which_one_hears_oneself_changes_nothing(stages: dict[str, Stage], mode: str) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    stage.air.echo = True
+    stage.go(0.5)
+    assert stage.moves
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("hours", [1.0, -1.0])
+def test_a_wall_clock_that_is_moved_by_an_hour_changes_nothing(
+    stages: dict[str, Stage], mode: str, hours: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() + 3600.0 * hours)
+    stage.go(0.5)
+    assert stage.moves if mode != "listen" else stage.advised
+
+
+def test_a_full_disk_ends_the_log_says_so_and_leaves_what_was_written(
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exchange, capture = Exchange.new(machine.num_joints, commands=False), Capture(tmp_path, DBC, machine, {"source": "test"}, 0.0)
+    sync, flush, count = os.fsync, Log.flush, [0]
+
+    def full(file: int) -> None:
+        count[0] += 1
+        if count[0] > 2:  # both files once
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(file)
+
+    def often(self: Log) -> None:
+        exchange.policy_log.put(b'J{"topic": "advice", "t_s": 1.0}')
+        flush(self)
+
+    exchange.policy_log.put(b'J{"topic": "advice", "t_s": 0.5}')
+    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(Log, "flush", often)
+    monkeypatch.setattr("deploy.recorder.capture.FLUSH_S", 0.0)
+    with pytest.raises(StorageError, match=r"No space left.*nothing more is recorded"):
+        record(lambda: False, capture, exchange)
+    assert reading.read(tmp_path / MCAP).messages["advice"][0][0] == 0.5
+    exchange.close()
