@@ -6,12 +6,12 @@ Axes: `J` joints, `E` entries (increments of all windows, over the simulator's n
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from brokk_rl.diagnosis import around, frames, remainder, sensors, tool
+from brokk_rl.diagnosis import around, frames, holding, library, remainder, sensors, tool
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.evidence import Evidence, Ray, rays
 from brokk_rl.diagnosis.found import Found
@@ -122,7 +122,12 @@ class Search:
         evidence = _adjusted(self.base.field.evidence, [*on_sensors, *on_tool.found])
         grown, shapes = self._simulated(evidence, tool.is_tracked(self.case.field, self.case.machine))
         known = Nulls(
-            self.base, {name: rays(ways[0].kind, SMALL) for name, ways in grown.items()}, grown, plain_joints(evidence), shapes
+            self.base,
+            {name: rays(ways[0].kind, SMALL) for name, ways in grown.items()},
+            grown,
+            plain_joints(evidence),
+            shapes,
+            self.shared,
         )
 
         def price(j: int, subset: frozenset[str]) -> float:
@@ -162,7 +167,7 @@ class Search:
     @property
     def shared(self) -> frozenset[str]:
         """Effects with one cause for all joints."""
-        return shared(self.kinds)
+        return library.shared(self.kinds)
 
     def _simulated(self, evidence: Evidence, tracked: bool) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
         """Returns the rays of each effect that free runs can show, and what it does to each joint."""
@@ -190,8 +195,17 @@ class Search:
         self.tell("the same on the reference", 0.7)
         prices = self.prices
         chosen = choose(tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint)
+        repaired = self._repaired(evidence, grown, tables, chosen)
+        if repaired and (kept := holding.kept(evidence, chosen, repaired, price, scatter, self.shared)) != chosen.subsets:
+            chosen = Chosen(kept, chosen.worth)
+            repaired = self._repaired(evidence, grown, tables, chosen)
+        return tables, chosen, repaired
+
+    def _repaired(
+        self, evidence: Evidence, grown: Mapping[str, list[Ray]], tables: Sequence[Table], chosen: Chosen
+    ) -> Repair | None:
         start = [table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)]
-        return tables, chosen, repair(evidence, chosen.subsets, grown, start) if chosen.names else None
+        return repair(evidence, chosen.subsets, grown, start) if chosen.names else None
 
     def _tables(
         self,
@@ -260,11 +274,6 @@ class Search:
         own = remainder.strayed(evidence, evidence.error_of(repaired.after - mean) if repaired else evidence.error)
         nulls = [remainder.strayed(one.evidence, one.evidence.error) for one in self.base.nulls]
         return np.sqrt(own / np.maximum(np.mean(nulls, 0), 1e-9)) if nulls else np.ones_like(own)
-
-
-def shared(kinds: Iterable[Kind]) -> frozenset[str]:
-    """Returns the effects with one cause for all joints."""
-    return frozenset(kind.name for kind in kinds if getattr(kind.target, "shared", False))
 
 
 def _promised(tables: Sequence[Table], chosen: Chosen) -> float:

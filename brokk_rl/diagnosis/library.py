@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -125,6 +125,11 @@ def load(machine: Machine, names: Sequence[str] | None = None) -> list[Kind]:
         except ConfigError as error:
             log.info("%s is left out: %s", kind.name, error)
     return usable
+
+
+def shared(kinds: Iterable[Kind]) -> frozenset[str]:
+    """Returns the effects with one cause for all joints."""
+    return frozenset(kind.name for kind in kinds if getattr(kind.target, "shared", False))
 
 
 def _try(kind: Kind, machine: Machine) -> None:

@@ -73,6 +73,12 @@ class Repair:
         """Returns which joints have an effect, `(J,)` bool."""
         return np.any([mask for ray, mask in zip(self.rays, self.mask, strict=True) if ray.kind is kind], 0)
 
+    def size(self, name: str, joint: int) -> float:
+        """Returns the largest size of an effect on a joint, along any of its rays."""
+        return max(
+            (abs(float(row[joint])) for ray, row in zip(self.rays, self.sizes, strict=True) if ray.kind.name == name), default=0.0
+        )
+
 
 def simulate(candidates: Candidates, rays: Sequence[Ray], sizes: np.ndarray) -> np.ndarray:
     """Returns free runs `(C, W, K, J)` with the effects at sizes `(C, R, J)`."""

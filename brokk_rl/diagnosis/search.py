@@ -149,7 +149,7 @@ def choose(
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
         priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising(table, least, share, shared)}
-        worth.append({subset: value for subset, value in priced.items() if value > 0})
+        worth.append({subset: value for subset, value in priced.items() if value > 0 or subset <= shared})
     felt = [shared & table.shapes.keys() for table in tables]
     best = _best(worth, felt, name_price, partial)
     while simpler := _simpler(best, worth, tables, felt, name_price, partial, share):

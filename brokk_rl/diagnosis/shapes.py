@@ -78,6 +78,7 @@ class Nulls:
         grown: The same as they are simulated in the field.
         plain: Errors of each joint in the field.
         shapes: What each effect does to each joint in the field.
+        shared: Effects with one cause for all joints.
         tables: Of each part and joint.
         known: Effects that were simulated on the reference.
     """
@@ -87,6 +88,7 @@ class Nulls:
     grown: Mapping[str, Sequence[Ray]]
     plain: Sequence[Plain]
     shapes: Sequence[Mapping[str, Sequence[Shape]]]
+    shared: frozenset[str]
     tables: list[list[Table]] = field(default_factory=list)
     known: set[str] = field(default_factory=set)
 
@@ -107,8 +109,12 @@ class Nulls:
         return found
 
     def earned(self, j: int, subset: frozenset[str]) -> float:
-        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field."""
-        return max([0.0, *(scored.total * part for scored, part in self._scored(j, subset))])
+        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
+
+        Of a cause that all joints share the mean: its price adds up over the joints, and the most of each adds up to too much.
+        """
+        found = [max(0.0, scored.total * part) for scored, part in self._scored(j, subset)]
+        return float((np.mean if subset <= self.shared else max)(found)) if found else 0.0
 
     def repeated(self, j: int, subset: frozenset[str]) -> float:
         """Returns what the subset earns in the field at the sizes that it has on the reference already; 0 where it has none."""

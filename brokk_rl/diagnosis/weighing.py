@@ -11,10 +11,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from brokk_rl.diagnosis.engine import Findings, Prices, shared
+from brokk_rl.diagnosis.engine import Findings, Prices
 from brokk_rl.diagnosis.evidence import Evidence
 from brokk_rl.diagnosis.found import Found
-from brokk_rl.diagnosis.library import Kind
+from brokk_rl.diagnosis.library import Kind, shared
 from brokk_rl.diagnosis.search import Chosen, Scored, Subset, Table, choose, promising
 from brokk_rl.diagnosis.sizes import plain
 
