@@ -192,6 +192,8 @@ class ArcDetector:
         size = np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3])
         good &= purity >= s.purity / slack
         good &= (rest_px <= s.rest_px + s.rest_relative * size) | (limits.lowest_px > 0)
+        if limits.lowest_px == 0:
+            good[good] &= ~ellipse_support.leaving(candidates[good], edges, support[good], length[good])
         good &= (
             ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses)) <= s.departure * slack
         )

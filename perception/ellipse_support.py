@@ -13,6 +13,12 @@ NUM_SAMPLES = 96
 """Places around an ellipse at which its support is looked for."""
 HARDLY = 0.3
 """A run of which a smaller part lies on an ellipse only crosses it."""
+OPEN = 0.12
+"""Part of the circumference without support at whose ends one asks how the edge goes on."""
+BACK_PX, STRIDE_PX = 4.0, 1.5
+"""How far before that end one begins to look, and how far apart the places are at which one does."""
+KINK_PX, KINK_RAD = 4.5, 0.15
+"""Length of an edge over which it turns at a corner, and by how much more than the ellipse does."""
 ANGLES = np.arange(NUM_SAMPLES) * (2 * np.pi / NUM_SAMPLES)
 
 
@@ -89,6 +95,60 @@ def departure(candidates: Candidates, edges: Edges, support: np.ndarray, length:
         hit = (along > 0.85) & (off > reach) & (off <= wide)
         beside |= hit & np.isin(rows * number + edges.chain[found], mine)
     return (length * (beside & (support < 0))).sum(1) / length.sum(1)
+
+
+def leaving(candidates: Candidates, edges: Edges, support: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Says which candidates have support that goes on smoothly elsewhere, `(C,)`: lobes of hearts, round corners, spirals.
+
+    Where something stands before an ellipse, its edge ends in a corner; where nothing does, in nothing.
+    """
+    result = np.zeros(len(support), bool)
+    there, ds = support >= 0, length * (2 * np.pi / support.shape[1])
+    for side in (1, -1):  # around one way, then the other
+        row, end = np.nonzero(there & ~np.roll(there, -side, 1))  # the last place of each stretch with support
+        ahead = (end[:, None] + side * np.arange(1, NUM_SAMPLES)) % NUM_SAMPLES
+        free = np.cumprod(~there[row[:, None], ahead], axis=1)
+        wide = (free * ds[row[:, None], ahead]).sum(1) > OPEN * ds.sum(1)[row]
+        row, end = row[wide], end[wide]
+        back = (end - side * np.ceil(BACK_PX / ds[row, end]).astype(int)) % NUM_SAMPLES
+        start = np.where(support[row, back] >= 0, back, end)
+        e = candidates.ellipses[row]
+        outward = conic.normals(e, edges.points[support[row, start]][:, None])[:, 0]
+        onward = side * np.column_stack([-outward[:, 1], outward[:, 0]])
+        size = np.sqrt(e[:, 2] * e[:, 3])
+        reach = np.clip(0.35 * size, 6.0, 16.0) + BACK_PX
+        bend = size**2 / length[row, end] ** 3
+        goes_on = _followed(edges, support[row, start], onward, reach, bend)
+        result[row[goes_on]] = True
+    return result
+
+
+def _followed(edges: Edges, start: np.ndarray, onward: np.ndarray, reach_px: np.ndarray, bend: np.ndarray) -> np.ndarray:
+    """Says which edges can be followed so far without a corner, `(M,)`.
+
+    Args:
+        edges: Edges.
+        start: Number of the edge point where each begins, `(M,)`.
+        onward: Direction in which it runs, `(M, 2)`.
+        reach_px: How far, `(M,)`.
+        bend: How much the ellipse bends there, 1/px, `(M,)`; what turns more by `KINK_RAD` over `KINK_PX` is a corner.
+    """
+    place, along = edges.points[start], onward
+    first = edges.directions[start]
+    hand = np.sign(along[:, 0] * first[:, 1] - along[:, 1] * first[:, 0])  # on which side it is bright
+    seen, alive = [first], np.ones(len(start), bool)
+    for step in range(int(np.ceil(reach_px.max(initial=0.0) / STRIDE_PX))):
+        onto = place + STRIDE_PX * along
+        number = edges.nearest[_pixels(onto, edges.nearest.shape)]
+        place, bright = edges.points[number], edges.directions[number]
+        along = np.column_stack([bright[:, 1], -bright[:, 0]]) * hand[:, None]
+        needed = step * STRIDE_PX < reach_px
+        near = np.linalg.norm(place - onto, axis=1) < STRIDE_PX
+        earlier = seen[max(0, len(seen) - round(KINK_PX / STRIDE_PX))]
+        turn = np.arccos(np.clip((bright * earlier).sum(1), -1.0, 1.0))
+        alive &= ~needed | (near & (turn < KINK_PX * bend + KINK_RAD))
+        seen.append(bright)
+    return alive
 
 
 def gap(there: np.ndarray, length: np.ndarray) -> np.ndarray:

@@ -91,6 +91,19 @@ def test_nothing_is_found_where_nothing_is(kind: str, detector) -> None:
     assert not detector.detect(bench_patterns.negative(kind, np.random.default_rng(0), 512, 384), None, None)
 
 
+def test_a_round_end_is_no_ellipse_and_as_much_of_a_covered_disc_is(detector) -> None:
+    for size in (14, 25, 40):
+        gray = np.full((240, 320), 210, np.uint8)
+        cv2.line(gray, (90, 120), (230, 150), 40, 2 * size, cv2.LINE_AA)
+        assert not detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
+        cv2.rectangle(gray, (90 + size // 8, 0), (319, 239), 120, -1)  # hides all but the end, which has sharp corners then
+        found = detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
+        assert len(found) == 1 and np.hypot(found[0].x - 90, found[0].y - 120) < 1.5
+    for seed in range(3):
+        hearts = bench_patterns.negative("hearts", np.random.default_rng(seed), 512, 384)
+        assert len(detector.detect(hearts, None, None)) <= 1
+
+
 def test_half_of_an_ellipse_tells_the_whole(detector) -> None:
     picture = np.full((200, 240), 180, np.uint8)
     cv2.ellipse(picture, (120, 100), (60, 45), 20, 0, 360, 40, -1, cv2.LINE_AA)
