@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from brokk_rl.errors import ConfigError
+from brokk_rl.errors import ConfigError, choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
@@ -20,8 +23,8 @@ from deploy.study.room import Sitters
 from deploy.study.trial import Times
 from deploy.twin.bench import Bench
 
-TARGET = "target.json"
-"""File in the run folder that says to the loop where the hole is."""
+LOCK, TARGET = ".sitting", "target.json"
+"""File in the study's folder that one program at a time holds; file in the run folder that says to the loop where the hole is."""
 
 
 @spec
@@ -69,12 +72,14 @@ class Sitting:
         """Leads sittings until a person stops the program.
 
         Raises:
-            ConfigError: the folder holds no study of this machine, or the plan has no such participant.
+            ConfigError: the folder holds no study of this machine, the plan has no such participant, or another program leads sittings
+                of this study.
         """
         data = folders.read(folder)
         machine.check_fingerprint(data.plan["fingerprint"], f"the study in {folder}")
-        if participant is not None and participant not in data.plan["participants"]:
-            raise ConfigError(f"study.participant={participant}: the plan has {', '.join(data.plan['participants'])}")
+        there = [who for who in data.plan["participants"] if who not in data.plan.get("erased", {})]
+        if participant is not None and participant not in there:
+            raise ConfigError(f"study.participant={participant}: nobody of the plan; {choices(participant, there)}")
         target = session.folder / TARGET
         loop = replace(self.loop, page=None, record=False, show=False, target=File(path=str(target)))
         limits, operators = loop.limits, self.bench.operators if isinstance(self.bench, Participant) else {}
@@ -93,4 +98,16 @@ class Sitting:
             port=self.bench.twin.fault_port if self.bench else None,
         )  # fmt: skip
         beside = self.bench.companions(machine, session) if self.bench else []
-        loop.run(machine, session, [*beside, Companion("study", "deploy.study.room:run", (room,), None)])
+        with alone(folder):
+            loop.run(machine, session, [*beside, Companion("study", "deploy.study.room:run", (room,), None)])
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Keeps others from leading sittings of the same study, as long as this process lives."""
+    with (folder / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise ConfigError(f"{folder}: sittings of this study go on already, in another program; end that one first") from error
+        yield

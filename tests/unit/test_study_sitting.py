@@ -24,6 +24,7 @@ from deploy.page.shown import Wish
 from deploy.study import analysis, folder, tlx
 from deploy.study.conductor import Conductor
 from deploy.study.room import StudyFeed
+from deploy.study.sitting import alone
 from deploy.study.steps import next_step
 
 MACHINE = machine()
@@ -229,6 +230,14 @@ def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
     assert not list(tmp_path.rglob("P01*"))
     assert conductor(tmp_path, arm).view()["participants"][0]["state"] == "erased"
     assert np.all([FACTS["twin"], not FACTS["simulated"]])
+
+
+def test_one_program_at_a_time_leads_sittings_of_a_study(tmp_path: Path) -> None:
+    with alone(tmp_path):
+        with pytest.raises(ConfigError, match="go on already"), alone(tmp_path):
+            pass
+    with alone(tmp_path):
+        pass
 
 
 HOLE = "{_target_: deploy.study.design.Hole, center_in_base_m: [2.6, 0.0, 0.75], radius_m: 0.05}"
