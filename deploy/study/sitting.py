@@ -72,8 +72,8 @@ class Sitting:
         """Leads sittings until a person stops the program.
 
         Raises:
-            ConfigError: the folder holds no study of this machine, the plan has no such participant, or another program leads sittings
-                of this study.
+            ConfigError: the folder holds no study of this machine, the plan has no such participant, or another program leads
+                sittings of this study.
         """
         data = folders.read(folder)
         machine.check_fingerprint(data.plan["fingerprint"], f"the study in {folder}")

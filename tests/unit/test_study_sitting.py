@@ -233,9 +233,8 @@ def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
 
 
 def test_one_program_at_a_time_leads_sittings_of_a_study(tmp_path: Path) -> None:
-    with alone(tmp_path):
-        with pytest.raises(ConfigError, match="go on already"), alone(tmp_path):
-            pass
+    with alone(tmp_path), pytest.raises(ConfigError, match="go on already"), alone(tmp_path):
+        pass
     with alone(tmp_path):
         pass
 
