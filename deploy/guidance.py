@@ -7,6 +7,7 @@ of that lever held. What is shown changes no faster than a hand can, and an axis
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,38 @@ from brokk_rl.spec import spec
 
 AXES = (("left", "theta"), ("left", "psi"), ("right", "theta"), ("right", "psi"))
 """Order of the four axes everywhere in this room."""
+
+
+@dataclass(frozen=True)
+class Levers:
+    """Positions of both levers, of full, in [-1, 1]: theta fore and aft, psi sideways; and whether the right button is held."""
+
+    left_theta: float
+    left_psi: float
+    right_theta: float
+    right_psi: float
+    button_right: bool
+
+
+@dataclass(frozen=True)
+class LeverAngles:
+    """Positions of both levers as angles; else as `Levers`."""
+
+    left_theta_rad: float
+    left_psi_rad: float
+    right_theta_rad: float
+    right_psi_rad: float
+    button_right: bool
+
+    def parts(self, full_rad: tuple[float, ...]) -> Levers:
+        """Returns them as parts of `full_rad`, the angle at full deflection of each of the four `AXES`."""
+        parts = (angle / full for angle, full in zip(self.angles_rad, full_rad, strict=True))
+        return Levers(*parts, button_right=self.button_right)
+
+    @property
+    def angles_rad(self) -> tuple[float, ...]:
+        """Angles of the four `AXES`."""
+        return self.left_theta_rad, self.left_psi_rad, self.right_theta_rad, self.right_psi_rad
 
 
 @spec
@@ -36,6 +69,11 @@ class Guidance:
     def check(self) -> None:
         if not 0 <= self.dead_zone < 1 or self.max_rate_rad_s <= 0:
             raise ConfigError("guidance: expected dead_zone in [0, 1) and max_rate_rad_s of more than 0")
+
+
+def full_angles_rad(levers: Sequence[Lever]) -> tuple[float, ...]:
+    """Returns the angle at full deflection of each of the four `AXES`; 1 where no joint hangs on it."""
+    return tuple(max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0) for axis in AXES)
 
 
 class LeverMap:

@@ -11,20 +11,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from deploy.guard import State
+from deploy.guidance import LeverAngles, Levers
 from deploy.loop.records import Exchange
 from deploy.loop.station import TRIPS
 from deploy.policy.adviser import REASONS, Advised
-
-
-@dataclass(frozen=True)
-class Levers:
-    """Positions of both levers: angles in rad (proposed) or parts of full (the operator's own); fore and aft, sideways."""
-
-    left_theta: float
-    left_psi: float
-    right_theta: float
-    right_psi: float
-    button_right: bool
 
 
 @dataclass(frozen=True)
@@ -32,11 +22,11 @@ class Advice:
     """What the policy proposes.
 
     Attributes:
-        valid: Whether there is an advice; if not, `levers_rad` are on their way to neutral and `reason` says why.
+        valid: Whether there is an advice; if not, `levers` are on their way to neutral and `reason` says why.
         reason: Why there is none.
         age_s: Since it was made.
         number: Counts up; tells a new advice from an old one.
-        levers_rad: To show in green.
+        levers: To show in green.
         command: The commands behind it, in machine order.
         target_in_base_m: The borehole it is for.
     """
@@ -45,7 +35,7 @@ class Advice:
     reason: str
     age_s: float
     number: int
-    levers_rad: Levers
+    levers: LeverAngles
     command: tuple[float, ...]
     target_in_base_m: tuple[float, ...]
 
@@ -145,7 +135,7 @@ def view(exchange: Exchange) -> View:
             reason=REASONS[int(advice["reason"])].value,
             age_s=now_s - float(advice["t_s"]),
             number=int(advice["number"]),
-            levers_rad=_levers(advice["lever_rad"], advice["button_right"]),
+            levers=LeverAngles(*advice["lever_rad"].tolist(), button_right=bool(advice["button_right"])),
             command=tuple(advice["u"].tolist()),
             target_in_base_m=tuple(advice["target_in_base_m"].tolist()),
         )
@@ -156,7 +146,7 @@ def view(exchange: Exchange) -> View:
         q=tuple(state["q"].tolist()),
         q_age_s=now_s - float(state["q_t_s"]),
         flow=tuple(state["flow"].tolist()),
-        levers=_levers(state["lever"], state["button_right"]),
+        levers=Levers(*state["lever"].tolist(), button_right=bool(state["button_right"])),
         levers_age_s=now_s - float(state["levers_t_s"]),
         exclusive_selected=bool(state["exclusive_selected"]),
         oil_c=oil_c if math.isfinite(oil_c) else None,
@@ -177,11 +167,6 @@ def view(exchange: Exchange) -> View:
         log_dropped=sum(pipe.dropped for pipe in exchange.logs),
     )
     return View(now_s, now_s - float(state["t_s"]) < ALIVE_S, proposed, machine, safety)
-
-
-def _levers(axes: Any, button: Any) -> Levers:
-    left_theta, left_psi, right_theta, right_psi = axes.tolist()
-    return Levers(left_theta, left_psi, right_theta, right_psi, bool(button))
 
 
 def _plain(value: Any) -> Any:

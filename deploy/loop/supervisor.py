@@ -24,7 +24,7 @@ from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.bus.description import Description
 from deploy.bus.wire import Replay, Wire
-from deploy.guidance import Guidance, LeverMap
+from deploy.guidance import Guidance, LeverMap, full_angles_rad
 from deploy.limits import Limits
 from deploy.loop.eyes import Camera
 from deploy.loop.outlet import view
@@ -112,7 +112,8 @@ class Loop:
             LinkError: bus or policy process died.
         """
         Description(self.dbc, machine)  # refused here, before anything runs
-        full_rad = float(LeverMap(self.guidance.levers or machine.levers, machine).full_rad.max())
+        levers = self.guidance.levers or machine.levers
+        LeverMap(levers, machine)
         Bundle(self.policy, machine)
         exchange = Exchange.new(machine.num_joints, self.commands, self.camera.num_px if self.camera else 0)
         children, recorder = _Children(exchange), self._recorder(exchange, machine, session.folder)
@@ -123,7 +124,7 @@ class Loop:
             recorder.refresh()
             write_json(session.folder / PROCESSES, children.pids | recorder.pids)
             aim = Aim(self.target.build(), exchange.target, exchange.holes)
-            self._watch(children, exchange, full_rad, Wanted(exchange, recorder, aim, self.armed, self.commands))
+            self._watch(children, exchange, full_angles_rad(levers), Wanted(exchange, recorder, aim, self.armed, self.commands))
         except KeyboardInterrupt:
             log.info("stopping")
         finally:
@@ -157,7 +158,7 @@ class Loop:
         recorder.wanted = self.record
         return recorder
 
-    def _watch(self, children: _Children, exchange: Exchange, full_rad: float, wanted: Wanted) -> None:
+    def _watch(self, children: _Children, exchange: Exchange, full_rad: tuple[float, ...], wanted: Wanted) -> None:
         """Shows, does what is wanted and looks after the children until it is time to stop."""
         end_s = None if self.seconds is None else time.monotonic() + self.seconds
         with contextlib.ExitStack() as stack:

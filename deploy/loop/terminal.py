@@ -7,21 +7,20 @@ import math
 from rich.table import Table
 from rich.text import Text
 
-from deploy.loop.outlet import Levers, View
+from deploy.guidance import Levers
+from deploy.loop.outlet import View
 
 WIDTH = 10
 """Characters from neutral to full."""
 
 
-def table(view: View, full_rad: float) -> Table:
-    """Returns the view as a table; `full_rad` is the lever angle at full command."""
+def table(view: View, full_rad: tuple[float, ...]) -> Table:
+    """Returns the view as a table; `full_rad` are the angles of the four axes at full deflection."""
     grid = Table.grid(padding=(0, 2))
     own = view.machine.levers if view.machine else None
-    proposed = view.advice.levers_rad if view.advice else None
+    proposed = view.advice.levers.parts(full_rad) if view.advice else None
     for name in ("left_theta", "left_psi", "right_theta", "right_psi"):
-        grid.add_row(
-            name.replace("_", " "), _bar(getattr(proposed, name, 0.0) / full_rad, "green"), _bar(getattr(own, name, 0.0), "blue")
-        )
+        grid.add_row(name.replace("_", " "), _bar(getattr(proposed, name, 0.0), "green"), _bar(getattr(own, name, 0.0), "blue"))
     grid.add_row("right button", _button(proposed, "green"), _button(own, "blue"))
     advice = "no policy yet" if view.advice is None else view.advice.reason
     safety = view.safety

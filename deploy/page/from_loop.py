@@ -19,7 +19,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from deploy.chain import tool
-from deploy.guidance import AXES, Guidance
+from deploy.guidance import Guidance, full_angles_rad
 from deploy.loop import outlet
 from deploy.loop.eyes import frame_of
 from deploy.loop.process import Stop
@@ -29,7 +29,7 @@ from deploy.loop.target import Place, holes_of, nearest, place_of
 from deploy.page.pointing import borehole_at
 from deploy.page.scene import approach
 from deploy.page.settings import LINK, OperatorPage
-from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Vector, Wish
+from deploy.page.shown import Advice, Drawn, Recording, Safety, Shown, Stream, Target, Vector, Wish
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +92,7 @@ class LoopFeed:
         self._beside, self._exchange, self._clock = beside, exchange, clock
         self._guiding, self._began_s = True, clock()
         machine = beside.machine
-        self._advised_full = _full(machine, beside.guidance.levers or machine.levers)
+        self._full_rad = full_angles_rad(beside.guidance.levers or machine.levers)
         self._exclusive = machine.is_exclusive
 
     def shown(self) -> Shown:
@@ -117,7 +117,7 @@ class LoopFeed:
             alive=seen.alive,
             guiding=self._guiding,
             advice=proposed and self._advice(proposed),
-            own=machine and Levers(**vars(machine.levers)),
+            own=machine and machine.levers,
             q=machine and machine.q,
             streams=tuple(Stream(name, *age) for name, age in ages_s.items()),
             safety=safety and Safety(safety.commands, safety.state, safety.trip, safety.deadman, safety.estop, safety.bus_up),
@@ -163,14 +163,13 @@ class LoopFeed:
         self._exchange.page_log.put(TEXT + json.dumps({"topic": topic, "t_s": self._clock(), **values}).encode())
 
     def _advice(self, proposed: outlet.Advice) -> Advice:
-        angles = proposed.levers_rad
-        parts = {name: getattr(angles, name) / full for name, full in self._advised_full.items()}
-        due_s = 0.0 if angles.button_right else None
-        if not angles.button_right and proposed.valid and np.asarray(proposed.command)[self._exclusive].any():
+        levers = proposed.levers.parts(self._full_rad)
+        due_s = 0.0 if levers.button_right else None
+        if not levers.button_right and proposed.valid and np.asarray(proposed.command)[self._exclusive].any():
             # the policy wants it already; what is shown goes through neutral first, as fast as a hand can
-            most_rad = max(abs(getattr(angles, name)) for name in self._advised_full)
+            most_rad = max(map(abs, proposed.levers.angles_rad))
             due_s = max(self._beside.machine.period_s, most_rad / self._beside.guidance.max_rate_rad_s)
-        return Advice(proposed.valid, proposed.reason, proposed.number, Levers(**parts, button_right=angles.button_right), due_s)
+        return Advice(proposed.valid, proposed.reason, proposed.number, levers, due_s)
 
     def _frame_t_s(self) -> float | None:
         return self._exchange.frame and self._exchange.frame.peek("t_s")
@@ -216,11 +215,3 @@ class LoopFeed:
 def _vector(values: Any) -> Vector:
     x, y, z = (float(value) for value in values)
     return x, y, z
-
-
-def _full(machine: Machine, levers: tuple[Any, ...]) -> dict[str, float]:
-    """Returns the angle at full deflection of each axis by its name in `Levers`; 1 where no joint hangs on it."""
-    return {
-        f"{side}_{axis}": max((one.max_angle_rad for one in levers if (one.side, one.axis) == (side, axis)), default=1.0)
-        for side, axis in AXES
-    }

@@ -11,22 +11,12 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, Protocol, get_args
 
 from brokk_rl.signals import Frame
+from deploy.guidance import Levers
 
 Vector = tuple[float, float, float]
 Kind = Literal["start", "stop", "record", "target", "point"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 """What can be wished for."""
-
-
-@dataclass(frozen=True)
-class Levers:
-    """Positions of both levers, of full, in [-1, 1]: theta fore and aft, psi sideways; and whether the right button is held."""
-
-    left_theta: float
-    left_psi: float
-    right_theta: float
-    right_psi: float
-    button_right: bool
 
 
 @dataclass(frozen=True)

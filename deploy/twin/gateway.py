@@ -18,7 +18,7 @@ from brokk_rl.machine import Machine
 from deploy.bus.description import COUNTER, LEVER_AXES, Description
 from deploy.bus.protection import Channel, Fault, Trust
 from deploy.bus.wire import Wired
-from deploy.guidance import AXES, LeverMap
+from deploy.guidance import AXES, LeverMap, full_angles_rad
 
 TIMEOUT_S = 0.07
 """Age of the last valid command from which there is none; three cycles and a half, within the 100 ms that are promised."""
@@ -119,7 +119,4 @@ class Gateway:
 
 def axis_full_rad(machine: Machine) -> np.ndarray:
     """Returns the angle of each of the four axes at full deflection, `(4,)`; 1 where no joint hangs on it."""
-    full = np.ones(len(AXES))
-    for lever in machine.levers:
-        full[AXES.index((lever.side, lever.axis))] = lever.max_angle_rad
-    return full
+    return np.array(full_angles_rad(machine.levers))
