@@ -96,6 +96,8 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
         remarks=list(data.remarks),
     )
     everything = [(trial, bool(trial["period"])) for trial in data.trials.values()] + [(trial, False) for trial in data.spare]
+    if at_twin := sum(bool(trial.get("twin")) for trial, counts in everything if counts):
+        found.remarks.append(Remark("study", f"{at_twin} trials that count were done at a simulated machine, the twin"))
     success = Success(**design["success"])
     for trial, counts in progress(everything):
         found.trials.append(_measured(data.folder, trial, counts, machine, success, found.remarks))
