@@ -79,6 +79,9 @@ class HolePose:
         frame: In which coordinates all of it stands: `camera` (optical) or `base`.
         score: How sure it is a hole, in [0, 1].
         t_s: When it was seen.
+        shared_m2: Part of `cov_m2` that no further frame takes away, since the camera's pose is off by the same in all of them;
+            `None` for none.
+        shared_rad2: The same part of `axis_cov_rad2`.
     """
 
     center_m: np.ndarray
@@ -89,24 +92,43 @@ class HolePose:
     frame: Literal["camera", "base"]
     score: float
     t_s: float
+    shared_m2: np.ndarray | None = None
+    shared_rad2: np.ndarray | None = None
 
-    def moved(self, base_from_camera: np.ndarray) -> HolePose:
-        """Returns the pose in the base frame; `base_from_camera` is the `(4, 4)` transform of a camera pose."""
+    def moved(self, base_from_camera: np.ndarray, camera_cov: np.ndarray | None = None) -> HolePose:
+        """Returns the pose in the base frame.
+
+        Args:
+            base_from_camera: Pose of the camera, `(4, 4)`.
+            camera_cov: How uncertain that is, see `Frame`; it adds to the covariances.
+        """
         rotation, shift = base_from_camera[:3, :3], base_from_camera[:3, 3]
+        shared = [None, None] if camera_cov is None else [
+            rotation @ lever @ camera_cov @ lever.T @ rotation.T
+            for lever in (np.hstack([np.eye(3), -_crossing(self.center_m)]), np.hstack([np.zeros((3, 3)), -_crossing(self.axis)]))
+        ]  # fmt: skip
         return HolePose(
             center_m=rotation @ self.center_m + shift,
             axis=rotation @ self.axis,
             radius_m=self.radius_m,
-            cov_m2=rotation @ self.cov_m2 @ rotation.T,
-            axis_cov_rad2=rotation @ self.axis_cov_rad2 @ rotation.T,
+            cov_m2=rotation @ self.cov_m2 @ rotation.T + (0.0 if shared[0] is None else shared[0]),
+            axis_cov_rad2=rotation @ self.axis_cov_rad2 @ rotation.T + (0.0 if shared[1] is None else shared[1]),
             frame="base",
             score=self.score,
             t_s=self.t_s,
+            shared_m2=shared[0],
+            shared_rad2=shared[1],
         )
 
     def borehole(self) -> Borehole:
         """Returns it as the word that the rest of the framework knows; for a pose in the base frame."""
         return Borehole(self.center_m, self.axis, self.radius_m, self.cov_m2)
+
+
+def _crossing(vector: np.ndarray) -> np.ndarray:
+    """Returns the matrix that takes the cross product with a vector from the left, `(3, 3)`."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 @dataclass(frozen=True)

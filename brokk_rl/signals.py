@@ -56,6 +56,8 @@ class Frame:
         right: Right picture of a rectified stereo pair, as `color`; `None` where there is none.
         baseline_m: Distance between the two cameras of the pair.
         name: Path of a frame on disk without its endings, else ''.
+        camera_cov: How uncertain the camera's pose is, the same way in all frames: covariance of a small motion of it in its own
+            coordinates, `(6, 6)`, m and then rad; `None` where nobody has told.
     """
 
     color: np.ndarray
@@ -67,3 +69,4 @@ class Frame:
     right: np.ndarray | None = None
     baseline_m: float | None = None
     name: str = ""
+    camera_cov: np.ndarray | None = None

@@ -49,7 +49,7 @@ class Fusion:
 
 @dataclass(frozen=True)
 class _Track:
-    """A place at which holes were seen; covariances are those of the average, without the shared floor."""
+    """A place at which holes were seen; covariances are those of the average, without what all frames share."""
 
     pose: HolePose
     num_frames: int
@@ -74,7 +74,7 @@ class FusionFilter:
         tracks = [track for track in self._tracks if t_s - track.seen_s <= s.forget_s]
         tracks = [self._drifted(track, t_s) for track in tracks]
         free = list(range(len(tracks)))
-        for pose in sorted(poses, key=lambda pose: -pose.score):
+        for pose in sorted(map(_own, poses), key=lambda pose: -pose.score):
             distances = {k: self._distance(tracks[k].pose, pose) for k in free}
             best = min(distances, key=distances.__getitem__, default=None)
             if best is not None and distances[best] <= s.gate * CHI2_3:
@@ -88,7 +88,11 @@ class FusionFilter:
             return None
         track = max(known, key=lambda track: (track.num_frames, track.pose.score))
         age_s = t_s - track.seen_s
-        pose = replace(track.pose, cov_m2=track.pose.cov_m2 + np.eye(3) * s.floor_m**2)
+        pose = track.pose
+        pose = replace(
+            pose, cov_m2=pose.cov_m2 + np.eye(3) * s.floor_m**2 + _or_zero(pose.shared_m2),
+            axis_cov_rad2=pose.axis_cov_rad2 + _or_zero(pose.shared_rad2),
+        )  # fmt: skip
         return Target(pose, track.num_frames, age_s, age_s > s.stale_s)
 
     def _drifted(self, track: _Track, t_s: float) -> _Track:
@@ -100,6 +104,17 @@ class FusionFilter:
         apart = second.center_m - first.center_m
         shared = first.cov_m2 + second.cov_m2 + np.eye(3) * self.settings.floor_m**2
         return float(apart @ np.linalg.solve(shared, apart))
+
+
+def _own(pose: HolePose) -> HolePose:
+    """Returns a pose with what is its own of its covariances: further frames take that away, and not what all of them share."""
+    return replace(
+        pose, cov_m2=pose.cov_m2 - _or_zero(pose.shared_m2), axis_cov_rad2=pose.axis_cov_rad2 - _or_zero(pose.shared_rad2)
+    )
+
+
+def _or_zero(cov: np.ndarray | None) -> np.ndarray:
+    return np.zeros((3, 3)) if cov is None else cov
 
 
 def _fused(track: _Track, pose: HolePose, t_s: float) -> _Track:
@@ -122,5 +137,7 @@ def _fused(track: _Track, pose: HolePose, t_s: float) -> _Track:
         frame=pose.frame,
         score=max(before.score, pose.score),
         t_s=t_s,
+        shared_m2=pose.shared_m2,
+        shared_rad2=pose.shared_rad2,
     )
     return _Track(fused, number, t_s, t_s)

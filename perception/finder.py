@@ -124,7 +124,7 @@ class Finder:
         if not ellipses:
             refused = [Rejection("ellipse", "ellipses of a possible size on the block", 0.0, 1.0)]
         if frame.base_from_camera is not None:
-            holes = [(ellipse, pose.moved(frame.base_from_camera)) for ellipse, pose in holes]
+            holes = [(ellipse, pose.moved(frame.base_from_camera, frame.camera_cov)) for ellipse, pose in holes]
         rejected = [*refused, *doubles]
         shown = [e for e, _ in holes] + [r.ellipse for r in rejected if r.ellipse is not None]
         ms["total"] = sum(ms.values())

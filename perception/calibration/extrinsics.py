@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +18,34 @@ Place = str | tuple[tuple[float, ...], ...] | None
 """How a config says where a camera is: a file of `mode=calibrate`, a 4 x 4 transform, or not at all."""
 
 
-def place_of(given: Place, where: str) -> np.ndarray | None:
-    """Returns `base_from_camera`, `(4, 4)`, as a config gives it; `None` where it does not.
+@dataclass(frozen=True)
+class Placed:
+    """Where a camera is.
+
+    Attributes:
+        base_from_camera: `(4, 4)`, `None` where nobody knows.
+        cov: Of a small motion of it in its own coordinates, `(6, 6)`, m and then rad; `None` where nobody has told.
+    """
+
+    base_from_camera: np.ndarray | None
+    cov: np.ndarray | None
+
+
+def placed(given: Place, where: str) -> Placed:
+    """Returns where a camera is as a config gives it.
 
     Raises:
-        FrameError: there is no such file, it is none of ours, or the transform is not rigid.
+        FrameError: there is no such file, it is none of ours, the transform is not rigid, or its covariance is none.
     """
     if given is None:
-        return None
-    if isinstance(given, str):
-        return soundness.pose(read(Path(given), where)["T_base_cam"], f"{where}={given}")
-    return soundness.pose(given, where)
+        return Placed(None, None)
+    if not isinstance(given, str):
+        return Placed(soundness.pose(given, where), None)
+    told, where = read(Path(given), where), f"{where}={given}"
+    cov = np.asarray(told.get("covariance", np.zeros((6, 6))), float)
+    if cov.shape != (6, 6) or not np.isfinite(cov).all() or np.linalg.eigvalsh((cov + cov.T) / 2).min() < -1e-9:
+        raise FrameError(f"{where}: covariance: expected a covariance of six numbers, (6, 6); calibrate again")
+    return Placed(soundness.pose(told["T_base_cam"], where), (cov + cov.T) / 2)
 
 
 def read(path: Path, where: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
-from perception.calibration.extrinsics import Place, place_of
+from perception.calibration.extrinsics import Place, placed
 from perception.sources import soundness
 from perception.stereo import Stereo
 
@@ -63,6 +63,7 @@ class Camera:
     distortion: np.ndarray | None
     baseline_m: float | None
     base_from_camera: np.ndarray | None
+    cov: np.ndarray | None = None
 
 
 def read_camera(path: Path) -> Camera:
@@ -127,9 +128,9 @@ class FolderSource:
         self._stems, self._next = dataset.stems(self._place), 0
         path = self._place / dataset.CAMERA
         self._camera = None if self._settings.needs == "nothing" and not path.exists() else read_camera(path)
-        place = place_of(self._settings.base_from_camera, "source.base_from_camera")
-        if self._camera is not None and place is not None:
-            self._camera = replace(self._camera, base_from_camera=place)
+        place = placed(self._settings.base_from_camera, "source.base_from_camera")
+        if self._camera is not None and place.base_from_camera is not None:
+            self._camera = replace(self._camera, base_from_camera=place.base_from_camera, cov=place.cov)
         return self
 
     def __exit__(self, *exc: Any) -> None:
@@ -163,7 +164,7 @@ class FolderSource:
         depth = self._depth(stem, color, right, camera)
         return Frame(
             color=color, depth_m=depth, camera_matrix=camera.matrix, base_from_camera=camera.base_from_camera, t_s=t_s,
-            distortion=camera.distortion, right=right, baseline_m=camera.baseline_m, name=str(stem),
+            distortion=camera.distortion, right=right, baseline_m=camera.baseline_m, name=str(stem), camera_cov=camera.cov,
         )  # fmt: skip
 
     def _depth(self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: Camera) -> np.ndarray:

@@ -88,12 +88,16 @@ class LiveSource:
         name: What it is called in messages.
         fresh: Which frames are too old, and how long to wait.
         base_from_camera: Where the camera is in the base frame, `(4, 4)`; `None` where nobody knows.
+        camera_cov: How uncertain that is, see `Frame`.
     """
 
     num_frames = None
 
-    def __init__(self, device: Device, name: str, fresh: Freshness, base_from_camera: np.ndarray | None) -> None:
-        self._device, self._name, self._fresh, self._pose = device, name, fresh, base_from_camera
+    def __init__(
+        self, device: Device, name: str, fresh: Freshness, base_from_camera: np.ndarray | None, camera_cov: np.ndarray | None = None
+    ) -> None:
+        self._device, self._name, self._fresh = device, name, fresh
+        self._pose, self._pose_cov = base_from_camera, camera_cov
         self._lens: Lens | None = None
         self._last_s = -np.inf
 
@@ -144,6 +148,7 @@ class LiveSource:
             depth_m=soundness.depth(capture.depth_m, self._name, self._fresh.least_known),
             camera_matrix=lens.matrix,
             base_from_camera=self._pose,
+            camera_cov=self._pose_cov,
             t_s=capture.t_s,
             distortion=lens.distortion,
             right=capture.right,

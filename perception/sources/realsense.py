@@ -10,7 +10,7 @@ import numpy as np
 
 from brokk_rl.errors import FrameError
 from brokk_rl.spec import spec
-from perception.calibration.extrinsics import Place, place_of
+from perception.calibration.extrinsics import Place, placed
 from perception.sources import soundness
 from perception.sources.live import Capture, Freshness, Lens, LiveSource
 
@@ -38,8 +38,8 @@ class RealSense:
 
     def build(self) -> LiveSource:
         """Returns the source, not yet opened."""
-        pose = place_of(self.base_from_camera, "source.base_from_camera")
-        return LiveSource(RealSenseDevice(self), "RealSense camera", self.fresh, pose)
+        place = placed(self.base_from_camera, "source.base_from_camera")
+        return LiveSource(RealSenseDevice(self), "RealSense camera", self.fresh, place.base_from_camera, place.cov)
 
 
 class RealSenseDevice:

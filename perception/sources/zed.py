@@ -10,7 +10,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.spec import spec
-from perception.calibration.extrinsics import Place, place_of
+from perception.calibration.extrinsics import Place, placed
 from perception.sources import soundness
 from perception.sources.live import Capture, Freshness, Lens, LiveSource
 
@@ -58,8 +58,8 @@ class Zed:
 
     def build(self) -> LiveSource:
         """Returns the source, not yet opened."""
-        pose = place_of(self.base_from_camera, "source.base_from_camera")
-        return LiveSource(ZedDevice(self), "ZED camera", self.fresh, pose)
+        place = placed(self.base_from_camera, "source.base_from_camera")
+        return LiveSource(ZedDevice(self), "ZED camera", self.fresh, place.base_from_camera, place.cov)
 
 
 class ZedDevice:

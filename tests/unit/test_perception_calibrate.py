@@ -214,6 +214,8 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(brokk: Callable[
         frame = source.read_latest()
     assert frame is not None
     np.testing.assert_allclose(frame.base_from_camera, np.array(told["T_base_cam"]))
+    assert frame.camera_cov is not None
+    np.testing.assert_allclose(frame.camera_cov, np.array(told["covariance"]), atol=1e-12)
     Path("other.yaml").write_text("schema: 7\n")
     lost = brokk("mode=perceive", f"perceive.input={footage}", "source.base_from_camera=other.yaml", "session.out=look")
     assert lost.code == 2 and "no calibration of schema 1" in lost.err
