@@ -61,8 +61,8 @@ class Drawing:
             _ellipse(picture, ellipse, scale, REFUSED if ellipse in refused else FOUND)
         for one in sighting.rejected:
             if one.ellipse is not None:
-                place = (round((one.ellipse.x + one.ellipse.a) * scale) + 3, round(one.ellipse.y * scale))
-                cv2.putText(picture, one.reason.split(",")[0], place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, REFUSED, 1, cv2.LINE_AA)
+                below = np.array([one.ellipse.x - one.ellipse.a, one.ellipse.y + one.ellipse.a]) * scale
+                _words(picture, one.reason.split(",")[0], below + np.array([0, 14]), REFUSED)
         for hole in sighting.holes:
             self._hole(picture, hole, frame, scale)
         return picture
@@ -85,14 +85,19 @@ class Drawing:
         cv2.ellipse(picture, _whole(start), _whole(axes[::-1]), angle, 0, 360, DOUBT, 1, cv2.LINE_AA)
         std = 1000 * np.sqrt(np.trace(hole.cov_m2))
         text = f"{np.linalg.norm(center):.2f} m, +-{std:.1f} mm, r {1000 * hole.radius_m:.1f} mm"
-        place = (_whole(start)[0] + 8, _whole(start)[1] - 8)
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, FOUND, 1, cv2.LINE_AA)
+        _words(picture, text, np.minimum(start, end) + np.array([8, -12]), FOUND)
 
 
 def _ellipse(picture: np.ndarray, ellipse: Ellipse, scale: float, color: tuple[int, int, int]) -> None:
     place = _whole(np.array([ellipse.x, ellipse.y]) * scale * 16)
     axes = _whole(np.array([ellipse.a, ellipse.b]) * scale * 16)
     cv2.ellipse(picture, place, axes, float(np.degrees(ellipse.theta_rad)), 0, 360, color, 1, cv2.LINE_AA, 4)
+
+
+def _words(picture: np.ndarray, text: str, place: np.ndarray, color: tuple[int, int, int]) -> None:
+    """Writes words that can be read on any ground."""
+    for ink, width in (((0, 0, 0), 3), (color, 1)):
+        cv2.putText(picture, text, _whole(place), cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, width, cv2.LINE_AA)
 
 
 def _pixel(camera_matrix: np.ndarray, point: np.ndarray) -> np.ndarray:
