@@ -2,7 +2,8 @@
 
 Advice at 20 Hz and levers at 50 Hz as from the loop, frames of 640 x 360 px at 3 and at 10 Hz, the 3D scene beside them. Latency is
 from the moment an advice stands in the feed to the moment its frame is through layout and paint, by the browser's clock, translated
-to ours to half the round trip. Frame rate and bytes are what the browser has drawn and received.
+to ours to half the round trip. Of it: on the way from the server to the page, and in the browser until drawn; the rest it waited
+for the server to look. Frame rate and bytes are what the browser has drawn and received.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from browser import FLAGS, chromium, served
 from composed import option
 
 from brokk_rl.machine import Machine
+from deploy.page import server
+from deploy.page.clock import PageClock, Said
 from deploy.page.cloud import encode
 from deploy.page.demo import Demo, DemoFeed
 from deploy.page.shown import Drawn
@@ -48,6 +51,26 @@ class Timed(DemoFeed):
         self.round_trip_s = min(self.round_trip_s, drawn.round_trip_s)
 
 
+class Parted(PageClock):
+    """The clock of a page, which also remembers where the time of an advice went: how long each lay in the browser until drawn."""
+
+    in_browser_ms: ClassVar[list[float]] = []
+    on_the_way_ms: ClassVar[list[float]] = []
+
+    def heard(self, text: str | bytes, now_s: float) -> Said | None:
+        number, came_ms, drawn_ms, _ = json.loads(text)
+        sent_s = self._sent.get(number, (np.nan, None))[0]
+        said = super().heard(text, now_s)
+        if said is not None and said.advice is not None:
+            self.in_browser_ms.append(drawn_ms - came_ms)
+            self.on_the_way_ms.append(1e3 * (said.drawn_s - sent_s) - self.in_browser_ms[-1])
+        return said
+
+
+def quantiles(values_ms: Any) -> dict[str, float]:
+    return {name: round(float(np.quantile(values_ms, part)), 1) for name, part in QUANTILES.items()}
+
+
 def measure(browser: Any, rate_hz: float, scene: bool) -> dict[str, Any]:
     demo = replace(option("feed", "demo"), rate_hz=rate_hz, frames=scene)
     machine = option("machine", "brokk170")
@@ -59,6 +82,8 @@ def measure(browser: Any, rate_hz: float, scene: bool) -> dict[str, Any]:
             page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))
         page.goto(f"http://localhost:{port}/")
         time.sleep(WARM_S)
+        Parted.in_browser_ms.clear()
+        Parted.on_the_way_ms.clear()
         begun_s, before = time.monotonic(), page.evaluate("window.measured")
         fps: list[float] = []
         while time.monotonic() - begun_s < SECONDS:
@@ -78,7 +103,9 @@ def measure(browser: Any, rate_hz: float, scene: bool) -> dict[str, Any]:
         "scene": scene,
         "points": after["points"],
         "load": round(os.getloadavg()[0], 1),
-        "lever_latency_ms": {name: round(1e3 * float(np.quantile(latency_s, part)), 1) for name, part in QUANTILES.items()},
+        "lever_latency_ms": quantiles(1e3 * latency_s),
+        "of_it_on_the_way_ms": quantiles(Parted.on_the_way_ms),
+        "of_it_in_browser_ms": quantiles(Parted.in_browser_ms),
         "clock_error_ms": round(500 * feed.round_trip_s, 2),
         "advices_drawn_share": round(len(latency_s) * machine.period_s / took_s, 3),
         "page_drawn_hz": round((after["drawn"] - before["drawn"]) / took_s, 1),
@@ -91,6 +118,7 @@ def measure(browser: Any, rate_hz: float, scene: bool) -> dict[str, Any]:
 
 
 def main() -> None:
+    server.PageClock = Parted
     with chromium() as browser:
         rows = []
         for rate_hz, scene in ((3.0, False), (3.0, True), (10.0, True)):

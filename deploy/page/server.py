@@ -52,8 +52,10 @@ class Annex(Protocol):
 
 log = logging.getLogger(__name__)
 
-POLL_S, FRAME_POLL_S = 0.004, 0.02
-"""Between looks at the feed: what a new advice, or frame, waits for at most."""
+POLL_S, CLOSE_S, FRAME_POLL_S = 0.004, 0.001, 0.02
+"""Between looks at the feed: for a new advice, the same when one is expected, and for a frame."""
+FRAME_S = 0.018
+"""Of a screen of 60 Hz, and what a message takes there."""
 HEARTBEAT_S = 0.1
 """Between messages when nothing changes, so that a page knows that it is connected."""
 UNDRAWN_STATES, UNDRAWN_FRAMES = 4, 2
@@ -115,19 +117,26 @@ class Server:
                 task.cancel()
 
     async def _watch(self) -> None:
-        """Looks at the feed. A new advice goes out at once, what else is new no faster than the rate."""
-        sent_s, before, advised = 0.0, None, None
+        """Looks at the feed. A new advice goes out at once, what else is new no faster than the rate.
+
+        A browser draws one frame in `FRAME_S`: what would take the frame of an advice that is expected waits and goes with it.
+        """
+        sent_s, before, advised, advised_s, apart_s = 0.0, None, None, 0.0, 0.0
         while True:
             shown, now_s = self._feed.shown(), time.monotonic()
             since_s = now_s - sent_s
             facts = (shown.advice, shown.own, shown.q, shown.safety, shown.alive, shown.guiding, shown.recording.on, shown.targets)
-            due = since_s >= HEARTBEAT_S or (facts != before and since_s >= 1.0 / self._page.rate_hz)
             number = shown.advice.number if shown.advice else None
+            until_s = advised_s + apart_s - now_s
+            expected = -POLL_S < until_s < FRAME_S
+            due = since_s >= HEARTBEAT_S or (facts != before and since_s >= 1.0 / self._page.rate_hz and not expected)
+            if number != advised:
+                apart_s, advised_s = now_s - advised_s, now_s
             if due or number != advised:
                 sent_s, before, advised = now_s, facts, number
                 text = json.dumps({"number": self._state.number + 1, "shown": shown.plain()}, separators=(",", ":"))
                 await self._state.put((shown, text))
-            await asyncio.sleep(POLL_S)
+            await asyncio.sleep(CLOSE_S if abs(until_s) < POLL_S else POLL_S)
 
     async def _watch_frames(self) -> None:
         """Takes frames while somebody looks; they are coded in a thread, once for all pages."""
