@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -23,7 +24,7 @@ from deploy.study.folder import StudyData
 from deploy.study.form import Form
 from deploy.study.stage import Stage
 from deploy.study.steps import Step, next_step, progress
-from deploy.study.trial import Attempt, Times
+from deploy.study.trial import Attempt, Times, keep
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +71,9 @@ class Conductor:
     ) -> None:
         self._folder, self._machine, self._stage, self._words, self._times = folder, machine, stage, words, times
         self._facts, self._seed, self._operators, self._clock = facts, seed, operators or {}, clock
+        for path in sorted((folder / folders.TRIALS).glob("*.json")):  # what an interruption left half saved
+            with suppress(ValueError):  # a file that cannot be read is said in the report
+                keep(folder, path, machine, stage)
         self._data: StudyData = folders.read(folder)
         self._who: str | None = None
         self._step: Step | None = None
@@ -112,7 +116,7 @@ class Conductor:
         """Takes what a page says; returns why it was not taken, empty where it was."""
         do, step = said.get("do"), self._step
         try:
-            if do == "choose" and isinstance(said.get("who"), str):
+            if do == "choose" and isinstance(said.get("who"), str) and not self.running:
                 self.choose(said["who"])
             elif do == "leave" and not self.running:
                 self.choose(None)
@@ -156,10 +160,9 @@ class Conductor:
         return found | (self._form.view() if self._form is not None else {})
 
     def close(self) -> None:
-        """Ends what is under way; what was recorded of it is kept."""
+        """Ends what is under way, at once."""
         if self._attempt is not None:
-            self._attempt.abort("the program ended")
-            self._attempt.close()
+            self._attempt.leave()
 
     def _in_trial(self, do: str, attempt: Attempt) -> str:
         if do == "begin":

@@ -20,7 +20,7 @@ from deploy.study.analysis import analyse
 from deploy.study.design import Design
 from deploy.study.practice import Practice, share_significant
 from deploy.study.simulation import NOTICE, Nowhere, simulate
-from deploy.study.sitting import Sitting
+from deploy.study.sitting import Sitting, alone
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +107,9 @@ class Steps:
     def _erase(self, session: Session) -> None:
         if not self.participant:
             raise ConfigError("study.do=erase needs study.participant=<pseudonym> and study.folder=<folder>")
-        gone, reports = folders.erase(self._home(session), self.participant)
+        folders.read_plan(self._home(session))
+        with alone(self._home(session)):
+            gone, reports = folders.erase(self._home(session), self.participant)
         log.info("%s erased: %d files deleted", self.participant, len(gone))
         for place in reports:
             log.warning("%s was made with this participant's data: delete it, and make it again with study.do=report", place)

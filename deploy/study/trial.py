@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -168,6 +169,11 @@ class Attempt:
             self._save()
         self._worker.shutdown(wait=True)
 
+    def leave(self) -> None:
+        """Ends it now; what is not on the disk yet is made of the capture the next time."""
+        self.abort("the program ended")
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
     @property
     def _captured(self) -> Path:
         assert self._path is not None
@@ -190,31 +196,40 @@ class Attempt:
     def _save(self) -> None:
         end_s = self._clock()
         self._stage.record(None)
-        self._saving = self._worker.submit(self._keep, self._began_s if self._seconds else end_s, end_s)
+        assert self._path is not None
+        if self._seconds:
+            window_s = [self._began_s, end_s]
+            folders.rewrite(self._path, {"capture": f"{folders.CAPTURES}/{self._path.stem}", "window_s": window_s})
+        self._saving = self._worker.submit(keep, self._folder, self._path, self._machine, self._stage)
         self._enter("saving")
 
-    def _keep(self, begin_s: float, end_s: float) -> None:
-        """Makes a recording of what was captured; what cannot be used is said in the trial's file."""
-        assert self._path is not None
-        changes: dict[str, Any] = {"capture": f"{folders.CAPTURES}/{self._path.stem}"}
-        try:
-            if end_s - begin_s > 2 * self._machine.period_s:
-                found = self._stage.keep(self._captured, begin_s, end_s)
-                name = f"{folders.RECORDINGS}/{self._path.stem}.parquet"
-                record.write(self._told(found), self._folder / name)
-                changes["recording"] = name
-                if FILLED in found.metadata:
-                    changes["recording_problem"] = found.metadata[FILLED]
-        except (BrokkError, OSError) as error:
-            log.error("%s: %s", self._path.stem, error)
-            changes["recording_problem"] = str(error)
-        folders.rewrite(self._path, changes)
 
-    def _told(self, found: record.Recording) -> record.Recording:
-        """Returns the recording with the hole, and without advice that was not shown."""
-        guided = self.trial.condition == "guided"
-        extra = {name: values for name, values in found.extra.items() if guided or not name.startswith("advice_")}
-        count = len(found.t_s)
-        at = zip("xyz", self._hole.center_in_base_m, strict=True)
-        extra |= {f"target_{axis}_m": np.full(count, value, np.float32) for axis, value in at}
-        return replace(found, extra=extra)
+def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
+    """Makes a recording of what was captured of the trial in the file `path`; what cannot be used is said in that file.
+
+    A trial that began has a `window_s`, so that this can be done again where it was interrupted: the clock is that of the capture.
+    """
+    trial = json.loads(path.read_text())
+    if "window_s" not in trial or "recording" in trial or "recording_problem" in trial:
+        return
+    changes: dict[str, Any] = {}
+    try:
+        found = stage.keep(folder.resolve() / trial["capture"], *trial["window_s"])
+        name = f"{folders.RECORDINGS}/{path.stem}.parquet"
+        record.write(_told(found, trial), folder / name)
+        changes["recording"] = name
+        if FILLED in found.metadata:
+            changes["recording_problem"] = found.metadata[FILLED]
+    except (BrokkError, OSError) as error:
+        log.error("%s: %s", path.stem, error)
+        changes["recording_problem"] = str(error)
+    folders.rewrite(path, changes)
+
+
+def _told(found: record.Recording, trial: dict[str, Any]) -> record.Recording:
+    """Returns the recording with the hole, and without advice that was not shown."""
+    guided = trial["condition"] == "guided"
+    extra = {name: values for name, values in found.extra.items() if guided or not name.startswith("advice_")}
+    at = zip("xyz", trial["hole"]["center_in_base_m"], strict=True)
+    extra |= {f"target_{axis}_m": np.full(len(found.t_s), value, np.float32) for axis, value in at}
+    return replace(found, extra=extra)

@@ -232,6 +232,20 @@ def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
     assert np.all([FACTS["twin"], not FACTS["simulated"]])
 
 
+def test_a_recording_that_an_interruption_left_unsaved_is_made_the_next_time(tmp_path: Path, arm: Arm) -> None:
+    lead = conductor(tmp_path, arm)
+    agreed(lead)
+    in_trial(lead, arm)
+    path = tmp_path / "trials" / "P01_1_01.json"
+    told = read(path)
+    path.write_text(json.dumps({key: value for key, value in told.items() if key != "recording"}))
+    (tmp_path / told["recording"]).unlink()
+    conductor(tmp_path, Arm(MACHINE))
+    assert read(path) == told and (tmp_path / told["recording"]).exists()
+    (path.parent / "P02_1_01.json").write_text("{half")
+    assert conductor(tmp_path, Arm(MACHINE)).view()["kind"] == "choose"
+
+
 def test_one_program_at_a_time_leads_sittings_of_a_study(tmp_path: Path) -> None:
     with alone(tmp_path), pytest.raises(ConfigError, match="go on already"), alone(tmp_path):
         pass

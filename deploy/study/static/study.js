@@ -23,10 +23,26 @@ const socket = token ? new Socket("/study", {
     refused = said.refused ?? refused;
     if ("refused" in said && !said.refused) refused = "";
     study = said.study;
+    hold();
     draw();
   },
   closed: event => { if (event.reason === "token") { socket.end(); study = { kind: "locked" }; draw(); } else root.classList.add("lost"); },
 }) : null;
+
+// keys come faster than answers: what was rated here counts until the server says the same
+let rated = null;
+function hold() {
+  const screen = rated !== null && study.kind === "questionnaire" && rated.scale === study.scales[study.at];
+  if (!screen || study.ratings[rated.scale] === rated.value) rated = null;
+  else study.ratings = { ...study.ratings, [rated.scale]: rated.value };
+}
+
+function rateAs(scale, value) {
+  rated = { scale, value };
+  hold();
+  tell("rate", rated);
+  draw();
+}
 
 const tell = (what, more = {}) => socket?.send(JSON.stringify({ do: what, ...more }));
 
@@ -104,7 +120,7 @@ function rate() {
   cells.setAttribute("role", "radiogroup");
   cells.setAttribute("aria-label", title);
   for (let value = 0; value <= 100; value += study.step) {
-    const cell = button(value % 25 ? "" : value, () => tell("rate", { scale, value }));
+    const cell = button(value % 25 ? "" : value, () => rateAs(scale, value));
     cell.setAttribute("role", "radio");
     cell.setAttribute("aria-checked", study.ratings[scale] === value);
     cell.setAttribute("aria-label", `${title} ${value}`);
@@ -208,8 +224,7 @@ addEventListener("keydown", event => {
     event.preventDefault();
     const scale = study.scales[study.at], now = study.ratings[scale];
     const value = event.key === "Home" ? 0 : event.key === "End" ? 100 : now === undefined ? 50 : Math.min(100, Math.max(0, now + way * study.step));
-    study.ratings = { ...study.ratings, [scale]: value };  // keys come faster than answers
-    tell("rate", { scale, value });
+    rateAs(scale, value);
   } else if (study?.kind === "questionnaire" && study.at < study.last && way) {
     event.preventDefault();
     root.querySelectorAll(".pair button")[way > 0 ? 1 : 0]?.click();
