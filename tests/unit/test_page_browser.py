@@ -301,3 +301,14 @@ def test_the_scene_shows_machine_points_and_picture(feed: Scripted, port: int, o
 def _share(page: Any, name: str, color: list[int], within: int = 25) -> float:
     picture = np.asarray(Image.open(io.BytesIO(page.locator(name).screenshot())).convert("RGB")).astype(int)
     return float((np.abs(picture - color) < within).all(-1).mean())
+
+
+def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    feed.now = replace(SHOWN, streams=(*SHOWN.streams, Stream("camera", 0.0, 1e6)))
+    page = opened(port)
+    until(page, "!document.getElementById('camera').hidden")
+    box = page.locator("#picture").bounding_box()
+    page.locator("#picture").click(position={"x": 0.25 * box["width"], "y": 0.6 * box["height"]})
+    eventually(lambda: bool(feed.wishes))
+    wish = feed.wishes[-1]
+    assert wish.kind == "point" and [float(part) for part in wish.value.split(",")] == pytest.approx([0.25, 0.6], abs=0.01)

@@ -119,7 +119,7 @@ function drawStreams(shown, since_s) {
 
 let listed = "";
 function drawTargets(shown) {
-  const key = JSON.stringify([shown.targets, language]);
+  const seen = shown.streams.some(one => one.name === "camera"), key = JSON.stringify([shown.targets, language, seen]);
   if (key === listed) return;
   listed = key;
   const focused = document.activeElement?.dataset?.target;
@@ -137,7 +137,7 @@ function drawTargets(shown) {
     return button;
   }));
   if (focused) [...$("targets").children].find(one => one.dataset.target === focused)?.focus();
-  put($("boreholes"), say(shown.targets.length ? "boreholes" : "no borehole"));
+  put($("boreholes"), say((shown.targets.length ? "boreholes" : "no borehole") + (seen ? " seen" : "")));
 }
 
 // ---- wishes out
@@ -189,7 +189,7 @@ function speak() {
   for (const id of ["start", "stop", "record"]) put($(id).querySelector("b"), say(id));
   put($("language"), language === "en" ? "DE" : "EN");
   $("language").setAttribute("aria-label", language === "en" ? "Deutsch" : "English");
-  put($("camera").querySelector("figcaption"), `${say("camera")} – ${say("point")}`);
+  put($("camera").querySelector("figcaption"), say("camera"));
   for (const side of ["left", "right"]) $(side).setAttribute("aria-label", say(side));
   $("scene").setAttribute("aria-label", say("scene"));
   const [advised, own] = $("legend").querySelectorAll("span");

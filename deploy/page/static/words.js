@@ -11,7 +11,7 @@ const DE = {
   "no 3D": "Kein 3D: dieser Browser bietet kein WebGL 2", unsure: "unbekannt", "no borehole": "Kein Bohrloch bekannt", scene: "3D-Ansicht: ziehen dreht",
   "refused token": "Kein Zugriff: Seite über den Link mit Schlüssel öffnen", "refused deadman": "Abgelehnt: Totmann halten",
   "refused target": "Abgelehnt: dieses Bohrloch gibt es nicht mehr", "refused busy": "Abgelehnt: die Steuerung nimmt es nicht an",
-  "refused nowhere": "Abgelehnt: dort ist keine Fläche gemessen", point: "Bohrloch im Bild antippen", "refused malformed": "Abgelehnt: nicht verstanden", "refused lost": "Keine Verbindung zur Steuerung",
+  "refused nowhere": "Abgelehnt: dort ist keine Fläche gemessen", "boreholes seen": "Loch wählen, antippen", "no borehole seen": "Bohrloch antippen", "refused malformed": "Abgelehnt: nicht verstanden", "refused lost": "Keine Verbindung zur Steuerung",
   nothing: "alles in Ordnung", "bus down": "Bus gestört", "time stood still": "Zeit stand still", "emergency stop": "NOT-HALT",
   "machine status missing": "Maschinenzustand fehlt", "remote missing": "Fernbedienung fehlt", "joint positions missing": "Gelenkstellungen fehlen",
   "joint positions not plausible": "Gelenkstellungen unglaubwürdig", "messages corrupted": "Nachrichten verfälscht",
@@ -31,7 +31,7 @@ const EN = {
   "no 3D": "No 3D: this browser offers no WebGL 2", unsure: "unknown", "no borehole": "No borehole is known", scene: "3D view: drag to turn",
   "refused token": "No access: open the page by the link with the key", "refused deadman": "Refused: hold the dead-man",
   "refused target": "Refused: that borehole is gone", "refused busy": "Refused: the loop does not take it", "refused malformed": "Refused: not understood",
-  "refused nowhere": "Refused: no face is measured there", point: "Touch a borehole in the picture",
+  "refused nowhere": "Refused: no face is measured there", "boreholes seen": "Choose or touch a borehole", "no borehole seen": "Touch the borehole",
   "refused lost": "No connection to the loop", nothing: "all is well", "emergency stop": "EMERGENCY STOP",
 };
 
