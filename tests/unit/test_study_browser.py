@@ -1,4 +1,4 @@
-"""The study's pages in a real browser: NASA-TLX by click and by key, in both languages, and gone on with after either side crashed."""
+"""The study's pages in a real browser: NASA-TLX by click and by key, in both languages, gone on with after either side crashed."""
 
 from __future__ import annotations
 
@@ -30,6 +30,17 @@ def browser() -> Iterator[Any]:
 def lead(tmp_path: Path) -> Conductor:
     plan(tmp_path, MACHINE)
     return conductor(tmp_path, Arm(MACHINE))
+
+
+@pytest.fixture
+def asked(lead: Conductor) -> Conductor:
+    """Everything before the first questionnaire is done, before a server also lets time go by."""
+    lead.choose("P01")
+    lead.take({"do": "consent", "agreed": True})
+    for _ in range(2):
+        in_trial(lead, lead._stage)  # type: ignore[arg-type]
+        lead.take({"do": "next"})
+    return lead
 
 
 @pytest.fixture
@@ -71,15 +82,6 @@ def at(page: Any, screen: int) -> None:
     until(page, f"() => window.sitting().at === {screen}")
 
 
-def to_questionnaire(lead: Conductor) -> None:
-    """Does everything before the first questionnaire, without the page."""
-    lead.choose("P01")
-    lead.take({"do": "consent", "agreed": True})
-    for _ in range(2):
-        in_trial(lead, lead._stage)  # type: ignore[arg-type]
-        lead.take({"do": "next"})
-
-
 def answers(place: Path) -> dict[str, Any]:
     return json.loads((place / "questionnaires" / "P01_1.json").read_text())
 
@@ -95,7 +97,7 @@ def test_a_sitting_is_walked_through_by_touch(tmp_path: Path, lead: Conductor, p
     assert page.locator("#study h1").inner_text() == {"guided": "With guidance", "unguided": "Without guidance"}[condition]
     assert page.locator("#study .joints .there").count() == 5
     page.locator("#begin").tap()
-    until(page, "() => window.sitting().phase === 'starting' || window.sitting().phase === 'countdown'")
+    until(page, "() => window.sitting().phase === 'countdown'")
     arm: Any = lead._stage
     arm.now_s += 5.0
     until(page, "() => window.sitting().phase === 'running'")
@@ -115,8 +117,7 @@ def test_a_sitting_is_walked_through_by_touch(tmp_path: Path, lead: Conductor, p
     assert json.loads((tmp_path / "trials" / "P01_1_01.json").read_text())["outcome"] == "inserted"
 
 
-def test_every_answer_can_be_given_with_gloves(lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
-    to_questionnaire(lead)
+def test_every_answer_can_be_given_with_gloves(asked: Conductor, port: int, opened: Callable[..., Any]) -> None:
     page = opened(port)
     at(page, 0)
     box = page.locator("#study .scale button").first.bounding_box()
@@ -125,8 +126,7 @@ def test_every_answer_can_be_given_with_gloves(lead: Conductor, port: int, opene
         assert min(button.bounding_box()["width"], button.bounding_box()["height"]) >= 64
 
 
-def test_the_whole_questionnaire_by_click(tmp_path: Path, lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
-    to_questionnaire(lead)
+def test_the_whole_questionnaire_by_click(tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]) -> None:
     page = opened(port)
     given = dict(zip(tlx.SCALES, (0, 25, 45, 70, 95, 100), strict=True))
     for screen, (scale, value) in enumerate(given.items()):
@@ -149,8 +149,7 @@ def test_the_whole_questionnaire_by_click(tmp_path: Path, lead: Conductor, port:
     assert tlx.weighted(found) == pytest.approx(sum(weights[scale] * given[scale] for scale in given) / 15)
 
 
-def test_the_whole_questionnaire_by_key_in_german(tmp_path: Path, lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
-    to_questionnaire(lead)
+def test_the_whole_questionnaire_by_key_in_german(tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]) -> None:
     page = opened(port, "?lang=de")
     at(page, 0)
     assert page.locator("#study h1").inner_text() == "Geistige Anforderung"
@@ -178,10 +177,9 @@ def test_the_whole_questionnaire_by_key_in_german(tmp_path: Path, lead: Conducto
 
 
 def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
-    tmp_path: Path, lead: Conductor, opened: Callable[..., Any]
+    tmp_path: Path, asked: Conductor, opened: Callable[..., Any]
 ) -> None:
-    to_questionnaire(lead)
-    with served(StudyFeed(feed(), lead), annex=StudyPages(lead)) as port:
+    with served(StudyFeed(feed(), asked), annex=StudyPages(asked)) as port:
         page = opened(port)
         at(page, 0)
         page.keyboard.press("End")
@@ -220,11 +218,10 @@ def test_nobody_leads_a_sitting_without_the_key(port: int, lead: Conductor, brow
     page.context.close()
 
 
-def test_stopping_takes_two_presses_and_is_kept(tmp_path: Path, lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
-    to_questionnaire(lead)
+def test_stopping_takes_two_presses_and_is_kept(tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]) -> None:
     page = opened(port)
     page.locator("#study .leave").click()
-    assert lead.view()["kind"] == "questionnaire"
+    assert asked.view()["kind"] == "questionnaire"
     page.locator("#study .leave", has_text="Really stop").click()
     until(page, "() => window.sitting().kind === 'stopped'")
     assert json.loads((tmp_path / "participants" / "P01.json").read_text())["stopped"] is True
