@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests"))
-os.environ["PYTHONPATH"] = str(ROOT / "tests")
+os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT / "tests"), str(ROOT), os.environ.get("PYTHONPATH", "")])
 
 from composed import option  # noqa: E402
 from desk import Desk, Stop  # noqa: E402
