@@ -81,17 +81,18 @@ class Twins:
         steps, left = round(trials.limit_s / machine.period_s), np.full(num, round(self.settle_s / machine.period_s))
         running = np.ones(num, bool)
         with Crew("deploy.study.twins:desks", parts, rows, num) as crew:
-            now = crew.ask("seen", running)
+            now, found = crew.ask("seen", running), dict[int, Recording]()
             for _ in track(range(steps), "simulated operators at the twin", transient=True):
                 q = np.stack([now[n][0] for n in range(num)])
                 advice = np.stack([now[n][1] if trials.guided[n] else nothing for n in range(num)])
                 given = operators.step(OperatorView(q=q, rim_in_base_m=trials.rim_in_base_m, advice=advice))
                 now |= crew.ask("period", running, given)
                 left -= _inserted(machine, q, trials) & running
+                found |= crew.ask("end", running & (left <= 0))
                 running &= left > 0
                 if not running.any():
                     break
-            found = crew.ask("recording", np.ones(num, bool))
+            found |= crew.ask("end", running)
         return [found[n] for n in range(num)]
 
 
@@ -232,6 +233,12 @@ class _Desk:
         self._adviser.cycle(0, now_s)
         advice = self._shared.advice.read()
         self._shown = self._display.command(np.array(advice["lever_rad"]), bool(advice["button_right"]))
+
+    def end(self) -> Recording:
+        """Returns the recording, and lets go of the twin: its memory is wanted for nothing any more."""
+        found = self.recording()
+        del self._twin, self._link
+        return found
 
     def recording(self) -> Recording:
         """Returns the trial at the control rate, commands as the valves got them."""
