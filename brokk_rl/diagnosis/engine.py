@@ -22,6 +22,7 @@ from brokk_rl.diagnosis.search import MOST, Chosen, Price, Table, choose
 from brokk_rl.diagnosis.shapes import SMALL, Nulls, add, plain_joints
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.sizes import Shape
+from brokk_rl.diagnosis.tied import tied
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -121,14 +122,8 @@ class Search:
         on_tool = tool.search(self.case, self.kinds, prices.joint, prices.name)
         evidence = _adjusted(self.base.field.evidence, [*on_sensors, *on_tool.found])
         grown, shapes = self._simulated(evidence, tool.is_tracked(self.case.field, self.case.machine))
-        known = Nulls(
-            self.base,
-            {name: rays(ways[0].kind, SMALL) for name, ways in grown.items()},
-            grown,
-            plain_joints(evidence),
-            shapes,
-            self.shared,
-        )
+        small = {name: rays(ways[0].kind, SMALL) for name, ways in grown.items()}
+        known = Nulls(self.base, small, grown, plain_joints(evidence), shapes, self.shared)
 
         def price(j: int, subset: frozenset[str]) -> float:
             known_there = max(prices.reference * known.earned(j, subset), known.repeated(j, subset))
@@ -195,6 +190,10 @@ class Search:
         self.tell("the same on the reference", 0.7)
         prices = self.prices
         chosen = choose(tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint)
+        if z is None and (common := chosen.names & self.shared):
+            grown, shapes = tied(common, tables, grown, shapes)
+            tables = self._tables(evidence, grown, shapes, scatter, z)
+            chosen = choose(tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint)
         repaired = self._repaired(evidence, grown, tables, chosen)
         if repaired and (kept := holding.kept(evidence, chosen, repaired, price, scatter, self.shared)) != chosen.subsets:
             chosen = Chosen(kept, chosen.worth)

@@ -34,12 +34,14 @@ class Ray:
         name: Of the number; empty for all at once.
         sizes: Sizes at which it is simulated, over the typical one, rising, 0 among them.
         shape: Values of the numbers that only shape the effect, over the typical ones, by name, each `(J,)`; 1 where not given.
+        is_tied: The size is known up to `sizes`, and goes no further.
     """
 
     kind: Kind
     name: str
     sizes: np.ndarray
     shape: Mapping[str, np.ndarray] = field(default_factory=dict)
+    is_tied: bool = False
 
     def values(self, size: np.ndarray) -> dict[str, np.ndarray]:
         """Returns the numbers at sizes `(C, J)`, each `(C, J)` or `(C, 1)`."""

@@ -145,7 +145,7 @@ def search(
         drawn = [_thinned(one) for one in _drawn(changes, kind)]
         gains[kind.name] = np.array([_gain(seen, one, scale) for one in drawn])
         best = drawn[int(np.argmax(gains[kind.name]))]
-        if any(_gain(one, best, scale) < 0.0 for one in map(seen.of, np.unique(seen.joint)) if len(one.value) >= FEWEST):
+        if any(_gain(one, best, scale) < -price for one in map(seen.of, np.unique(seen.joint)) if len(one.value) >= FEWEST):
             gains[kind.name] = gains[kind.name] * 0.0  # frames are late for all joints or for none
         share = [len(seen.value) / max(1, len(one.value)) for one in known]
         earned[kind.name] = max(0.0, *(_gain(one, best, scale) * part for one, part in zip(known, share, strict=True)))

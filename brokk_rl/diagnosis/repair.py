@@ -178,7 +178,8 @@ class _Fit:
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest sizes, `(R, 1)`: beyond what was simulated before, within the bounds of the numbers."""
         low, high = (np.array([ray.sizes[end] for ray in self.rays])[:, None] for end in (0, -1))
-        return np.where(low < 0, BEYOND * low, low), BEYOND * high
+        by = np.array([1.0 if ray.is_tied else BEYOND for ray in self.rays])[:, None]
+        return np.where(low < 0, by * low, low), by * high
 
     def simulated(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns errors over the noise `(F, J, E)` and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
@@ -197,7 +198,8 @@ class _Fit:
         for _ in range(steps):
             z, slopes, _ = _linear(self.evidence, self.rays, now)
             least = _totals(z, now, weights)
-            trials = np.clip(np.stack([now + self._step(z, slopes, now, used, by * damping) for by in DAMPING]), *self.bounds)
+            trials = np.stack([now + self._step(z, slopes, now, used, by * damping) for by in DAMPING])
+            trials = np.clip(trials, *self.bounds) * self.mask
             tried = self.simulated(trials.reshape(-1, *now.shape[1:]))[0].reshape(len(DAMPING), *z.shape)
             totals = np.stack([_totals(one, sizes, weights) for one, sizes in zip(tried, trials, strict=True)])  # (D, F, J)
             best = totals.argmin(0)
