@@ -109,8 +109,11 @@ class Conductor:
 
     def tick(self) -> None:
         """Looks at the machine; called some twenty times a second."""
-        if self._attempt is not None:
-            self._attempt.tick()
+        try:
+            if self._attempt is not None:
+                self._attempt.tick()
+        except BrokkError as error:
+            self._fall_back(error)
 
     def take(self, said: dict[str, Any]) -> str:
         """Takes what a page says; returns why it was not taken, empty where it was."""
@@ -141,8 +144,7 @@ class Conductor:
             else:
                 return "not now"
         except BrokkError as error:
-            self.problem = str(error)
-            log.error("%s", error)
+            self._fall_back(error)
             return "failed"
         return ""
 
@@ -163,6 +165,12 @@ class Conductor:
         """Ends what is under way, at once."""
         if self._attempt is not None:
             self._attempt.leave()
+
+    def _fall_back(self, error: BrokkError) -> None:
+        """Goes back to the list of participants, and says what went wrong there; what stands on the disk is gone on with later."""
+        log.error("%s", error)
+        self._stage.record(None)
+        self._who, self._step, self._attempt, self._form, self.problem = None, None, None, None, str(error)
 
     def _in_trial(self, do: str, attempt: Attempt) -> str:
         if do == "begin":

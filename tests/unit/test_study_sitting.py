@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -217,6 +218,24 @@ def test_advice_leaves_the_loop_in_guided_trials_alone(tmp_path: Path, arm: Arm)
         arm.later(lead, 1.0)
         saved(lead, arm)
         lead.take({"do": "next"})
+
+
+def test_a_disk_that_takes_no_more_ends_the_trial_and_is_said(tmp_path: Path, arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
+    lead = conductor(tmp_path, arm)
+    agreed(lead)
+    lead.take({"do": "begin"})
+    arm.later(lead, 2.0)
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(folder, "write_json", full)
+        arm.q = MACHINE.home
+        arm.later(lead, 0.2)
+        assert lead.view()["kind"] == "choose" and "No space left" in lead.view()["problem"] and arm.recorded is None
+    lead.take({"do": "choose", "who": "P01"})
+    assert (lead.view()["kind"], lead.view()["number"], lead.view()["problem"]) == ("trial", 1, ""), "it is done again"
 
 
 def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
