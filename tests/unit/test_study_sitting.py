@@ -245,6 +245,8 @@ def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
     assert lead.take({"do": "choose", "who": "Jane"}) == "failed" and "Jane" in lead.view()["problem"]
     assert lead.take({"do": "begin"}) == "nobody" and lead.take({}) == "nobody"
     agreed(lead)
+    (tmp_path / "captures" / "P01_1_01").mkdir(parents=True)
+    (tmp_path / "captures" / "P01_1_01" / "capture.mcap").write_bytes(b"all that was on the bus")
     folder.erase(tmp_path, "P01")
     assert not list(tmp_path.rglob("P01*"))
     assert conductor(tmp_path, arm).view()["participants"][0]["state"] == "erased"
