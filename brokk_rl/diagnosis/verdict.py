@@ -150,8 +150,14 @@ def unknown_chance(findings: Findings, prices: Prices, weights: Certainty) -> fl
 
 
 def is_unknown(findings: Findings, prices: Prices, weights: Certainty) -> bool:
-    """Says whether something is there that the library does not explain."""
-    return unknown_chance(findings, prices, weights) > 0.5
+    """Says whether an unknown cause is probable, or more so than every effect that was found and than that there is nothing."""
+    chances = [certainty.chance(weights.right, other_signs(findings, weights, one)) for one in findings.others]
+    for name in findings.chosen.names:
+        swaps = rivals(findings, name)
+        signs = named_signs(findings, prices, weights, name, swaps, same_as(swaps, own_gain(findings, name)))
+        chances.append(certainty.chance(weights.right, signs))
+    chances = chances or [certainty.chance(weights.none, none_signs(findings, prices, weights))]
+    return unknown_chance(findings, prices, weights) > min(0.5, max(chances))
 
 
 def other(findings: Findings, found: Found, weights: Certainty, machine: Machine) -> Selected:
