@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
-from brokk_rl.diagnosis.exam import rules, tally
+from brokk_rl.diagnosis.exam import marking, rules, tally
 from brokk_rl.diagnosis.exam.ground import Errors
 from brokk_rl.diagnosis.exam.marking import Claim, Mark, mark
 from brokk_rl.diagnosis.sizes import Shape
@@ -168,3 +168,17 @@ def test_forward_selection_takes_what_is_there_and_bic_leaves_what_does_not_pay(
     assert set(rules.grown(errors, rules.bic)) == {"lag"}
     assert next(iter(rules.grown(errors, rules.held_out))) == "lag"
     assert rules.grown(Errors(generator.standard_normal(600), shapes, fold), rules.bic) == {}
+
+
+def test_a_number_that_all_joints_share_counts_once() -> None:
+    joints = ("q1", "q2", "q3")
+    label = {"effect": "frame_loss", "parameters": {"probability": dict.fromkeys(joints, 0.1)}, "nothing": {"probability": 0.0}}
+    shared: dict[str, Any] = {"probability": dict.fromkeys(joints, Estimate(0.11, (0.09, 0.13)))}
+    own: dict[str, Any] = {"probability": {joint: Estimate(0.11 + 0.001 * n, (0.09, 0.13)) for n, joint in enumerate(joints)}}
+    counts = [
+        len(
+            marking._numbers(label, Selected(effect="frame_loss", joints=joints, probability=1.0, parameters=said, gap_closed=None))
+        )
+        for said in (shared, own)
+    ]
+    assert counts == [1, 3]

@@ -188,6 +188,8 @@ def _numbers(true: Mapping[str, Any], one: Selected) -> list[Number]:
         values = dict(by_joint)
         if "machine" in said:  # a number that joints do not have
             values = {"machine": next(iter(by_joint.values()))}
+        elif len(set(values.values())) == 1 and len(set(said.values())) == 1 and set(said) >= set(values):
+            values = dict(list(values.items())[:1])  # one that they share counts once
         for joint, value in values.items():
             if joint not in said:
                 continue
