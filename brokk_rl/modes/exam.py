@@ -210,7 +210,7 @@ class Exam:
         if place.is_file():
             found = json.loads(place.read_text())  # of a run that was interrupted
         todo = [label for label in labels if label["case"] not in found]
-        job = partial(_closed_by, self._folder, self.exam.oracle, self.machine)
+        job = partial(oracle.of_label, self._folder / paper.CASES, self.exam.oracle, self.machine)
         with Progress(transient=True) as progress, ProcessPoolExecutor(self.exam.workers) as pool:
             task = progress.add_task(f"{len(labels)} cases", total=len(labels), completed=len(labels) - len(todo))
             for label, share in zip(todo, pool.map(job, todo), strict=True):
@@ -287,11 +287,6 @@ class Exam:
         if all(mark.verdict == "failed" for mark in marks):
             raise RecordingError(f"exam.answers: {folder} holds no answer to any case of {self._folder}")
         return tally(marks)
-
-
-def _closed_by(folder: Path, fit: ActuatorFit, machine: Machine, label: Mapping[str, Any]) -> float | None:
-    effects = {one["effect"]: one["joints"] for one in label["effects"]}
-    return oracle.closed_by(folder / paper.CASES / label["case"], effects, fit, machine)
 
 
 def _show(tables: dict[str, dict[str, Any]]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,11 @@ def closed_by(folder: Path, effects: Mapping[str, Sequence[str]], fit: ActuatorF
     start = [_start(errors, subset) for errors, subset in zip(found.errors, subsets, strict=True)]
     after = gap.rmse(gap.squares(repair(evidence, subsets, found.rays, start).after, measured, machine))
     return (before - after) / (before - floor)
+
+
+def of_label(cases: Path, fit: ActuatorFit, machine: Machine, label: Mapping[str, Any]) -> float | None:
+    """Returns the same for the case of a label, in the folder `cases`."""
+    return closed_by(cases / label["case"], {one["effect"]: one["joints"] for one in label["effects"]}, fit, machine)
 
 
 def _start(errors: Errors, names: frozenset[str]) -> dict[str, np.ndarray]:
