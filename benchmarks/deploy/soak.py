@@ -27,7 +27,7 @@ def resident_bytes(pid: int) -> int | None:
 def main(folder: Path, seconds: float) -> None:
     command = [
         sys.executable, "-P", "-m", "brokk_rl", "preset=bench", "link=nominal", f"deploy.seconds={seconds}", "deploy.show=false",
-        f"session.out={folder}",
+        f"session.out={folder}", f"bus.port={20000 + os.getpid() % 20000}", "page.port=0",
     ]  # fmt: skip
     run, memory, begun_s = subprocess.Popen(command), [], time.monotonic()
     while run.poll() is None:

@@ -12,17 +12,28 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from desk import free_port
+from PIL import Image
 from websockets.asyncio.client import connect
 
+from deploy.page.demo import BLOCK_M, TARGETS
+from deploy.page.demo_camera import Camera
+
+FRAME = Camera(640, 360, BLOCK_M, TARGETS).frame(0, 0.0)
 TOKEN = "correct horse battery staple"
 
 
 @pytest.mark.slow
 def test_the_loop_is_shown_recorded_again_on_a_wish_and_outlives_its_page(tmp_path: Path) -> None:
+    _photograph(tmp_path / "camera")
     # a simulated operator, who holds the dead-man
     command = [sys.executable, "-c", "from brokk_rl.cli import main; main()", "preset=bench", "bench=guided", "deploy.show=false"]
     command += [f"session.out={tmp_path / 'run'}", "page.port=0", f"page.token='{TOKEN}'", "deploy.seconds=300"]
+    command += [f"bus.port={free_port()}"]
+    command += ["camera=pictures", "perception/source@source=folder", f"source.folder={tmp_path / 'camera'}"]
+    command += ["deploy.camera.record_hz=5"]
     loop = subprocess.Popen(command, cwd=tmp_path, env=os.environ | {"OMP_NUM_THREADS": "1"})
     try:
         address = _patiently(lambda: (tmp_path / "run" / "page.url").read_text().strip(), 90).partition("/#")[0]
@@ -53,8 +64,30 @@ async def _use(host: str, run: Path) -> None:
             await control.send(json.dumps({"kind": "record", "value": value}))
             assert json.loads(await control.recv()) == {"done": "record", "kind": "record"}
             await _shown(state, lambda shown, on=on: shown["recording"]["on"] == on)
+        x, y = seen_at(FRAME, np.array(TARGETS[1].center_in_base_m))
+        await control.send(json.dumps({"kind": "point", "value": f"{x:.4f},{y:.4f}"}))
+        assert json.loads(await control.recv()) == {"done": "point", "kind": "point"}
+        touched = (await _shown(state, lambda shown: shown["targets"][0]["std_m"] is not None))["targets"][0]
+        assert np.linalg.norm(np.array(touched["center_in_base_m"]) - TARGETS[1].center_in_base_m) < 0.02 and touched["chosen"]
         assert (run / "capture.mcap").stat().st_size > 0
         _patiently(lambda: (run / "recording_2" / "capture.mcap").stat(), 20)
+
+
+def _photograph(folder: Path) -> None:
+    """Leaves a folder with a frame of the demo's camera."""
+    assert FRAME.base_from_camera is not None
+    folder.mkdir()
+    Image.fromarray(FRAME.color).save(folder / "0.color.png")
+    np.save(folder / "0.depth.npy", FRAME.depth_m)
+    camera = {"K": FRAME.camera_matrix.tolist(), "T_base_cam": FRAME.base_from_camera.tolist()}
+    (folder / "camera.yaml").write_text(json.dumps(camera))
+
+
+def seen_at(frame: Any, center_m: np.ndarray) -> tuple[float, float]:
+    """Returns where in the picture a point of the base frame is, as parts of width and height."""
+    from_base = np.linalg.inv(frame.base_from_camera)
+    u, v, w = frame.camera_matrix @ (from_base[:3, :3] @ center_m + from_base[:3, 3])
+    return (u / w + 0.5) / frame.color.shape[1], (v / w + 0.5) / frame.color.shape[0]
 
 
 async def _shown(state: Any, claim: Any) -> dict[str, Any]:
