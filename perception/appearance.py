@@ -12,7 +12,8 @@ from perception.plane import Plane
 
 INSIDE, RING = 0.8, (1.15, 1.8)
 """Radii: the inside without the rim's blur, and the ring around that shows how bright the face is."""
-
+WIDE = 8.0
+"""Radii: its surroundings, in which something else is dark too, unless there is dust."""
 CLEARLY_M = 0.03
 """How far behind the face depth must be to be taken for the inside of a hole, whatever the noise."""
 
@@ -28,12 +29,16 @@ class Interior:
             the hole and the dark depth on the near side: clearly negative in a hole, about zero on a disc.
         deeper: Part of the known depth inside that lies clearly behind the face.
         unknown: Part of the inside without depth.
+        around: Brightness of the darkest hundredth of what surrounds it, over that of the face.
+        contrast: By how much its darkest quarter is darker than the face, in standard deviations of the brightness of the face.
     """
 
     darkness: float
     slope: float
     deeper: float
     unknown: float
+    around: float
+    contrast: float
 
 
 def interior(
@@ -50,7 +55,7 @@ def interior(
     radii = conic.radii(ellipse, columns, rows)
     inside, ring = radii < INSIDE, (radii > RING[0]) & (radii < RING[1])
     if inside.sum() < 8 or ring.sum() < 8:
-        return Interior(np.nan, np.nan, np.nan, np.nan)
+        return Interior(*[np.nan] * 6)
     face = max(float(np.median(part[ring])), 1.0)
     smooth = cv2.GaussianBlur(part, (0, 0), max(0.15 * float(np.sqrt(ellipse[2] * ellipse[3])), 0.6))
     inside &= smooth < face  # what is brighter is the lit arm before it, where it has no depth
@@ -61,7 +66,7 @@ def interior(
         before = (known & (behind < -4 * plane.sigma)).astype(np.uint8)  # an arm that hides a part of it
         inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
     if inside.sum() < 8:
-        return Interior(np.nan, np.nan, np.nan, np.nan)
+        return Interior(*[np.nan] * 6)
     values = smooth[inside]
     darkness = float(np.percentile(values, 25.0)) / face
     unknown = float(np.mean(~known[inside]))
@@ -75,7 +80,11 @@ def interior(
         drift = _gradient(part, place, ring, ellipse) * min(darkness, 1.0)  # of dust, which lies over hole and face alike
         values = values - (place[inside][:, :2] - (x, y)) @ drift
         slope = float(np.polyfit(along, values, 1)[0]) / max(face * (1.0 - darkness), 1.0)
-    return Interior(darkness, slope, deeper, unknown)
+    grain = 1.4826 * float(np.median(np.abs(smooth[ring] - face)))
+    wide = WIDE * a
+    near = gray[max(0, int(y - wide)) : int(y + wide), max(0, int(x - wide)) : int(x + wide)]
+    around = float(np.percentile(near[::2, ::2], 1.0)) / face
+    return Interior(darkness, slope, deeper, unknown, around, face * (1.0 - darkness) / max(grain, 1.0))
 
 
 def _gradient(part: np.ndarray, place: np.ndarray, ring: np.ndarray, ellipse: np.ndarray) -> np.ndarray:

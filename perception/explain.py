@@ -22,6 +22,7 @@ WORDS = {
         "Look at perception.pose.radius_m if the holes are of another size.",
     ),
     "brightness inside over outside": ("it is not dark inside", "A ring, a filled hole, or a lamp in it."),
+    "contrast to the grain of the face": ("it is hardly darker than the spots of the face", "A stain or a shadow."),
     "mouth probability inside": ("the network does not take it for the mouth of a hole", "A flat dark disc looks like this."),
     "evidence of depth inside": ("it is evenly dark, and as deep as the face", "A flat dark disc looks like this."),
     "distance to a larger rim, m": ("it lies within a larger rim", "The far rim or the floor of a hole."),

@@ -16,6 +16,9 @@ from perception.appearance import Interior
 from perception.plane import Plane
 from perception.rim import Circle
 
+VEILED_SCORE = 0.5
+"""Of what nobody can tell from a flat disc, since dust lies over it."""
+
 
 @spec
 class Looks:
@@ -23,6 +26,9 @@ class Looks:
 
     Attributes:
         darkness: Largest brightness of the darkest quarter inside over that of the face.
+        veiled: From which on something lies over both: dust, behind which nobody sees how deep a hole is; or it is a stain.
+        darker: If something near it is darker by more than this, over the brightness of the face, it is no dust.
+        contrast: Least contrast, in standard deviations of the face's own brightness, of what is veiled: a stain has less.
         mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives one.
         sure_mouth: From which the mouth channel needs no other witness.
         slope: Slope of brightness inside, see `Interior`, that alone would show a hole; less is as much less evidence, and adds up.
@@ -32,6 +38,9 @@ class Looks:
     """
 
     darkness: float
+    veiled: float
+    darker: float
+    contrast: float
     mouth: float
     sure_mouth: float
     slope: float
@@ -155,7 +164,7 @@ class PlaneConicEstimator:
             cov_m2=covariance(replace(face, cov=face.cov * s.depth_alike), circle, frame.camera_matrix, s.center_px, s.bias_per_m),
             axis_cov_rad2=face.normal_cov_rad2() * s.tilt_alike,
             frame="camera",
-            score=float(ellipse.score),
+            score=float(ellipse.score) * (VEILED_SCORE if inside.darkness > s.looks.veiled and masks.mouth is None else 1.0),
             t_s=frame.t_s,
         )
 
@@ -198,6 +207,12 @@ class PlaneConicEstimator:
                 return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
             if mouth >= looks.sure_mouth:
                 return None
+        if inside.darkness > looks.veiled:
+            if inside.around < inside.darkness - looks.darker:
+                return Rejection("pose", "brightness inside over outside", inside.darkness, looks.veiled, ellipse)
+            if inside.contrast >= looks.contrast:
+                return None
+            return Rejection("pose", "contrast to the grain of the face", inside.contrast, looks.contrast, ellipse)
         shown = [max(one, 0.0) for one in (inside.slope / looks.slope, inside.deeper / looks.deeper) if np.isfinite(one)]
         against = (parallax - 1.0) / (
             looks.parallax - 1.0

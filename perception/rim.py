@@ -24,8 +24,8 @@ NEAR_PX, INLIER_PX = 0.7, 1.0
 """A profile speaks for a circle that has an edge so near to it; of the final one."""
 NARROW_PX = 2.0
 """Reach of the profiles across a circle that is known already."""
-ALIKE_PX = 2.0
-"""Points of a rim are alike over this length."""
+ALIKE_PX = 5.0
+"""Points of a rim are alike over this length: the chips of it, and the blur."""
 LEAST = 12
 
 

@@ -32,7 +32,8 @@ class DepthPlane:
         min_extent_m: Smallest extent of a face.
         max_extent_m: Largest extent of a face; what is larger is ground or wall.
         max_tilt_rad: Largest angle between the face's normal and the line of sight.
-        min_front: Of the surroundings that are not in the plane, at least this part must lie behind it.
+        min_front: Of the surroundings that are not in the plane, at least this part must lie behind it where the plane also holds
+            something wider than a face.
         edge_px: Radius of the filter that moves the mask's edge onto the picture's edge, in px of the small picture.
         edge_contrast: Grey step, of 1, below which the picture does not move the mask's edge.
         seed: Of the trials; the same frame always gives the same mask.
@@ -161,8 +162,10 @@ class PlaneSegmenter:
         nearer = known & (excess > self._tolerance)
         pieces = [_filled((labels == label).astype(np.uint8), nearer) for label in large]
         faces = np.zeros_like(support)
+        # ground or wall? so are the pieces of it that something before them cuts off; of a face that may hide all surroundings
+        wide = any(_extents(piece, plane, grid).prod() > settings.max_extent_m**2 for piece in pieces)
         for piece in pieces:
-            if self._fits(piece, plane, grid) and self._front(piece, excess, known) >= settings.min_front:
+            if self._fits(piece, plane, grid) and (not wide or self._front(piece, excess, known) >= settings.min_front):
                 faces |= piece
         # an arm before a face cuts it in pieces, of which the smaller ones have little but the arm around them
         for piece in pieces if faces.any() else ():
