@@ -28,11 +28,11 @@ from brokk_rl.machine import Machine
 log = logging.getLogger(__name__)
 
 SIZES = (0.12, 0.3, 0.45, 0.6, 1.0)
-SURE = 8.0
+SURE = 6.0
 """Log of a Bayes factor, all parts together, from which an effect is there."""
 AGREEING = 0.75
 """Share of the parts in which it must pay."""
-EACH = 2
+EACH = 3
 """This is looked for on one of so many stretches of each part."""
 
 Ways = Mapping[str, Sequence[Ray]]
@@ -42,16 +42,15 @@ def refined(base: Base, kinds: Sequence[Kind], machine: Machine) -> Base:
     """Returns the simulator with the effects around it that the reference shows.
 
     Args:
-        base: A simulator, and fits that left out parts of the reference.
+        base: A simulator, and fits that left out parts of the reference, their noise known, before any discrepancy is learned.
         kinds: The library.
         machine: The machine.
     """
     ways = {key: way for kind in kinds if _can_be_there(kind) for key, way in _ways(kind).items()}
     if len(base.nulls) < 2 or base.is_flexible:
         return base
-    bare = _around(base, [], machine)
-    found = _there([thinned(one.evidence, EACH) for one in bare.nulls], ways)
-    return simulator.learned(_around(bare, found, machine), machine) if found else base
+    found = _there([thinned(one.evidence, EACH) for one in base.nulls], ways)
+    return _around(base, found, machine) if found else base
 
 
 def _can_be_there(kind: Kind) -> bool:
@@ -74,7 +73,7 @@ def _there(parts: Sequence[Evidence], ways: Ways) -> list[tuple[Kind, Values]]:
     """Returns the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
     responses = {key: [[part.response(ray) for ray in way] for part in parts] for key, way in ways.items()}
     of_part = np.repeat(np.arange(len(parts)), [part.z.shape[1] for part in parts])
-    sizes: dict[str, np.ndarray] = {}
+    found: dict[str, tuple[Kind, dict[str, np.ndarray]]] = {}
     for j in range(parts[0].z.shape[0]):
         joint = plain(np.concatenate([part.z[j] for part in parts]), np.concatenate([part.faults[j] for part in parts], 1))
         shapes: dict[str, list[Shape]] = {}
@@ -85,23 +84,26 @@ def _there(parts: Sequence[Evidence], ways: Ways) -> list[tuple[Kind, Values]]:
         table = Table(joint, shapes, of_part)
         scored = {key: table.score(frozenset({key})) for key in shapes}
         best = max(scored, key=lambda key: scored[key].total, default=None)
-        if best is None or scored[best].total < SURE:
+        if best is None or scored[best].total < SURE or np.mean(np.bincount(of_part, scored[best].gain) > 0) < AGREEING:
             continue
-        if np.mean(np.bincount(of_part, scored[best].gain) > 0) >= AGREEING:
-            sizes.setdefault(best, np.zeros((len(ways[best]), len(parts[0].z))))[:, j] = scored[best].sizes[best]
-            log.info("the reference shows %s on joint %d already", best, j + 1)
-    return [(ways[key][0].kind, _values(ways[key], size)) for key, size in sizes.items()]
+        kind = ways[best][0].kind
+        log.info("the reference shows %s on joint %d already", kind.name, j + 1)
+        _, values = found.setdefault(kind.name, (kind, _values(kind, ways[best], np.zeros(len(ways[best])))))
+        for name, value in _values(kind, ways[best], scored[best].sizes[best]).items():
+            values[name][:, j] = value[:, j]
+    return list(found.values())
 
 
-def _values(ways: Sequence[Ray], sizes: np.ndarray) -> dict[str, np.ndarray]:
-    found: dict[str, np.ndarray] = {}
+def _values(kind: Kind, ways: Sequence[Ray], sizes: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the numbers of an effect at sizes along its rays, the same on all joints, each `(1, J)`."""
+    found = {name: np.full((1, kind.num_joints), kind.numbers[name].typical) for name in kind.shaping}
     for ray, size in zip(ways, sizes, strict=True):
-        found |= ray.values(size[None])
-    return found
+        found |= ray.values(np.full((1, kind.num_joints), size))
+    return {name: np.broadcast_to(value, (1, kind.num_joints)).copy() for name, value in found.items()}
 
 
 def _around(base: Base, effects: Sequence[tuple[Kind, Values]], machine: Machine) -> Base:
-    """Returns the simulator with more effects around it, and the noise of what it errs by then; no discrepancy is taken off."""
+    """Returns the simulator with effects around it, and the noise of what it errs by then."""
 
     def around(one: Held) -> Held:
         candidates = one.evidence.candidates

@@ -31,6 +31,8 @@ SCATTERED = 1.3
 """Mean square error over that of the reference from which what effects earn is taken down."""
 CUT = 25.0
 """Squares of errors over the noise count no more than this in what scatters."""
+FEW = 2
+"""Parts of the reference that tell how delays scatter."""
 TURNS = 2
 """Times that effects are simulated around what was found, where adding up is far off."""
 Tell = Callable[[str, float], None]
@@ -141,7 +143,7 @@ class Search:
             grown = wide[1]
         self.tell("frames", 0.8)
         after = repaired.after if repaired else evidence.base
-        late = frames.search(evidence, evidence.error_of(after), nulls, self.kinds, prices.joint, prices.name)
+        late = frames.search(evidence, evidence.error_of(after), nulls[:FEW], self.kinds, prices.joint, prices.name)
         scatter = np.maximum(1.0, self._scatter(evidence, repaired))
         for _ in range(2 if late else int(scatter.max() > SCATTERED)):
             if late:  # what delays change depends on when commands act, and so on what else delays them

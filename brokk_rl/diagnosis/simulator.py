@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -101,10 +101,13 @@ def held(actuator: Actuator, begun: Begun, machine: Machine, seed: int) -> Held:
     return Held([recording for recording, _ in begun], Evidence(candidates, None, claims), np.array(source), np.array(row))
 
 
-def fitted(case: Case, fit: ActuatorFit, folder: Path, seed: int, device: torch.device) -> Base:
+def fitted(
+    case: Case, fit: ActuatorFit, folder: Path, seed: int, device: torch.device, refined: Callable[[Base], Base] = lambda base: base
+) -> Base:
     """Returns a simulator fitted to the reference, and fits that leave a part of it out.
 
     A fit that knows how to `refit` is fitted anew to each rest, all others once to two thirds: the price of a fit that takes long.
+    `refined` may change the simulator before what it gets wrong is learned; see `already`.
 
     Raises:
         RecordingError: too little reference.
@@ -123,7 +126,7 @@ def fitted(case: Case, fit: ActuatorFit, folder: Path, seed: int, device: torch.
         nulls = _noised([one.with_base(tuning.changed(one.evidence.candidates.base, changes, machine)) for one in nulls], machine)
         field = field.with_base(actuator)
     field = replace(field, evidence=replace(field.evidence, claims=_known(case, field)))
-    return learned(Base(actuator, field, nulls), machine)
+    return learned(refined(Base(actuator, field, nulls)), machine)
 
 
 def learned(base: Base, machine: Machine) -> Base:

@@ -117,7 +117,9 @@ class Diagnose:
     def _base(self, given: Case, kinds: Sequence[Kind]) -> Base:
         seed, device, folder = self.session.stream("base"), self.session.torch_device(), self.session.folder
         if given.reference:
-            return already.refined(simulator.fitted(given, self.fit, folder / "base", seed, device), kinds, self.machine)
+            return simulator.fitted(
+                given, self.fit, folder / "base", seed, device, lambda base: already.refined(base, kinds, self.machine)
+            )
         assert self.actuator is not None, "there is one where there is no reference"
         return simulator.given(given, self.actuator, self.fit, folder / "flexible", seed, device)
 
