@@ -34,12 +34,22 @@ class Augmentation(Protocol):
         ...
 
 
-def augmented(pictures: torch.Tensor, steps: Mapping[str, Augmentation], generator: torch.Generator) -> torch.Tensor:
-    """Returns the pictures after all augmentations in their order, each with its probability, clipped to [0, 1]."""
+def augmented(
+    pictures: torch.Tensor, steps: Mapping[str, Augmentation], chance: torch.Generator, generator: torch.Generator
+) -> torch.Tensor:
+    """Returns the pictures after all augmentations in their order, each with its probability, clipped to [0, 1].
+
+    Args:
+        pictures: `(B, 3, h, w)`.
+        steps: By name.
+        chance: On the CPU, says which pictures each one changes: whoever asks a graphics card for that waits for it.
+        generator: Of the pictures' device, says how.
+    """
     for step in steps.values():
-        if step.probability > 0.0:
-            chosen = _drawn((0.0, 1.0), pictures, generator) < step.probability
-            pictures = torch.where(chosen, step.changed(pictures, generator), pictures)
+        chosen = torch.nonzero(torch.rand(len(pictures), generator=chance) < step.probability)[:, 0]
+        if len(chosen):
+            chosen = chosen.to(pictures.device, non_blocking=True)
+            pictures = pictures.index_copy(0, chosen, step.changed(pictures[chosen], generator))
     return pictures.clamp(0.0, 1.0)
 
 

@@ -131,7 +131,7 @@ class Samples:
         taken = self._layers[frame.to(self._layers.device), look.to(self._layers.device)].to(self._device)
         windows = self._crop.windows(count, (taken.shape[2], taken.shape[3]), generator)
         layers = cut(taken, windows, self._size_px)
-        return augmented(layers[:, :3], self._steps, generator), layers[:, 3:]
+        return augmented(layers[:, :3], self._steps, chance, generator), layers[:, 3:]
 
 
 def cut(layers: torch.Tensor, windows: torch.Tensor, size_px: tuple[int, int]) -> torch.Tensor:

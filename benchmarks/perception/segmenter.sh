@@ -10,12 +10,13 @@ mkdir -p "$OUT"
 work=$(mktemp -d "${TMPDIR:-/tmp}/segmenter.XXXX")
 begun=$(date +%s); say() { echo "[$(( $(date +%s) - begun )) s] $*" | tee -a "$work/log"; }
 export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
-half="rig.width=960 rig.height=540 rig.focal_px=528.0"; full=""
-[ -n "$SMALL" ] && half="rig.width=480 rig.height=270 rig.focal_px=264.0" && full=$half
+half="rig.width=960 rig.height=540 rig.focal_px=528.0"; near="rig.width=960 rig.height=540 rig.focal_px=1056.0"; full=""
+[ -n "$SMALL" ] && half="rig.width=480 rig.height=270 rig.focal_px=264.0" && near=$half && full=$half
 
 each=8; (( CORES < 40 )) && each=5
 # One process a core. Of each eight (five, if there are few) one draws scenes to judge by, a condition at a time; of the others
-# every third draws varied scenes at 1080p, the rest at half of that, which is what the network sees of a block at 1 to 2 m.
+# every second draws the middle of varied scenes at 1080p, which is as sharp as the second look at a block is, the rest all of them
+# at half of that, which is what the first look sees.
 render() {  # scene, size, seed, folder, first, count, until
   local left=$(( $7 - $(date +%s) )); (( left > 3 )) || return
   timeout -k 5 -s INT $left brokk mode=render scene="$1" rig=zed_2i_1080p $2 session.seed="$3" session.out="$work/$4" \
@@ -27,7 +28,7 @@ draw() {  # number of the process
     for scene in varied clean haze dark hidden decoy empty; do
       render $scene "$full" 900 test/$scene/$k $(( k * 100 )) $(( CORES >= 5 ? 6 : 2 )) $until
     done
-  elif (( k % 3 == 0 )); then render varied "$full" $(( SEED + k )) train/$k 0 100000 $until
+  elif (( k % 2 == 0 )); then render varied "$near" $(( SEED + k )) train/$k 0 100000 $until
   else render varied "$half" $(( SEED + k )) train/$k 0 100000 $until; fi
 }
 say "renders on $CORES cores for $RENDER_S s"

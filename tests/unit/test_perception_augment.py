@@ -39,7 +39,7 @@ def chance(seed: int) -> torch.Generator:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_each_changes_each_picture_its_own_way_and_the_same_for_the_same_seed(name: str) -> None:
     step = {name: replace(SHIPPED[name], probability=1.0)}
-    one, same, other = (augment.augmented(picture(), step, chance(seed)) for seed in (1, 1, 2))
+    one, same, other = (augment.augmented(picture(), step, chance(seed), chance(seed)) for seed in (1, 1, 2))
     assert one.shape == (2, 3, 64, 96) and one.dtype == torch.float32
     assert one.min() >= 0.0 and one.max() <= 1.0
     assert torch.equal(one, same)
@@ -50,9 +50,9 @@ def test_each_changes_each_picture_its_own_way_and_the_same_for_the_same_seed(na
 @pytest.mark.parametrize("name", SHIPPED)
 def test_each_happens_as_often_as_its_probability_says(name: str) -> None:
     off = {name: replace(SHIPPED[name], probability=0.0)}
-    assert torch.equal(augment.augmented(picture(), off, chance(0)), picture())
+    assert torch.equal(augment.augmented(picture(), off, chance(0), chance(0)), picture())
     half, many = {name: replace(SHIPPED[name], probability=0.5)}, picture()[:1, :, :16, :16].repeat(200, 1, 1, 1)
-    changed = (augment.augmented(many, half, chance(0)) != many).flatten(1).any(1)
+    changed = (augment.augmented(many, half, chance(0), chance(0)) != many).flatten(1).any(1)
     assert 0.35 < changed.float().mean() < 0.65
 
 
@@ -61,7 +61,7 @@ def test_nothing_moves_in_the_picture(name: str) -> None:
     step, bright = {name: replace(SHIPPED[name], probability=1.0)}, torch.zeros(8, 3, 64, 96)
     bright[:, :, 28:36, 44:52] = 0.6
     rows, columns = np.meshgrid(np.arange(64), np.arange(96), indexing="ij")
-    for seen in augment.augmented(bright, step, chance(0)).mean(1).numpy():
+    for seen in augment.augmented(bright, step, chance(0), chance(0)).mean(1).numpy():
         weight = np.clip(seen - np.median(seen) - 0.12, 0.0, None)
         if weight.sum() > 1.0:  # strong dust leaves nothing to see
             assert abs((rows * weight).sum() / weight.sum() - 31.5) < 1.0
