@@ -65,6 +65,8 @@ class Diagnosis:
         return self._outcome(search.run())
 
     def _outcome(self, findings: Findings) -> Outcome:
+        weighed = weighing.weighed(findings, self.prices)
+        findings = verdict.likely(findings, self.prices, self.certainty)
         field, evidence = self.base.field, findings.evidence
         before, floor = field.runs(field.evidence.base), self._floor()
         unknown = verdict.is_unknown(findings, self.prices, self.certainty)
@@ -91,7 +93,10 @@ class Diagnosis:
             gap=reach.gap(),
             next_experiment=self._next(findings, selected),
             reason=self._reason(told, findings, selected, remainder),
-            more=seen.more() | self._more(findings, foretold) | {"unknown_remainder": remainder} | self._unseen(findings, repaired),
+            more=seen.more()
+            | self._more(findings, weighed, foretold)
+            | {"unknown_remainder": remainder}
+            | self._unseen(findings, repaired),
         )
         return Outcome(answer, before, after, floor)
 
@@ -173,7 +178,7 @@ class Diagnosis:
     def _dead_time_s(self) -> np.ndarray:
         return np.full(self.case.machine.num_joints, self.case.machine.dead_time_s)
 
-    def _more(self, findings: Findings, foretold: Estimate | None) -> dict[str, Any]:
+    def _more(self, findings: Findings, weighed: Mapping[str, Any], foretold: Estimate | None) -> dict[str, Any]:
         names = self.case.machine.joint_names
         rivals = [
             {
@@ -194,7 +199,6 @@ class Diagnosis:
             for name, a, b, c in zip(names, findings.left.T, findings.left_null.T, findings.scatter, strict=True)
             for best in [int(np.argmax(a - b))]
         }
-        weighed = weighing.weighed(findings, self.prices)
         null = [
             row["null"] for joint in weighed["joints"] for row in joint["subsets"] if len(row["effects"]) == 1 and "null" in row
         ]

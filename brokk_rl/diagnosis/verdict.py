@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from brokk_rl.diagnosis import certainty
 from brokk_rl.diagnosis.answer import Estimate, Ranked, Selected
+from brokk_rl.diagnosis.around import without
 from brokk_rl.diagnosis.certainty import Certainty
 from brokk_rl.diagnosis.engine import Findings, Prices
 from brokk_rl.diagnosis.found import Found
 from brokk_rl.diagnosis.library import Kind
+from brokk_rl.diagnosis.search import Chosen
 from brokk_rl.machine import Machine
 
 SAME = 0.9
@@ -20,6 +22,8 @@ SAME = 0.9
 AS_GOOD = 3.0
 """Difference in log likelihood that says nothing."""
 LISTED = 8
+NAMED = 0.4
+"""Probability from which a further effect is named: somewhat below a half, as one that is missed costs what a wrong one does."""
 LEFT = 15.0
 """Evidence of a clue, beyond that on the reference, from which the report says that something is left on a joint."""
 TOLD = 0.9
@@ -149,15 +153,34 @@ def unknown_chance(findings: Findings, prices: Prices, weights: Certainty) -> fl
     return max(found, TOLD) if findings.tool_left > prices.tool and not seen else found
 
 
-def is_unknown(findings: Findings, prices: Prices, weights: Certainty) -> bool:
-    """Says whether an unknown cause is probable, or more so than every effect that was found and than that there is nothing."""
-    chances = [certainty.chance(weights.right, other_signs(findings, weights, one)) for one in findings.others]
+def named_chances(findings: Findings, prices: Prices, weights: Certainty) -> dict[str, float]:
+    """Returns the probability of each effect that was found."""
+    found = {one.kind.name: certainty.chance(weights.right, other_signs(findings, weights, one)) for one in findings.others}
     for name in findings.chosen.names:
         swaps = rivals(findings, name)
         signs = named_signs(findings, prices, weights, name, swaps, same_as(swaps, own_gain(findings, name)))
-        chances.append(certainty.chance(weights.right, signs))
+        found[name] = certainty.chance(weights.right, signs)
+    return found
+
+
+def is_unknown(findings: Findings, prices: Prices, weights: Certainty) -> bool:
+    """Says whether an unknown cause is probable, or more so than every effect that was found and than that there is nothing."""
+    chances = list(named_chances(findings, prices, weights).values())
     chances = chances or [certainty.chance(weights.none, none_signs(findings, prices, weights))]
     return unknown_chance(findings, prices, weights) > min(0.5, max(chances))
+
+
+def likely(findings: Findings, prices: Prices, weights: Certainty) -> Findings:
+    """Returns the findings without effects that are more probably not there; the most probable one stays."""
+    chances = named_chances(findings, prices, weights)
+    best = max(chances, key=chances.__getitem__, default=None)
+    kept = {name for name, chance in chances.items() if chance >= NAMED or name == best}
+    subsets = tuple(subset & kept for subset in findings.chosen.subsets)
+    others, repaired = [one for one in findings.others if one.kind.name in kept], findings.repair
+    if repaired and subsets != findings.chosen.subsets:
+        ways = {name: [ray for ray in repaired.rays if ray.kind.name == name] for name in findings.chosen.names}
+        repaired = without(findings.evidence, ways, repaired, subsets) if any(subsets) else None
+    return replace(findings, chosen=Chosen(subsets, findings.chosen.worth), others=others, repair=repaired)
 
 
 def other(findings: Findings, found: Found, weights: Certainty, machine: Machine) -> Selected:
@@ -195,7 +218,7 @@ def ranking(
         if name not in named and places:
             odds = float(np.clip((worth - over) / weights.temperature, -30.0, 30.0))
             joints = tuple(machine.joint_names[j] for j in places)
-            named[name] = Ranked(name, joints, float(1.0 / (1.0 + np.exp(-odds))))
+            named[name] = Ranked(name, joints, min(float(1.0 / (1.0 + np.exp(-odds))), 1.0 - unknown))
     chances = [one.probability for one in selected]
     nothing = certainty.chance(weights.none, none_signs(findings, prices, weights))
     none = 1.0 - max(chances) if chances else min(nothing, 1.0 - unknown) if unknown > 0.5 else nothing

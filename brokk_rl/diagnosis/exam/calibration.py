@@ -108,7 +108,7 @@ class Claims:
 
 def answered(item: Item, prices: Prices, weights: Certainty, kinds: Sequence[Kind], machine: Machine) -> tuple[Answer, Claims]:
     """Returns what the diagnosis would say at these prices, without numbers, and why it is so sure."""
-    found = weighing.findings(item.told, prices, kinds)
+    found = verdict.likely(weighing.findings(item.told, prices, kinds), prices, weights)
     unknown = verdict.is_unknown(found, prices, weights)
     selected = [] if unknown else [verdict.other(found, one, weights, machine) for one in found.others]
     signs = [(one.kind.name, verdict.other_signs(found, weights, one)) for one in found.others]
