@@ -91,6 +91,21 @@ def test_an_ellipse_that_is_no_circle_on_the_face_is_refused(estimator) -> None:
     assert isinstance(refused, Rejection) and refused.reason == "axis ratio on the face"
 
 
+def test_in_dust_a_disc_may_be_a_hole_for_half_the_score_and_in_clear_air_a_pale_one_is_none(estimator) -> None:
+    frame, masks, ellipse = drawn(depth_m=0.0)  # a flat dark disc
+    pale = (0.3 * frame.color.astype(float) + 0.7 * 150).astype(np.uint8)  # three quarters as bright as the face
+    dusty = estimator.estimate(replace(frame, color=pale), masks, ellipse)
+    assert isinstance(dusty, HolePose) and dusty.score == pytest.approx(0.5 * ellipse.score)
+    shaded = pale.copy()
+    shaded[int(ellipse.y + 4 * ellipse.a) :] //= 4  # something dark nearby: nothing lies over it
+    stain = estimator.estimate(replace(frame, color=shaded), masks, ellipse)
+    assert isinstance(stain, Rejection) and stain.reason == "brightness inside over outside"
+    spots = np.random.default_rng(0).normal(0, 25, pale.shape[:2])
+    spotted = np.clip(pale + cv2.GaussianBlur(spots, (0, 0), 2.0)[..., None] * 9, 0, 255).astype(np.uint8)
+    spot = estimator.estimate(replace(frame, color=spotted), masks, ellipse)
+    assert isinstance(spot, Rejection)
+
+
 def test_the_mouth_channel_is_believed(estimator) -> None:
     frame, masks, ellipse = drawn()
     refused = estimator.estimate(frame, replace(masks, mouth=np.zeros_like(masks.block)), ellipse)
