@@ -24,6 +24,9 @@ GRID = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
 GAIN, FAULT_S, FAULT = 0.01, 0.004, 0.01
 """What a simulator gets wrong from day to day, and what is no effect: speeds by a percent, times in s, other numbers."""
 
+UNSURE = 0.5
+"""What effects of chance change on average is known up to so much of it: their forms differ."""
+
 
 @dataclass(frozen=True, eq=False)
 class Ray:
@@ -191,7 +194,11 @@ class Evidence:
             moved = increments(candidates.paths([], 1, {name: value.numpy() + by})[0], self.start) - self.way
             found.append(self.whitened(moved[None]))
         lines = np.concatenate(found, 1)
-        return lines if self.widths is None else lines * self.widths[:, None]
+        lines = lines if self.widths is None else lines * self.widths[:, None]
+        if self.mean is None:
+            return lines
+        known = increments(self.mean, np.zeros_like(self.start))
+        return np.concatenate([lines, self.whitened(UNSURE * known[None])], 1)
 
     def response(self, ray: Ray) -> np.ndarray:
         """Returns what an effect on all joints changes at each size of the ray, over the noise, `(J, C, E)`."""

@@ -15,11 +15,11 @@ from composed import option
 
 from actuators.effects.affected import Affected
 from actuators.effects.command import DeadBand
-from actuators.effects.speed import FlowGain
+from actuators.effects.speed import Compliance, FlowGain
 from actuators.lag import Lag
 from brokk_rl import record
 from brokk_rl.contracts import Effect
-from brokk_rl.diagnosis import answer, case, library, prescription, simulator
+from brokk_rl.diagnosis import already, answer, case, library, prescription, simulator
 from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, JointGap, NextExperiment, Ranked, RegimeGap, Selected, Where
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.conclusion import Diagnosis
@@ -108,6 +108,21 @@ def test_nothing_is_found_where_nothing_was_changed(axis: Machine, reference: li
     found = diagnosed(axis, reference, {}, tmp_path)
     assert found.verdict == "none" and not found.selected
     assert found.ranking[0].effect == "none"
+
+
+def test_what_the_reference_shows_already_is_put_around_the_simulator(axis: Machine, tmp_path: Path) -> None:
+    soft = driven(axis, {"compliance": Compliance(joints="all", ringing_s=0.3, damping=0.12)}, 3, 120.0, 4)
+    kinds, before = library.load(axis, ("compliance", "dead_band", "lag")), []
+
+    def refined(base: simulator.Base) -> simulator.Base:
+        before.append(base)
+        return already.refined(base, kinds, axis)
+
+    after = simulator.fitted(Case(axis, soft, soft[:1]), option("fit", "valve"), tmp_path, 0, CPU, refined)
+    ((kind, values),) = after.field.evidence.candidates.fixed
+    assert kind.name == "compliance" and values["ringing_s"][0, 0] == pytest.approx(0.3, abs=0.1)
+    turns = [base.nulls[0].evidence.noise[0].change for base in (before[0], after)]  # what is missed where speeds change
+    assert turns[1] < 0.7 * turns[0]
 
 
 @pytest.mark.slow

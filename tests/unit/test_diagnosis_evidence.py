@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from actuators.valve import Pose
-from brokk_rl.diagnosis import gap, noise
+from brokk_rl.diagnosis import gap, library, noise
+from brokk_rl.diagnosis.evidence import rays
 from brokk_rl.diagnosis.noise import Noise
 from brokk_rl.diagnosis.search import Table, choose
 from brokk_rl.diagnosis.sizes import Shape, earned, fitted, plain
+from brokk_rl.diagnosis.tied import tied
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 
@@ -130,6 +132,34 @@ def test_an_effect_with_one_cause_for_all_joints_is_not_found_on_one_of_many() -
     price = {"price": lambda j, subset: 5.0 * len(subset), "name_price": 5.0, "share": 0.03}
     assert choose(tables, **price).names == {"clock"}
     assert not choose(tables, **price, shared=frozenset({"clock"}), partial=30.0).names
+
+
+def test_a_cause_that_all_joints_share_may_earn_little_on_each() -> None:
+    random = np.random.default_rng(9)
+    columns = random.standard_normal((5, 400))
+    z = 0.25 * columns + random.standard_normal(columns.shape)
+    tables = [joint(z[j], {"clock": [line(columns[j])]}) for j in range(5)]
+    for table in tables:
+        table.explore({"clock": 0.0}, 3)
+    apart = choose(tables, lambda j, subset: 12.0 * len(subset), 12.0, 0.03, least=12.0)
+    together = choose(tables, lambda j, subset: 0.0, 12.0, 0.03, shared=frozenset({"clock"}), partial=16.0, least=12.0)
+    assert len(frozenset().union(*apart.subsets)) == 0 or not all(apart.subsets)
+    assert together.subsets == (frozenset({"clock"}),) * 5
+
+
+def test_a_cause_that_all_joints_share_gets_the_size_that_most_of_them_have(machine: Machine) -> None:
+    random, sizes = np.random.default_rng(10), (0.5, 0.55, 0.45, 2.0, 0.5)  # the fourth joint has another effect too
+    columns = random.standard_normal((5, 800))
+    tables = [
+        joint(size * x + random.standard_normal(800), {"clock_offset": [line(x)]}) for size, x in zip(sizes, columns, strict=True)
+    ]
+    (kind,) = library.load(machine, ("clock_offset",))
+    grown = {"clock_offset": rays(kind)}
+    ways, shapes = tied(frozenset(grown), tables, grown, [table.shapes for table in tables])
+    (way,) = ways["clock_offset"]
+    assert way.is_tied and way.sizes[1] == pytest.approx(0.5, abs=0.1) and way.sizes[-1] < 0.8
+    for mine, column in zip(shapes, columns, strict=True):
+        np.testing.assert_allclose(mine["clock_offset"][0].at(float(way.sizes[1]))[0], way.sizes[1] * column, atol=1e-9)
 
 
 def test_the_closed_share_of_a_worked_example() -> None:
