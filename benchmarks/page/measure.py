@@ -1,4 +1,4 @@
-"""How fast the page is, in a headless Chromium: python benchmarks/page/measure.py [out.json]
+"""How fast the page is, in a headless Chromium: [chrt -r 1] python benchmarks/page/measure.py [out.json]
 
 Advice at 20 Hz and levers at 50 Hz as from the loop, frames of 640 x 360 px at 3 and at 10 Hz, the 3D scene beside them. Latency is
 from the moment an advice stands in the feed to the moment its frame is through layout and paint, by the browser's clock, translated
@@ -128,6 +128,7 @@ def main() -> None:
             "browser": f"Chromium {browser.version}, headless",
             "flags": FLAGS,
             "cores": os.cpu_count(),
+            "scheduler": {os.SCHED_OTHER: "ordinary", os.SCHED_FIFO: "fifo", os.SCHED_RR: "rr"}.get(os.sched_getscheduler(0)),
             "window": SIZE,
             "seconds": SECONDS,
         }

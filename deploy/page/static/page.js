@@ -239,5 +239,5 @@ function startScene() {
 
 speak();
 if (!token) answer("refused token");
-setInterval(draw, 100);  // ages grow even when nothing comes
+setInterval(() => { if (performance.now() - came > 150) draw(); }, 100);  // ages grow even when nothing comes
 scene = startScene();

@@ -6,7 +6,7 @@ import { Shapes, block, boreholes, ground, machine, path } from "./shapes.js";
 import { Socket } from "./socket.js";
 
 const FOV = 0.7, NEAR = 0.1, FAR = 40, REPORT_MS = 1000;
-const APART_MS = 24;  // 30 frames a second are enough here; what is left belongs to the levers
+const APART_MS = 15;  // no faster than a screen, nor than the state comes; what is left belongs to the levers
 const view = { at: [1.7, 0, 0.7], distance: 6.2, azimuth: -1.05, height: 0.42 };
 const floor = new Shapes();
 ground(floor);
