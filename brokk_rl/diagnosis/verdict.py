@@ -221,7 +221,7 @@ def ranking(
             named[name] = Ranked(name, joints, min(float(1.0 / (1.0 + np.exp(-odds))), 1.0 - unknown))
     chances = [one.probability for one in selected]
     nothing = certainty.chance(weights.none, none_signs(findings, prices, weights))
-    none = 1.0 - max(chances) if chances else min(nothing, 1.0 - unknown) if unknown > 0.5 else nothing
+    none = min(nothing, 1.0 - max([*chances, unknown if unknown > 0.5 else 0.0]))
     rows = [*named.values(), Ranked("none", (), none), Ranked("unknown", (), unknown)]
     return sorted(rows, key=lambda one: -one.probability)[:LISTED]
 
