@@ -32,9 +32,6 @@ class ContourArcs:
             in px; for an ellipse seen in part, as large a part of that.
         angle_rms_small: See `angle_rms_rad`.
         purity: Least part of the supporting edges, from corner to corner, that lies on the ellipse.
-        rest_px: Longest rest of a supporting edge, from corner to corner, that lies elsewhere, plus `rest_relative` per px of the
-            geometric mean semi-axis; asked where no size is given.
-        rest_relative: See `rest_px`.
         departure: Largest part of the circumference where the supporting chains run on beside the ellipse (spirals, hearts).
         evidence: Least decimal exponent by which the support is no accident.
         score: Least score of an ellipse that is seen nearly all around; of half of one any will do.
@@ -61,8 +58,6 @@ class ContourArcs:
     angle_rms_rad: float
     angle_rms_small: float
     purity: float
-    rest_px: float
-    rest_relative: float
     departure: float
     evidence: float
     score: float

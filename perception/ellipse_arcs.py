@@ -188,10 +188,7 @@ class ArcDetector:
         rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
         rms_limit, angle_limit = rms_limit[good], angle_limit[good]
         good = ellipse_support.gap(support >= 0, length) <= s.gap
-        purity, rest_px = ellipse_support.purity(edges, support, length)
-        size = np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3])
-        good &= purity >= s.purity / slack
-        good &= (rest_px <= s.rest_px + s.rest_relative * size) | (limits.lowest_px > 0)
+        good &= ellipse_support.purity(edges, support, length) >= s.purity / slack
         if limits.lowest_px == 0:
             good[good] &= ~ellipse_support.leaving(candidates[good], edges, support[good], length[good])
         good &= (

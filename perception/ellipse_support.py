@@ -11,8 +11,6 @@ from perception.ellipse_edges import Edges
 
 NUM_SAMPLES = 96
 """Places around an ellipse at which its support is looked for."""
-HARDLY = 0.3
-"""A run of which a smaller part lies on an ellipse only crosses it."""
 OPEN = 0.12
 """Part of the circumference without support at whose ends one asks how the edge goes on."""
 BACK_PX, STRIDE_PX = 4.0, 1.5
@@ -57,8 +55,8 @@ def gather(
     return np.where(good, found, -1), off, along
 
 
-def purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how much of the runs that support each candidate lies on it, in the mean over the support, and the longest rest, px.
+def purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Returns how much of the runs that support each candidate lies on it, in the mean over the support, `(C,)`.
 
     The edge of an ellipse that something hides ends there with a corner; that of a spiral or a heart goes on smoothly elsewhere.
     """
@@ -70,11 +68,9 @@ def purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> tuple[np.nd
     _, number, inverse = np.unique(key[known], return_index=True, return_inverse=True)
     whole = edges.run_length[run[known]][number]
     share = np.bincount(inverse, ds[known], minlength=len(number)) / whole
-    rest = np.zeros(len(support))
-    np.maximum.at(rest, np.nonzero(known)[0][number], np.where(share > HARDLY, (1.0 - share) * whole, 0.0))
     each = np.ones(support.shape)
     each[known] = np.minimum(share, 1.3)[inverse]  # of short runs a sample more or less
-    return np.minimum((each * ds * there).sum(1) / np.maximum((ds * there).sum(1), 1e-9), 1.0), rest
+    return np.minimum((each * ds * there).sum(1) / np.maximum((ds * there).sum(1), 1e-9), 1.0)
 
 
 def departure(candidates: Candidates, edges: Edges, support: np.ndarray, length: np.ndarray, reach_px: np.ndarray) -> np.ndarray:
