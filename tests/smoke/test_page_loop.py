@@ -52,8 +52,8 @@ def test_the_loop_is_shown_recorded_again_on_a_wish_and_outlives_its_page(tmp_pa
 async def _use(host: str, run: Path) -> None:
     async with (
         connect(f"ws://{host}/state", proxy=None) as state,
-        connect(f"ws://{host}/control", origin=f"http://{host}", proxy=None) as control,
-    ):  # type: ignore[arg-type]
+        connect(f"ws://{host}/control", origin=f"http://{host}", proxy=None) as control,  # type: ignore[arg-type]
+    ):
         await control.send(json.dumps({"token": TOKEN}))
         assert json.loads(await control.recv()) == {"ready": True}
         await _shown(
