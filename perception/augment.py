@@ -39,11 +39,7 @@ def augmented(
 ) -> torch.Tensor:
     """Returns the pictures after all augmentations in their order, each with its probability, clipped to [0, 1].
 
-    Args:
-        pictures: `(B, 3, h, w)`.
-        steps: By name.
-        chance: On the CPU, says which pictures each one changes: whoever asks a graphics card for that waits for it.
-        generator: Of the pictures' device, says how.
+    `chance`, on the CPU, says which pictures each one changes (whoever asks a graphics card for that waits); `generator` says how.
     """
     for step in steps.values():
         chosen = torch.nonzero(torch.rand(len(pictures), generator=chance) < step.probability)[:, 0]
