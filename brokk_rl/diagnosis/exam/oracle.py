@@ -42,14 +42,14 @@ def closed_by(folder: Path, effects: Mapping[str, Sequence[str]], fit: ActuatorF
         for joint, errors in zip(machine.joint_names, found.errors, strict=True)
     ]
     measured = evidence.candidates.cut.measured
-    before = gap.rmse(gap.squares(evidence.base, measured, machine))
+    before = gap.squares(evidence.base, measured, machine)
     floors = [gap.squares(one.evidence.base, one.evidence.candidates.cut.measured, machine) for one in found.base.nulls]
-    floor = gap.rmse(np.concatenate(floors))
-    if not any(subsets) or before < NO_GAP * floor:
+    floor = np.concatenate(floors)
+    if not any(subsets) or gap.rmse(before) < NO_GAP * gap.rmse(floor):
         return None
     start = [_start(errors, subset) for errors, subset in zip(found.errors, subsets, strict=True)]
-    after = gap.rmse(gap.squares(repair(evidence, subsets, found.rays, start).after, measured, machine))
-    return (before - after) / (before - floor)
+    after = gap.squares(repair(evidence, subsets, found.rays, start).after, measured, machine)
+    return float(gap.shares(before, after, floor, [])[0])  # as an answer says it: no repair is better than the floor
 
 
 def of_label(cases: Path, fit: ActuatorFit, machine: Machine, label: Mapping[str, Any]) -> float | None:
