@@ -49,7 +49,7 @@ def refined(base: Base, kinds: Sequence[Kind], machine: Machine) -> Base:
     ways = {key: way for kind in kinds if _can_be_there(kind) for key, way in _ways(kind).items()}
     if len(base.nulls) < 2 or base.is_flexible:
         return base
-    found = _there([thinned(one.evidence, EACH) for one in base.nulls], ways)
+    found = _there([thinned(one.evidence, EACH) for one in base.nulls], ways, machine.joint_names)
     return _around(base, found, machine) if found else base
 
 
@@ -69,7 +69,7 @@ def _ways(kind: Kind) -> dict[str, list[Ray]]:
     return found
 
 
-def _there(parts: Sequence[Evidence], ways: Ways) -> list[tuple[Kind, Values]]:
+def _there(parts: Sequence[Evidence], ways: Ways, joint_names: Sequence[str]) -> list[tuple[Kind, Values]]:
     """Returns the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
     responses = {key: [[part.response(ray) for ray in way] for part in parts] for key, way in ways.items()}
     of_part = np.repeat(np.arange(len(parts)), [part.z.shape[1] for part in parts])
@@ -87,7 +87,7 @@ def _there(parts: Sequence[Evidence], ways: Ways) -> list[tuple[Kind, Values]]:
         if best is None or scored[best].total < SURE or np.mean(np.bincount(of_part, scored[best].gain) > 0) < AGREEING:
             continue
         kind = ways[best][0].kind
-        log.info("the reference shows %s on joint %d already", kind.name, j + 1)
+        log.info("the reference shows %s on %s already", kind.name, joint_names[j])
         _, values = found.setdefault(kind.name, (kind, _values(kind, ways[best], np.zeros(len(ways[best])))))
         for name, value in _values(kind, ways[best], scored[best].sizes[best]).items():
             values[name][:, j] = value[:, j]
