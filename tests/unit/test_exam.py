@@ -158,7 +158,6 @@ def test_cases_of_an_exam_hang_on_the_salt_and_those_of_development_on_the_seed_
 
 
 def test_a_forest_learns_from_development_cases_only_and_answers(exam: Path, machine: Machine, tmp_path: Path) -> None:
-    pytest.importorskip("sklearn")
     trees = Trees(exam=str(exam), trees=20, least=0.3, seed=0)
     trees.answer(exam / paper.CASES / "0000", tmp_path / "out", machine)
     found = answer.read(tmp_path / "out" / FILE)
