@@ -106,7 +106,7 @@ def _look(finder: Any, frame: Frame) -> list[HolePose]:
         log.debug("%s", error)
         return []
     assert frame.base_from_camera is not None
-    return [hole if hole.frame == "base" else hole.moved(frame.base_from_camera) for hole in found]
+    return [hole if hole.frame == "base" else hole.moved(frame.base_from_camera, frame.camera_cov) for hole in found]
 
 
 def _publish(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:
@@ -140,7 +140,8 @@ def frame_of(record: Any) -> Frame:
 class KnownHoles:
     """Boreholes over many frames, each under the name that it got when it was first seen.
 
-    What a new frame says counts by its variance against what was known, of which no more than `MEMORY` sightings count.
+    What a new frame says counts by its variance against what was known, of which no more than `MEMORY` sightings count. What the
+    camera's pose is wrong by is the same in all of them: it is no reason to trust one frame more than another, and it stays.
 
     Args:
         forget_s: Time after which one that is not seen any more is forgotten.
@@ -153,7 +154,8 @@ class KnownHoles:
     def take(self, found: list[HolePose], now_s: float) -> None:
         """Takes in what one frame shows."""
         for pose in found:
-            weight = 1.0 / max(1e-8, float(np.trace(pose.cov_m2)) / 3)
+            shared = 0.0 if pose.shared_m2 is None else float(np.trace(pose.shared_m2)) / 3
+            weight = 1.0 / max(1e-8, float(np.trace(pose.cov_m2)) / 3 - shared)
             name = min(self._holes, key=lambda one: self._apart_m(one, pose), default=None)
             if name is None or self._apart_m(name, pose) > NEAR_M:
                 self._names += 1
@@ -164,7 +166,7 @@ class KnownHoles:
                 center_m = (before * old["center_in_base_m"] + weight * pose.center_m) / (before + weight)
             self._holes[name] = {
                 "center_in_base_m": center_m, "axis_in_base": pose.axis, "radius_m": pose.radius_m, "score": pose.score,
-                "weight": before + weight, "t_s": now_s,
+                "weight": before + weight, "shared_m2": shared, "t_s": now_s,
             }  # fmt: skip
         self._holes = {name: hole for name, hole in self._holes.items() if now_s - hole["t_s"] <= self._forget_s}
 
@@ -175,7 +177,7 @@ class KnownHoles:
         record["t_s"], record["count"] = now_s, len(surest)
         for row, name in enumerate(surest):
             for field, value in self._holes[name].items():
-                if field != "weight":
+                if field not in ("weight", "shared_m2"):
                     record["holes"][row][field] = value
             record["holes"][row]["name"], record["holes"][row]["std_m"] = name, self._std_m(name)
         slot.write(record)
@@ -189,7 +191,8 @@ class KnownHoles:
         ]  # fmt: skip
 
     def _std_m(self, name: int) -> float:
-        return float(self._holes[name]["weight"] ** -0.5)
+        hole = self._holes[name]
+        return math.sqrt(1.0 / hole["weight"] + hole["shared_m2"])
 
     def _apart_m(self, name: int, pose: HolePose) -> float:
         return float(np.linalg.norm(self._holes[name]["center_in_base_m"] - pose.center_m))

@@ -97,6 +97,19 @@ def test_boreholes_keep_their_names_are_averaged_by_variance_and_forgotten() -> 
     assert [one["name"] for one in known.plain()] == [1, 3], "the second was not seen for more than 10 s"
 
 
+def test_what_the_calibration_is_wrong_by_is_never_averaged_away() -> None:
+    calibration = replace(pose(2.6, 0.0), cov_m2=(0.004**2 + 0.003**2) * np.eye(3), shared_m2=0.003**2 * np.eye(3))
+    known = KnownHoles(10.0)
+    for number in range(4):
+        known.take([calibration], float(number))
+    # of its own 4 mm, over four frames 2 mm; of the calibration 3 mm, in all of them: sqrt(4 + 9)
+    assert known.plain()[0]["std_m"] == pytest.approx(0.001 * np.sqrt(13.0), abs=1e-5)
+    surer = replace(calibration, center_m=np.array([2.605, 0.0, 0.75]), cov_m2=(0.002**2 + 0.003**2) * np.eye(3))
+    known.take([surer], 4.0)
+    # 2 mm of its own, as what is known: half way
+    assert known.plain()[0]["center_in_base_m"][0] == pytest.approx(2.6025, abs=1e-4)
+
+
 def test_a_base_that_moved_is_noticed_within_a_few_sightings() -> None:
     known = KnownHoles(10.0)
     for number in range(200):
