@@ -30,19 +30,24 @@ class Memory:
         self.name, self.size = name, size
         self.fd = os.memfd_create(f"brokk_{name}")
         os.ftruncate(self.fd, size)
-        self.bytes = mmap.mmap(self.fd, size)
+        self.bytes = _mapped(self.fd, size)
 
     def __getstate__(self) -> tuple[str, int, int]:
         return self.name, self.size, self.fd
 
     def __setstate__(self, state: tuple[str, int, int]) -> None:
         self.name, self.size, self.fd = state
-        self.bytes = mmap.mmap(self.fd, self.size)
+        self.bytes = _mapped(self.fd, self.size)
 
     def close(self) -> None:
         """Lets go of it."""
         self.bytes.close()
         os.close(self.fd)
+
+
+def _mapped(fd: int, size: int) -> mmap.mmap:
+    # with all of its pages: what is there from the beginning costs no cycle later, and does not look like growth
+    return mmap.mmap(fd, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
 
 
 class Slot:
