@@ -280,13 +280,16 @@ class Exam:
         mix, marks = self.exam.mix, []
         best = {} if self.exam.oracles is None else json.loads((Path(self.exam.oracles) / ORACLE).read_text())
         of_machine = self._of_machine()
-        for label in labels:
+        begun = [label for label in labels if sitting.is_begun(folder / label["case"])]
+        if len(begun) < len(labels):
+            log.warning("%s: %d of %d cases sat; the others are left out", folder, len(begun), len(labels))
+        for label in begun:
             place = folder / label["case"]
             said = answer.read(place / answer.FILE) if (place / answer.FILE).is_file() else None
             marks.append(marking.mark(label, said, mix.classes, of_machine, sitting.seconds(place), best.get(label["case"])))
         if all(mark.verdict == "failed" for mark in marks):
             raise RecordingError(f"exam.answers: {folder} holds no answer to any case of {self._folder}")
-        return tally(marks)
+        return tally(marks, len(labels) - len(begun))
 
 
 def _show(tables: dict[str, dict[str, Any]]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -131,6 +132,23 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(exam: Path, brokk:
     assert line["candidate"] == "none" and line["labels_sha256"] == (exam / seal.HASH).read_text().split()[0]
 
 
+def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
+    exam: Path, machine: Machine, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    first, second = sorted((exam / paper.CASES).iterdir())
+    answers, marks = tmp_path / "answers", tmp_path / "marks"
+    answers.mkdir()
+    assert sitting.sit(Recorder(ValueError("ran away")), [first], answers, machine, 1, lambda: None) == 1
+    sitting.sit(Always(effect=None, probability=0.5), [second], answers, machine, 1, lambda: None)
+    score = ("mode=exam", "exam.do=score", f"exam.folder={exam}", f"+exam.answers.it={answers}")
+    for expected, missed in (({"value": 2, "of": 2}, 1), ({"value": 1, "of": 2}, 0)):
+        done = brokk(*score, f"session.out={marks}_{missed}")
+        assert done.code == 0, done.err
+        found = json.loads((tmp_path / f"marks_{missed}" / "marks.json").read_text())["candidates"]["it"]
+        assert found["sat"] == expected and found["failed"] == missed
+        shutil.rmtree(answers / first.name, ignore_errors=True)  # from then on nobody has begun it
+
+
 def test_baselines_sit_and_are_scored_by_one_command(exam: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
     about = ("mode=exam", "exam.do=baselines", f"exam.folder={exam}", "~exam.baselines.greedy", "~exam.baselines.bic")
     done = brokk(*about, f"exam.baselines.trees.exam={exam}", "exam.baselines.trees.trees=20", f"session.out={tmp_path / 'b'}")
@@ -170,16 +188,16 @@ def test_a_forest_learns_from_development_cases_only_and_answers(exam: Path, mac
 
 
 class Recorder:
-    """A candidate that notes what it is given, and fails at first."""
+    """A candidate that notes what it is given, and says that there is no gap, or fails."""
 
-    def __init__(self, fails: bool) -> None:
+    def __init__(self, failure: Exception | None) -> None:
         self.given: list[tuple[Path, list[str]]] = []
-        self._fails = fails
+        self._failure = failure
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
         self.given.append((case, sorted(str(path.relative_to(case)) for path in case.rglob("*"))))
-        if self._fails:
-            raise RecordingError("no")
+        if self._failure:
+            raise self._failure
         Always(effect=None, probability=0.5).answer(case, out, machine)
 
 
@@ -188,7 +206,7 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     (case / "field").mkdir(parents=True)
     (case / "field" / "00.parquet").touch()
     seal.seal(tmp_path / "exam", {"cases": []}, "salt")
-    first, second, third = Recorder(True), Recorder(False), Recorder(False)
+    first, second, third = Recorder(RecordingError("no")), Recorder(None), Recorder(None)
     assert sitting.sit(first, [case], answers, machine, 1, lambda: None) == 1
     assert sitting.seconds(answers / "0000") is None
     assert sitting.sit(second, [case], answers, machine, 1, lambda: None) == 0

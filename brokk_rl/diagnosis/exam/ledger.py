@@ -28,7 +28,11 @@ def append(path: Path, when: str, exam: dict[str, Any], name: str, table: dict[s
     Raises:
         StorageError: it cannot be written.
     """
-    figures = {key: table[key]["value"] for key in HEADLINES} | {"seconds": table["seconds"]["median"], "failed": table["failed"]}
+    figures = {key: table[key]["value"] for key in HEADLINES} | {
+        "seconds": table["seconds"]["median"],
+        "sat": table["sat"]["value"],
+        "failed": table["failed"],
+    }
     line = {"when": when, "commit": commit(), "candidate": name, **exam, **{key: _short(value) for key, value in figures.items()}}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

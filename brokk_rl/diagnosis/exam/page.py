@@ -55,6 +55,7 @@ def rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
             cells.append(Cell(f"{value:.2f}", note, value == best))
         found.append(cells)
     found.append(["seconds a case, median (most)", *(_seconds(table["seconds"]) for table in tables.values())])
+    found.append(["cases sat", *(Cell(f"{table['sat']['value']} of {table['sat']['of']}") for table in tables.values())])
     found.append(["no answer", *(Cell(str(table["failed"])) for table in tables.values())])
     return found
 
@@ -75,6 +76,9 @@ def write(folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[st
     page = Page(
         f"Exam of {', '.join(tables)}", f"{exam['num_cases']} cases ({kinds}), roughness {exam['roughness']}, seed {exam['seed']}."
     )
+    for name, table in tables.items():
+        if table["sat"]["value"] < table["sat"]["of"]:
+            page.text(f"{name} sat {table['sat']['value']} of {table['sat']['of']} cases; the others are left out.", "warn")
     if not exam["sealed"]:
         page.text("A development seed: its cases may have been looked at while the candidates were made.", "warn")
     page.heading("Marks")

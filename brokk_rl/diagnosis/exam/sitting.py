@@ -123,8 +123,8 @@ def _one(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
             candidate.answer(copy, place, machine)
             if not (place / FILE).is_file():
                 error = f"it left no {FILE}"
-        except RecordingError as failure:
-            error = str(failure)
+        except Exception as failure:  # whoever answers may break in any way: that is an answer missed, and no end of the exam
+            error = str(failure) or repr(failure)
         seconds = time.monotonic() - begun
         if error is None:
             shutil.copytree(place, out, dirs_exist_ok=True)
@@ -132,6 +132,11 @@ def _one(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
             out.mkdir(parents=True, exist_ok=True)
             log.warning("case %s: no answer: %s", case.name, error.splitlines()[-1])
     write_json(out / NOTE, {"seconds": round(seconds, 2), "error": error})
+
+
+def is_begun(answer: Path) -> bool:
+    """Says whether anybody answered the case, or tried to, whose answer belongs into a folder."""
+    return (answer / NOTE).is_file() or (answer / FILE).is_file()
 
 
 def seconds(answer: Path) -> float | None:

@@ -46,8 +46,8 @@ def over_cases(marks: Sequence[Mark], figure: Callable[[Sequence[Mark]], float |
     return {"value": float(value), "of": len(marks), "ci95": [float(low), float(high)]}
 
 
-def tally(marks: Sequence[Mark]) -> dict[str, Any]:
-    """Returns all figures of an exam, plain JSON."""
+def tally(marks: Sequence[Mark], not_begun: int = 0) -> dict[str, Any]:
+    """Returns all figures of an exam, plain JSON; cases that nobody has begun, `not_begun`, are told and count for nothing."""
     one = [mark for mark in marks if mark.kind == "one"]
     several = [mark for mark in marks if mark.kind == "several"]
     quiet = [mark for mark in marks if mark.kind in QUIET]
@@ -56,6 +56,7 @@ def tally(marks: Sequence[Mark]) -> dict[str, Any]:
     seconds = [mark.seconds for mark in marks if mark.seconds is not None]
     return {
         "cases": {kind: sum(mark.kind == kind for mark in marks) for kind in ("none", "faint", "one", "several", "outside")},
+        "sat": {"value": len(marks), "of": len(marks) + not_begun},
         "failed": sum(mark.verdict == "failed" for mark in marks),
         "top1": rate([mark.first for mark in one]),
         "top1_strictly": rate([mark.first_strictly for mark in one]),
