@@ -48,7 +48,8 @@ class Child:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=tuple(files), env=environment)
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it died already; `code` says so
-            self._process.stdin.write(pickle.dumps((name, target, tuple(arguments), realtime, os.getpid())))
+            self._process.stdin.write(pickle.dumps((name, target, realtime, os.getpid())))
+            self._process.stdin.write(pickle.dumps(tuple(arguments)))
             self._process.stdin.close()
 
     @property
@@ -79,7 +80,7 @@ class Child:
 
 def enter() -> None:
     """Where a child process begins."""
-    name, target, arguments, realtime, parent = pickle.load(sys.stdin.buffer)
+    name, target, realtime, parent = pickle.load(sys.stdin.buffer)
     _libc().prctl(_DIE_WITH_PARENT, signal.SIGTERM)
     if os.getppid() != parent:
         raise SystemExit(1)  # it died meanwhile
@@ -88,23 +89,24 @@ def enter() -> None:
     signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
     logging.basicConfig(level=logging.INFO, format=f"{name}: %(message)s")
     if realtime is not None:
-        become_realtime(realtime)
-    resolve_name(target)(lambda: bool(asked), *arguments)
+        ask_for_priority(realtime)  # before all that has to be imported: a busy computer would take ten times as long
+    arguments, function = pickle.load(sys.stdin.buffer), resolve_name(target)
+    if realtime is not None:
+        keep_in_memory()
+    function(lambda: bool(asked), *arguments)
 
 
-def become_realtime(priority: int) -> Literal["fifo", "ordinary"]:
-    """Asks for SCHED_FIFO and locked memory, and keeps the garbage collector out; returns what was granted."""
+def keep_in_memory() -> None:
+    """Asks for locked memory, and keeps the garbage collector out."""
     gc.collect()
     gc.freeze()
     gc.disable()
-    granted = ask_for_priority(priority)
     if _libc().mlockall(_LOCK_ALL) != 0:
         log.debug("memory is not locked: %s", os.strerror(ctypes.get_errno()))
-    return granted
 
 
 def ask_for_priority(priority: int) -> Literal["fifo", "ordinary"]:
-    """Asks for SCHED_FIFO alone; returns what was granted."""
+    """Asks for SCHED_FIFO; returns what was granted."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
