@@ -47,10 +47,11 @@ class SegmenterTraining:
         batch: Samples a step.
         rate: Learning rate at its highest; it rises for a twentieth of the updates, then falls as a cosine to nothing.
         decay: Weight decay.
+        bfloat16: Whether the network is trained in sixteen bits: in half the time on a graphics card or a processor that can.
         closer: How often a sample is cut from the closer view of the block.
         margin: Room around the block in that view, as a part of its box; that of the segmenter.
         validate_every: Updates between two judgements, after each of which the training can go on if it is stopped.
-        crop: Which part of a view a sample shows.
+        crop: What a sample shows, beside what the segmenter would see.
         augment: What happens to its picture, by name, in this order.
     """
 
@@ -65,6 +66,7 @@ class SegmenterTraining:
     batch: int
     rate: float
     decay: float
+    bfloat16: bool
     closer: float
     margin: float
     validate_every: int
@@ -123,6 +125,8 @@ class _Training:
             self._train, settings.crop, settings.augment, settings.size_px, settings.closer, self._session.stream("samples"),
             self._device,
         )  # fmt: skip
+        if settings.start is not None and self._update == 0:
+            self._validate(pictures, known, None)  # a training may make a good network worse
         with _progress(self._update, settings.updates) as advance:
             while self._spent() < 1.0:
                 total += self._step(*samples.batch(self._update, settings.batch))
@@ -169,7 +173,7 @@ class _Training:
         self._network.train()
         for group in self._optimizer.param_groups:
             group["lr"] = self._rate()
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._device.type == "cuda"):
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._settings.bfloat16):
             logits = self._network(picture.to(memory_format=torch.channels_last))
         value = loss(logits.float(), target)
         self._optimizer.zero_grad(set_to_none=True)
@@ -188,17 +192,18 @@ class _Training:
         rise = 20.0 * (self._spent() + 1.0 / self._settings.updates)
         return self._settings.rate * min(1.0, rise) * fall
 
-    def _validate(self, pictures: torch.Tensor, known: torch.Tensor, mean_loss: float) -> None:
+    def _validate(self, pictures: torch.Tensor, known: torch.Tensor, mean_loss: float | None) -> None:
         probabilities = training_report.predicted(self._network, pictures, self._device)
         figures = training_report.judged(probabilities, known, self._unseen.conditions)["all"]
         block, mouth = figures["block"] or 0.0, figures["mouth"] or 0.0
         self._curve.append({"update": self._update, "loss": mean_loss, "block": block, "mouth": mouth})
-        if not math.isfinite(mean_loss):
+        if mean_loss is not None and not math.isfinite(mean_loss):
             raise CheckpointError(f"the training diverged before update {self._update}; try a smaller training.rate")
         if block + mouth > self._best["score"]:
             self._best = {"score": block + mouth, "update": self._update}
             self._best_tensors = {name: value.cpu().clone() for name, value in self._network.state_dict().items()}
-        log.info("update %d: loss %.4f, overlap of blocks %.3f, of mouths %.3f", self._update, mean_loss, block, mouth)
+        passed = "" if mean_loss is None else f"loss {mean_loss:.4f}, "
+        log.info("update %d: %soverlap of blocks %.3f, of mouths %.3f", self._update, passed, block, mouth)
 
     def _finish(self, pictures: torch.Tensor, known: torch.Tensor) -> dict[str, Any]:
         network = UNet(self._settings.widths)
@@ -237,8 +242,9 @@ class _Training:
     def _identity(self) -> dict[str, str]:
         """Returns what must be the same for a training to go on."""
         settings = self._settings
-        same = (settings.size_px, settings.widths, settings.updates, settings.batch, settings.rate, settings.decay, settings.closer,
-                settings.margin, settings.crop, settings.augment, settings.start, self._session.seed)  # fmt: skip
+        same = (settings.size_px, settings.widths, settings.updates, settings.batch, settings.rate, settings.decay,
+                settings.bfloat16, settings.closer, settings.margin, settings.crop, settings.augment, settings.start,
+                self._session.seed)  # fmt: skip
         data = hashlib.sha256()
         for views in (self._train, self._unseen):
             data.update(views.layers[:: max(1, len(views) // 50)].numpy().tobytes())

@@ -28,6 +28,8 @@ from perception.segment_window import Window, around, block_box, whole
 ROOM = 1.5
 """Size of a stored view over the network's picture: what a crop can take away without loss of detail."""
 LOOKS = ("whole", "closer")
+SEEN = (1.0, 1.0 / ROOM)
+"""Part of the width of each view that the segmenter sees."""
 FINER = 2
 """Places at which a pixel of a sample is looked at, in each direction: it may be larger than one of the view."""
 PART_OF_MEMORY = 0.5
@@ -36,11 +38,11 @@ PART_OF_MEMORY = 0.5
 
 @spec
 class Crop:
-    """Which part of a view a sample shows.
+    """What a sample shows, beside what the segmenter would see.
 
     Attributes:
-        width: Range of the part of the view's width; above 1 there is black around it.
-        shift: Largest shift of its middle, as a part of the view's size.
+        width: Range of its width, as a part of the width that the segmenter sees; beyond the view it is black.
+        shift: Largest shift of its middle, likewise.
         roll_rad: Largest turn about the line of sight.
         mirror: How often left and right are swapped.
     """
@@ -54,14 +56,19 @@ class Crop:
         if not 0 < self.width[0] <= self.width[1]:
             raise ConfigError(f"training.crop.width: expected 0 < lowest <= highest, got {list(self.width)}")
 
-    def windows(self, count: int, shape: tuple[int, int], generator: torch.Generator) -> torch.Tensor:
-        """Returns random parts of views of a `shape` (height, width), `(count, 2, 3)`: maps from a sample's places to the view's.
+    def windows(self, seen: torch.Tensor, shape: tuple[int, int], generator: torch.Generator) -> torch.Tensor:
+        """Returns random parts of views, `(B, 2, 3)`: maps from a sample's places to the view's.
 
         Both run from -1 to 1 from border to border, as `torch.nn.functional.affine_grid` wants them.
+
+        Args:
+            seen: Part of each view's width that the segmenter would see, `(B,)`.
+            shape: Height and width of the views.
+            generator: Draws them.
         """
-        draw = torch.rand((5, count), device=generator.device, generator=generator)
-        scale = self.width[0] + (self.width[1] - self.width[0]) * draw[0]
-        shift = 2.0 * self.shift * (2.0 * draw[1:3] - 1.0)
+        draw = torch.rand((5, len(seen)), device=generator.device, generator=generator)
+        scale = seen * (self.width[0] + (self.width[1] - self.width[0]) * draw[0])
+        shift = 2.0 * self.shift * seen * (2.0 * draw[1:3] - 1.0)
         roll_rad, slant = self.roll_rad * (2.0 * draw[3] - 1.0), shape[1] / shape[0]
         side = torch.where(draw[4] < self.mirror, -scale, scale)
         cos, sin = roll_rad.cos(), roll_rad.sin()
@@ -129,7 +136,8 @@ class Samples:
         look = (torch.rand(count, generator=chance) < self._closer).long()
         generator = torch.Generator(self._device).manual_seed(seed)
         taken = self._layers[frame.to(self._layers.device), look.to(self._layers.device)].to(self._device)
-        windows = self._crop.windows(count, (taken.shape[2], taken.shape[3]), generator)
+        seen = torch.tensor(SEEN)[look].to(self._device)
+        windows = self._crop.windows(seen, (taken.shape[2], taken.shape[3]), generator)
         layers = cut(taken, windows, self._size_px)
         return augmented(layers[:, :3], self._steps, chance, generator), layers[:, 3:]
 

@@ -113,17 +113,19 @@ def draw_samples(path: Path, pictures: torch.Tensor, probabilities: torch.Tensor
     cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
 
 
-def draw_curve(path: Path, curve: Sequence[dict[str, float]]) -> None:
+def draw_curve(path: Path, curve: Sequence[dict[str, float | None]]) -> None:
     """Draws loss and overlaps over the updates; writes a PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    updates = [entry["update"] for entry in curve]
-    left.plot(updates, [entry["loss"] for entry in curve], color="black")
+    fitted = [entry for entry in curve if entry["loss"] is not None]  # the network that it began with was not fitted yet
+    left.plot([entry["update"] for entry in fitted], [entry["loss"] for entry in fitted], color="black")
     left.set(xlabel="update", ylabel="loss (cross-entropy + Dice)", yscale="log")
     for name, colour in COLOURS.items():
-        right.plot(updates, [entry[name] for entry in curve], color=tuple(c / 255 for c in colour), label=name)
+        right.plot(
+            [entry["update"] for entry in curve], [entry[name] for entry in curve], color=tuple(c / 255 for c in colour), label=name
+        )
     right.set(xlabel="update", ylabel="intersection over union, unseen frames", ylim=(0, 1))
     right.legend(frameon=False, loc="lower right")
     for axis in (left, right):

@@ -16,8 +16,8 @@ from hydra.utils import instantiate
 
 import conf
 from brokk_rl.errors import ConfigError
-from perception import augment, jpeg
-from perception.training_data import Crop, cut
+from perception import augment, jpeg, training_report
+from perception.training_data import Crop, Samples, Views, cut
 
 SHIPPED: dict[str, Any] = instantiate(
     yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())["training"]["augment"],
@@ -127,7 +127,7 @@ def test_a_crop_keeps_picture_and_mask_together() -> None:
     bright = torch.zeros(12, 2, 144, 240, dtype=torch.uint8)
     bright[:, 0, 50:90, 80:150] = 255
     bright[:, 1] = 255 - bright[:, 0]
-    windows = crop.windows(12, (144, 240), chance(3))
+    windows = crop.windows(torch.ones(12), (144, 240), chance(3))
     seen = cut(bright, windows, (80, 48))
     assert seen.shape == (12, 2, 48, 80)
     inside = cut(torch.full_like(bright, 255), windows, (80, 48))[:, 0]
@@ -135,11 +135,22 @@ def test_a_crop_keeps_picture_and_mask_together() -> None:
     assert len({round(float(one.sum()), 1) for one in seen[:, 0]}) == 12
 
 
+@pytest.mark.parametrize("closer", [0.0, 1.0])
+def test_a_sample_that_nothing_is_done_to_is_what_the_segmenter_would_see(closer: float) -> None:
+    plain = Crop(width=(1.0, 1.0), shift=0.0, roll_rad=0.0, mirror=0.0)
+    down, across = np.mgrid[0:72, 0:120]
+    layers = np.stack([across, down, 127 + 60 * np.sin(across / 9.0), 0 * down, 0 * down]).astype(np.uint8)
+    views = Views(torch.from_numpy(np.stack([layers, layers[:, ::-1].copy()])[None]), ("clean",), ("one",))
+    seen, _ = training_report.looked_at(views, (80, 48))
+    sample, _ = Samples(views, plain, {}, (80, 48), closer, 0, torch.device("cpu")).batch(0, 1)
+    assert float((255.0 * sample[0] - seen[0, int(closer)].float()).abs().mean()) < 2.0
+
+
 def test_a_crop_is_the_part_that_opencv_cuts_out() -> None:
     view = (255 * np.random.default_rng(0).random((12, 20))).astype(np.uint8)
     view = cv2.resize(view, (240, 144), interpolation=cv2.INTER_CUBIC)
     crop = Crop(width=(0.5, 0.5), shift=0.1, roll_rad=0.3, mirror=0.0)
-    window = crop.windows(1, (144, 240), chance(5))
+    window = crop.windows(torch.ones(1), (144, 240), chance(5))
     seen = cut(torch.from_numpy(view)[None, None], window, (80, 48))[0, 0].numpy()
     # from a sample's pixels to places from -1 to 1, to places in the view, to its pixels
     into = np.array([[2 / 80, 0, 1 / 80 - 1], [0, 2 / 48, 1 / 48 - 1], [0, 0, 1]])

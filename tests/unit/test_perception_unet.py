@@ -85,6 +85,9 @@ def test_a_training_begins_with_the_network_it_is_given(brokk: Callable[..., Any
     again = brokk(*slow, "training.start=first/segmenter.safetensors", "training.updates=1", "session.out=again")
     assert again.code == 0, again.err
     one, other = (json.loads(Path(name, "training.json").read_text())["conditions"]["all"] for name in ("first", "again"))
+    curve = json.loads(Path("again/training.json").read_text())["curve"]
+    assert (curve[0]["update"], curve[0]["loss"]) == (0, None), "what it began with is judged too"
+    assert curve[0]["block"] == pytest.approx(one["block"], abs=1e-3)
     assert one["block"] > 0.3 and other["block"] == pytest.approx(one["block"], abs=0.1)
     refused = brokk(*command, "training.start=first/segmenter.safetensors", "training.widths=[6,12]", "session.out=no")
     assert refused.code == 2 and "widths [6, 12, 16]" in refused.err
