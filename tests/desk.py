@@ -86,7 +86,9 @@ class Desk:
         self.exchange = Exchange.new(machine.num_joints, commands)
         self._description = Description(DBC, machine)
         self._setting = Setting(self.wire, DBC, machine, limits)
-        twin = Twin(wire=self.wire, dbc=DBC, remote=True, deadman=True, fault_port=self.port, seconds=None, realtime=False)
+        twin = Twin(
+            wire=self.wire, dbc=DBC, remote=True, deadman=True, again_s=None, fault_port=self.port, seconds=None, realtime=False
+        )
         session = Session(out=str(folder), seed=0, device="cpu")
         self._twin_arguments = (twin, machine, NominalMachine(), session, None)
         self.children: dict[str, Child] = {}

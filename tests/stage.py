@@ -97,16 +97,19 @@ class Stage:
         machine: The machine.
         mode: Who commands.
         folder: Where a session may write.
+        again_s: When the operator who is not followed presses the dead-man again.
     """
 
-    def __init__(self, machine: Machine, mode: Mode, folder: Path) -> None:
+    def __init__(self, machine: Machine, mode: Mode, folder: Path, again_s: float | None = None) -> None:
         self.machine, self.mode, self.ms = machine, mode, 0
         self.exchange = Exchange.new(machine.num_joints, commands=mode != "listen")
         self.air, self.request_s, self.wanted = Air(self), 0.05, WANTED
         self.stopped_ms: int | None = None
         self._times = 0
         with self._time():
-            twin = Twin(wire=NO_WIRE, dbc=DBC, remote=True, deadman=True, fault_port=None, seconds=None, realtime=False)
+            twin = Twin(
+                wire=NO_WIRE, dbc=DBC, remote=True, deadman=True, again_s=again_s, fault_port=None, seconds=None, realtime=False
+            )
             link = NominalMachine().build(machine, 1, Session(out=str(folder), seed=0, device="cpu"))
             self.twin = Running(twin, machine, link, Gateway(self), FaultPort(None))
             limits, wire = option("guard", "default"), self.air

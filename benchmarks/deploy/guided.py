@@ -2,7 +2,7 @@
 
 Each trial is `preset=bench` with real processes, in real time. `guided`: the default mode, nothing is sent, a simulated person
 moves the levers as the policy trained behind a person shows them. `alone`: the other shipped policy commands the valves itself.
-Success is the strict one, from the captured positions.
+Success is the strict one, from the captured positions. `latched`: why the guard stopped a trial until the operator pressed again.
 """
 
 from __future__ import annotations
@@ -89,8 +89,15 @@ def judged(out: Path, machine: object, task: object, hole: np.ndarray) -> dict[s
     late = {one["process"]: one["late_p99_s"] for one in timing["processes"]}
     moved = t_s[np.abs(q - q[0]).max(1) > 0.01]
     first_s = float(t_s[inside.argmax()] - moved[0]) if inside.any() and len(moved) else None
+    latched = [values["cause"] for _, values in contents.messages.get("guard", []) if values["state"] == "LATCHED"]
     sent = any(values.get("sent") for values in (message[1] for message in contents.messages.get("ValveCmd", [])))
-    return {"success": bool(inside.any()), "time_to_insert_s": first_s, "late_p99_s": late, "commands_sent": sent}
+    return {
+        "success": bool(inside.any()),
+        "time_to_insert_s": first_s,
+        "late_p99_s": late,
+        "commands_sent": sent,
+        "latched": latched,
+    }
 
 
 if __name__ == "__main__":

@@ -169,7 +169,9 @@ class _Desk:
         start, hole = tuple(q.tolist()), tuple(rim_m.tolist())
         placed = replace(ground.plant, start=start, hole_in_base_m=hole)  # type: ignore[type-var]
         self._link, self._air = placed.build(machine, 1, session), _Air()
-        twin = Twin(wire=NO_BUS, dbc=ground.dbc, remote=False, deadman=False, fault_port=None, seconds=None, realtime=False)
+        twin = Twin(
+            wire=NO_BUS, dbc=ground.dbc, remote=False, deadman=False, again_s=None, fault_port=None, seconds=None, realtime=False
+        )
         self._twin = Running(twin, machine, self._link, self._air, FaultPort(None))
         self._remote, self._receiver = Remote(description), Receiver(description, machine, ground.limits)
         self._remote.deadman = True

@@ -24,13 +24,13 @@ from deploy.bus.header import c_header
 from deploy.bus.wire import Wire, Wired
 from deploy.loop.process import Pace, Stop, ask_for_priority
 from deploy.twin.faults import FaultPort, Faults
-from deploy.twin.gateway import Gateway
+from deploy.twin.gateway import NOBODY, PC, Gateway
 from deploy.twin.remote import Remote
 
 log = logging.getLogger(__name__)
 
 CYCLE_S = 0.01
-PRESS_S = 1.0
+PRESS_S, LET_GO_S = 1.0, 0.3
 HEADER = "gateway.h"
 TWIN_PRIORITY = 45
 """Below bus and policy: the loop must not look better or worse for the company it has on a desk."""
@@ -49,6 +49,7 @@ class Twin:
         dbc: Its description.
         remote: Whether the twin plays the remote too; `false` where an operator is a node of its own.
         deadman: Whether an operator at that remote presses the dead-man, one second after the PC is first heard, and holds it.
+        again_s: When that operator, if the valves do not follow the PC, lets go and presses again; `null`: holds it all the same.
         fault_port: Local port for faults on request; `null`: none.
         seconds: When to stop; `null`: when told to.
         realtime: Whether to ask for real-time priority: a machine is never late.
@@ -58,6 +59,7 @@ class Twin:
     dbc: str
     remote: bool
     deadman: bool
+    again_s: float | None
     fault_port: int | None
     seconds: float | None
     realtime: bool
@@ -65,6 +67,8 @@ class Twin:
     def check(self) -> None:
         if self.fault_port is not None and not 0 < self.fault_port < 65536:
             raise ConfigError(f"twin.fault_port: expected 1 to 65535, or null, got {self.fault_port}")
+        if self.again_s is not None and self.again_s <= 0:
+            raise ConfigError(f"twin.again_s: expected more than 0, or null, got {self.again_s}")
 
     def run(self, stop: Stop, machine: Machine, plant: Connection, session: Session) -> None:
         """Runs until told to stop, or the time is over; leaves `gateway.h`, the bus for the firmware of a real gateway.
@@ -117,6 +121,7 @@ class Running:
         self._due_s: dict[str, float] = {}
         self._q = self._before = np.asarray(link.read().q, dtype=float)
         self._flow, self._oil_c = np.zeros(machine.num_joints), _oil_c(link)
+        self._source, self._grip_s = NOBODY, -np.inf
         self._period_began_s = -np.inf
         self._stuck: np.ndarray | None = None
         remote = self._description.layouts[self._description.message_of("DeadMan")]
@@ -184,9 +189,9 @@ class Running:
     def _valves(self, now_s: float) -> tuple[np.ndarray, dict[str, float]]:
         """Returns what the valves get, `(J,)`, and what is said of it; that they get nothing any more is said at once."""
         gateway, before = self._gateway, self._flow
-        self._flow, source, state = gateway.flow(now_s)
+        self._flow, self._source, state = gateway.flow(now_s)
         said = {f"Flow_{name}": float(u) for name, u in zip(self._machine.joint_names, self._flow, strict=True)}
-        said |= {"FlowSource": source, "EStop": gateway.estop, "ExclusiveSelected": gateway.exclusive_selected}
+        said |= {"FlowSource": self._source, "EStop": gateway.estop, "ExclusiveSelected": gateway.exclusive_selected}
         said |= {"GatewayState": state.value, "OilTemperature": self._oil_c}
         if before.any() and not self._flow.any():
             for signal in ("FlowSource", "EStop"):
@@ -196,7 +201,7 @@ class Running:
     def _play_remote(self, now_s: float) -> None:
         faults, remote = self._faults, self._remote
         layout = self._description.layouts[self._description.message_of("DeadMan")]
-        held = self._twin.deadman and now_s - self._gateway.heard_s > PRESS_S and not faults.on("deadman_released", "", now_s)
+        held = self._held(now_s)
         released = remote.deadman and not held  # which does not wait for its turn either
         if now_s < self._due_s.get(layout.name, now_s) and not released:
             return
@@ -208,6 +213,17 @@ class Running:
         self._gateway.take(frame, now_s)
         for one in faults.pass_on(layout, frame, now_s):
             self._bus.send(one)
+
+    def _held(self, now_s: float) -> bool:
+        """Says whether the operator holds the dead-man; a PC that was not ready when it was pressed waits for it to be let go."""
+        heard = now_s - self._gateway.heard_s > PRESS_S
+        pressed = self._twin.deadman and heard and not self._faults.on("deadman_released", "", now_s)
+        again_s = self._twin.again_s
+        if not pressed or self._source == PC:
+            self._grip_s = now_s
+        elif again_s is not None and now_s - self._grip_s > again_s:
+            self._grip_s = now_s + LET_GO_S
+        return pressed and now_s >= self._grip_s
 
     def _send(self, name: str, values: dict[str, float], now_s: float, at_once: bool = False) -> None:
         layout = self._description.layouts[name]

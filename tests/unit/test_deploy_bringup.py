@@ -77,7 +77,7 @@ def test_the_checklist_runs_with_an_operator_and_finds_a_sound_machine(
 ) -> None:
     bus_port, port = free_port(), free_port()
     wire = Wire(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=bus_port)
-    twin = Twin(wire=wire, dbc=DBC, remote=False, deadman=False, fault_port=port, seconds=None, realtime=False)
+    twin = Twin(wire=wire, dbc=DBC, remote=False, deadman=False, again_s=None, fault_port=port, seconds=None, realtime=False)
     session, stop = Session(out=str(tmp_path / "twin"), seed=0, device="cpu"), threading.Event()
     child = Child("twin", "deploy.twin.twin:run", (twin, machine, NominalMachine(), session), (), 60)
     time.sleep(2.0)

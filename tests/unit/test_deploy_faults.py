@@ -199,3 +199,18 @@ def test_a_full_disk_ends_the_log_says_so_and_leaves_what_was_written(
         record(lambda: False, capture, exchange)
     assert reading.read(tmp_path / MCAP).messages["advice"][0][0] == 0.5
     exchange.close()
+
+
+@pytest.mark.parametrize("again_s", [None, 2.0])
+def test_a_dead_man_pressed_before_there_was_advice_has_to_be_pressed_again(
+    machine: Machine, tmp_path: Path, again_s: float | None
+) -> None:
+    stage = Stage(machine, "auto", tmp_path, again_s)
+    late, stage.adviser = stage.adviser, None
+    stage.go(3.0)
+    safety = stage.view.safety
+    assert safety is not None and safety.state == "LATCHED" and not stage.moves
+    stage.adviser = late
+    stage.go(6.0, lambda: stage.moves)
+    assert stage.moves == (again_s is not None)
+    stage.close()
