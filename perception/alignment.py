@@ -120,6 +120,8 @@ def aligned(
     `None` where they do not agree: the right picture is another's, or shifted.
 
     What dust, exposure and vignetting add to one of them varies slowly, so only what departs from the mean of a window counts.
+    The slopes of a noisy picture are larger than those of what it shows: steps by them are too short, and the plane would seem too
+    sure. So differences are held against the slopes of the left picture, whose noise is another (instrumental variables).
 
     Args:
         both: The face in both pictures.
@@ -157,16 +159,17 @@ def aligned(
         return (values - cv2.boxFilter(values * weight, -1, window) / counted)[on].astype(float)
 
     mine = departing(both.left[::stride])
-    slope = cv2.Sobel(both.right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    instrument, slope = (cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=3, scale=0.125) for picture in (both.left, both.right))
+    instrument = departing(instrument[::stride])
     m, ray, seen = face.m, rays[on], mine
     for _ in range(ROUNDS):
         seen, rise = (departing(both.seen(u, row, rays, m, picture)) for picture in (both.right, slope))
-        push = np.column_stack([ray * (-both.pull_px / both.shrink * rise)[:, None], -mine])
+        push, heavy = (np.column_stack([ray * (-both.pull_px / both.shrink * one)[:, None], -mine]) for one in (rise, instrument))
         gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
         off = seen - gain * mine
         scale = 1.4826 * float(np.median(np.abs(off))) + 1e-6
         trust = np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
-        heavy = push * trust[:, None]
+        heavy *= trust[:, None]
         m = m - np.linalg.lstsq(heavy.T @ push, heavy.T @ off, rcond=1e-12)[0][:3]
     likeness = float(seen @ mine) / max(float(np.sqrt((seen @ seen) * (mine @ mine))), 1e-9)
     if likeness < ALIKE:
@@ -175,7 +178,7 @@ def aligned(
     if not np.isfinite(m).all() or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px:
         return face
     cell = (v[on] // cell_px).astype(np.int64) * 10_000 + (u[on] // cell_px).astype(np.int64)
-    return merged(face, replace(face, m=m, cov=sandwich(push[:, :3], trust, off, cell)), bias_per_m)
+    return merged(face, replace(face, m=m, cov=sandwich(push[:, :3], heavy[:, :3], off, cell)), bias_per_m)
 
 
 def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:

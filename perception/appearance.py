@@ -29,7 +29,8 @@ class Interior:
             the hole and the dark depth on the near side: clearly negative in a hole, about zero on a disc.
         deeper: Part of the known depth inside that lies clearly behind the face.
         unknown: Part of the inside without depth.
-        around: Brightness of the darkest hundredth of what surrounds it, over that of the face.
+        around: Brightness of the darkest hundredth of what surrounds it, over that of the face; before the face there is less dust,
+            and what stands there does not count.
         contrast: By how much its darkest quarter is darker than the face, in standard deviations of the brightness of the face.
     """
 
@@ -81,10 +82,27 @@ def interior(
         values = values - (place[inside][:, :2] - (x, y)) @ drift
         slope = float(np.polyfit(along, values, 1)[0]) / max(face * (1.0 - darkness), 1.0)
     grain = 1.4826 * float(np.median(np.abs(smooth[ring] - face)))
-    wide = WIDE * a
-    near = gray[max(0, int(y - wide)) : int(y + wide), max(0, int(x - wide)) : int(x + wide)]
-    around = float(np.percentile(near[::2, ::2], 1.0)) / face
+    around = _darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
     return Interior(darkness, slope, deeper, unknown, around, face * (1.0 - darkness) / max(grain, 1.0))
+
+
+def _darkest_around(
+    gray: np.ndarray, depth_m: np.ndarray, ellipse: np.ndarray, camera_matrix: np.ndarray, plane: Plane | None
+) -> float:
+    """Returns the grey level of the darkest hundredth of what is on or behind the face around an ellipse; 0 where nothing is."""
+    x, y, wide = ellipse[0], ellipse[1], WIDE * ellipse[2]
+    step = max(2, int(wide / 60))
+    rows, columns = (
+        np.arange(max(0, int(middle - wide)), min(size, int(middle + wide)), step)
+        for middle, size in ((y, len(gray)), (x, len(gray[0])))
+    )
+    near = gray[np.ix_(rows, columns)]
+    if plane is not None:
+        down, across = np.meshgrid(rows, columns, indexing="ij")
+        place = np.stack([across, down, np.ones_like(down)], -1) @ np.linalg.inv(camera_matrix).T
+        behind = place @ plane.m - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma  # false where depth is unknown
+        near = near[cv2.erode(behind.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0]
+    return float(np.percentile(near, 1.0)) if near.size else 0.0
 
 
 def _gradient(part: np.ndarray, place: np.ndarray, ring: np.ndarray, ellipse: np.ndarray) -> np.ndarray:

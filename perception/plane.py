@@ -162,7 +162,9 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
         first = sigma if ring == rings[0] else first
         extent = ring
     residual = points.inverse - points.rays @ m
-    return Plane(m, sandwich(points.rays, weight, residual, points.cell), sigma, int((weight > 0).sum()), extent)
+    return Plane(
+        m, sandwich(points.rays, points.rays * weight[:, None], residual, points.cell), sigma, int((weight > 0).sum()), extent
+    )
 
 
 def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40) -> np.ndarray:
@@ -178,19 +180,18 @@ def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator
     return planes[np.argmin(np.partition(off, middle, axis=0)[middle])]
 
 
-def sandwich(slopes: np.ndarray, weight: np.ndarray, residual: np.ndarray, cell: np.ndarray) -> np.ndarray:
+def sandwich(slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """Returns the covariance of a fit of three numbers, `(3, 3)`: the sandwich estimate over cells, in which noise may be alike.
 
     Args:
         slopes: Of the residuals for each number, `(P, 3)`.
-        weight: `(P,)`.
+        heavy: What the residuals are held against to find them, `(P, 3)`: the weighted slopes, or instruments in their place.
         residual: `(P,)`.
         cell: Number of each point's cell, `(P,)`.
     """
-    heavy = slopes * weight[:, None]
     bread = np.linalg.inv(heavy.T @ slopes)
     _, cell = np.unique(cell, return_inverse=True)
     push = heavy * residual[:, None]
     sums = np.column_stack([np.bincount(cell, push[:, k]) for k in range(3)])
     num = max(int(cell.max()) + 1, 4)
-    return bread @ (sums.T @ sums) @ bread * num / (num - 3)
+    return bread @ (sums.T @ sums) @ bread.T * num / (num - 3)

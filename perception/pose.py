@@ -72,7 +72,7 @@ class PlaneConic:
         matcher_bias_per_m: Standard deviation of inverse depth by which a matcher is off all over a face, 1/m; with a right picture
             the face is aligned anew.
         bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual shows, 1/m.
-        center_px: Standard deviation of an ellipse's centre that no residual shows, px.
+        center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
         looks: What it must look like.
         without_depth: What is tried where the face has no depth; `null` for nothing.
         blind: Part of the face around a hole with known depth below which it has none.
@@ -146,7 +146,7 @@ class PlaneConicEstimator:
             shape = self._shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
-        circle = rim.circle(gray, row, frame.camera_matrix, face.m, s.radius_m, s.radius_tolerance)
+        circle = rim.circle(gray, row, frame.camera_matrix, face.m, s.radius_m, s.radius_tolerance, s.center_px)
         if circle is None or circle.coverage < s.coverage:
             return Rejection(
                 "pose", "part of a circle on the face with a rim", circle.coverage if circle else 0.0, s.coverage, ellipse
@@ -161,7 +161,7 @@ class PlaneConicEstimator:
             center_m=circle.center_m,
             axis=face.normal,
             radius_m=circle.radius_m,
-            cov_m2=covariance(replace(face, cov=face.cov * s.depth_alike), circle, frame.camera_matrix, s.center_px, s.bias_per_m),
+            cov_m2=covariance(replace(face, cov=face.cov * s.depth_alike), circle, s.bias_per_m),
             axis_cov_rad2=face.normal_cov_rad2() * s.tilt_alike,
             frame="camera",
             score=float(ellipse.score) * (VEILED_SCORE if inside.darkness > s.looks.veiled and masks.mouth is None else 1.0),
@@ -221,14 +221,12 @@ class PlaneConicEstimator:
         return None if evidence >= 1.0 else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
 
 
-def covariance(face: Plane, circle: Circle, camera_matrix: np.ndarray, center_px: float, bias_per_m: float) -> np.ndarray:
+def covariance(face: Plane, circle: Circle, bias_per_m: float) -> np.ndarray:
     """Returns the covariance of a centre, `(3, 3)` m²: along the ray by the plane's, on the plane by the circle's."""
     center = circle.center_m
     ray = center / center[2]
     depth_var = center[2] ** 4 * (float(ray @ face.cov @ ray) + bias_per_m**2)
-    across = np.linalg.inv(camera_matrix)[:, :2] * (center_px * center[2])
-    slip = np.eye(3) - np.outer(ray, face.m) / float(face.m @ ray)  # across the ray, the centre stays on the plane
-    return np.outer(ray, ray) * depth_var + circle.cov_m2 + slip @ across @ across.T @ slip.T
+    return np.outer(ray, ray) * depth_var + circle.cov_m2
 
 
 def vector(ellipse: Ellipse) -> np.ndarray:

@@ -74,7 +74,13 @@ class Chart:
 
 
 def circle(
-    gray: np.ndarray, ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray, radius_m: float, tolerance: float
+    gray: np.ndarray,
+    ellipse: np.ndarray,
+    camera_matrix: np.ndarray,
+    m: np.ndarray,
+    radius_m: float,
+    tolerance: float,
+    center_px: float,
 ) -> Circle | None:
     """Returns the circle on the plane `m · P = 1` whose rim has the most edges of dark to bright; `None` where nothing agrees.
 
@@ -85,6 +91,7 @@ def circle(
         m: The plane, `(3,)`.
         radius_m: About how large it is.
         tolerance: By how much it may be larger or smaller, as a part of that.
+        center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
     """
     ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
     normal = m / np.linalg.norm(m)
@@ -103,7 +110,7 @@ def circle(
         profiles = _edges(gray, seen, NARROW_PX, chart) if np.isfinite(seen).all() else None
         if profiles is None:
             return None
-        found, cov, rms_px, coverage = _fitted(found, *profiles)
+        found, cov, rms_px, coverage = _fitted(found, *profiles, center_px)
         if found is not None and abs(found[2] - radius_m) > 1.5 * tolerance * radius_m:
             return None
     if found is None:
@@ -176,7 +183,9 @@ def _agreed(edges: np.ndarray, pixel_m: np.ndarray, radius_m: float, tolerance: 
     return circles[np.argmax(np.maximum(1 - (near / NEAR_PX) ** 2, 0.0).sum(1))]
 
 
-def _fitted(start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, float, float]:
+def _fitted(
+    start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray, center_px: float
+) -> tuple[np.ndarray | None, np.ndarray, float, float]:
     """Returns the circle that fits the edges nearest to one, the covariance of its centre, its residual in px and its coverage."""
     found = start
     for scale_px in (NARROW_PX, INLIER_PX, 0.6 * INLIER_PX):
@@ -200,5 +209,7 @@ def _fitted(start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray) -> tuple[
     rms_px = float(np.sqrt(np.average(off[on] ** 2, weights=weight[on])))
     spacing_px = float(2 * np.pi * found[2] / len(rows) / np.median(pixel_m))
     alike = max(ALIKE_PX / spacing_px, 1.0)
-    cov = np.linalg.inv(normal)[:2, :2] * rms_px**2 * alike
+    # a whole rim of n profiles knows its centre by 2 / n of a profile's variance; what is left of one, by its own geometry less
+    unseen = 0.5 * len(rows) * center_px**2
+    cov = np.linalg.inv(normal)[:2, :2] * (rms_px**2 * alike + unseen)
     return found, cov, rms_px, float(np.mean(on))

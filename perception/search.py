@@ -17,6 +17,8 @@ OCTAVES = 5
 """Resolutions: the full one, half of it, and so on."""
 LEAST = 20
 """Pixels of that grid below which a region is an accident of depth."""
+UNSEEN = 3.0
+"""Sizes of a hole across which a face may go on where nobody knows the depth: beside an arm, whose other side one camera sees."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
 
     A circle's major semi-axis is focal length times radius over depth, however it is tilted. What is looked at reaches as far
     beyond the mask as a hole is wide: one is a gap of the mask where the segmenter does not count it to the block, and lies at its
-    border where something stands before half of it.
+    border where something stands before half of it; where depth is unknown beside the mask, the face may go on a few times as far.
 
     Args:
         frame: For depth and camera.
@@ -77,7 +79,8 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
         if np.count_nonzero(here) < LEAST:
             continue
         reach = float(np.percentile(size_px[here], 98.0)) * (1.0 + slack) / STEP
-        count, pieces = cv2.connectedComponents(_dilated(here, reach))
+        hidden = (_dilated(here, UNSEEN * reach) > 0) & ~np.isfinite(depth)
+        count, pieces = cv2.connectedComponents(_dilated(here | hidden, reach))
         for piece in range(1, count):
             part = pieces == piece
             sizes_px = size_px[part & here]

@@ -12,7 +12,7 @@ from drawn import AXIS, CENTER, drawn
 
 from brokk_rl.errors import FrameError
 from brokk_rl.sight import HolePose, Masks
-from perception import dataset
+from perception import dataset, search
 from perception.bench import Tally, compare, judge
 from perception.finder import Finder, rectified
 
@@ -95,3 +95,14 @@ def test_a_frame_that_is_refused_counts_as_one_in_which_nothing_was_found() -> N
     missed, sighting = judge(blind, replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), truth)
     assert (missed.refused, missed.true, missed.found, missed.is_perfect) == (1, 1, 0, False)
     assert not sighting.holes
+
+
+def test_beside_an_arm_a_face_is_searched_where_nobody_knows_its_depth() -> None:
+    depth_m = np.full((480, 640), 2.0, np.float32)
+    depth_m[:, 300:360], depth_m[:, 360:] = np.nan, 0.8  # what the arm hides from the right camera, and the arm
+    mask = np.zeros(depth_m.shape, bool)
+    mask[100:400, 100:300] = True
+    frame = replace(drawn()[0], depth_m=depth_m)
+    (level,) = search.levels(frame, mask, 0.05, 0.25, 8.0)
+    # a hole has 13 px there, 17 at most: the whole strip is searched, the arm no farther than a rim reaches, the ground likewise
+    assert level.roi[110:390, 300:360].all() and not level.roi[:, 390:].any() and not level.roi[:, :70].any()

@@ -11,7 +11,7 @@ from composed import option
 from drawn import AXIS, CENTER, RAYS, K, drawn
 
 from brokk_rl.sight import HolePose, Rejection
-from perception import alignment, plane
+from perception import alignment, plane, rim
 from perception.pose import gray_of
 from perception.pose import vector as pose_row
 
@@ -41,20 +41,50 @@ def test_a_third_of_a_rim_that_is_hidden_is_not_missed(estimator) -> None:
     assert float(pose.axis @ AXIS) > np.cos(np.radians(0.2))
 
 
-def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() -> None:
-    generator = np.random.default_rng(3)
-    frame, masks, ellipse = drawn()
-    m, row = AXIS / (AXIS @ CENTER), pose_row(ellipse)
+def both_views(m: np.ndarray, pull_px: float, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a plane's grain, of variance one before it is smoothed, as both cameras see it, `(480, 640)` each."""
     grain = cv2.GaussianBlur(generator.normal(0, 1, (480, 900)).astype(np.float32), (0, 0), 1.2)
-    left = np.clip(120 + 60 * grain[:, 200:840], 0, 255)
-    pull_px = K[0, 0] * 0.12
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
     # the right camera sees at column x what the left one has at u = x + pull (m . ray(u)), solved for u
     x = u - pull_px * (m[0] * (u - K[0, 2]) / K[0, 0] + m[1] * (v - K[1, 2]) / K[1, 1] + m[2])
     back = (u - x[:, :1]) / (1 - pull_px * m[0] / K[0, 0])
-    right = cv2.remap(grain, (back + 200).astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC)
-    right = np.clip(0.9 * (120 + 60 * right) + 8, 0, 255)
-    color, partner = (np.repeat(np.rint(one).astype(np.uint8)[..., None], 3, 2) for one in (left, right))
+    return grain[:, 200:840], cv2.remap(grain, (back + 200).astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC)
+
+
+def as_color(gray: np.ndarray) -> np.ndarray:
+    return np.repeat(np.rint(np.clip(gray, 0, 255)).astype(np.uint8)[..., None], 3, 2)
+
+
+def test_in_noise_a_face_is_aligned_without_bias_and_as_surely_as_is_claimed() -> None:
+    generator = np.random.default_rng(4)
+    frame, masks, ellipse = drawn()
+    m, row, pull_px = AXIS / (AXIS @ CENTER), pose_row(ellipse), K[0, 0] * 0.12
+    off, ray = 0.3 / pull_px, CENTER / CENTER[2]
+    depth = (1.0 / (RAYS @ m + off)).astype(np.float32)
+    begin = plane.Plane(m + np.array([0.0, 0.0, off]), np.eye(3) * 1e-4, 0.5 / pull_px, 1000, 7.0)
+    errors, claims = [], []
+    for _ in range(16):
+        views = both_views(m, pull_px, generator)
+        # dust: grain of four grey levels, noise of six
+        color, partner = (as_color(120 + 16 * one + generator.normal(0, 6, one.shape)) for one in views)
+        seen = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
+        both = alignment.pair(seen, gray_of(seen), begin.m, row, begin.extent)
+        assert both is not None
+        found = alignment.aligned(both, begin, seen, masks.block > 0.5, row, 1.25, 24, 1.0)
+        assert found is not None
+        errors.append(float((found.m - m) @ ray) * pull_px)
+        claims.append(float(np.sqrt(ray @ found.cov @ ray)) * pull_px)
+    assert abs(np.mean(errors)) < 0.02, "of the 0.3 px that it began with"
+    assert 0.6 < np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(claims))) < 1.5
+
+
+def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() -> None:
+    generator = np.random.default_rng(3)
+    frame, masks, ellipse = drawn()
+    m, row = AXIS / (AXIS @ CENTER), pose_row(ellipse)
+    pull_px = K[0, 0] * 0.12
+    left, right = both_views(m, pull_px, generator)
+    color, partner = as_color(120 + 60 * left), as_color(0.9 * np.clip(120 + 60 * right, 0, 255) + 8)
     off = 0.1 / pull_px  # a tenth of a pixel
     depth = (1.0 / (RAYS @ m + off + generator.normal(0, 0.3, (480, 640)) / pull_px)).astype(np.float32)
     frame = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
@@ -100,6 +130,33 @@ def test_in_dust_a_disc_may_be_a_hole_for_half_the_score_and_in_clear_air_a_pale
     shaded[int(ellipse.y + 4 * ellipse.a) :] //= 4  # something dark nearby: nothing lies over it
     stain = estimator.estimate(replace(frame, color=shaded), masks, ellipse)
     assert isinstance(stain, Rejection) and stain.reason == "brightness inside over outside"
+
+
+def test_what_stands_before_a_face_may_be_darker_than_dust(estimator) -> None:
+    frame, masks, ellipse = drawn()
+    dusty = (0.3 * frame.color.astype(float) + 0.7 * 150).astype(np.uint8)
+    depth_m = frame.depth_m.copy()
+    below = int(ellipse.y + 4 * ellipse.a)
+    dusty[below:] //= 4
+    depth_m[below:] *= 0.5  # an arm, halfway: there is half of the dust before it
+    pose = estimator.estimate(replace(frame, color=dusty, depth_m=depth_m), masks, ellipse)
+    assert isinstance(pose, HolePose)
+
+
+@pytest.mark.parametrize("seen_rad", [np.pi, 2 * np.pi / 3])
+def test_a_rim_knows_its_centre_by_what_is_seen_of_it(seen_rad: float) -> None:
+    angles = np.linspace(-np.pi, np.pi, 72, endpoint=False)
+    edges = np.full((72, rim.PEAKS, 2), np.nan)
+    on = np.abs(angles) <= seen_rad
+    edges[on, 0] = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])[on]
+    found, cov, rms_px, coverage = rim._fitted(np.array([0.0, 0.0, 0.05]), edges, np.full(72, 0.002), 0.03)
+    assert found is not None and rms_px == pytest.approx(0.0, abs=1e-6) and coverage == pytest.approx(on.mean())
+    if on.all():
+        # a pixel is 2 mm long: 0.03 px are 60 um, in every direction
+        assert cov == pytest.approx(np.eye(2) * (0.03 * 0.002) ** 2, abs=1e-12)
+    else:
+        # towards the part that is hidden, radius and centre are told apart by what bends: much worse than across it
+        assert cov[0, 0] > 2.5 * cov[1, 1] > 3.0 * (0.03 * 0.002) ** 2
 
 
 def test_the_mouth_channel_is_believed(estimator) -> None:
