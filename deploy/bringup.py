@@ -13,6 +13,7 @@ It only listens; the operator moves the machine.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -25,17 +26,11 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.bus.description import GATEWAY, REMOTE, Description
-from deploy.bus.wire import Replay, Wire
-from deploy.guidance import Guidance
-from deploy.limits import Limits
-from deploy.loop.process import Child
+from deploy.loop.listener import Children, Listener
 from deploy.loop.records import Exchange
-from deploy.loop.station import Setting
-from deploy.loop.supervisor import BUS_PRIORITY, PATIENCE_S, POLICY_PRIORITY
-from deploy.loop.target import Aim, TargetSource
+from deploy.loop.target import Aim
 from deploy.motion import Motion, judge
-from deploy.policy.adviser import REASONS, Advised, Counsel
-from deploy.policy.bundle import Bundle
+from deploy.policy.adviser import REASONS, Advised
 from deploy.recorder import reading
 from deploy.recorder.capture import MCAP, Capture
 
@@ -56,36 +51,22 @@ class Finding:
 
 
 @spec
-class Bringup:
-    """The checklist.
+class Bringup(Listener):
+    """The checklist; policy and borehole are those of the shadow run.
 
-    Attributes:
-        wire: The bus.
-        dbc: Its description.
-        limits: Of the guard.
-        guidance: How advice would be shown.
-        policy: Policy bundle of the shadow run.
-        target: Borehole of the shadow run.
+    Attributes (and those of `Listener`):
         listen_s: How long to listen at rest.
         patience_s: How long to wait for each thing that the operator is asked to do.
         shadow_s: Length of the shadow run.
         quiet: Largest standard deviation of a position at rest (rad or m).
         rate: Smallest part of a message's nominal rate.
-        realtime: Whether to ask for real-time priority, as the loop does.
     """
 
-    wire: Wire | Replay
-    dbc: str
-    limits: Limits
-    guidance: Guidance
-    policy: str
-    target: TargetSource
     listen_s: float
     patience_s: float
     shadow_s: float
     quiet: float
     rate: float
-    realtime: bool
 
     def check(self) -> None:
         for name in ("listen_s", "patience_s", "shadow_s", "quiet", "rate"):
@@ -104,24 +85,16 @@ class Bringup:
             LinkError: nothing is heard at all.
             CheckpointError: the policy cannot be used on this machine.
         """
-        Bundle(self.policy, machine)
+        self.refuse(machine)
         exchange = Exchange.new(machine.num_joints, commands=False)
-        counsel = Counsel(machine, self.policy, self.guidance, self.limits.joints_s, 1e9, None)
-        targets = {
-            "bus": ("deploy.loop.station:run", Setting(self.wire, self.dbc, machine, self.limits), BUS_PRIORITY),
-            "policy": ("deploy.policy.adviser:run", counsel, POLICY_PRIORITY),
-            "log": ("deploy.recorder.capture:run", Capture(session.folder, self.dbc, machine, {"source": "bring-up"}, 0.0), None),
-        }
-        children = [
-            Child(name, target, (what, exchange), exchange.files, priority if self.realtime else None)
-            for name, (target, what, priority) in targets.items()
-        ]
+        children = Children(exchange, self.realtime)
         try:
-            running = _Checks(self, machine, exchange, say)
-            findings = running.all()
+            self.listen(children, machine, target_s=math.inf, pitch_rad=None)
+            capture = Capture(session.folder, self.dbc, machine, {"source": "bring-up"}, pictures_hz=0.0)
+            children.start("log", "deploy.recorder.capture:run", (capture,))
+            findings = _Checks(self, machine, exchange, say).all()
         finally:
-            for child in (children[1], children[0], children[2]):
-                child.end(PATIENCE_S)
+            children.end()
             exchange.close()
         findings.insert(0, self._rates(machine, session))
         write_json(session.folder / REPORT, {"machine": machine.name, "findings": [asdict(one) for one in findings]})

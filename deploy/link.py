@@ -20,11 +20,11 @@ from brokk_rl.spec import spec
 from deploy.bus.wire import Wire
 from deploy.guard import State
 from deploy.limits import Limits
+from deploy.loop.listener import BUS_PRIORITY, PATIENCE_S
 from deploy.loop.outlet import view
 from deploy.loop.process import Child, ask_for_priority, back_to_ordinary
 from deploy.loop.records import Exchange
 from deploy.loop.station import Setting
-from deploy.loop.supervisor import BUS_PRIORITY, PATIENCE_S
 
 log = logging.getLogger(__name__)
 

@@ -9,11 +9,11 @@ import numpy as np
 from browser import SHOWN, Scripted
 from composed import option
 
+from brokk_rl.chain import tool
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from deploy.chain import tool
 from deploy.study import design, folder
 from deploy.study.conductor import Conductor, Words
 from deploy.study.stage import Sight

@@ -11,80 +11,57 @@ import json
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.live import Live
 
-from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
-from deploy.bus.description import Description
-from deploy.bus.wire import Replay, Wire
-from deploy.guidance import Guidance, LeverMap, full_angles_rad
-from deploy.limits import Limits
+from deploy.guidance import full_angles_rad
 from deploy.loop.eyes import Camera
+from deploy.loop.listener import PATIENCE_S, Children, Listener
 from deploy.loop.outlet import view
 from deploy.loop.process import Child
 from deploy.loop.records import Exchange
-from deploy.loop.station import Setting
-from deploy.loop.target import Aim, Seen, TargetSource
+from deploy.loop.target import Aim, Seen
 from deploy.loop.terminal import table
 from deploy.loop.wanted import Recorder, Wanted
 from deploy.page.from_loop import Beside
 from deploy.page.settings import OperatorPage
-from deploy.policy.adviser import Counsel
-from deploy.policy.bundle import Bundle
 from deploy.recorder.capture import Capture
 
 log = logging.getLogger(__name__)
 
 PROCESSES, TIMING = "processes.json", "timing.json"
 WATCH_S = 0.05
-PATIENCE_S = 3.0
-BUS_PRIORITY, POLICY_PRIORITY = 55, 50
-OPTIONAL = {"page": "nothing is shown any more", "camera": "nothing new is seen any more"}
-"""Processes without which the loop goes on, and what is lost with them."""
 
 
 @spec
-class Loop:
+class Loop(Listener):
     """The loop on the machine: listens, advises, records; commands valves only where `commands` says so.
 
-    Attributes:
-        wire: The bus.
-        dbc: Its description.
-        limits: Of the guard.
-        guidance: How advice is shown.
-        policy: Policy bundle.
-        target: Where the borehole is.
+    Attributes (and those of `Listener`):
         target_s: Age of the borehole from which there is no advice.
         pitch_rad: Wanted pitch of the tool, for policies that ask for one; else `null`.
         commands: Whether the policy's advice is sent to the valves. `false`: nothing is ever sent.
         armed: Whether sending is armed from the beginning; the dead-man must be held all the same.
         record: Whether everything is recorded.
-        realtime: Whether to ask for real-time priority.
         seconds: When to stop; `null`: when told to.
         show: Whether to show levers and state in the terminal.
         page: The operator's page; `null`: none.
         camera: What is seen of the boreholes; `null`: there is no camera.
     """
 
-    wire: Wire | Replay
-    dbc: str
-    limits: Limits
-    guidance: Guidance
-    policy: str
-    target: TargetSource
     target_s: float
     pitch_rad: float | None
     commands: bool
     armed: bool
     record: bool
-    realtime: bool
     seconds: float | None
     show: bool
     page: OperatorPage | None
@@ -111,20 +88,18 @@ class Loop:
             ConfigError: bus description or levers do not fit the machine.
             LinkError: bus or policy process died.
         """
-        Description(self.dbc, machine)  # refused here, before anything runs
-        levers = self.guidance.levers or machine.levers
-        LeverMap(levers, machine)
-        Bundle(self.policy, machine)
+        self.refuse(machine)
         exchange = Exchange.new(machine.num_joints, self.commands, self.camera.num_px if self.camera else 0)
-        children, recorder = _Children(exchange), self._recorder(exchange, machine, session.folder)
+        children, recorder = Children(exchange, self.realtime), self._recorder(exchange, machine, session.folder)
         try:
             for companion in companions:
-                children.start(companion.name, companion.target, companion.arguments, companion.realtime if self.realtime else None)
+                children.start(companion.name, companion.target, companion.arguments, companion.realtime)
             self._start(children, machine, session)
             recorder.refresh()
             write_json(session.folder / PROCESSES, children.pids | recorder.pids)
             aim = Aim(self.target.build(), exchange.target, exchange.holes)
-            self._watch(children, exchange, full_angles_rad(levers), Wanted(exchange, recorder, aim, self.armed, self.commands))
+            full_rad = full_angles_rad(self.guidance.levers or machine.levers)
+            self._watch(children, exchange, full_rad, Wanted(exchange, recorder, aim, self.armed, self.commands))
         except KeyboardInterrupt:
             log.info("stopping")
         finally:
@@ -133,19 +108,16 @@ class Loop:
             _report(exchange, session)
             exchange.close()
 
-    def _start(self, children: _Children, machine: Machine, session: Session) -> None:
-        setting = Setting(self.wire, self.dbc, machine, self.limits)
-        counsel = Counsel(machine, self.policy, self.guidance, self.limits.joints_s, self.target_s, self.pitch_rad)
-        children.start("bus", "deploy.loop.station:run", (setting,), BUS_PRIORITY if self.realtime else None)
-        children.start("policy", "deploy.policy.adviser:run", (counsel,), POLICY_PRIORITY if self.realtime else None)
+    def _start(self, children: Children, machine: Machine, session: Session) -> None:
+        self.listen(children, machine, self.target_s, self.pitch_rad)
         if self.page is not None:
             camera_s = self.camera.stale_s if self.camera else None
             beside = Beside(
                 self.page, machine, self.guidance, session, self.limits.joints_s, self.limits.levers_s, self.target_s, camera_s
             )
-            children.start("page", "deploy.page.from_loop:run", (beside,), None)
+            children.start("page", "deploy.page.from_loop:run", (beside,))
         if self.camera is not None:
-            children.start("camera", "deploy.loop.eyes:run", (self.camera,), None)
+            children.start("camera", "deploy.loop.eyes:run", (self.camera,))
 
     def _recorder(self, exchange: Exchange, machine: Machine, folder: Path) -> Recorder:
         facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
@@ -158,7 +130,7 @@ class Loop:
         recorder.wanted = self.record
         return recorder
 
-    def _watch(self, children: _Children, exchange: Exchange, full_rad: tuple[float, ...], wanted: Wanted) -> None:
+    def _watch(self, children: Children, exchange: Exchange, full_rad: tuple[float, ...], wanted: Wanted) -> None:
         """Shows, does what is wanted and looks after the children until it is time to stop."""
         end_s = None if self.seconds is None else time.monotonic() + self.seconds
         with contextlib.ExitStack() as stack:
@@ -186,35 +158,6 @@ class Companion:
     target: str
     arguments: tuple[Any, ...]
     realtime: int | None
-
-
-@dataclass
-class _Children:
-    exchange: Exchange
-    running: list[Child] = field(default_factory=list)
-
-    @property
-    def pids(self) -> dict[str, int]:
-        return {child.name: child.pid for child in self.running}
-
-    def start(self, name: str, target: str, arguments: tuple[Any, ...], realtime: int | None) -> None:
-        self.running.append(Child(name, target, (*arguments, self.exchange), self.exchange.files, realtime))
-
-    def check(self) -> None:
-        for child in list(self.running):
-            if child.code is None:
-                continue
-            self.running.remove(child)
-            if child.name in OPTIONAL:
-                log.error("ALARM: the %s has ended (exit code %s); %s", child.name, child.code, OPTIONAL[child.name])
-            else:
-                raise LinkError(f"the {child.name} process has died (exit code {child.code}); what it said stands above")
-
-    def end(self) -> None:
-        """Ends policy before bus, so that it can say goodbye; companions last."""
-        order = {"policy": 0, "bus": 1}
-        for child in sorted(self.running, key=lambda child: order.get(child.name, 2)):
-            child.end(PATIENCE_S)
 
 
 def _report(exchange: Exchange, session: Session) -> None:

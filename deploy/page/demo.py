@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from brokk_rl.chain import tool
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from deploy.chain import tool
 from deploy.loop.target import NEAR_M
 from deploy.page.demo_camera import Camera
 from deploy.page.pointing import borehole_at

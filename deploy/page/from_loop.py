@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from brokk_rl.chain import tool
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from deploy.chain import tool
 from deploy.guidance import Guidance, full_angles_rad
 from deploy.loop import outlet
 from deploy.loop.eyes import frame_of

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from brokk_rl import record
+from brokk_rl.chain import tool
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from deploy.chain import tool
 from deploy.study import exact, tlx
 from deploy.study.crossover import Effect, effect
 from deploy.study.design import CONDITIONS, PERIODS, Hole, Success

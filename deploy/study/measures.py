@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from brokk_rl.chain import tool
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from deploy.chain import tool
 from deploy.study.design import Hole, Success
 from deploy.study.smoothness import sparc
 

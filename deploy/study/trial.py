@@ -13,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 
 from brokk_rl import record
+from brokk_rl.chain import tool
 from brokk_rl.errors import BrokkError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from deploy.chain import tool
 from deploy.study import folder as folders
 from deploy.study.design import Hole, Success, Trial
 from deploy.study.measures import insertion

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 
+from brokk_rl.chain import tool
 from brokk_rl.contracts import Connection, OperatorModel, OperatorView, TrialBatch
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -23,7 +24,6 @@ from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.bus.description import Description
 from deploy.bus.wire import Wire, Wired
-from deploy.chain import tool
 from deploy.guidance import Guidance, LeverMap
 from deploy.limits import Limits
 from deploy.loop.receiver import Receiver

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 import yaml
 
 from brokk_rl import record
+from brokk_rl.chain import tool
 from brokk_rl.errors import ConfigError
-from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from perception.calibration import rigid
 
@@ -37,10 +36,8 @@ def links(machine: Machine, q: np.ndarray) -> Links:
     Raises:
         ConfigError: the machine's geometry is not known.
     """
-    found = Kinematics(machine).pose(torch.as_tensor(q, dtype=torch.float32))
-    origins, axes, along, tip = (
-        values.double().numpy() for values in (found.joints_in_base_m, found.axes_in_base, found.axis_in_base, found.tip_in_base_m)
-    )
+    found = tool(machine, q)
+    origins, axes, along, tip = found.joints_in_base_m, found.axes_in_base, found.axis_in_base, found.tip_in_base_m
     z = axes[:, -1]
     x = along - (along * z).sum(-1, keepdims=True) * z
     if np.linalg.norm(x, axis=-1).min() < 0.1:  # a tool along its own joint: any direction across will do

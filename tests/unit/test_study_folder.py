@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from brokk_rl import record
+from brokk_rl.chain import tool
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from deploy.chain import tool
 from deploy.study import analysis, design, folder, report, tlx
 
 RATE_HZ = 20.0

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from brokk_rl.chain import tool
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from deploy.chain import tool
 from deploy.study import measures, tlx
 from deploy.study.design import Hole, Success
 from deploy.study.smoothness import sparc

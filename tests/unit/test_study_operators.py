@@ -15,9 +15,9 @@ import torch
 from composed import every, option
 
 from actuators.person import Person
+from brokk_rl.chain import tool
 from brokk_rl.contracts import OperatorView
 from brokk_rl.machine import Machine
-from deploy.chain import tool
 from deploy.study.operators.hands import Hands
 from deploy.study.operators.traits import Traits
 

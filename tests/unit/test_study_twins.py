@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from composed import option
 
+from brokk_rl.chain import tool
 from brokk_rl.contracts import OperatorView, TrialBatch
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session
 from brokk_rl.signals import Command
-from deploy.chain import tool
 from deploy.study.twins import BEFORE_S, desks
 from deploy.twin.faults import Faults
 

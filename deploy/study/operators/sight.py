@@ -10,10 +10,10 @@ import math
 
 import numpy as np
 
+from brokk_rl.chain import tool
 from brokk_rl.contracts import OperatorView
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from deploy.chain import tool
 from deploy.study.operators.traits import Range, Traits
 
 DAMPING = 0.05

@@ -1,4 +1,6 @@
-"""Where the tool is: forward kinematics of a serial machine over a whole recording, in numpy (the machine's computer has no torch).
+"""Where the tool is: forward kinematics of a serial machine over a whole recording, in numpy and double precision.
+
+For computers without torch, and where there is no hurry; `brokk_rl.kinematics` is for every step of a thousand machines.
 
 Axes: `T` time, `J` joints; anything may stand before `J`.
 """
@@ -21,6 +23,7 @@ class Tool(NamedTuple):
         jacobian: Motion of the tip for unit motion of each joint, `(…, 3, J)`, m/rad or m/m.
         turn: Motion of the axis likewise, `(…, 3, J)`, 1/rad.
         joints_in_base_m: Origins of the joints, `(…, J, 3)`.
+        axes_in_base: Unit axes of the joints, `(…, J, 3)`.
     """
 
     tip_in_base_m: np.ndarray
@@ -28,6 +31,7 @@ class Tool(NamedTuple):
     jacobian: np.ndarray
     turn: np.ndarray
     joints_in_base_m: np.ndarray
+    axes_in_base: np.ndarray
 
 
 def tool(machine: Machine, q: np.ndarray) -> Tool:
@@ -52,7 +56,7 @@ def tool(machine: Machine, q: np.ndarray) -> Tool:
     hinge = np.array([joint.kind == "hinge" for joint in machine.joints])[:, None]
     jacobian = np.where(hinge, np.cross(axes, tip[..., None, :] - origins), axes)
     turn = np.where(hinge, np.cross(axes, axis[..., None, :]), 0.0)
-    return Tool(tip, axis, np.swapaxes(jacobian, -1, -2), np.swapaxes(turn, -1, -2), origins)
+    return Tool(tip, axis, np.swapaxes(jacobian, -1, -2), np.swapaxes(turn, -1, -2), origins, axes)
 
 
 def _turned(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
