@@ -28,6 +28,10 @@ class ContourArcs:
         rms_px: Largest standard deviation of the support's distances, plus `rms_relative` per px of the geometric mean semi-axis;
             for an ellipse seen in part, as large a part of that.
         rms_relative: See `rms_px`.
+        wave_px: Deviation of the support's distances in the mean over an eighth of a turn, which noise leaves no trace in; together
+            with that of its angles, over this and `wave_rad`, at most 1 where half is seen, 2 where all is.
+        wave_rad: See `wave_px`; plus `wave_small` over the geometric mean semi-axis in px.
+        wave_small: See `wave_rad`.
         angle_rms_rad: Largest standard deviation of the support's angles, plus `angle_rms_small` over the geometric mean semi-axis
             in px; for an ellipse seen in part, as large a part of that.
         angle_rms_small: See `angle_rms_rad`.
@@ -55,6 +59,9 @@ class ContourArcs:
     gap: float
     rms_px: float
     rms_relative: float
+    wave_px: float
+    wave_rad: float
+    wave_small: float
     angle_rms_rad: float
     angle_rms_small: float
     purity: float

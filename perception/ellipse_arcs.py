@@ -19,11 +19,17 @@ if TYPE_CHECKING:
 NUM_SEEDS = 40
 """Points that stand for an arc in its first fit."""
 NOTHING = np.empty((0, 5))
+PART = 0.6
+"""Coverage below which the limit of angles no longer shrinks: what is left is told by how they change along the arc."""
+PIECE = 0.6
+"""Of an arc, that may be an ellipse's where not all of it is."""
+STROKE_PX, SAME_AREA = 4.5, 0.6
+"""Two ellipses that differ by no more than this, and in area by no more than this part, are the two edges of a line."""
 LEAST_ARC = 0.2
 """Part of an ellipse from which the rest of it can be told."""
 ROUNDS_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
 """Rounds of refinement: the distance at which a point counts a quarter; the rougher ones where the size is known beforehand."""
-TAIL = 2.0
+TAIL = 1.6
 """Of the limit of what is typical, which holds for the residuals of all the support."""
 TIGHT = 0.7
 """Of the reach, once the ellipse is refined."""
@@ -91,7 +97,7 @@ class ArcDetector:
         whole = set(map(tuple, spans.tolist()))
         parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int).reshape(-1, 2)
         groups = [arcs[group] for group in ellipse_groups.find(arcs, edges, (4, 3, 2))]
-        kinds = (spans[:, None], parts[:, None], *groups)
+        kinds = (spans[:, None], parts[:, None], _within(arcs, self.settings.arc_points)[:, None], *groups)
         seeds = np.concatenate([_seeds(some) for some in kinds])
         lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
         first = self.first(seeds, lengths, edges, limits)
@@ -108,9 +114,9 @@ class ArcDetector:
         found = []
         for k in np.argsort(-judged.score, kind="stable"):
             mine = judged.support[k][judged.support[k] >= 0]
-            if claimed[mine].mean() > 0.4:
-                continue
             one = judged.candidates[k : k + 1]
+            if claimed[mine].mean() > 0.4 or _other_side(one.ellipses[0], [row for row, *_ in found]):
+                continue
             claimed[mine] = True
             number = max(NUM_SAMPLES, int(conic.perimeter(*one.ellipses[0, 2:4])) * 2)
             dense = self._gather(one, edges, np.arange(number) * (2 * np.pi / number))[0][0]
@@ -180,9 +186,13 @@ class ArcDetector:
         size = np.sqrt(e[:, 2] * e[:, 3])
         whole = np.clip(2 * coverage - 1, 0.0, 1.0)  # what is seen in part must fit the better: a lobe of a heart nearly does
         slack = s.prior_slack if limits.lowest_px > 0 else 1.0
+        seen = np.maximum(coverage, PART)
         rms_limit = slack * (s.rms_px * coverage + s.rms_relative * size * whole)
-        angle_limit = slack * (s.angle_rms_rad * coverage**1.5 + s.angle_rms_small / size * coverage)
+        angle_limit = slack * (s.angle_rms_rad * seen**1.5 + s.angle_rms_small / size * seen)
         good = (coverage >= s.coverage) & (spread <= rms_limit) & (rms <= TAIL * rms_limit) & (angle <= angle_limit)
+        wave_px, wave_rad = ellipse_support.waves(candidates, edges, support, off)
+        form = np.hypot(wave_px / s.wave_px, wave_rad / (s.wave_rad + s.wave_small / size))
+        good &= form <= slack * (1 + whole)
         good &= ellipse_support.evidence(coverage, angle, conic.perimeter(e[:, 2], e[:, 3]), s.angle_rad) >= s.evidence
         candidates, support, length = candidates[good], support[good], length[good]
         rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
@@ -234,6 +244,25 @@ class ArcDetector:
     def _reach(self, ellipses: np.ndarray) -> np.ndarray:
         size = np.sqrt(ellipses[:, 2] * ellipses[:, 3])
         return np.clip(self.settings.reach_relative * size, self.settings.reach_px, 4.0 * self.settings.reach_px)
+
+
+def _other_side(ellipse: np.ndarray, others: list[np.ndarray]) -> bool:
+    """Says whether an ellipse is one edge of a thin line and another one, found before, the other edge."""
+    apart = np.abs(np.array(others).reshape(-1, 5) - ellipse)[:, :4]
+    area = ellipse[2] * ellipse[3]
+    alike = [min(area, a * b) > SAME_AREA * max(area, a * b) for _, _, a, b, _ in others]
+    return bool(((apart[:, :2].max(1) < 0.5 * STROKE_PX) & (apart[:, 2:].max(1) < STROKE_PX) & np.array(alike, bool)).any())
+
+
+def _within(arcs: np.ndarray, least: int) -> np.ndarray:
+    """Returns the first, the middle and the last of each arc as arcs of their own: its ends may belong to something else."""
+    start, length = arcs[:, 0], arcs[:, 1] - arcs[:, 0]
+    part = np.maximum((PIECE * length).astype(int), least)
+    long = length > part + 2
+    start, length, part = start[long], length[long], part[long]
+    return np.concatenate(
+        [np.column_stack([start + shift, start + shift + part]) for shift in (0 * part, (length - part) // 2, length - part)]
+    )
 
 
 def _seeds(groups: np.ndarray) -> np.ndarray:

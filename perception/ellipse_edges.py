@@ -27,6 +27,7 @@ class Edges:
     Attributes:
         points: Sub-pixel places `(E, 2)`.
         directions: Unit gradients `(E, 2)`, from dark to bright.
+        strength: Length of the gradient `(E,)`, grey levels a pixel.
         chain: Number of the connected chain of each point, `(E,)`.
         nearest: Number of the edge point nearest to each pixel, `(h, w)`.
         spans: Pieces of chains without a branch, `(S, 2)`: first point and one past the last.
@@ -37,6 +38,7 @@ class Edges:
 
     points: np.ndarray
     directions: np.ndarray
+    strength: np.ndarray
     chain: np.ndarray
     nearest: np.ndarray
     spans: np.ndarray
@@ -106,7 +108,10 @@ def find(
     if not len(pixels):
         return _none(gray.shape)
     points, directions = _refined(pixels, gx, gy, magnitude)
-    return Edges(points, directions, chain, _nearest(pixels, gray.shape), spans, NO_SPANS, np.full(len(points), -1), np.empty(0))
+    strength = magnitude[pixels[:, 1], pixels[:, 0]]
+    return Edges(
+        points, directions, strength, chain, _nearest(pixels, gray.shape), spans, NO_SPANS, np.full(len(points), -1), np.empty(0)
+    )
 
 
 def _pieces(edges: Edges, tolerance_px: float, corner_rad: float, least: int) -> tuple[np.ndarray, np.ndarray]:
@@ -233,4 +238,4 @@ def _bilinear(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _none(shape: tuple) -> Edges:
     empty = np.empty((0, 2))
     none = np.empty(0, int)
-    return Edges(empty, empty, none, np.zeros(shape, np.int32), NO_SPANS, NO_SPANS, none, np.empty(0))
+    return Edges(empty, empty, np.empty(0), none, np.zeros(shape, np.int32), NO_SPANS, NO_SPANS, none, np.empty(0))

@@ -11,11 +11,17 @@ from perception.ellipse_edges import Edges
 
 NUM_SAMPLES = 96
 """Places around an ellipse at which its support is looked for."""
+WINDOW = NUM_SAMPLES // 8
+"""Neighbouring places over which noise is averaged away."""
 OPEN = 0.12
 """Part of the circumference without support at whose ends one asks how the edge goes on."""
-BACK_PX, STRIDE_PX = 4.0, 1.5
+BACK_PX, STRIDE_PX = 4.0, 2.0
 """How far before that end one begins to look, and how far apart the places are at which one does."""
-KINK_PX, KINK_RAD = 4.5, 0.15
+NEAR_PX, LEAST_PX = 1.5, 0.5
+"""Of that stride; where an edge ends, nothing nearer lies ahead than its last point."""
+ALIKE = 1.5
+"""Times as strong or as weak as an edge may be where it is followed to: what hides something has edges of its own."""
+KINK_PX, KINK_RAD = 4.5, 0.4
 """Length of an edge over which it turns at a corner, and by how much more than the ellipse does."""
 ANGLES = np.arange(NUM_SAMPLES) * (2 * np.pi / NUM_SAMPLES)
 
@@ -93,6 +99,30 @@ def departure(candidates: Candidates, edges: Edges, support: np.ndarray, length:
     return (length * (beside & (support < 0))).sum(1) / length.sum(1)
 
 
+def waves(candidates: Candidates, edges: Edges, support: np.ndarray, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns how far distance and angle of the support stray from 0 in the mean over an eighth of a turn, px and rad, `(C,)` each.
+
+    Noise is gone from such a mean; what stays is that another curve than an ellipse was fitted by one.
+    """
+    there = support >= 0
+    outward = conic.sample(candidates.ellipses, ANGLES)[1]
+    bright = edges.directions[support] * candidates.polarity[:, None, None]
+    turn = np.arctan2(outward[..., 0] * bright[..., 1] - outward[..., 1] * bright[..., 0], (outward * bright).sum(-1))
+    known = _around(there)
+    enough = known >= 0.6 * WINDOW
+    return tuple(
+        np.sqrt(((_around(value * there) / np.maximum(known, 1)) ** 2 * enough).sum(1) / np.maximum(enough.sum(1), 1))
+        for value in (off, turn)
+    )
+
+
+def _around(values: np.ndarray) -> np.ndarray:
+    """Returns the sum of `WINDOW` neighbours around an ellipse at each place, `(C, P)`."""
+    half = WINDOW // 2
+    total = np.cumsum(np.concatenate([values[:, -half:], values, values[:, :half]], axis=1, dtype=float), axis=1)
+    return total[:, WINDOW:] - total[:, :-WINDOW]
+
+
 def leaving(candidates: Candidates, edges: Edges, support: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Says which candidates have support that goes on smoothly elsewhere, `(C,)`: lobes of hearts, round corners, spirals.
 
@@ -120,7 +150,7 @@ def leaving(candidates: Candidates, edges: Edges, support: np.ndarray, length: n
 
 
 def _followed(edges: Edges, start: np.ndarray, onward: np.ndarray, reach_px: np.ndarray, bend: np.ndarray) -> np.ndarray:
-    """Says which edges can be followed so far without a corner, `(M,)`.
+    """Says which edges can be followed so far without a corner, as strong as they were, `(M,)`.
 
     Args:
         edges: Edges.
@@ -133,18 +163,21 @@ def _followed(edges: Edges, start: np.ndarray, onward: np.ndarray, reach_px: np.
     first = edges.directions[start]
     hand = np.sign(along[:, 0] * first[:, 1] - along[:, 1] * first[:, 0])  # on which side it is bright
     seen, alive = [first], np.ones(len(start), bool)
+    strength = np.zeros(len(start))
     for step in range(int(np.ceil(reach_px.max(initial=0.0) / STRIDE_PX))):
         onto = place + STRIDE_PX * along
         number = edges.nearest[_pixels(onto, edges.nearest.shape)]
-        place, bright = edges.points[number], edges.directions[number]
+        came, place, bright = ((edges.points[number] - place) * along).sum(1), edges.points[number], edges.directions[number]
         along = np.column_stack([bright[:, 1], -bright[:, 0]]) * hand[:, None]
         needed = step * STRIDE_PX < reach_px
-        near = np.linalg.norm(place - onto, axis=1) < STRIDE_PX
+        near = (np.linalg.norm(place - onto, axis=1) < NEAR_PX) & (came > LEAST_PX)
         earlier = seen[max(0, len(seen) - round(KINK_PX / STRIDE_PX))]
         turn = np.arccos(np.clip((bright * earlier).sum(1), -1.0, 1.0))
         alive &= ~needed | (near & (turn < KINK_PX * bend + KINK_RAD))
+        strength = np.where(needed, edges.strength[number], strength)
         seen.append(bright)
-    return alive
+    alike = np.abs(np.log(np.maximum(strength, 1e-6) / edges.strength[start])) < np.log(ALIKE)
+    return alive & alike
 
 
 def gap(there: np.ndarray, length: np.ndarray) -> np.ndarray:
