@@ -17,13 +17,15 @@ import sys
 import time
 from array import array
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, Literal
 
 log = logging.getLogger(__name__)
 
 _ENTRY = "from deploy.loop.process import enter; enter()"
-_DIE_WITH_PARENT, _LOCK_ALL = 1, 3  # PR_SET_PDEATHSIG; MCL_CURRENT | MCL_FUTURE
+_DIE_WITH_PARENT, _LOCK_ALL, _ON_USE = 1, 3, 4  # PR_SET_PDEATHSIG; MCL_CURRENT | MCL_FUTURE; MCL_ONFAULT
+_LARGE_BYTES = 1 << 30
 
 Stop = Callable[[], bool]
 """Says whether the process is asked to end."""
@@ -97,11 +99,15 @@ def enter() -> None:
 
 
 def keep_in_memory() -> None:
-    """Asks for locked memory, and keeps the garbage collector out."""
+    """Asks for locked memory, and keeps the garbage collector out.
+
+    What maps gigabytes, as the simulator of a twin does, keeps what it has used; all else is there from the beginning.
+    """
     gc.collect()
     gc.freeze()
     gc.disable()
-    if _libc().mlockall(_LOCK_ALL) != 0:
+    mapped_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    if _libc().mlockall(_LOCK_ALL | (_ON_USE if mapped_bytes > _LARGE_BYTES else 0)) != 0:
         log.debug("memory is not locked: %s", os.strerror(ctypes.get_errno()))
 
 

@@ -1,8 +1,9 @@
 """What the policy remembers, sampled from a faster bus at its own rate.
 
 One sample a control period: the newest measured position, and the mean of what the valves really got over the period, as a
-recording holds it. A single missed period is filled in halfway between its neighbours; after more, or after anything stale, the
-ring is filled anew before the policy speaks again: a history with a hole is one that it has never seen in training.
+recording holds it. A single missed period is filled in halfway between its neighbours, and valves of which nothing was heard in
+one period still get what they got. After more, or after anything stale, the ring is filled anew before the policy speaks again: a
+history with a hole is one that it has never seen in training.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class Ring:
         shape = (machine.num_history, machine.num_joints)
         self.q, self.u, self.proposed = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         self.filled = 0
-        self._flow_sum, self._flow_number = np.zeros(machine.num_joints), -1
+        self._flow_sum, self._flow_number, self._silent = np.zeros(machine.num_joints), -1, 0
 
     @property
     def full(self) -> bool:
@@ -40,14 +41,15 @@ class Ring:
 
     def empty(self) -> None:
         """Forgets all samples."""
-        self.filled, self._flow_number = 0, -1
+        self.filled, self._flow_number, self._silent = 0, -1, 0
 
     def sample(self, state: Any, missed: int) -> None:
         """Takes a sample of a fresh record of `STATE`; `missed` periods went by without one."""
         number, before = int(state["flow_number"]), self._flow_number
         u = (state["flow_sum"] - self._flow_sum) / (number - before) if 0 <= before < number else np.array(state["flow"])
-        if before >= 0 and number == before:  # the valves' messages have stopped
-            self.empty()
+        self._silent = self._silent + 1 if number == before else 0
+        if self._silent > 1:  # the valves' messages have stopped
+            self.filled = 0
         self._flow_sum, self._flow_number = np.array(state["flow_sum"]), number
         if missed > 1:
             self.filled = 0

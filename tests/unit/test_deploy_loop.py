@@ -118,7 +118,12 @@ def test_valves_that_say_nothing_more_empty_the_ring(machine: Machine) -> None:
     ring = Ring(machine)
     for k in range(13):
         ring.sample(state(machine, k + 1, 0.0, 1.0), missed=0)
-    ring.sample(state(machine, 13, 0.0, 1.0), missed=0)
+    late = state(machine, 13, 0.4, 1.0)
+    ring.sample(late, missed=0)
+    assert ring.full and ring.u[-1].tolist() == [0.4] * 5, "one period without a message: they still get what they got"
+    ring.sample(late, missed=0)
+    assert ring.filled == 1
+    ring.sample(late, missed=0)
     assert ring.filled == 1
 
 
