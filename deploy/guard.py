@@ -134,8 +134,7 @@ class Guard:
         self._limits, self._body = limits, body
         self._still = (0.0,) * len(body.lower)
         self._state, self._cause = State.SILENT, Trip.NONE
-        self._sent, self._before_s = self._still, -math.inf
-        self._followed_s = -math.inf
+        self._sent, self._before_s, self._followed_s = self._still, math.nan, math.nan  # never: no comparison with nan holds
 
     def decide(self, now_s: float, armed: bool, seen: Seen, request: Request | None) -> Decision:
         """Returns what to send in this cycle.

@@ -355,6 +355,14 @@ def test_a_gateway_that_does_not_follow_is_noticed() -> None:
     assert decision.state is State.LATCHED and decision.u == STILL and decision.cause is Trip.IGNORED
 
 
+def test_a_gateway_has_all_of_the_time_that_it_is_given_to_follow() -> None:
+    hand = Hand(replace(LIMITS, ignored_s=0.25)).active()
+    hand.decide(followed=True, dt=0.125)
+    for _ in range(2):  # times that binary numbers hold exactly
+        assert hand.decide(followed=False, dt=0.125).state is State.ACTIVE
+    assert hand.decide(followed=False, dt=0.125).cause is Trip.IGNORED
+
+
 def test_nobody_needs_to_follow_what_is_not_commanded() -> None:
     hand = Hand()
     for _ in range(100):
