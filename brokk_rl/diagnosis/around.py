@@ -162,7 +162,9 @@ def thinned(evidence: Evidence, each: int) -> Evidence:
     rows = np.concatenate(evidence.groups[::each])
     candidates = evidence.candidates
     cut = replace(candidates.cut, **{name: getattr(candidates.cut, name)[rows] for name in ("u", "q", "run")})
-    some = {name: value[rows] for name in ("claims", "mean", "bias") if (value := getattr(evidence, name, None)) is not None}
+    some = {
+        name: value[rows] for name in ("claims", "mean", "bias", "late") if (value := getattr(evidence, name, None)) is not None
+    }
     return replace(evidence, candidates=replace(candidates, cut=cut, running_s=candidates.running_s[rows]), **some)
 
 

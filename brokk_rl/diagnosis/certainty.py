@@ -26,6 +26,8 @@ NATS = 10.0
 """Evidence below is little."""
 MUCH = 50.0
 """What effects explain is much beyond: then a part that they leave says less, as no form is exactly that of the library."""
+MOST = 100.0
+"""The same for what they leave that is about something else than form."""
 
 
 @spec
@@ -83,7 +85,7 @@ def outside(findings: Findings) -> dict[str, float]:
     seen = bool(stages & {"kinematics", "sensing"})
     return {
         "constant": 1.0,
-        "clue": float(np.log1p(left[1:].max(initial=0.0) / NATS)),
+        "clue": float(np.log1p((left[1:] / (1.0 + gained / MOST)).max(initial=0.0) / NATS)),
         "form": float(np.log1p((left[:1] / (1.0 + gained / MUCH)).max(initial=0.0) / NATS)),
         "scatter": 0.0 if late else _log(findings.scatter) / explained,
         "strays": _log(findings.strays) / explained,

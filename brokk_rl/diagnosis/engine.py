@@ -16,7 +16,6 @@ from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.evidence import Evidence, Ray, rays
 from brokk_rl.diagnosis.found import Found
 from brokk_rl.diagnosis.library import Kind
-from brokk_rl.diagnosis.noise import increments
 from brokk_rl.diagnosis.repair import Repair, repair
 from brokk_rl.diagnosis.search import MOST, Chosen, Price, Table, choose
 from brokk_rl.diagnosis.shapes import SMALL, Nulls, add, plain_joints
@@ -122,7 +121,7 @@ class Search:
         self.tell("sensors", 0.32)
         on_sensors = sensors.search(self.case, self.kinds, prices.joint, prices.name)
         on_tool = tool.search(self.case, self.kinds, prices.joint, prices.name)
-        evidence = _adjusted(self.base.field.evidence, [*on_sensors, *on_tool.found])
+        evidence = _adjusted(self.base.field.evidence, self.case, [*on_sensors, *on_tool.found])
         grown, shapes = self._simulated(evidence, tool.is_tracked(self.case.field, self.case.machine))
         small = {name: rays(ways[0].kind, SMALL) for name, ways in grown.items()}
         known = Nulls(self.base, small, grown, plain_joints(evidence), shapes, self.shared)
@@ -143,8 +142,16 @@ class Search:
             grown = wide[1]
         self.tell("frames", 0.8)
         after = repaired.after if repaired else evidence.base
-        late = frames.search(evidence, evidence.error_of(after), nulls[:FEW], self.kinds, prices.joint, prices.name)
-        scatter = np.maximum(1.0, self._scatter(evidence, repaired))
+        changes, error = frames.Changes(evidence), evidence.error_of(after)
+        late = frames.search(changes, error, nulls[:FEW], self.kinds, prices.joint, prices.name)
+        if late:  # from here on errors scatter after each change of a command
+            chancy = replace(evidence, late=changes.spread(error))
+            shapes = [
+                {name: [replace(s, change=chancy.rewhitened(evidence, s.change, j)) for s in own] for name, own in mine.items()}
+                for j, mine in enumerate(shapes)
+            ]
+            evidence = chancy
+        scatter = np.maximum(1.0, self._scatter(evidence.whitened(error[None])[:, 0]))
         for _ in range(2 if late else int(scatter.max() > SCATTERED)):
             if late:  # what delays change depends on when commands act, and so on what else delays them
                 steady = [*evidence.candidates.fixed, *(repaired.effects() if repaired else [])]
@@ -157,8 +164,8 @@ class Search:
         others = [*on_sensors, *on_tool.found, *([late] if late else [])]
         left, left_null = self._left(evidence, repaired)
         return Findings(
-            evidence, tables, grown, price, chosen, repaired, others, left, left_null, self._scatter(evidence, repaired),
-            self._strays(evidence, repaired), on_tool.left,
+            evidence, tables, grown, price, chosen, repaired, others, left, left_null,
+            self._scatter(repaired.z if repaired else evidence.z), self._strays(evidence, repaired), on_tool.left,
         )  # fmt: skip
 
     @property
@@ -255,9 +262,8 @@ class Search:
         worth = sum(table.score(s).total - price(j, s) for j, (table, s) in enumerate(zip(tables, subsets, strict=True)) if s)
         return wide, tables, Chosen(subsets, worth - self.prices.name * len(frozenset().union(*subsets))), best
 
-    def _scatter(self, evidence: Evidence, repaired: Repair | None) -> np.ndarray:
-        """Returns the mean square of errors over the noise over that of the reference, outliers cut, `(J,)`."""
-        z = repaired.z if repaired else evidence.z
+    def _scatter(self, z: np.ndarray) -> np.ndarray:
+        """Returns the mean square of errors over the noise `(J, E)` over that of the reference, outliers cut, `(J,)`."""
         nulls = [one.evidence.z for one in self.base.nulls]
         usual = np.mean(np.minimum(np.concatenate(nulls, 1) ** 2, CUT), 1) if nulls else np.ones(len(z))
         return np.mean(np.minimum(z**2, CUT), 1) / usual
@@ -281,18 +287,17 @@ def _promised(tables: Sequence[Table], chosen: Chosen) -> float:
     return sum(table.score(subset).total for table, subset in zip(tables, chosen.subsets, strict=True))
 
 
-def _adjusted(evidence: Evidence, found: Sequence[Found]) -> Evidence:
+def _adjusted(evidence: Evidence, case: Case, found: Sequence[Found]) -> Evidence:
     """Returns the evidence where encoders err as was found, and where sensors that scatter more say less."""
     steady = [(one.kind, one.values()) for one in found if one.kind.target.side == "measurement" and _is_steady(one.kind)]
     evidence = replace(evidence, candidates=replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady]))
-    for one in found:
-        if one.kind.target.side == "measurement" and not _is_steady(one.kind):
-            assert evidence.noise is not None, "noise is known by now"
-            paths = evidence.candidates.paths([(one.kind, one.values())])[0]
-            more = (increments(paths, evidence.start) - evidence.way).std((0, 1))
-            noise = [replace(n, sensor=float(np.hypot(n.sensor, m))) for n, m in zip(evidence.noise, more, strict=True)]
-            evidence = replace(evidence, noise=noise)
-    return evidence
+    rough = [one.joints for one in found if one.kind.target.side == "measurement" and not _is_steady(one.kind)]
+    if not rough:
+        return evidence
+    assert evidence.noise is not None, "noise is known by now"
+    reading = sensors.readings(case.field, case.reference, case.machine) * np.any(rough, 0)
+    noise = [replace(one, reading=float(more)) for one, more in zip(evidence.noise, reading, strict=True)]
+    return replace(evidence, noise=noise)
 
 
 def _is_steady(kind: Kind) -> bool:

@@ -91,6 +91,7 @@ class Evidence:
         mean: What effects of chance change on average, which are known already, `(W, K, J)`.
         bias: Increments that the simulator misses already on the reference, `(W, I, J)`; see `discrepancy`.
         widths: How large faults of the simulator's own numbers are, over the usual, `(P,)`; see `discrepancy`.
+        late: What each change of a command does when it comes a standard deviation late, `(W, C, I, J)`, where that is by chance.
     """
 
     candidates: Candidates
@@ -99,6 +100,7 @@ class Evidence:
     mean: np.ndarray | None = None
     bias: np.ndarray | None = None
     widths: np.ndarray | None = None
+    late: np.ndarray | None = None
 
     @cached_property
     def base(self) -> np.ndarray:
@@ -154,10 +156,28 @@ class Evidence:
 
     @cached_property
     def _whiteners(self) -> list[list[np.ndarray]]:
-        assert self.noise is not None, "noise is found before anything is whitened"
         return [
-            [noise.whitener(self.way[group, :, j].reshape(1, -1))[0] for j, noise in enumerate(self.noise)] for group in self.groups
+            [np.linalg.inv(np.linalg.cholesky(self._covariance(group, j))) for j in range(self.way.shape[2])]
+            for group in self.groups
         ]
+
+    def _covariance(self, group: np.ndarray, j: int) -> np.ndarray:
+        """Returns the covariance of the increments of joint `j` in windows in a row, `(S, S)`."""
+        assert self.noise is not None, "noise is found before anything is whitened"
+        found = self.noise[j].covariance(self.way[group, :, j].reshape(1, -1))[0]
+        for place, window in enumerate(group if self.late is not None else ()):
+            assert self.late is not None, "asked before"
+            own, moved = slice(place * self.way.shape[1], (place + 1) * self.way.shape[1]), self.late[window, ..., j]
+            found[own, own] += moved.T @ moved
+        return found
+
+    def rewhitened(self, other: Evidence, values: np.ndarray, j: int) -> np.ndarray:
+        """Returns values of joint `j` over the noise of `other`, `(…, E)`, over this one's: the same windows, another noise."""
+        found, steps = np.empty_like(values), self.way.shape[1]
+        for group, mine, theirs in zip(self.groups, self._whiteners, other._whiteners, strict=True):
+            entries = slice(group[0] * steps, (group[-1] + 1) * steps)
+            found[..., entries] = np.linalg.solve(theirs[j], values[..., entries].T).T @ mine[j].T
+        return found
 
     def whitened(self, ways: np.ndarray) -> np.ndarray:
         """Returns increments `(C, W, I, J)` over their noise, `(J, C, E)`; 0 where a window says nothing."""

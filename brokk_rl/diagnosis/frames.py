@@ -116,14 +116,20 @@ class Changes:
             value[mine] -= np.average(value[mine], weights=deviation[mine] ** -2)
         return Delays(value, deviation, joint)
 
+    def spread(self, error: np.ndarray) -> np.ndarray:
+        """Returns what each change does when it comes late by the standard deviation of the delays seen, `(W, C, I, J)`."""
+        seen = self.delays(error)
+        by = np.sqrt(max(0.0, float(np.mean(np.square(seen.value) - np.square(seen.error)))))
+        return by * self.responses.swapaxes(0, 1)
+
 
 def search(
-    field: Evidence, error: np.ndarray, nulls: Sequence[Evidence], kinds: Sequence[Kind], price: float, name_price: float
+    changes: Changes, error: np.ndarray, nulls: Sequence[Evidence], kinds: Sequence[Kind], price: float, name_price: float
 ) -> Found | None:
     """Returns the effect on the arrival of commands that the scatter of hidden delays shows, if any.
 
     Args:
-        field: The simulator against the field.
+        changes: Of the commands in the field.
         error: Measured less simulated increments after what else was found, `(W, I, J)`.
         nulls: The simulator against parts of the reference that it was not fitted to.
         kinds: The library.
@@ -131,7 +137,7 @@ def search(
         name_price: For the effect as such.
     """
     kinds = [kind for kind in kinds if kind.target.stochastic and kind.target.side == "command"]
-    changes, others = Changes(field), [Changes(one) for one in nulls]
+    others = [Changes(one) for one in nulls]
     seen, known = changes.delays(error), [one.delays(one.evidence.error) for one in others]
     if not kinds or len(seen.value) < FEWEST or sum(len(one.value) for one in known) < FEWEST:
         return None
@@ -154,7 +160,7 @@ def search(
     if worth[best.name] <= 0:
         return None
     ends = np.array(interval(SIZES, gains[best.name]))
-    machine = field.candidates.machine
+    machine = changes.evidence.candidates.machine
     parameters = {}
     for name in best.fitted:
         mean, low, high = (float(v) for v in best.clipped(name, best.numbers[name].none + best.size(name) * ends))

@@ -50,12 +50,14 @@ class Noise:
         change: The same over the change of speed between neighbouring increments.
         wander: Relative standard deviation of the speed.
         memory: Increments over which a wandering speed forgets.
+        reading: Standard deviation of each position as it is read, rad or m: what one increment gains the next one loses.
     """
 
     sensor: float
     change: float
     wander: float
     memory: float
+    reading: float = 0.0
 
     def covariance(self, way: np.ndarray) -> np.ndarray:
         """Returns the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `way` `(B, S)`."""
@@ -63,7 +65,8 @@ class Noise:
         kept = np.exp(-lag / self.memory)
         turn = np.abs(np.diff(way, axis=1, prepend=way[:, :1])) + np.abs(np.diff(way, axis=1, append=way[:, -1:]))
         single = self.sensor**2 + (self.change * turn) ** 2
-        return self.wander**2 * way[:, :, None] * way[:, None, :] * kept + single[:, :, None] * np.eye(way.shape[1])
+        read = self.reading**2 * np.clip(2.0 - 3.0 * lag, -1.0, 2.0) * (lag <= 1)
+        return self.wander**2 * way[:, :, None] * way[:, None, :] * kept + single[:, :, None] * np.eye(way.shape[1]) + read
 
     def strayed(self, way: np.ndarray) -> np.ndarray:
         """Returns the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""

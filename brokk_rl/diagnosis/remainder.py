@@ -166,6 +166,8 @@ def strayed(evidence: Evidence, error: np.ndarray) -> np.ndarray:
     """
     assert evidence.noise is not None, "noise is known by now"
     expected = np.stack([noise.strayed(evidence.way[..., j]).mean(1) for j, noise in enumerate(evidence.noise)], -1)
+    if evidence.late is not None:
+        expected = expected + np.square(np.cumsum(evidence.late, 2)).sum(1).mean(1)
     over = np.minimum(np.square(np.cumsum(error, 1)).mean(1) / np.maximum(expected, 1e-18), FAR) * evidence.claims
     return over.sum(0) / np.maximum(evidence.claims.sum(0), 1)
 

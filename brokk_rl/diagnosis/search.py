@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
-from brokk_rl.diagnosis.sizes import Plain, Shape, alone, earned
+from brokk_rl.diagnosis.sizes import Plain, Shape, alone, earned, predicted
 
 MOST = 4
 """Effects in a set."""
@@ -77,11 +77,28 @@ class Table:
             shapes = [shape for name in names for shape in self.shapes[name]]
             if not shapes:
                 return Scored(np.zeros(len(self.joint.z)), {})
-            start = [self.alone(shape) for shape in shapes]
-            gain, sizes = earned(self.joint, shapes, np.array(start) * (1.0 if len(shapes) == 1 else 0.7))
+            found = [earned(self.joint, shapes, start) for start in self._starts(names)]
+            gain, sizes = max(found, key=lambda one: one[0].sum())
             ends = np.cumsum([len(self.shapes[name]) for name in names])[:-1]
             self.scored[subset] = Scored(gain, dict(zip(names, np.split(sizes, ends), strict=True)))
         return self.scored[subset]
+
+    def _starts(self, names: Sequence[str]) -> list[np.ndarray]:
+        """Returns sizes at which a fit of several effects may begin: all somewhat smaller than alone, and the best smaller set.
+
+        What begins at a threshold does nothing below it, and a fit that begins there stays there. So a set also begins where the
+        best set with one effect less ended, with the other at what explains best what that one leaves.
+        """
+        every = [shape for name in names for shape in self.shapes[name]]
+        starts = [np.array([self.alone(shape) for shape in every]) * (1.0 if len(every) == 1 else 0.7)]
+        smaller = [(one, new) for new in names if len(names) > 1 and (one := self.scored.get(frozenset(names) - {new}))]
+        if smaller:
+            best, new = max(smaller, key=lambda pair: pair[0].total)
+            known = [shape for name in sorted(best.sizes) for shape in self.shapes[name]]
+            left = self.joint.z - predicted(known, np.concatenate([best.sizes[name] for name in sorted(best.sizes)]))
+            added = [alone(left, shape) for shape in self.shapes[new]]
+            starts.append(np.concatenate([added if name == new else best.sizes[name] for name in names]))
+        return starts
 
     def alone(self, shape: Shape) -> float:
         """Returns the size of a shape that explains the joint's errors best by itself."""

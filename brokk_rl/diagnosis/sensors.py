@@ -28,6 +28,8 @@ BLUR = np.array([0.08, 0.08, 0.03, 0.03, 0.08, 0.08])
 """Differences in the statistics that say nothing: sensors are not quite the same from day to day."""
 MOST = 60.0
 """Evidence is not counted beyond this: the statistics are no exact likelihood."""
+WHITE = 6.0
+"""Variance of the second differences of white noise, over its own."""
 TINY = 2e-6
 """Noise that float32 cannot hold, rad or m."""
 
@@ -52,6 +54,21 @@ def statistics(q: np.ndarray, machine: Machine) -> np.ndarray:
                 moved = step[rows, j][step[rows, j] >= TINY / 2]
                 found[j, 4 + place] = np.log(np.quantile(moved, 0.2) if len(moved) > FEWEST else TINY)
     return found
+
+
+def readings(field: Sequence[Recording], reference: Sequence[Recording], machine: Machine) -> np.ndarray:
+    """Returns how far positions in the field scatter as they are read, beyond those of the reference, rad or m, `(J,)`.
+
+    Seen in second differences, at rest or in motion, whichever is more: a joint that rests between two steps of a coarse sensor
+    flickers.
+    """
+    squares = []
+    for some in (field, reference):
+        seen = np.exp(2.0 * np.stack([statistics(r.q.astype(float), machine)[:, :2] for r in some]))
+        told = np.isfinite(seen)
+        squares.append(np.where(told, seen, 0.0).sum(0) / np.maximum(told.sum(0), 1))
+    now, then = squares
+    return np.sqrt(np.maximum(now - then, 0.0).max(1) / WHITE)
 
 
 def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -> list[Found]:

@@ -23,6 +23,9 @@ from brokk_rl.record import Recording
 
 COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 FEWEST = 40
+"""Seconds with measured tool points that tell something."""
+TURNS = 3
+"""Times that sets of errors are compared: about nothing, then about what was found."""
 MOST = 3
 """Errors in a set."""
 STEP = 0.2
@@ -49,7 +52,12 @@ class _Cause:
 
 def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
     """Says whether the recordings hold enough measured tool points of a machine whose geometry is known."""
-    return machine.has_bodies and len(_samples(recordings)[0]) >= FEWEST
+    if not machine.has_bodies:
+        return False
+    given = [
+        np.isfinite(np.stack([r.extra[column] for column in COLUMNS])).all(0).sum() / r.rate_hz for r in recordings if _is_seen(r)
+    ]
+    return sum(given) >= FEWEST
 
 
 @dataclass(frozen=True)
@@ -71,16 +79,32 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
     if not is_tracked(field, machine):
         return Seen([], 1.0)
     kinds = [k for k in kinds if not k.target.stochastic and k.target.smooth and k.target.side in ("kinematics", "measurement")]
-    q, seen = _samples(field)
-    off = (seen - _points(None, {}, q, machine)).ravel()
-    causes = _causes(kinds, q, machine)
-    size_m = LEAST_M
+    q, seen, ways = _samples(field, machine)
+    off, causes = _untimed((seen - _points(None, {}, q, machine)).ravel(), ways), _causes(kinds, q, ways, machine)
+    everything = np.concatenate([cause.columns for cause in causes], 1)
+    size_m = usual_m = max(LEAST_M, float(np.std(off - everything @ np.linalg.lstsq(everything, off, rcond=1e-9)[0])))
     if is_tracked(reference, machine):
-        at, known = _samples(reference)
-        size_m = max(size_m, float(np.std(known - _points(None, {}, at, machine))))
-    else:
-        everything = np.concatenate([cause.columns for cause in causes], 1)
-        size_m = max(size_m, float(np.std(off - everything @ np.linalg.lstsq(everything, off, rcond=1e-9)[0])))
+        at, known, moved = _samples(reference, machine)
+        usual_m = max(LEAST_M, float(np.std(_untimed((known - _points(None, {}, at, machine)).ravel(), moved))))
+        size_m = max(size_m, usual_m)
+    straight, chosen = off, ()
+    for _ in range(TURNS):  # what errors do is straight about what was found, not about nothing
+        fits, worth = _compared(causes, straight, size_m, price, name_price)
+        before, chosen = chosen, max(worth, key=worth.__getitem__)
+        if chosen in ((), before):
+            break
+        values = _split(causes, chosen, fits[chosen][1])
+        bent = [_bent(causes[c], own, q, machine) for c, own in zip(chosen, values, strict=True)]
+        straight = off - _untimed(np.sum(bent, 0), ways)
+    names = dict.fromkeys(causes[c].kind.name for c in chosen)
+    left = straight - np.concatenate([causes[c].columns for c in chosen], 1) @ fits[chosen][1] if chosen else straight
+    return Seen([_found(name, chosen, causes, fits, worth, machine) for name in names], float(np.std(left)) / usual_m)
+
+
+def _compared(
+    causes: Sequence[_Cause], off: np.ndarray, size_m: float, price: float, name_price: float
+) -> tuple[dict[tuple[int, ...], Fit], dict[tuple[int, ...], float]]:
+    """Returns all sets of causes, by their numbers, and what they are worth."""
     fits: dict[tuple[int, ...], Fit] = {(): (0.0, np.zeros(0), np.zeros((0, 0)))}
     worth: dict[tuple[int, ...], float] = {(): 0.0}
     for count in range(1, MOST + 1):
@@ -90,10 +114,7 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
             split = zip(chosen, _split(causes, chosen, fits[chosen][1]), strict=True)
             large = all(_size(causes[c], part) >= LEAST for c, part in split)
             worth[chosen] = fits[chosen][0] - price * count - name_price * len(names) if large else -np.inf
-    best = max(worth, key=worth.__getitem__)
-    names = dict.fromkeys(causes[c].kind.name for c in best)
-    left = np.sqrt(max(off @ off - 6.0 * size_m**2 * fits[best][0], 0.0) / len(off)) / size_m
-    return Seen([_found(name, best, causes, fits, worth, machine) for name in names], float(left))
+    return fits, worth
 
 
 def _found(
@@ -130,8 +151,8 @@ def _found(
     return Found(kind, mask, parameters, worth[best] - without, own, closed, rivals)
 
 
-def _causes(kinds: Sequence[Kind], q: np.ndarray, machine: Machine) -> list[_Cause]:
-    """Returns the errors that move the tool point at all."""
+def _causes(kinds: Sequence[Kind], q: np.ndarray, ways: np.ndarray, machine: Machine) -> list[_Cause]:
+    """Returns the errors that move the tool point at all, other than along the ways that it goes."""
     plain, found = _points(None, {}, q, machine), []
     for kind in kinds:
         joined = all(not kind.numbers[name].per_joint for name in kind.fitted)
@@ -139,13 +160,37 @@ def _causes(kinds: Sequence[Kind], q: np.ndarray, machine: Machine) -> list[_Cau
             columns = []
             for name in kind.fitted:
                 step = STEP * kind.size(name)
-                value = np.full(machine.num_joints if kind.numbers[name].per_joint else 1, kind.numbers[name].none, dtype=float)
-                value[slice(None) if joint is None else joint] += step
-                columns.append((_points(kind, {name: value}, q, machine) - plain).ravel() / step)
+                moved = _points(kind, {name: _value(kind, name, joint, step, machine)}, q, machine) - plain
+                columns.append(_untimed(moved.ravel() / step, ways))
             column = np.stack(columns, 1)
             if np.abs(column).max() > 1e-6:
                 found.append(_Cause(kind, joint, kind.fitted, column))
     return found
+
+
+def _value(kind: Kind, name: str, joint: int | None, by: float, machine: Machine) -> np.ndarray:
+    """Returns a number of an effect that is `by` more than neutral on a joint, or on all, `(J,)` or `(1,)`."""
+    value = np.full(machine.num_joints if kind.numbers[name].per_joint else 1, kind.numbers[name].none, dtype=float)
+    value[slice(None) if joint is None else joint] += by
+    return value
+
+
+def _bent(cause: _Cause, values: np.ndarray, q: np.ndarray, machine: Machine) -> np.ndarray:
+    """Returns by how much an error of some size moves the tool point other than in proportion, `(D,)`."""
+    given = {n: _value(cause.kind, n, cause.joint, value, machine) for n, value in zip(cause.names, values, strict=True)}
+    steps = {n: STEP * cause.kind.size(n) for n in cause.names}
+    small = [_points(cause.kind, {n: _value(cause.kind, n, cause.joint, by, machine)}, q, machine) for n, by in steps.items()]
+    plain = _points(None, {}, q, machine)
+    line = sum((value / by * (one - plain) for value, by, one in zip(values, steps.values(), small, strict=True)), np.zeros(()))
+    return (_points(cause.kind, given, q, machine) - plain - line).ravel()
+
+
+def _untimed(off: np.ndarray, ways: np.ndarray) -> np.ndarray:
+    """Returns errors `(D,)` without their part along the ways `(D, 2)` that the tool point goes.
+
+    Instruments beside the machine have a clock of their own: a period between them and the encoders moves the tool by centimetres.
+    """
+    return off - ways @ np.linalg.lstsq(ways, off, rcond=1e-9)[0]
 
 
 def _fit(causes: Sequence[_Cause], off: np.ndarray, size_m: float) -> Fit:
@@ -168,16 +213,21 @@ def _size(cause: _Cause, values: np.ndarray) -> float:
     return max(abs(value / cause.kind.size(name)) for name, value in zip(cause.names, values, strict=True))
 
 
-def _samples(recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns positions and measured tool points, about one a second."""
-    having = [r for r in recordings if all(column in r.extra for column in COLUMNS)]
-    if not having:
-        return np.zeros((0, 0)), np.zeros((0, 3))
+def _samples(recordings: Sequence[Recording], machine: Machine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns positions, measured tool points and the ways of a period to and from them, `(D, 2)`, about once a second."""
+    having = [r for r in recordings if _is_seen(r)]
     every = max(1, round(having[0].rate_hz))
     seen = np.concatenate([np.stack([r.extra[column] for column in COLUMNS], 1)[::every] for r in having]).astype(float)
-    q = np.concatenate([r.q[::every] for r in having]).astype(float)
+    q = [r.q.astype(float) for r in having]
+    steps = [np.diff(_points(None, {}, one, machine), axis=0) for one in q]
+    none = np.zeros((1, 3))
+    ways = [np.stack([np.concatenate([none, one]), np.concatenate([one, none])], -1)[::every] for one in steps]
     given = np.isfinite(seen).all(1)
-    return q[given], seen[given]
+    return np.concatenate([one[::every] for one in q])[given], seen[given], np.concatenate(ways)[given].reshape(-1, 2)
+
+
+def _is_seen(recording: Recording) -> bool:
+    return all(column in recording.extra for column in COLUMNS)
 
 
 def _points(kind: Kind | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine) -> np.ndarray:

@@ -34,6 +34,15 @@ def test_errors_of_a_wandering_speed_are_white_after_division_by_their_noise() -
     assert found.wander == pytest.approx(truth.wander, rel=0.25)
 
 
+def test_what_a_coarse_reading_adds_to_one_increment_it_takes_from_the_next() -> None:
+    random, truth = np.random.default_rng(9), Noise(sensor=1e-4, change=0.0, wander=0.0, memory=10.0, reading=2e-3)
+    error = np.diff(truth.reading * random.standard_normal((4000, 13)), axis=1)
+    covariance = truth.covariance(np.zeros((1, 12)))[0]
+    np.testing.assert_allclose(np.cov(error.T), covariance, atol=6e-7)
+    # the position after a minute is no less sure than after a second
+    np.testing.assert_allclose(truth.strayed(np.zeros((1, 12)))[0], 2 * truth.reading**2 + 1e-8 * np.arange(1, 13), rtol=1e-9)
+
+
 def test_increments_add_up_to_the_way_since_the_start() -> None:
     random = np.random.default_rng(1)
     paths, start = random.standard_normal((2, 3, 20, 1)), random.standard_normal((3, 1))
@@ -83,6 +92,16 @@ def test_an_effect_that_is_not_there_earns_less_than_nothing() -> None:
         z, column = random.standard_normal(800), random.standard_normal(800)
         gains.append(earned(plain(z, []), [line(column)])[0].sum())
     assert np.mean(gains) < -1.0 and np.max(gains) < 2.0
+
+
+def test_what_begins_at_a_threshold_is_found_beside_another() -> None:
+    random = np.random.default_rng(12)
+    a, b = 2.0 * random.standard_normal((2, 800))
+    z = 0.8 * a + 0.16 * 6.0 * b + random.standard_normal(800)  # size 0.66 of the second, 0.7 of which is below its threshold
+    table = joint(z, {"a": [line(a)], "b": [bend(6.0 * b)]})
+    both, alone = table.score(frozenset("ab")), [table.score(frozenset(name)).total for name in "ab"]
+    assert both.total > max(alone) + 50.0
+    assert both.sizes["b"][0] == pytest.approx(0.66, abs=0.03) and both.sizes["a"][0] == pytest.approx(0.8, abs=0.05)
 
 
 def test_a_pair_is_found_of_which_neither_pays_alone() -> None:

@@ -76,6 +76,27 @@ def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Mac
     assert not tool.search(Case(machine, [reference], [reference]), kinds, 8.0, 12.0).found
 
 
+def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine: Machine) -> None:
+    none, bias = np.zeros(5), np.array([0.0, 0.0, 0.0, 0.012, 0.0])
+
+    def late(recording: Recording) -> Recording:
+        return dataclasses.replace(
+            recording, extra={name: np.concatenate([row[:1], row[:-1]]) for name, row in recording.extra.items()}
+        )
+
+    reference, field, biased = (
+        late(tracked(swept(machine, 120.0, seed), machine, b, 0.0, seed)) for seed, b in ((5, none), (7, none), (7, bias))
+    )
+    kinds = library.load(machine)
+    one = tool.search(Case(machine, [reference], [biased]), kinds, 8.0, 12.0)
+    assert [found.kind.name for found in one.found] == ["encoder_bias"] and one.left < 1.2
+    assert one.found[0].joints.tolist() == [False, False, False, True, False]
+    assert one.found[0].parameters["bias_rad"]["q4"].mean == pytest.approx(0.012, abs=0.001)
+    # the clock itself is no error of geometry, even where the reference is not late at all
+    plain = tracked(swept(machine, 120.0, 5), machine, none, 0.0, 5)
+    assert not tool.search(Case(machine, [plain], [field]), kinds, 8.0, 12.0).found
+
+
 def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) -> None:
     one = swept(machine, 20.0, 9)
     assert tool.search(Case(machine, [one], [one]), library.load(machine), 8.0, 12.0) == tool.Seen([], 1.0)
@@ -112,10 +133,17 @@ def test_frames_that_were_lost_are_counted_by_where_joints_end_up(machine: Machi
     noises = simulator.noises(held[:2], machine)
     whole, other, lossy = (dataclasses.replace(one.evidence, noise=noises) for one in held)
     kinds = library.load(machine, ["frame_loss", "delay_jitter"])
-    found = frames.search(lossy, lossy.error, [whole, other], kinds, 8.0, 12.0)
+    changes = frames.Changes(lossy)
+    found = frames.search(changes, lossy.error, [whole, other], kinds, 8.0, 12.0)
     assert found and found.kind.name == "frame_loss" and found.joints.all()
     assert found.parameters["probability"]["q1"].mean == pytest.approx(0.2, abs=0.08)
-    assert frames.search(other, other.error, [whole], kinds, 8.0, 12.0) is None
+    assert frames.search(frames.Changes(other), other.error, [whole], kinds, 8.0, 12.0) is None
+    # with their delays taken for chance, errors scatter far less: the rest is that lost frames delay on average too
+    chancy = dataclasses.replace(lossy, late=changes.spread(lossy.error))
+    before, after = (float(np.mean(np.minimum(one.z**2, 25.0))) for one in (lossy, chancy))
+    assert before > 5.0 and after < 0.4 * before
+    for j in range(2):
+        np.testing.assert_allclose(chancy.rewhitened(lossy, lossy.z[j : j + 1], j)[0], chancy.z[j], atol=1e-6)
 
 
 def test_the_interval_of_a_gaussian_likelihood_is_its_own() -> None:
