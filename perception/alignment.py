@@ -195,10 +195,11 @@ def _rays(u: np.ndarray, v: np.ndarray, camera_matrix: np.ndarray) -> np.ndarray
 
 def disagreement(
     both: Pair, face: Plane, depth_m: np.ndarray, ellipse: np.ndarray, inner: float, ring: tuple[float, float]
-) -> float:
+) -> tuple[float, float]:
     """Returns how much the pictures differ inside an ellipse by the plane's warp, over how much they do on the face around it.
 
-    A flat disc looks the same from both cameras, the inside of a hole does not. NaN where too little of it can be seen.
+    A flat disc looks the same from both cameras, the inside of a hole does not. NaN where too little of it can be seen. With it,
+    the part of the inside that something hides from the right camera alone.
 
     Args:
         both: The ellipse's surroundings in both pictures.
@@ -216,7 +217,7 @@ def disagreement(
     part = np.s_[down[0] : down[1], across[0] : across[1]]
     row, column = np.mgrid[part].astype(np.float64)
     if not row.size:
-        return float("nan")
+        return float("nan"), 0.0
     u, v = both.pixel(column, row)
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(both.camera_matrix).T
     radii = conic.radii(ellipse, u, v)
@@ -224,13 +225,35 @@ def disagreement(
     with np.errstate(invalid="ignore"):
         before = (1.0 / depth - rays @ face.m > 4 * face.sigma).astype(np.uint8)
     shown = both.inside(u, rays, face.m) & (cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0)
+    hidden = shown & (radii < inner) & _hidden(both, face, depth_m, u, v, rays)
+    covered = float(hidden.sum() / max(np.count_nonzero(shown & (radii < inner)), 1))
+    shown &= ~hidden
     within, around = shown & (radii < inner), shown & (radii > ring[0]) & (radii < ring[1])
     if within.sum() < LEAST_INSIDE or around.sum() < LEAST_INSIDE:
-        return float("nan")
+        return float("nan"), covered
     mine, seen = both.left[part], both.seen(u, row, rays, face.m, both.right)
     within &= seen < np.median(seen[around])  # the right camera may see there what stands before a disc
     if within.sum() < LEAST_INSIDE:
-        return float("nan")
+        return float("nan"), covered
     off = mine - seen * (np.median(mine[around]) / max(float(np.median(seen[around])), 1.0))
     usual = 1.4826 * float(np.median(np.abs(off[around] - np.median(off[around]))))
-    return float(np.std(off[within])) / max(usual, 0.1)
+    return float(np.std(off[within])) / max(usual, 0.1), covered
+
+
+def _hidden(both: Pair, face: Plane, depth_m: np.ndarray, u: np.ndarray, v: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Says which points of a face, `(h, w)`, seen by the left camera, something nearer hides from the right one."""
+    rows = np.rint(v[:, 0]).astype(int).clip(0, len(depth_m) - 1)
+    columns = np.arange(max(0, int(u[0, 0])), depth_m.shape[1])  # what hides them from the right camera lies to their right
+    sight = _rays(columns, np.zeros(len(columns)), both.camera_matrix) @ (face.m * [1.0, 0.0, 1.0])
+    tilt = (rows - both.camera_matrix[1, 2]) / both.camera_matrix[1, 1] * face.m[1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        inverse = 1.0 / depth_m[np.ix_(rows, columns)]
+        nearer = inverse - (tilt[:, None] + sight) > 4 * face.sigma
+    shadow = np.zeros((len(rows), depth_m.shape[1]), np.uint8)
+    row, column = np.nonzero(nearer)
+    place = np.rint(columns[column] - both.pull_px * inverse[row, column]).astype(int)
+    on = (place >= 0) & (place < shadow.shape[1])
+    shadow[row[on], place[on]] = 1
+    shadow = cv2.dilate(shadow, np.ones((3, 2 * MARGIN_PX + 1), np.uint8))
+    seen = np.rint(u - both.pull_px * (rays @ face.m)).astype(int).clip(0, shadow.shape[1] - 1)
+    return np.take_along_axis(shadow, seen, 1) > 0

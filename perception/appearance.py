@@ -31,7 +31,7 @@ class Interior:
         unknown: Part of the inside without depth.
         around: Brightness of the darkest hundredth of what surrounds it, over that of the face; before the face there is less dust,
             and what stands there does not count.
-        contrast: By how much its darkest quarter is darker than the face, in standard deviations of the brightness of the face.
+        contrast: By how much its darkest quarter is darker than the darker part of the face, in standard deviations of the grain.
     """
 
     darkness: float
@@ -81,9 +81,23 @@ def interior(
         drift = _gradient(part, place, ring, ellipse) * min(darkness, 1.0)  # of dust, which lies over hole and face alike
         values = values - (place[inside][:, :2] - (x, y)) @ drift
         slope = float(np.polyfit(along, values, 1)[0]) / max(face * (1.0 - darkness), 1.0)
-    grain = 1.4826 * float(np.median(np.abs(smooth[ring] - face)))
     around = _darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
-    return Interior(darkness, slope, deeper, unknown, around, face * (1.0 - darkness) / max(grain, 1.0))
+    return Interior(darkness, slope, deeper, unknown, around, _contrast(smooth[ring], face * darkness))
+
+
+def _contrast(ring: np.ndarray, dark: float) -> float:
+    """Returns by how much `dark` is darker than a ring, in standard deviations of its grain.
+
+    The edge of a shadow across the ring is no grain: the darker of its two parts (Otsu 1979) counts, by what varies within it.
+    """
+    limit = cv2.threshold(np.rint(ring).clip(0, 255).astype(np.uint8).reshape(-1, 1), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[
+        0
+    ]
+    part = ring[ring <= limit + 0.5]
+    part = part if len(part) > 0.2 * len(ring) else ring
+    level = float(np.median(part))
+    grain = 1.4826 * float(np.median(np.abs(part - level)))
+    return (level - dark) / max(grain, 1.0)
 
 
 def _darkest_around(

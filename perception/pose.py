@@ -16,8 +16,9 @@ from perception.appearance import Interior
 from perception.plane import Plane
 from perception.rim import Circle
 
-VEILED_SCORE = 0.5
-"""Of what nobody can tell from a flat disc, since dust lies over it."""
+UNTOLD, UNTOLD_SCORE = 0.8, 0.5
+"""Part of an inside without depth, hidden from the right camera, from which on nobody can tell it from a flat disc; the score of
+what nobody can, for dust or for this."""
 
 
 @spec
@@ -28,7 +29,7 @@ class Looks:
         darkness: Largest brightness of the darkest quarter inside over that of the face.
         veiled: From which on something lies over both: dust, behind which nobody sees how deep a hole is; or it is a stain.
         darker: If something near it is darker by more than this, over the brightness of the face, it is no dust.
-        contrast: Least contrast, in standard deviations of the face's own brightness, of what is veiled: a stain has less.
+        contrast: Least contrast, in standard deviations of the face's grain, of what is veiled: a stain has less.
         mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives one.
         sure_mouth: From which the mouth channel needs no other witness.
         slope: Slope of brightness inside, see `Interior`, that alone would show a hole; less is as much less evidence, and adds up.
@@ -55,8 +56,9 @@ class PlaneConic:
 
     Attributes:
         radius_m: Radius of the holes that are looked for.
-        radius_tolerance: How far the measured radius may be off, as a part of it.
-        axis_ratio: Least ratio of the semi-axes on the plane; 1 is a circle.
+        radius_tolerance: How far the measured radius may be off, as a part of it; in proportion more at first, where something
+            hides a part of the rim.
+        axis_ratio: Least ratio of the semi-axes on the plane; 1 is a circle; likewise.
         coverage: Least part of the circle on the face whose rim is seen.
         tilt_rad: Largest angle between the face's normal and the line of sight.
         inner: Inner limit of the face's support in radii of the ellipse; keeps the rim's bleeding out.
@@ -151,10 +153,15 @@ class PlaneConicEstimator:
             return Rejection(
                 "pose", "part of a circle on the face with a rim", circle.coverage if circle else 0.0, s.coverage, ellipse
             )
+        if abs(circle.radius_m - s.radius_m) > s.radius_tolerance * s.radius_m:
+            limit = s.radius_m * (1.0 + np.sign(circle.radius_m - s.radius_m) * s.radius_tolerance)
+            return Rejection("pose", "radius, m", circle.radius_m, float(limit), ellipse)
         row = circle.ellipse
         inside = appearance.interior(gray, frame.depth_m, row, frame.camera_matrix, face)
-        parallax = alignment.disagreement(both, face, frame.depth_m, row, *s.looks.parts) if both else float("nan")
-        refused = self._looks(inside, parallax, masks, row, ellipse)
+        parallax, covered = alignment.disagreement(both, face, frame.depth_m, row, *s.looks.parts) if both else (float("nan"), 0.0)
+        # behind something that stands before it, or in dust, nobody can tell
+        untold = masks.mouth is None and (inside.darkness > s.looks.veiled or (covered > UNTOLD and inside.unknown > UNTOLD))
+        refused = self._looks(inside, parallax, masks, row, ellipse, untold)
         if refused:
             return refused
         return HolePose(
@@ -164,7 +171,7 @@ class PlaneConicEstimator:
             cov_m2=covariance(replace(face, cov=face.cov * s.depth_alike), circle, s.bias_per_m),
             axis_cov_rad2=face.normal_cov_rad2() * s.tilt_alike,
             frame="camera",
-            score=float(ellipse.score) * (VEILED_SCORE if inside.darkness > s.looks.veiled and masks.mouth is None else 1.0),
+            score=float(ellipse.score) * (UNTOLD_SCORE if untold else 1.0),
             t_s=frame.t_s,
         )
 
@@ -189,15 +196,20 @@ class PlaneConicEstimator:
         if not np.isfinite(axes).all():
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
-        tolerance = s.radius_tolerance * s.radius_m
+        hidden = hidden_part(face, row * [1.0, 1.0, *[1.0 + s.radius_tolerance] * 2, 1.0], frame)
+        seen = max(1.0 - hidden, s.coverage)  # the less of a rim there is, the less it tells
+        tolerance = s.radius_tolerance / seen * s.radius_m
         if abs(radius - s.radius_m) > tolerance:
             limit = s.radius_m + np.sign(radius - s.radius_m) * tolerance
             return Rejection("pose", "radius, m", radius, float(limit), ellipse)
-        if ratio < s.axis_ratio:
-            return Rejection("pose", "axis ratio on the face", ratio, s.axis_ratio, ellipse)
+        least = 1.0 - (1.0 - s.axis_ratio) / seen
+        if ratio < least:
+            return Rejection("pose", "axis ratio on the face", ratio, least, ellipse)
         return center, radius
 
-    def _looks(self, inside: Interior, parallax: float, masks: Masks, row: np.ndarray, ellipse: Ellipse) -> Rejection | None:
+    def _looks(
+        self, inside: Interior, parallax: float, masks: Masks, row: np.ndarray, ellipse: Ellipse, untold: bool
+    ) -> Rejection | None:
         looks = self.settings.looks
         if not inside.darkness <= looks.darkness:
             return Rejection("pose", "brightness inside over outside", inside.darkness, looks.darkness, ellipse)
@@ -217,6 +229,8 @@ class PlaneConicEstimator:
         against = (parallax - 1.0) / (
             looks.parallax - 1.0
         )  # a dark disc is noisier nowhere than the face: below 1 it speaks against
+        if untold and not np.isfinite(against):
+            return None
         evidence = sum(shown) + (against if np.isfinite(against) else 0.0)
         return None if evidence >= 1.0 else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
 
@@ -227,6 +241,17 @@ def covariance(face: Plane, circle: Circle, bias_per_m: float) -> np.ndarray:
     ray = center / center[2]
     depth_var = center[2] ** 4 * (float(ray @ face.cov @ ray) + bias_per_m**2)
     return np.outer(ray, ray) * depth_var + circle.cov_m2
+
+
+def hidden_part(face: Plane, row: np.ndarray, frame: Frame) -> float:
+    """Returns the part of an ellipse `(5,)` on a face before which something nearer stands."""
+    points = conic.sample(row[None], np.linspace(0.0, 2 * np.pi, 72, endpoint=False))[0][0]
+    column, line = np.rint(points).astype(int).T
+    height, width = frame.depth_m.shape
+    on = (column >= 0) & (column < width) & (line >= 0) & (line < height)
+    rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
+    nearer = 1.0 / frame.depth_m[line[on], column[on]] - rays[on] @ face.m > 4 * face.sigma  # false where depth is unknown
+    return float(nearer.sum() / len(points))
 
 
 def vector(ellipse: Ellipse) -> np.ndarray:

@@ -24,7 +24,7 @@ NEAR_PX, INLIER_PX = 0.7, 1.0
 """A profile speaks for a circle that has an edge so near to it; of the final one."""
 NARROW_PX = 2.0
 """Reach of the profiles across a circle that is known already."""
-ALIKE_PX = 5.0
+ALIKE_PX = 10.0
 """Points of a rim are alike over this length: the chips of it, and the blur."""
 LEAST = 12
 

@@ -11,7 +11,7 @@ from composed import option
 from drawn import AXIS, CENTER, RAYS, K, drawn
 
 from brokk_rl.sight import HolePose, Rejection
-from perception import alignment, plane, rim
+from perception import alignment, appearance, conic, plane, rim
 from perception.pose import gray_of
 from perception.pose import vector as pose_row
 
@@ -130,6 +130,53 @@ def test_in_dust_a_disc_may_be_a_hole_for_half_the_score_and_in_clear_air_a_pale
     shaded[int(ellipse.y + 4 * ellipse.a) :] //= 4  # something dark nearby: nothing lies over it
     stain = estimator.estimate(replace(frame, color=shaded), masks, ellipse)
     assert isinstance(stain, Rejection) and stain.reason == "brightness inside over outside"
+
+
+@pytest.mark.parametrize("arm", [True, False])
+def test_an_arc_may_be_taken_for_a_smaller_rim_where_something_hides_the_rest(arm: bool, estimator) -> None:
+    frame, masks, ellipse = drawn()
+    smaller = replace(ellipse, x=ellipse.x - 0.19 * ellipse.a, a=0.8 * ellipse.a, b=0.8 * ellipse.b, coverage=0.65)
+    if arm:
+        color, depth_m = frame.color.copy(), frame.depth_m.copy()
+        edge = int(ellipse.x + 0.4 * ellipse.a)
+        color[:, edge:], depth_m[:, edge:] = 210, 0.5
+        pose = estimator.estimate(replace(frame, color=color, depth_m=depth_m), masks, smaller)
+        assert isinstance(pose, HolePose) and pose.radius_m == pytest.approx(0.05, abs=2e-3)
+    else:
+        refused = estimator.estimate(frame, masks, smaller)
+        assert isinstance(refused, Rejection) and refused.reason == "radius, m"
+
+
+@pytest.mark.parametrize("arm", [True, False])
+def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(arm: bool, estimator) -> None:
+    frame, masks, ellipse = drawn()
+    m, row, pull_px = AXIS / (AXIS @ CENTER), pose_row(ellipse), K[0, 0] * 0.12
+    left, right = (120 + 60 * one for one in both_views(m, pull_px, np.random.default_rng(5)))
+    columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    left[conic.radii(row, columns, rows) < 1] = 15  # a flat disc
+    back = columns + pull_px * (RAYS @ m) / (1 - pull_px * m[0] / K[0, 0])
+    right[conic.radii(row, back, rows) < 1] = 15
+    depth_m = (1.0 / (RAYS @ m)).astype(np.float32)
+    if arm:  # from 5 px beside it on, 0.5 m away: 127 px of disparity where the face has 53
+        edge = int(ellipse.x + ellipse.a + 5)
+        left[:, edge : edge + 90], right[:, edge - 127 : edge - 37], depth_m[:, edge : edge + 90] = 60, 60, 0.5
+        depth_m[:, edge - 74 : edge] = np.nan
+    frame = replace(frame, color=as_color(left), right=as_color(right), baseline_m=0.12, depth_m=depth_m)
+    found = estimator.estimate(frame, masks, ellipse)
+    if arm:
+        assert isinstance(found, HolePose) and found.score == pytest.approx(0.5 * ellipse.score)
+    else:
+        assert isinstance(found, Rejection) and found.reason == "evidence of depth inside"
+
+
+def test_the_edge_of_a_shadow_across_the_face_is_no_grain() -> None:
+    generator = np.random.default_rng(6)
+    even = generator.normal(150, 6, 4000).astype(np.float32)
+    half = np.concatenate([even[:2000], even[2000:] - 40])
+    # the darker part lies 30 above what is inside, five standard deviations of its grain
+    assert appearance._contrast(half, 80.0) == pytest.approx(5.0, rel=0.25)
+    # even grain, as far: its darker half lies 0.67 standard deviations nearer, and varies half as much
+    assert appearance._contrast(even, 120.0) == pytest.approx((5.0 - 0.67) / 0.5, rel=0.25)
 
 
 def test_what_stands_before_a_face_may_be_darker_than_dust(estimator) -> None:
