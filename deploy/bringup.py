@@ -107,7 +107,7 @@ class Bringup(Listener):
         description, contents = Description(self.dbc, machine), reading.read(session.folder / MCAP)
         values, poor = {}, []
         for layout in (*description.sent_by(GATEWAY), *description.sent_by(REMOTE)):
-            times = [t_s for t_s, _ in contents.messages.get(layout.name, [])]
+            times = contents.messages[layout.name].series("t_s") if layout.name in contents.messages else ()
             rate_hz = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
             values[layout.name] = {"rate_hz": rate_hz, "nominal_hz": 1 / layout.period_s if layout.period_s else None}
             if layout.period_s and rate_hz * layout.period_s < self.rate:

@@ -75,8 +75,8 @@ def judged(out: Path, machine: object, task: object, hole: np.ndarray) -> dict[s
     positions = {}
     for messages in contents.messages.values():
         for name in machine.joint_names:
-            if f"Position_{name}" in messages[0][1]:
-                positions[name] = np.array([(t_s, values[f"Position_{name}"]) for t_s, values in messages])
+            if f"Position_{name}" in messages.names:
+                positions[name] = np.stack([messages.series("t_s"), messages.series(f"Position_{name}")], 1)
     if len(positions) < machine.num_joints:
         return {"success": False, "error": "the twin was never heard"}
     t_s = next(iter(positions.values()))[:, 0]
@@ -90,7 +90,7 @@ def judged(out: Path, machine: object, task: object, hole: np.ndarray) -> dict[s
     moved = t_s[np.abs(q - q[0]).max(1) > 0.01]
     first_s = float(t_s[inside.argmax()] - moved[0]) if inside.any() and len(moved) else None
     latched = [values["cause"] for _, values in contents.messages.get("guard", []) if values["state"] == "LATCHED"]
-    sent = any(values.get("sent") for values in (message[1] for message in contents.messages.get("ValveCmd", [])))
+    sent = any(values.get("sent") for _, values in contents.messages.get("ValveCmd", []))
     return {
         "success": bool(inside.any()),
         "time_to_insert_s": first_s,

@@ -113,10 +113,12 @@ def _series(contents: Contents, signal: str, path: Path) -> Series:
     """Returns times and values of a signal, whatever message it came in; of what was called invalid nothing."""
     joint, positions = signal.partition("_")[2], signal.startswith("Position_")
     for messages in contents.messages.values():
-        if signal in messages[0][1]:
-            kept = [(t_s, values[signal]) for t_s, values in messages if not positions or values.get(f"Valid_{joint}", 1.0) == 1.0]
-            if len(kept) > 1:
-                t_s, values = np.array(kept, dtype=float).T
+        if signal in messages.names:
+            t_s, values, valid = messages.series("t_s"), messages.series(signal), f"Valid_{joint}"
+            if positions and valid in messages.names:
+                kept = messages.series(valid) == 1.0
+                t_s, values = t_s[kept], values[kept]
+            if len(t_s) > 1:
                 forward = np.concatenate([[True], np.diff(t_s) > 0])
                 return t_s[forward], values[forward]
     raise RecordingError(f"{path}: signal '{signal}' was never heard (topics: {', '.join(sorted(contents.messages)) or 'none'})")
@@ -150,11 +152,11 @@ def _extra(contents: Contents, grid_s: np.ndarray, machine: Machine) -> dict[str
     """Returns the oil's temperature and the advice shown, where there was any; NaN where not."""
     extra: dict[str, np.ndarray] = {}
     for messages in contents.messages.values():
-        if "OilTemperature" in messages[0][1]:
-            t_s, values = np.array([(t_s, values["OilTemperature"]) for t_s, values in messages], dtype=float).T
-            extra["oil_c"] = np.interp(grid_s, t_s, values).astype(np.float32)
+        if "OilTemperature" in messages.names:
+            oil_c = np.interp(grid_s, messages.series("t_s"), messages.series("OilTemperature"))
+            extra["oil_c"] = oil_c.astype(np.float32)
     if advised := contents.messages.get("advice"):
-        t_s = np.array([t_s for t_s, _ in advised])
+        t_s = advised.series("t_s")
         shown = np.array([values["u"] if values["reason"] == "valid" else [np.nan] * machine.num_joints for _, values in advised])
         rows = np.searchsorted(t_s, grid_s, side="right") - 1
         for j, name in enumerate(machine.joint_names):

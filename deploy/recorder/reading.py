@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import can
+import numpy as np
 from can.io.blf import BLFReader
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
@@ -23,19 +25,70 @@ from deploy.recorder.capture import FACTS, DurableBlf
 log = logging.getLogger(__name__)
 
 
+class Messages(Sequence[tuple[float, dict[str, Any]]]):
+    """The messages of a topic, in order: (t_s, values); `t_s` is monotonic time.
+
+    Topics of numbers alone, which is what a bus says, are kept by column: an hour of them takes a tenth of the memory of as many
+    dictionaries.
+    """
+
+    def __init__(self) -> None:
+        self._t_s = array("d")
+        self._columns: dict[str, array[float]] = {}
+        self._rows: list[dict[str, Any]] = []
+
+    def add(self, t_s: float, values: dict[str, Any]) -> None:
+        """Appends a message."""
+        numbers = all(isinstance(value, (int, float)) for value in values.values())
+        if not self._t_s and numbers:
+            self._columns = {name: array("d") for name in values}
+        elif self._columns and not (numbers and values.keys() == self._columns.keys()):
+            self._rows, self._columns = [row for _, row in self], {}
+        self._t_s.append(t_s)
+        if not self._columns:
+            self._rows.append(values)
+        for name, column in self._columns.items():
+            column.append(values[name])
+
+    @property
+    def names(self) -> frozenset[str]:
+        """What the first of them says."""
+        return frozenset(self._columns or self._rows[0])
+
+    def series(self, name: str) -> np.ndarray:
+        """Returns a signal's values, `(T,)`, or those of `t_s`."""
+        if name == "t_s":
+            return np.array(self._t_s)
+        return np.array(self._columns[name] if self._columns else [row[name] for row in self._rows], dtype=float)
+
+    def __len__(self) -> int:
+        return len(self._t_s)
+
+    @overload
+    def __getitem__(self, index: int) -> tuple[float, dict[str, Any]]: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[tuple[float, dict[str, Any]]]: ...
+    def __getitem__(self, index: int | slice) -> tuple[float, dict[str, Any]] | list[tuple[float, dict[str, Any]]]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        if not self._columns:
+            return self._t_s[index], self._rows[index]
+        return self._t_s[index], {name: column[index] for name, column in self._columns.items()}
+
+
 @dataclass
 class Contents:
     """What a capture holds.
 
     Attributes:
         facts: Metadata of the run: `machine`, `fingerprint`, `dbc`, `started_ns`, …
-        messages: By topic, in order: (t_s, values); `t_s` is monotonic time.
+        messages: By topic.
         wall_ns: Wall-clock time of the first message.
         whole: Whether the file was closed properly.
     """
 
     facts: dict[str, str] = field(default_factory=dict)
-    messages: dict[str, list[tuple[float, dict[str, Any]]]] = field(default_factory=dict)
+    messages: dict[str, Messages] = field(default_factory=dict)
     wall_ns: int = 0
     whole: bool = True
 
@@ -55,7 +108,7 @@ def read(path: Path) -> Contents:
         elif isinstance(record, Message):
             values = json.loads(record.data)
             contents.wall_ns = contents.wall_ns or record.log_time
-            contents.messages.setdefault(topics[record.channel_id], []).append((values.pop("t_s"), values))
+            contents.messages.setdefault(topics[record.channel_id], Messages()).add(values.pop("t_s"), values)
     if not contents.facts:
         raise RecordingError(f"{path}: no capture of this framework, or cut off within its first second")
     return contents

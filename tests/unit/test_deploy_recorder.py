@@ -150,3 +150,17 @@ def test_recover_and_convert_are_commands(brokk: Callable[..., Any], machine: Ma
     done = brokk("mode=convert", "import=capture", "convert.input=whole/*.mcap", "session.out=made")
     assert done.code == 0 and len(record.read_all("made/recordings/*.parquet", machine)) == 1
     assert brokk("mode=recover", "recover.input=nothing/*", "session.out=x").code == 2
+
+
+def test_messages_of_numbers_are_kept_by_column_and_others_as_they_are() -> None:
+    said = [(0.1, {"q": 1.5, "sent": True}), (0.2, {"q": 2, "sent": False}), (0.3, {"q": -1.0, "sent": True})]
+    messages = reading.Messages()
+    for t_s, values in said:
+        messages.add(t_s, values)
+    assert list(messages) == said and messages[-1] == said[-1] and messages[:2] == said[:2] and len(messages) == 3
+    assert messages.series("q").tolist() == [1.5, 2.0, -1.0] and messages.series("t_s").tolist() == [0.1, 0.2, 0.3]
+    said += [(0.4, {"q": 0.0, "why": "text"}), (0.5, {"q": 7.0})]
+    for t_s, values in said[3:]:
+        messages.add(t_s, values)
+    assert list(messages) == said and messages.series("q").tolist() == [1.5, 2.0, -1.0, 0.0, 7.0]
+    assert messages.names == {"q", "sent"}
