@@ -225,9 +225,10 @@ def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(tmp_path: Path, 
     before = time.monotonic()
     collect.run()
     assert time.monotonic() - before > 2.2
-    first, *_, last = made(tmp_path / "run", machine).values()
+    files = list(made(tmp_path / "run", machine).values())
+    first, last = files[0], files[-1]
     assert first.metadata["run"] == last.metadata["run"] and first is not last
-    periods_s = np.diff(first.t_s)
+    periods_s = np.concatenate([np.diff(file.t_s) for file in files])  # busy computers come late more than once
     assert np.median(periods_s) == pytest.approx(0.05, abs=0.006) and len(np.unique(periods_s)) > 3, "as measured"
     assert 0.0 < max(np.abs(file.u).max() for file in (first, last)) <= 0.5, "as sent"
 
