@@ -1,7 +1,7 @@
 """A long run of the loop against the twin: lateness, memory, lost records. python benchmarks/deploy/soak.py <folder> <seconds>.
 
 A simulated person follows the advice, and the borehole is another one every 20 s, so that the machine moves all the time. Writes
-`<folder>/soak.json`: lateness of bus and policy, each process's own and shared memory every minute, the load, records that the log
+`<folder>/soak.json`: lateness of bus and policy, each process's own and shared memory every five minutes, the load, records that the log
 had to drop, and messages in the capture against those that were sent.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from deploy.recorder import reading
 
-LOOK_S, ELSEWHERE_S, EVERY_S = 5.0, 20.0, 60.0
+LOOK_S, ELSEWHERE_S, EVERY_S = 5.0, 20.0, 300.0
 HOLES_M = ((2.3, 2.8), (-0.6, 0.6), (0.6, 0.9))
 """Where boreholes lie, x, y and z: within what the policy was trained for."""
 LONG_S = 300.0
