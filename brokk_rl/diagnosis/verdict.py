@@ -22,8 +22,8 @@ SAME = 0.9
 AS_GOOD = 3.0
 """Difference in log likelihood that says nothing."""
 LISTED = 8
-NAMED = 0.4
-"""Probability from which a further effect is named: somewhat below a half, as one that is missed costs what a wrong one does."""
+NAMED = 0.5
+"""Probability from which a further effect is named: one that is missed costs what a wrong one does."""
 LEFT = 15.0
 """Evidence of a clue, beyond that on the reference, from which the report says that something is left on a joint."""
 TOLD = 0.9

@@ -77,8 +77,11 @@ def test_weights_of_signs_are_those_that_made_the_truth() -> None:
     random = np.random.default_rng(2)
     signs = [{"constant": 1.0, "margin": m, "names": n} for m, n in random.standard_normal((6000, 2))]
     true = [random.random() < certainty.chance({"constant": -1.0, "margin": 2.0, "names": 0.0}, one) for one in signs]
-    found = logistic(signs, true)
+    begin = {"constant": 0.0, "margin": 0.5, "names": 1.0}
+    found = logistic(signs, true, begin)
     assert found == pytest.approx({"constant": -1.0, "margin": 2.0, "names": 0.0}, abs=0.15)
+    few = logistic(signs[:4], true[:4], begin)  # a handful of answers changes little but how often anything is true
+    assert [few[name] for name in ("margin", "names")] == pytest.approx([0.5, 1.0], abs=0.2)
 
 
 def test_no_answer_is_surer_than_answers_can_tell(weights: Certainty) -> None:

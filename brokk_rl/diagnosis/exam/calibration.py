@@ -39,8 +39,8 @@ NEAR = 0.25
 """Around the best so far the second half of the trials is drawn: standard deviation of the logarithm."""
 QUIET_WEIGHT = 2.0
 """A false alarm costs as much as so many effects that are missed."""
-PULL = 0.5
-"""Precision of a weight about 0; signs are of about unit size."""
+PULL = 10.0
+"""Precision of a weight about where it begins, which earlier answers told; signs are of about unit size."""
 FORMS = np.linspace(0.0, 0.3, 61)
 COVERED = 0.9
 """Share of true sizes that 90 % intervals should hold."""
@@ -196,15 +196,15 @@ class Calibration:
     def weighed(self, cases: Sequence[Item], prices: Prices, start: Certainty) -> Certainty:
         """Returns the weights under which what is true of these cases is most probable, and what forms add to errors."""
         is_outside = [item.label["kind"] == "outside" for item in cases]
-        outside = logistic([claims.outside for _, claims in self._marked(cases, prices, start)], is_outside)
+        outside = logistic([claims.outside for _, claims in self._marked(cases, prices, start)], is_outside, start.outside)
         weights = replace(start, outside=outside)
         named, true = self._named(cases, prices, weights)
-        found = {"right": logistic(named, true) if len(set(true)) > 1 else start.right}
+        found = {"right": logistic(named, true, start.right) if len(set(true)) > 1 else start.right}
         silent = [
             (claims.none, mark.kind in QUIET) for mark, claims in self._marked(cases, prices, weights) if mark.verdict == "none"
         ]
         if len({quiet for _, quiet in silent}) > 1:
-            found["none"] = logistic([signs for signs, _ in silent], [quiet for _, quiet in silent])
+            found["none"] = logistic([signs for signs, _ in silent], [quiet for _, quiet in silent], start.none)
         return replace(weights, form=self.forms(cases, weights.form), **found)
 
     def _named(self, cases: Sequence[Item], prices: Prices, weights: Certainty) -> tuple[list[dict[str, float]], list[bool]]:
@@ -257,18 +257,18 @@ def _value(prices: Prices) -> float:
     return calibration.value(cases, prices, weights)
 
 
-def logistic(signs: Sequence[Mapping[str, float]], true: Sequence[bool]) -> dict[str, float]:
-    """Returns the weights of a logistic regression, pulled towards 0 but for the constant."""
+def logistic(signs: Sequence[Mapping[str, float]], true: Sequence[bool], start: Mapping[str, float]) -> dict[str, float]:
+    """Returns the weights of a logistic regression, pulled towards those at which it begins but for the constant."""
     names, y = list(signs[0]), np.array(true, dtype=float)
-    x = np.array([[one[name] for name in names] for one in signs])
+    x, begin = np.array([[one[name] for name in names] for one in signs]), np.array([start[name] for name in names])
     pull = np.array([0.0 if name == "constant" else PULL for name in names])
 
     def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
-        at = x @ w
-        slope = x.T @ (1.0 / (1.0 + np.exp(-at)) - y) + pull * w
-        return float(np.logaddexp(0.0, at).sum() - y @ at + 0.5 * pull @ w**2), slope
+        at, off = x @ w, w - begin
+        slope = x.T @ (1.0 / (1.0 + np.exp(-at)) - y) + pull * off
+        return float(np.logaddexp(0.0, at).sum() - y @ at + 0.5 * pull @ off**2), slope
 
-    found = minimize(loss, np.zeros(len(names)), jac=True, method="L-BFGS-B")
+    found = minimize(loss, begin, jac=True, method="L-BFGS-B")
     return {name: round(float(value), 3) for name, value in zip(names, found.x, strict=True)}
 
 
