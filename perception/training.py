@@ -7,12 +7,9 @@ import io
 import logging
 import math
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.session import Session
@@ -25,6 +22,8 @@ from perception.unet import UNet, loss
 
 STATE = "training.pt"
 """What an interrupted training goes on from."""
+FREE = ("frames", "validation", "hold_out", "max_seconds", "validate_every")
+"""Settings that may be others when it does; frames and validation are compared by what they hold."""
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +46,8 @@ class SegmenterTraining:
         batch: Samples a step.
         rate: Learning rate at its highest; it rises for a twentieth of the updates, then falls as a cosine to nothing.
         decay: Weight decay.
+        average: The network is the mean of what it was lately, over about this part of the training: the steps of the last batches
+            are as much chance as gain.
         bfloat16: Whether the network is trained in sixteen bits: in half the time on a graphics card or a processor that can.
         closer: How often a sample is cut from the closer view of the block.
         margin: Room around the block in that view, as a part of its box; that of the segmenter.
@@ -66,6 +67,7 @@ class SegmenterTraining:
     batch: int
     rate: float
     decay: float
+    average: float
     bfloat16: bool
     closer: float
     margin: float
@@ -82,8 +84,8 @@ class SegmenterTraining:
             )
         if min(self.updates, self.batch, self.validate_every) < 1 or self.hold_out < 2:
             raise ConfigError("training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or more")
-        if min(self.rate, math.inf if self.max_seconds is None else self.max_seconds) <= 0:
-            raise ConfigError("training: expected rate and max_seconds above 0")
+        if min(self.average, self.rate, math.inf if self.max_seconds is None else self.max_seconds) <= 0:
+            raise ConfigError("training: expected average, rate and max_seconds above 0")
 
     def fit(self, session: Session, resume: bool) -> dict[str, Any]:
         """Trains; leaves the network as safetensors and ONNX, curve and samples as PNG in the session's folder.
@@ -108,6 +110,7 @@ class _Training:
         self._train, self._unseen = self._views()
         self._network = self._begun().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimizer = torch.optim.AdamW(self._network.parameters(), lr=settings.rate, weight_decay=settings.decay)
+        self._mean = {name: value.clone() for name, value in self._network.state_dict().items()}
         self._update, self._best, self._curve = 0, {"score": -1.0, "update": 0}, []
         self._seconds = 0.0
         self._best_tensors: dict[str, torch.Tensor] = {}
@@ -127,11 +130,13 @@ class _Training:
         )  # fmt: skip
         if settings.start is not None and self._update == 0:
             self._validate(pictures, known, None)  # a training may make a good network worse
-        with _progress(self._update, settings.updates) as advance:
+        with training_report.progress(self._update, settings.updates) as advance:
             while self._spent() < 1.0:
+                before = self._spent()
                 total += self._step(*samples.batch(self._update, settings.batch))
                 self._update += 1
                 self._seconds = time.monotonic() - begun
+                self._remember(1.0 - math.exp((before - self._spent()) / settings.average))
                 advance()
                 over = self._spent() >= 1.0
                 if self._update % settings.validate_every == 0 or over:
@@ -182,6 +187,15 @@ class _Training:
         self._optimizer.step()
         return value.detach()
 
+    @torch.no_grad()
+    def _remember(self, part: float) -> None:
+        """Moves the mean network by a part of the way to the one under training."""
+        for name, value in self._network.state_dict().items():
+            if value.is_floating_point():
+                self._mean[name].lerp_(value, part)
+            else:
+                self._mean[name].copy_(value)
+
     def _spent(self) -> float:
         """Returns which part of the training is over, by updates or by seconds, in [0, 1]."""
         in_time = self._seconds / (self._settings.max_seconds or math.inf)
@@ -193,7 +207,9 @@ class _Training:
         return self._settings.rate * min(1.0, rise) * fall
 
     def _validate(self, pictures: torch.Tensor, known: torch.Tensor, mean_loss: float | None) -> None:
-        probabilities = training_report.predicted(self._network, pictures, self._device)
+        network = UNet(self._settings.widths).to(self._device)
+        network.load_state_dict(self._mean)
+        probabilities = training_report.predicted(network, pictures, self._device)
         figures = training_report.judged(probabilities, known, self._unseen.conditions)["all"]
         block, mouth = figures["block"] or 0.0, figures["mouth"] or 0.0
         self._curve.append({"update": self._update, "loss": mean_loss, "block": block, "mouth": mouth})
@@ -201,7 +217,7 @@ class _Training:
             raise CheckpointError(f"the training diverged before update {self._update}; try a smaller training.rate")
         if block + mouth > self._best["score"]:
             self._best = {"score": block + mouth, "update": self._update}
-            self._best_tensors = {name: value.cpu().clone() for name, value in self._network.state_dict().items()}
+            self._best_tensors = {name: value.cpu().clone() for name, value in self._mean.items()}
         passed = "" if mean_loss is None else f"loss {mean_loss:.4f}, "
         log.info("update %d: %soverlap of blocks %.3f, of mouths %.3f", self._update, passed, block, mouth)
 
@@ -241,21 +257,21 @@ class _Training:
 
     def _identity(self) -> dict[str, str]:
         """Returns what must be the same for a training to go on."""
-        settings = self._settings
-        same = (settings.size_px, settings.widths, settings.updates, settings.batch, settings.rate, settings.decay,
-                settings.bfloat16, settings.closer, settings.margin, settings.crop, settings.augment, settings.start,
-                self._session.seed)  # fmt: skip
+        same = {name: value for name, value in vars(self._settings).items() if name not in FREE}
         data = hashlib.sha256()
         for views in (self._train, self._unseen):
             data.update(views.layers[:: max(1, len(views) // 50)].numpy().tobytes())
-        return {"settings": hashlib.sha256(repr(same).encode()).hexdigest()[:16], "data": data.hexdigest()[:16]}
+        return {
+            "settings": hashlib.sha256(repr((same, self._session.seed)).encode()).hexdigest()[:16],
+            "data": data.hexdigest()[:16],
+        }
 
     def _save(self) -> None:
         content = io.BytesIO()
         torch.save(
             {
                 "stamp": self._stamp, "update": self._update, "best": self._best, "curve": self._curve, "seconds": self._seconds,
-                "network": self._network.state_dict(), "optimizer": self._optimizer.state_dict(),
+                "network": self._network.state_dict(), "optimizer": self._optimizer.state_dict(), "mean": self._mean,
                 "best_tensors": self._best_tensors,
             },
             content,
@@ -278,6 +294,7 @@ class _Training:
                 "began with, or choose another folder (session.out=…)."
             )
         self._network.load_state_dict(state["network"])
+        self._mean = state["mean"]
         self._optimizer.load_state_dict(state["optimizer"])
         self._update, self._best, self._curve, self._seconds = (state[key] for key in ("update", "best", "curve", "seconds"))
         self._best_tensors = {name: value.cpu() for name, value in state["best_tensors"].items()}
@@ -285,11 +302,3 @@ class _Training:
 
 def _several(folders: str | tuple[str, ...]) -> tuple[str, ...]:
     return (folders,) if isinstance(folders, str) else folders
-
-
-@contextmanager
-def _progress(done: int, total: int) -> Iterator[Any]:
-    columns = (TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True) as progress:
-        task = progress.add_task("training", total=total, completed=done)
-        yield lambda: progress.advance(task)

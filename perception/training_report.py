@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from perception.segment_network import THRESHOLD
 from perception.segment_window import around, whole
@@ -90,6 +92,15 @@ def pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
         found += bool(best and (there & piece).sum() / (there | piece).sum() > ALIKE)
     false = sum(not known[said_labels == label].any() for label in range(1, num_said))
     return found, num_known - 1, false
+
+
+@contextmanager
+def progress(done: int, total: int) -> Iterator[Callable[[], None]]:
+    """Shows how far a training is; yields what says that it is one update farther."""
+    columns = (TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True) as bar:
+        task = bar.add_task("training", total=total, completed=done)
+        yield lambda: bar.advance(task)
 
 
 def draw_samples(path: Path, pictures: torch.Tensor, probabilities: torch.Tensor, known: torch.Tensor) -> None:

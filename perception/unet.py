@@ -42,7 +42,9 @@ class UNet(nn.Module):
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
         """Returns logits, `(B, 2, h, w)`, of RGB pictures `(B, 3, h, w)` in [0, 1]."""
-        # each picture by its own brightness and contrast: dusk and dust are the same picture then, but for the noise
+        # of the root, in which the noise of light is alike at every brightness, and what is in the shade is not all black; each
+        # picture by its own brightness and contrast: dusk and dust are the same picture then, but for the noise
+        picture = picture.sqrt()
         mean = picture.mean((1, 2, 3), keepdim=True)
         spread = (picture - mean).square().mean((1, 2, 3), keepdim=True).sqrt()
         x, bridges = (picture - mean) / (spread + DARKEST), []

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from safetensors.torch import load_file
 
 import conf
 from perception import dataset, training, training_report
@@ -91,6 +92,30 @@ def test_a_training_begins_with_the_network_it_is_given(brokk: Callable[..., Any
     assert one["block"] > 0.3 and other["block"] == pytest.approx(one["block"], abs=0.1)
     refused = brokk(*command, "training.start=first/segmenter.safetensors", "training.widths=[6,12]", "session.out=no")
     assert refused.code == 2 and "widths [6, 12, 16]" in refused.err
+
+
+def test_a_training_keeps_the_mean_of_its_last_networks(
+    brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ("mode=train_perception", f"training.frames={frames}", *SMALL, "training.validate_every=4")
+    assert brokk(*command, "training.updates=1", "session.out=first").code == 0
+    seen, step = [], training._Training._step
+
+    def watched(self: Any, *batch: torch.Tensor) -> torch.Tensor:
+        value = step(self, *batch)
+        seen.append((self, self._network.head.weight.detach().clone()))
+        return value
+
+    monkeypatch.setattr(training._Training, "_step", watched)
+    done = brokk(
+        *command, "training.updates=4", "training.average=0.25", "training.start=first/segmenter.safetensors", "session.out=run"
+    )
+    assert done.code == 0, done.err
+    # a quarter of the training is one update here: each one moves the mean by 1 - 1/e of the way
+    mean = load_file("first/segmenter.safetensors")["head.weight"]
+    for _, weight in seen:
+        mean = mean + (1.0 - np.exp(-1.0)) * (weight - mean)
+    torch.testing.assert_close(seen[0][0]._mean["head.weight"], mean)
 
 
 def test_an_interrupted_training_goes_on_exactly(brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
