@@ -47,6 +47,9 @@ class Scripted:
         self.wishes: list[Wish] = []
         self.seen: list[Drawn] = []
 
+    def news(self) -> int | None:
+        return self.now.advice.number if self.now.advice else None
+
     def shown(self) -> Shown:
         return self.now
 

@@ -82,6 +82,10 @@ class DemoFeed:
         self._camera = Camera(demo.width_px, demo.height_px, BLOCK_M, TARGETS) if demo.frames else None
         self._exclusive = machine.is_exclusive
 
+    def news(self) -> int:
+        """See `Feed`."""
+        return int((self._clock() - self._began_s) / self._machine.period_s)
+
     def shown(self) -> Shown:
         """See `Feed`."""
         now_s, machine = self._clock(), self._machine

@@ -95,6 +95,10 @@ class LoopFeed:
         self._full_rad = full_angles_rad(beside.guidance.levers or machine.levers)
         self._exclusive = machine.is_exclusive
 
+    def news(self) -> int | None:
+        """See `Feed`."""
+        return self._exchange.advice.peek("number")
+
     def shown(self) -> Shown:
         """See `Feed`."""
         seen, beside = outlet.view(self._exchange), self._beside

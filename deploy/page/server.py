@@ -121,21 +121,32 @@ class Server:
 
         A browser draws one frame in `FRAME_S`: what would take the frame of an advice that is expected waits and goes with it.
         """
-        sent_s, before, advised, advised_s, apart_s = 0.0, None, None, 0.0, 0.0
+        sent_s = looked_s = advised_s = apart_s = 0.0
+        before = advised = None
         while True:
-            shown, now_s = self._feed.shown(), time.monotonic()
-            since_s = now_s - sent_s
-            facts = (shown.advice, shown.own, shown.q, shown.safety, shown.alive, shown.guiding, shown.recording.on, shown.targets)
-            number = shown.advice.number if shown.advice else None
+            now_s, number = time.monotonic(), self._feed.news()
             until_s = advised_s + apart_s - now_s
             expected = -POLL_S < until_s < FRAME_S
-            due = since_s >= HEARTBEAT_S or (facts != before and since_s >= 1.0 / self._page.rate_hz and not expected)
-            if number != advised:
-                apart_s, advised_s = now_s - advised_s, now_s
-            if due or number != advised:
-                sent_s, before, advised = now_s, facts, number
-                text = json.dumps({"number": self._state.number + 1, "shown": shown.plain()}, separators=(",", ":"))
-                await self._state.put((shown, text))
+            silent = now_s - sent_s >= HEARTBEAT_S
+            if number != advised or silent or (now_s - looked_s >= 1.0 / self._page.rate_hz and not expected):
+                looked_s, shown = now_s, self._feed.shown()
+                facts = (
+                    shown.advice,
+                    shown.own,
+                    shown.q,
+                    shown.safety,
+                    shown.alive,
+                    shown.guiding,
+                    shown.recording.on,
+                    shown.targets,
+                )
+                number = shown.advice.number if shown.advice else None
+                if number != advised:
+                    apart_s, advised_s = now_s - advised_s, now_s
+                if silent or facts != before:
+                    sent_s, before, advised = now_s, facts, number
+                    text = json.dumps({"number": self._state.number + 1, "shown": shown.plain()}, separators=(",", ":"))
+                    await self._state.put((shown, text))
             await asyncio.sleep(CLOSE_S if abs(until_s) < POLL_S else POLL_S)
 
     async def _watch_frames(self) -> None:

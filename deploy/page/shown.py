@@ -194,6 +194,10 @@ class Drawn:
 class Feed(Protocol):
     """Where the page gets its state from, and where wishes go. No method waits: the loop must never feel the page."""
 
+    def news(self) -> int | None:
+        """Returns the number of the newest advice, `None` where there is none: whether `shown` has a new one, at little cost."""
+        ...
+
     def shown(self) -> Shown:
         """Returns the newest state."""
         ...

@@ -99,6 +99,10 @@ class StudyFeed:
     def __init__(self, feed: Feed, conductor: Conductor) -> None:
         self._feed, self._conductor = feed, conductor
 
+    def news(self) -> int | None:
+        """See `Feed`."""
+        return self._feed.news() if self._conductor.shows_advice else None
+
     def shown(self) -> Shown:
         """See `Feed`."""
         shown = self._feed.shown()

@@ -144,8 +144,8 @@ def test_a_frame_is_shrunk_and_its_camera_with_it() -> None:
 
 
 def test_what_is_too_far_or_infinite_is_unknown() -> None:
-    units = cloud.differences(np.array([[np.inf, 70.0, -1.0, 0.5, np.nan]], np.float32)).cumsum(1, dtype=np.uint16)
-    assert units.tolist() == [[0, 0, 0, 500, 0]]
+    low, high = cloud.planes(np.array([[np.inf, 70.0, -1.0, 0.5, np.nan]], np.float32)).astype(int)
+    assert (low + 256 * high).tolist() == [[0, 0, 0, 1000, 999]], "0 mm, 0, 0, then 500 up and 500 down"
 
 
 def test_depth_and_colour_of_different_sizes_are_refused() -> None:

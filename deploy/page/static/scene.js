@@ -32,8 +32,12 @@ async function take(data, socket) {
   const length = new DataView(data).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
   const { width, height, depth_bytes } = header;
-  const depth = new Uint16Array(decompress(new Uint8Array(data, 4 + length, depth_bytes), new Uint8Array(2 * width * height)).buffer);
-  for (let row = 0; row < depth.length; row += width) for (let i = row + 1; i < row + width; i++) depth[i] += depth[i - 1];  // modulo 2^16
+  const count = width * height, depth = new Uint16Array(count);
+  const bytes = decompress(new Uint8Array(data, 4 + length, depth_bytes), new Uint8Array(2 * count));
+  for (let row = 0; row < count; row += width) for (let i = row, unit = 0; i < row + width; i++) {
+    const outwards = bytes[i] | bytes[count + i] << 8;
+    depth[i] = unit += (outwards >> 1) ^ -(outwards & 1);  // modulo 2^16
+  }
   const jpeg = new Blob([new Uint8Array(data, 4 + length + depth_bytes)], { type: "image/jpeg" });
   const picture = await createImageBitmap(jpeg);
   painter.cloud(header, depth, picture, setup.points);
