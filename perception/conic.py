@@ -35,18 +35,35 @@ def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     t = -np.linalg.solve(s3[known], s2[known].transpose(0, 2, 1))
     m = s1[known] + s2[known] @ t
     m = np.stack([m[:, 2] / 2, -m[:, 1], m[:, 0] / 2], 1)
-    vectors = np.real(np.linalg.eig(m)[1])
-    condition = 4 * vectors[:, 0] * vectors[:, 2] - vectors[:, 1] ** 2
-    best = np.argmax(condition, 1)
-    rows = np.arange(len(best))
-    a1 = vectors[rows, :, best]
+    a1 = _largest(m)
     a2 = np.einsum("cij,cj->ci", t, a1)
     fitted = ellipse_of(form_of_coefficients(np.concatenate([a1, a2], 1)))
-    fitted[condition[rows, best] <= 0] = np.nan
+    fitted[4 * a1[:, 0] * a1[:, 2] - a1[:, 1] ** 2 <= 0] = np.nan
     fitted[:, :4] *= scale[known][:, None]
     fitted[:, :2] += center[known]
     result[known] = fitted
     return result
+
+
+def _largest(m: np.ndarray) -> np.ndarray:
+    """Returns the eigenvectors to the largest eigenvalues of matrices `(C, 3, 3)` whose eigenvalues are real, `(C, 3)`.
+
+    Of a direct fit it is the only positive one, which belongs to the ellipse. By the cubic's roots: a thousand at once.
+    """
+    m = m / np.maximum(np.abs(m).max((1, 2), keepdims=True), 1e-300)
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    minors = sum(m[:, i, i] * m[:, j, j] - m[:, i, j] * m[:, j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
+    rows = [m[:, k] for k in range(3)]
+    det = (rows[0] * np.cross(rows[1], rows[2])).sum(1)
+    spread = np.sqrt(np.maximum(trace**2 - 3 * minors, 0.0)) / 3
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = np.clip(np.nan_to_num((2 * trace**3 - 9 * trace * minors + 27 * det) / (54 * spread**3)), -1.0, 1.0)
+        value = trace / 3 + 2 * spread * np.cos(np.arccos(cosine) / 3)
+        step = (((value - trace) * value + minors) * value - det) / (3 * value**2 - 2 * trace * value + minors)
+        value = value - np.where(np.abs(step) < 1e-6, step, 0.0)
+    rest = m - value[:, None, None] * np.eye(3)
+    normals = np.stack([np.cross(rest[:, i], rest[:, j]) for i, j in ((0, 1), (0, 2), (1, 2))], 1)
+    return normals[np.arange(len(m)), (normals**2).sum(2).argmax(1)]
 
 
 def form_of_coefficients(coefficients: np.ndarray) -> np.ndarray:
@@ -71,21 +88,21 @@ def form(ellipses: np.ndarray) -> np.ndarray:
 
 def ellipse_of(forms: np.ndarray) -> np.ndarray:
     """Returns the ellipses `(C, 5)` of forms `(C, 3, 3)`, rows of NaN where a form is no ellipse."""
-    inner, side, last = forms[:, :2, :2], forms[:, :2, 2], forms[:, 2, 2]
-    result = np.full((len(forms), 5), np.nan)
-    det = np.linalg.det(inner)
-    known: np.ndarray = np.isfinite(forms).all((1, 2)) & (det > 1e-15 * np.maximum(np.abs(inner).max((1, 2)), 1e-300) ** 2)
-    if not known.any():
-        return result
-    center = -np.linalg.solve(inner[known], side[known][..., None])[..., 0]
-    level = -(np.einsum("ci,ci->c", side[known], center) + last[known])
-    size = np.abs(level) > 1e-300
-    values, vectors = np.linalg.eigh(inner[known] / np.where(size, level, 1.0)[:, None, None])
-    axes = 1.0 / np.sqrt(np.where((values > 0) & size[:, None], values, np.nan))
-    major = vectors[:, :, 0]
-    theta = np.arctan2(major[:, 1], major[:, 0]) % np.pi
-    result[known] = np.where(np.isfinite(axes).all(axis=1, keepdims=True), np.column_stack([center, axes, theta]), np.nan)
-    return result
+    a, b, c = forms[:, 0, 0], forms[:, 0, 1], forms[:, 1, 1]
+    d, e, last = forms[:, 0, 2], forms[:, 1, 2], forms[:, 2, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        det = a * c - b * b
+        x, y = (b * e - c * d) / det, (b * d - a * e) / det
+        level = -(d * x + e * y + last)
+        mean, half, skew = (a + c) / 2 / level, (a - c) / 2 / level, b / level
+        apart = np.hypot(half, skew)
+        flat = mean - apart
+        flat = np.where(flat < 0.5 * mean, det / level**2 / (mean + apart), flat)  # their product, where they cancel
+        axes = 1.0 / np.sqrt(np.stack([flat, mean + apart], -1))
+        theta = np.arctan2(-skew, -half) / 2 % np.pi
+        result = np.column_stack([x, y, axes, theta])
+        known = (det > 1e-15 * np.maximum(np.abs(forms[:, :2, :2]).max((1, 2)), 1e-300) ** 2) & np.isfinite(result).all(1)
+    return np.where(known[:, None], result, np.nan)
 
 
 def distance(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:

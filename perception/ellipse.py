@@ -43,6 +43,7 @@ class ContourArcs:
             given: it shuts out most of what else they do, and rims are chipped.
         smallest_px: Least minor semi-axis.
         flattest: Least ratio of the semi-axes.
+        prior_flattest: The same where a size is given: what has a known size lies on a face that is seen.
     """
 
     sigma_px: float
@@ -71,6 +72,7 @@ class ContourArcs:
     prior_slack: float
     smallest_px: float
     flattest: float
+    prior_flattest: float
 
     def check(self) -> None:
         if not 0 < self.percentile < 100 or not 0 < self.low <= 1 or self.sigma_px <= 0:

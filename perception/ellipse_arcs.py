@@ -97,7 +97,9 @@ class ArcDetector:
         whole = set(map(tuple, spans.tolist()))
         parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int).reshape(-1, 2)
         groups = [arcs[group] for group in ellipse_groups.find(arcs, edges, (4, 3, 2))]
-        kinds = (spans[:, None], parts[:, None], _within(arcs, self.settings.arc_points)[:, None], *groups)
+        if limits.lowest_px == 0:
+            parts = np.concatenate([parts, _within(arcs, self.settings.arc_points)])
+        kinds = (spans[:, None], parts[:, None], *groups)
         seeds = np.concatenate([_seeds(some) for some in kinds])
         lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
         first = self.first(seeds, lengths, edges, limits)
@@ -129,7 +131,7 @@ class ArcDetector:
 
         The arcs that the seeds stand for have `lengths`, `(C,)` points, which must be a good part of the circumference.
         """
-        smallest = conic.perimeter(np.array(limits.lowest_px / 1.5), np.array(limits.lowest_px / 1.5 * self.settings.flattest))
+        smallest = conic.perimeter(np.array(limits.lowest_px / 1.5), np.array(limits.lowest_px / 1.5 * self._flattest(limits)))
         seeds, lengths = (some[lengths >= LEAST_ARC * smallest] for some in (seeds, lengths))
         if not len(seeds):
             return Candidates(np.empty((0, 5)), np.empty(0))
@@ -224,8 +226,11 @@ class ArcDetector:
                 (a * slack >= limits.lowest_px)
                 & (a <= limits.highest_px * slack)
                 & (b * slack >= self.settings.smallest_px)
-                & (b * slack >= a * self.settings.flattest)
+                & (b * slack >= a * self._flattest(limits))
             )
+
+    def _flattest(self, limits: SizePrior) -> float:
+        return self.settings.prior_flattest if limits.lowest_px > 0 else self.settings.flattest
 
     def _inside(self, ellipses: np.ndarray, edges: Edges) -> np.ndarray:
         """Says which centres lie in the picture."""
@@ -255,14 +260,11 @@ def _other_side(ellipse: np.ndarray, others: list[np.ndarray]) -> bool:
 
 
 def _within(arcs: np.ndarray, least: int) -> np.ndarray:
-    """Returns the first, the middle and the last of each arc as arcs of their own: its ends may belong to something else."""
+    """Returns first, middle and last piece of each arc, of `least` points or more: its ends may belong to something else."""
     start, length = arcs[:, 0], arcs[:, 1] - arcs[:, 0]
     part = np.maximum((PIECE * length).astype(int), least)
-    long = length > part + 2
-    start, length, part = start[long], length[long], part[long]
-    return np.concatenate(
-        [np.column_stack([start + shift, start + shift + part]) for shift in (0 * part, (length - part) // 2, length - part)]
-    )
+    start, part, left = (some[length > part + 2] for some in (start, part, length - part))
+    return np.concatenate([np.column_stack([start + shift, start + shift + part]) for shift in (0 * part, left // 2, left)])
 
 
 def _seeds(groups: np.ndarray) -> np.ndarray:

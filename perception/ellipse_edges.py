@@ -15,6 +15,8 @@ END_PX = 3.0
 """Of each arc: where it ends the edges of two things meet and are bent by the blur."""
 BLUNT_PX = 5.0
 """A side of a polygon shorter than this may be a corner that the blur has cut off."""
+LONG_PX, LONG = 25.0, 6.0
+"""A side longer than this, and so many times longer than the next, is a straight line that goes over into something else."""
 CLOSE = 4
 """Points from the ends of a closed line at which its directions are compared."""
 NO_SPANS = np.empty((0, 2), int)
@@ -143,9 +145,12 @@ def _pieces(edges: Edges, tolerance_px: float, corner_rad: float, least: int) ->
     cut_off &= np.abs(turn[1:] + turn[:-1]) > corner_rad + half[2:] + half[:-2]
     sharp[:-1] |= cut_off
     sharp[1:] |= cut_off
+    straight = (np.maximum(size[1:], size[:-1]) > LONG_PX) & (
+        np.maximum(size[1:], size[:-1]) > LONG * np.minimum(size[1:], size[:-1])
+    )
     back = np.concatenate([[False], (turn[1:] * turn[:-1] < 0) & inner[1:] & inner[:-1]])
     found = []
-    for cuts in ((sharp | back) & inner, sharp & inner):
+    for cuts in ((sharp | back | straight) & inner, (sharp | straight) & inner):
         cut = np.flatnonzero(cuts) + 1
         bounds = np.unique(np.concatenate([spans.ravel(), _places(fine, spans, corners[cut], owner[cut])]))
         pieces = np.column_stack([bounds[:-1], bounds[1:]])

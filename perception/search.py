@@ -72,12 +72,14 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
     if np.count_nonzero(known) < LEAST:
         return [Level(1, _full(_dilated(inside, 0.03 * inside.shape[1]), mask.shape), None)]
     size_px = np.divide(focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=known)
-    octave = np.floor(np.log2(np.maximum(size_px, 1e-3) / comfortable_px)).clip(0, OCTAVES - 1)
-    found = []
-    for number in range(OCTAVES):
-        here = known & (octave == number)
+    found, rest = [], known.copy()
+    for _ in range(OCTAVES):  # the resolution next that suits most of what is left, the coarser one of two alike
+        suited = [rest & _suited(size_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)]
+        number = max(range(OCTAVES), key=lambda octave: (np.count_nonzero(suited[octave]), octave))
+        here = suited[number]
         if np.count_nonzero(here) < LEAST:
-            continue
+            break
+        rest &= ~here
         reach = float(np.percentile(size_px[here], 98.0)) * (1.0 + slack) / STEP
         hidden = (_dilated(here, UNSEEN * reach) > 0) & ~np.isfinite(depth)
         count, pieces = cv2.connectedComponents(_dilated(here | hidden, reach))
@@ -99,6 +101,12 @@ def box(mask: np.ndarray, whole: Sequence[Level]) -> list[Level]:
     priors = [level.prior for level in whole if level.prior]
     prior = SizePrior(min(p.lowest_px for p in priors), max(p.highest_px for p in priors)) if priors else None
     return [Level(1, roi, prior)]
+
+
+def _suited(size_px: np.ndarray, comfortable_px: float, octave: int) -> np.ndarray:
+    """Says which sizes suit a resolution: from the least comfortable one to three times it, and what suits none beyond."""
+    low = comfortable_px if octave else 0.0
+    return (size_px >= low) & ((size_px < 3.0 * comfortable_px) | (octave == OCTAVES - 1))
 
 
 def _dilated(small: np.ndarray, reach: float) -> np.ndarray:
