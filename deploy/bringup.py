@@ -82,7 +82,7 @@ class Bringup(Listener):
             say: Tells the operator what to do, and what was found.
 
         Raises:
-            LinkError: nothing is heard at all.
+            LinkError: nothing is heard at all, or one of the processes has died.
             CheckpointError: the policy cannot be used on this machine.
         """
         self.refuse(machine)
@@ -92,7 +92,7 @@ class Bringup(Listener):
             self.listen(children, machine, target_s=math.inf, pitch_rad=None)
             capture = Capture(session.folder, self.dbc, machine, {"source": "bring-up"}, pictures_hz=0.0)
             children.start("log", "deploy.recorder.capture:run", (capture,))
-            findings = _Checks(self, machine, exchange, say).all()
+            findings = _Checks(self, machine, children, say).all()
         finally:
             children.end()
             exchange.close()
@@ -120,13 +120,16 @@ class Bringup(Listener):
 class _Checks:
     """The checks that go by the machine's state."""
 
-    def __init__(self, bringup: Bringup, machine: Machine, exchange: Exchange, say: Callable[[str], None]) -> None:
-        self._bringup, self._machine, self._exchange, self._say = bringup, machine, exchange, say
+    def __init__(self, bringup: Bringup, machine: Machine, children: Children, say: Callable[[str], None]) -> None:
+        self._bringup, self._machine, self._children, self._say = bringup, machine, children, say
+        self._exchange = children.exchange
         self._samples: list[tuple[float, np.ndarray, np.ndarray]] = []
 
     def all(self) -> list[Finding]:
         """Runs them."""
-        self._until(lambda state: float(state["q_t_s"]) > 0, self._bringup.patience_s, "joint positions")
+        self._say("listening for the machine")
+        if self._until(lambda state: float(state["q_t_s"]) > 0) is None:
+            raise LinkError(f"no joint positions within {self._bringup.patience_s:g} s; is the machine on, and the bus connected?")
         return [
             self._positions(),
             self._seen("dead-man", "deadman", "press the dead-man, then release it"),
@@ -150,11 +153,11 @@ class _Checks:
 
     def _seen(self, check: str, field: str, request: str) -> Finding:
         self._say(request)
-        try:
-            pressed_s = self._until(lambda state: bool(state[field]), self._bringup.patience_s, request)
-            released_s = self._until(lambda state: not state[field], self._bringup.patience_s, request)
-        except LinkError as error:
-            return Finding(check, False, str(error), {})
+        pressed_s = self._until(lambda state: bool(state[field]))
+        released_s = None if pressed_s is None else self._until(lambda state: not state[field])
+        if pressed_s is None or released_s is None:
+            what = "pressed" if pressed_s is None else "released"
+            return Finding(check, False, f"not seen to be {what} within {self._bringup.patience_s:g} s", {})
         return Finding(check, True, "pressed and released", {"held_s": released_s - pressed_s})
 
     def _joints(self) -> Finding:
@@ -201,16 +204,19 @@ class _Checks:
     def _watch(self, seconds: float) -> None:
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
+            self._children.check()
             state = self._exchange.state.read()
             if state is not None and (not self._samples or float(state["t_s"]) > self._samples[-1][0]):
                 self._samples.append((float(state["t_s"]), np.array(state["q"]), np.array(state["flow"])))
             time.sleep(POLL_S)
 
-    def _until(self, holds: Callable[[Any], bool], patience_s: float, what: str) -> float:
-        end_s = time.monotonic() + patience_s
+    def _until(self, holds: Callable[[Any], bool]) -> float | None:
+        """Returns when the state first `holds`; `None` if it does not in all of the operator's time."""
+        end_s = time.monotonic() + self._bringup.patience_s
         while time.monotonic() < end_s:
+            self._children.check()
             state = self._exchange.state.read()
             if state is not None and holds(state):
                 return time.monotonic()
             time.sleep(POLL_S)
-        raise LinkError(f"nothing seen within {patience_s:g} s: {what}")
+        return None

@@ -78,7 +78,7 @@ class Wire:
         except (can.CanError, OSError, ValueError, ImportError) as error:
             raise LinkError(
                 f"bus.interface={self.interface} bus.channel={self.channel}: cannot be opened ({error}). `ip link` shows the CAN "
-                "interfaces of this computer; bus=udp needs none."
+                "interfaces of this computer; bus=udp needs none"
             ) from error
         return OpenWire(bus)
 
