@@ -20,6 +20,9 @@ UNTOLD, UNTOLD_SCORE = 0.8, 0.5
 """Part of an inside without depth, hidden from the right camera, from which on nobody can tell it from a flat disc; the score of
 what nobody can, for dust or for this."""
 
+BESIDE = (1.15, 1.45)
+"""Radii of an ellipse at which what stands before the rest of a rim is seen."""
+
 
 @spec
 class Looks:
@@ -196,8 +199,7 @@ class PlaneConicEstimator:
         if not np.isfinite(axes).all():
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
-        hidden = hidden_part(face, row * [1.0, 1.0, *[1.0 + s.radius_tolerance] * 2, 1.0], frame)
-        seen = max(1.0 - hidden, s.coverage)  # the less of a rim there is, the less it tells
+        seen = max(1.0 - hidden_part(face, row, frame), s.coverage)  # the less of a rim there is, the less it tells
         tolerance = s.radius_tolerance / seen * s.radius_m
         if abs(radius - s.radius_m) > tolerance:
             limit = s.radius_m + np.sign(radius - s.radius_m) * tolerance
@@ -244,14 +246,20 @@ def covariance(face: Plane, circle: Circle, bias_per_m: float) -> np.ndarray:
 
 
 def hidden_part(face: Plane, row: np.ndarray, frame: Frame) -> float:
-    """Returns the part of an ellipse `(5,)` on a face before which something nearer stands."""
-    points = conic.sample(row[None], np.linspace(0.0, 2 * np.pi, 72, endpoint=False))[0][0]
-    column, line = np.rint(points).astype(int).T
+    """Returns the part of a rim on a face, about where an ellipse `(5,)` is, before which something nearer stands.
+
+    It may be smaller than the rim; and where the nearer thing begins, its depth is often unknown.
+    """
     height, width = frame.depth_m.shape
-    on = (column >= 0) & (column < width) & (line >= 0) & (line < height)
-    rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
-    nearer = 1.0 / frame.depth_m[line[on], column[on]] - rays[on] @ face.m > 4 * face.sigma  # false where depth is unknown
-    return float(nearer.sum() / len(points))
+    nearer = np.zeros(72, bool)
+    for scale in BESIDE:
+        points = conic.sample((row * [1.0, 1.0, scale, scale, 1.0])[None], np.linspace(0.0, 2 * np.pi, 72, endpoint=False))[0][0]
+        column, line = np.rint(points).astype(int).T
+        on = (column >= 0) & (column < width) & (line >= 0) & (line < height)
+        depth = frame.depth_m[line.clip(0, height - 1), column.clip(0, width - 1)]
+        rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
+        nearer |= on & (1.0 / depth - rays @ face.m > 4 * face.sigma)  # false where depth is unknown
+    return float(nearer.mean())
 
 
 def vector(ellipse: Ellipse) -> np.ndarray:

@@ -161,12 +161,12 @@ class _Training:
 
     def _views(self) -> tuple[Views, Views]:
         settings, seed = self._settings, self._session.stream("views")
-        stems = training_data.frames(_several(settings.frames))
+        stems = training_data.frames(settings.frames)
         if settings.validation is None:
             last = max(1, len(stems) // settings.hold_out)
             stems, unseen = stems[:-last], stems[-last:]
         else:
-            unseen = training_data.frames(_several(settings.validation))
+            unseen = training_data.frames(settings.validation)
             if shared := {path.resolve() for path in stems} & {path.resolve() for path in unseen}:
                 raise ConfigError(f"training.validation: {min(shared)} is also among training.frames; judge by other frames")
         if not stems:
@@ -298,7 +298,3 @@ class _Training:
         self._optimizer.load_state_dict(state["optimizer"])
         self._update, self._best, self._curve, self._seconds = (state[key] for key in ("update", "best", "curve", "seconds"))
         self._best_tensors = {name: value.cpu() for name, value in state["best_tensors"].items()}
-
-
-def _several(folders: str | tuple[str, ...]) -> tuple[str, ...]:
-    return (folders,) if isinstance(folders, str) else folders

@@ -157,14 +157,14 @@ def cut(layers: torch.Tensor, windows: torch.Tensor, size_px: tuple[int, int]) -
     return functional.avg_pool2d(seen, FINER)
 
 
-def frames(folders: Sequence[str]) -> list[Path]:
-    """Returns the frames with a mask in some folders and those below them, as paths without endings, sorted.
+def frames(folders: str | Sequence[str]) -> list[Path]:
+    """Returns the frames with a mask in a folder, or in some, and those below them, as paths without endings, sorted.
 
     Raises:
         FrameError: a folder holds none.
     """
     stems: list[Path] = []
-    for folder in folders:
+    for folder in (folders,) if isinstance(folders, str) else folders:
         here = sorted(Path(folder).rglob(f"*{dataset.MASK}"))
         here = [path.with_name(path.name.removesuffix(dataset.MASK)) for path in here if not path.name.startswith(".")]
         if not here:
