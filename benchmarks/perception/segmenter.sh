@@ -2,7 +2,7 @@
 # Makes the segmenter that ships: renders pictures on all cores, trains on a GPU, exports, judges on scenes it has not seen.
 #   OUT=<folder> [CORES=16 RENDER_S=200 TRAIN_S=250 GPU=0 START=<network to go on from> SEED=<of the scenes>] bash benchmarks/perception/segmenter.sh
 # Leaves in $OUT: segmenter.{safetensors,onnx} (for perception/weights), training.json, masks.json, curve.png, samples.png, log.
-# To try it: CORES=2 RENDER_S=60 TRAIN_S=60 SMALL=1 GPU= ; pictures lie in $TMPDIR meanwhile, some 0.3 MB each.
+# To try it: CORES=1 RENDER_S=90 TRAIN_S=40 SMALL=1 GPU= ; pictures lie in $TMPDIR meanwhile, some 0.3 MB each.
 set -u
 CORES=${CORES:-$(nproc)} RENDER_S=${RENDER_S:-600} TRAIN_S=${TRAIN_S:-600} GPU=${GPU-0} SMALL=${SMALL:-}
 START=${START:-null} SEED=${SEED:-1000}
