@@ -50,20 +50,27 @@ def _largest(m: np.ndarray) -> np.ndarray:
 
     Of a direct fit it is the only positive one, which belongs to the ellipse. By the cubic's roots: a thousand at once.
     """
-    m = m / np.maximum(np.abs(m).max((1, 2), keepdims=True), 1e-300)
-    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    minors = sum(m[:, i, i] * m[:, j, j] - m[:, i, j] * m[:, j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
-    rows = [m[:, k] for k in range(3)]
-    det = (rows[0] * np.cross(rows[1], rows[2])).sum(1)
+    m = np.ascontiguousarray((m / np.maximum(np.abs(m).max((1, 2), keepdims=True), 1e-300)).transpose(1, 2, 0))
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    minors = sum(m[i, i] * m[j, j] - m[i, j] * m[j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
+    det = (m[0] * _cross(m[1], m[2])).sum(0)
     spread = np.sqrt(np.maximum(trace**2 - 3 * minors, 0.0)) / 3
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = np.clip(np.nan_to_num((2 * trace**3 - 9 * trace * minors + 27 * det) / (54 * spread**3)), -1.0, 1.0)
         value = trace / 3 + 2 * spread * np.cos(np.arccos(cosine) / 3)
         step = (((value - trace) * value + minors) * value - det) / (3 * value**2 - 2 * trace * value + minors)
         value = value - np.where(np.abs(step) < 1e-6, step, 0.0)
-    rest = m - value[:, None, None] * np.eye(3)
-    normals = np.stack([np.cross(rest[:, i], rest[:, j]) for i, j in ((0, 1), (0, 2), (1, 2))], 1)
-    return normals[np.arange(len(m)), (normals**2).sum(2).argmax(1)]
+    m[[0, 1, 2], [0, 1, 2]] -= value
+    normals = np.stack([_cross(m[0], m[1]), _cross(m[0], m[2]), _cross(m[1], m[2])])
+    best = (normals**2).sum(1).argmax(0)
+    return normals[best, :, np.arange(len(best))]
+
+
+def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Returns the cross products of vectors `(3, C)`."""
+    return np.stack(
+        [one[1] * other[2] - one[2] * other[1], one[2] * other[0] - one[0] * other[2], one[0] * other[1] - one[1] * other[0]]
+    )
 
 
 def form_of_coefficients(coefficients: np.ndarray) -> np.ndarray:

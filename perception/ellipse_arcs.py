@@ -16,7 +16,7 @@ from perception.ellipse_support import ANGLES, NUM_SAMPLES, Candidates
 if TYPE_CHECKING:
     from perception.ellipse import ContourArcs
 
-NUM_SEEDS = 40
+NUM_SEEDS = 28
 """Points that stand for an arc in its first fit."""
 NOTHING = np.empty((0, 5))
 PART = 0.6
@@ -164,7 +164,7 @@ class ArcDetector:
             robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / 0.05) ** 2) ** 2
             weights = np.where(support >= 0, robust / np.maximum(slope, 1e-3) ** 2, 0.0)
             ellipses = conic.fit(edges.points[support], weights)
-            keep = np.isfinite(ellipses).all(1)
+            keep = np.isfinite(ellipses).all(1) & ((support >= 0).mean(1) >= LEAST_ARC)
             candidates = Candidates(ellipses[keep], candidates.polarity[keep])
         return candidates
 

@@ -15,6 +15,8 @@ END_PX = 3.0
 """Of each arc: where it ends the edges of two things meet and are bent by the blur."""
 BLUNT_PX = 5.0
 """A side of a polygon shorter than this may be a corner that the blur has cut off."""
+WEAK = 2.5
+"""Standard deviations of noise below which an edge does not go on: chains of noise alone would."""
 LONG_PX, LONG = 25.0, 6.0
 """A side longer than this, and so many times longer than the next, is a straight line that goes over into something else."""
 CLOSE = 4
@@ -97,9 +99,11 @@ def find(
     if not looked.size:
         return _none(gray.shape)
     median, upper = np.percentile(looked, (50.0, percentile))
-    upper = max(float(upper), noise * float(median) / 1.18, 1.0)  # the median of a Rayleigh distribution is 1.18 sigma
+    sigma = float(median) / 1.18  # of a Rayleigh distribution
+    upper = max(float(upper), noise * sigma, 1.0)
+    weak = max(low * upper, WEAK * sigma)
     whole = [cv2.addWeighted(g, SCALE, g, 0.0, 0.0, dtype=cv2.CV_16S) for g in (gx, gy)]
-    canny = cv2.Canny(whole[0], whole[1], low * upper * SCALE, upper * SCALE, L2gradient=True)
+    canny = cv2.Canny(whole[0], whole[1], weak * SCALE, max(upper, weak) * SCALE, L2gradient=True)
     if roi is not None:
         canny = cv2.bitwise_and(canny, canny, mask=roi.view(np.uint8))
     canny[[0, -1]] = canny[:, [0, -1]] = 0

@@ -182,12 +182,10 @@ def _followed(edges: Edges, start: np.ndarray, onward: np.ndarray, reach_px: np.
 
 def gap(there: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Returns the longest stretch without support as a part of the circumference, `(C,)`."""
-    run, longest = np.zeros(len(there)), np.zeros(len(there))
-    for k in range(2 * there.shape[1]):  # twice around: a stretch may run over the end
-        column = k % there.shape[1]
-        run = np.where(there[:, column], 0.0, run + length[:, column])
-        longest = np.maximum(longest, run)
-    return np.minimum(longest / length.sum(1), 1.0)
+    twice = np.concatenate([there, there], 1)  # around twice: a stretch may run over the end
+    way = np.cumsum(np.concatenate([length, length], 1), 1)
+    seen = np.maximum.accumulate(np.where(twice, way, 0.0), 1)
+    return np.minimum((way - seen).max(1, initial=0.0) / length.sum(1), 1.0)
 
 
 def typical(values: np.ndarray, there: np.ndarray) -> np.ndarray:

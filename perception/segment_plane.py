@@ -159,13 +159,16 @@ class PlaneSegmenter:
         support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=4)
         large = [label for label in range(1, count) if stats[label, cv2.CC_STAT_AREA] >= settings.min_area * support.size]
-        nearer = known & (excess > self._tolerance)
+        nearer = (known & (excess > self._tolerance)).astype(np.uint8)
+        nearer = np.asarray(cv2.morphologyEx(nearer, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
         pieces = [_filled((labels == label).astype(np.uint8), nearer) for label in large]
+        pieces = [piece for piece in pieces if piece[::2, ::2].any()]
         faces = np.zeros_like(support)
         # ground or wall? so are the pieces of it that something before them cuts off; of a face that may hide all surroundings
-        wide = any(_extents(piece, plane, grid).prod() > settings.max_extent_m**2 for piece in pieces)
-        for piece in pieces:
-            if self._fits(piece, plane, grid) and (not wide or self._front(piece, excess, known) >= settings.min_front):
+        extents_m = [_extents(piece, plane, grid) for piece in pieces]
+        wide = any(extent.prod() > settings.max_extent_m**2 for extent in extents_m)
+        for piece, extent in zip(pieces, extents_m, strict=True):
+            if self._fits(piece, extent, plane, grid) and (not wide or self._front(piece, excess, known) >= settings.min_front):
                 faces |= piece
         # an arm before a face cuts it in pieces, of which the smaller ones have little but the arm around them
         for piece in pieces if faces.any() else ():
@@ -173,20 +176,15 @@ class PlaneSegmenter:
                 faces |= piece
         return faces
 
-    def _fits(self, piece: np.ndarray, plane: np.ndarray, grid: np.ndarray) -> bool:
+    def _fits(self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, grid: np.ndarray) -> bool:
         """Says whether a piece of a plane has the size of a face and looks at the camera."""
         settings = self._settings
-        rows, columns = np.nonzero(piece)
-        if not len(rows):
+        if extents_m.min() < settings.min_extent_m or extents_m.max() > settings.max_extent_m:
             return False
+        rows, columns = np.nonzero(piece)
         sight = grid[round(float(rows.mean())), round(float(columns.mean()))]
         tilt_rad = np.arccos(np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0))
-        extents_m = _extents(piece, plane, grid)
-        return bool(
-            tilt_rad <= settings.max_tilt_rad
-            and extents_m.min() >= settings.min_extent_m
-            and extents_m.max() <= settings.max_extent_m
-        )
+        return bool(tilt_rad <= settings.max_tilt_rad)
 
     def _front(self, piece: np.ndarray, excess: np.ndarray, known: np.ndarray) -> float:
         """Returns which part of what surrounds a piece lies behind its plane, a half where nothing speaks for either side."""
@@ -240,8 +238,7 @@ def _filled(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
     """Fills a piece's holes (a mouth, lost depth), except where something stands in front of it."""
     outlines, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     whole = cv2.drawContours(np.zeros_like(piece), outlines, -1, 1, cv2.FILLED)
-    hidden = cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    return np.where(np.asarray(hidden) > 0, 0, whole).astype(np.uint8)
+    return np.where(nearer > 0, np.uint8(0), np.asarray(whole, np.uint8))
 
 
 def _extents(piece: np.ndarray, plane: np.ndarray, grid: np.ndarray) -> np.ndarray:
