@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from brokk_rl.sight import Ellipse, SizePrior
@@ -61,13 +62,8 @@ class ArcDetector:
     def detect(self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None) -> list[Ellipse]:
         """Returns ellipses, the best first; see `EllipseDetector`."""
         s = self.settings
-        if roi is not None:
-            rows, columns = (np.flatnonzero(roi.any(k)) for k in (1, 0))
-            if not len(rows):
-                return []
-            top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
-        else:
-            top, bottom, left, right = 0, gray.shape[0], 0, gray.shape[1]
+        left, top, width, height = (0, 0, *gray.shape[::-1]) if roi is None else cv2.boundingRect(roi.view(np.uint8))
+        bottom, right = top + height, left + width
         part = gray[top:bottom, left:right]
         if min(part.shape) < 8:
             return []
@@ -158,7 +154,7 @@ class ArcDetector:
             if not len(candidates.ellipses):
                 break
             e = candidates.ellipses
-            support, off, along = self._gather(candidates, edges, ANGLES[:: 1 if scale_px == rounds_px[-1] else 2])
+            support, off, along = self._gather(candidates, edges, ANGLES[:: 1 if scale_px == ROUNDS_PX[-1] else 2])
             size = np.sqrt(e[:, 2] * e[:, 3])
             slope = conic.slopes(e, edges.points[support]) * size[:, None]
             robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / 0.05) ** 2) ** 2

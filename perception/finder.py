@@ -108,7 +108,7 @@ class Finder:
         with _timed(ms, "segment"):
             masks = self._segmenter.segment(frame)
         roi = masks.block > s.block_probability
-        share = float(roi.mean())
+        share = cv2.countNonZero(roi.view(np.uint8)) / roi.size
         if share < s.smallest_block:
             return Sighting([], [Rejection("segment", "part of the picture that is block", share, s.smallest_block)], [], masks, ms)
         with _timed(ms, "ellipse"):

@@ -39,9 +39,9 @@ class Level:
         """Returns the ellipses of this level, in px of the picture `(h, w)`."""
         if self.shrink == 1:
             return detector.detect(gray, self.roi, self.prior)
-        rows, columns = (np.flatnonzero(self.roi.any(k)) for k in (1, 0))
-        top, left = (int(places[0]) // self.shrink * self.shrink for places in (rows, columns))
-        height, width = ((int(places[-1]) + 1 - start) // self.shrink for places, start in ((rows, top), (columns, left)))
+        x, y, wide, high = cv2.boundingRect(self.roi.view(np.uint8))
+        top, left = (start // self.shrink * self.shrink for start in (y, x))
+        height, width = (y + high - top) // self.shrink, (x + wide - left) // self.shrink
         if min(height, width) < 1:
             return []
         part = np.s_[top : top + height * self.shrink, left : left + width * self.shrink]
@@ -115,7 +115,7 @@ def _dilated(small: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _full(small: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    return cv2.resize(small, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    return np.asarray(cv2.resize(np.minimum(small, 1), shape[::-1], interpolation=cv2.INTER_NEAREST)).view(bool)
 
 
 def _enlarged(one: Ellipse, factor: int, left: int, top: int) -> Ellipse:
