@@ -1,8 +1,8 @@
 """A long run of the loop against the twin: lateness, memory, lost records. python benchmarks/deploy/soak.py <folder> <seconds>.
 
 A simulated person follows the advice, and the borehole is another one every 20 s, so that the machine moves all the time. Writes
-`<folder>/soak.json`: lateness of bus and policy, each process's own and shared memory every five minutes, the load, records that the log
-had to drop, and messages in the capture against those that were sent.
+`<folder>/soak.json`: lateness of bus and policy, each process's own and shared memory every five minutes, the load, records that
+the log had to drop, and messages in the capture against those that were sent.
 """
 
 from __future__ import annotations
