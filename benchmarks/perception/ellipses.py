@@ -1,4 +1,4 @@
-"""The table of ellipses: synthetic calibration patterns under every condition, photographs' styles, and pictures without any.
+"""The table of ellipses: calibration patterns under every condition, photographs' styles, hidden ellipses, pictures without any.
 
     python benchmarks/perception/ellipses.py <out> --count 10 contour_arcs edge_drawing
 
@@ -22,6 +22,8 @@ from rich.progress import track
 from rich.table import Table
 
 from brokk_rl.sight import EllipseDetector
+from perception.bench_hidden import SHAPES, hidden, shapes
+from perception.bench_hidden import STYLES as HIDDEN
 from perception.bench_patterns import CONDITIONS, NEGATIVES, matches, negative, pattern
 from perception.bench_photographs import STYLES, photograph
 
@@ -57,8 +59,12 @@ def kinds() -> Iterator[tuple[str, Callable[[np.random.Generator], tuple[np.ndar
         yield f"pattern, {condition}", lambda generator, condition=condition: pattern(generator, condition)
     for style in STYLES:
         yield f"photograph, {style}", lambda generator, style=style: photograph(generator, style)
+    for style in HIDDEN:
+        yield f"hidden, {style}", lambda generator, style=style: hidden(generator, style)
     for kind in NEGATIVES:
         yield f"nothing, {kind}", lambda generator, kind=kind: (negative(kind, generator), NONE)
+    for kind in SHAPES:
+        yield f"nothing, {kind}", lambda generator, kind=kind: (shapes(generator, kind), NONE)
 
 
 def build(option: str) -> EllipseDetector:

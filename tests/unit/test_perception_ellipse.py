@@ -12,7 +12,7 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.sight import Ellipse, SizePrior
-from perception import bench_patterns, bench_photographs, conic, ellipse_drawing
+from perception import bench_hidden, bench_patterns, bench_photographs, conic, ellipse_drawing
 
 K = np.array([[1056.0, 0.0, 959.5], [0.0, 1056.0, 539.5], [0.0, 0.0, 1.0]])
 
@@ -89,6 +89,21 @@ def test_coloured_photographs_are_searched_as_well(style: str, detector) -> None
 @pytest.mark.parametrize("kind", ["noise", "spiral", "squares", "octagons", "hearts"])
 def test_nothing_is_found_where_nothing_is(kind: str, detector) -> None:
     assert not detector.detect(bench_patterns.negative(kind, np.random.default_rng(0)), None, None)
+
+
+@pytest.mark.parametrize("kind", ["hearts of arcs", "spirals", "polygons", "salt"])
+def test_shapes_like_parts_of_ellipses_are_none(kind: str, detector) -> None:
+    assert not detector.detect(bench_hidden.shapes(np.random.default_rng(3), kind), None, None)
+
+
+@pytest.mark.parametrize("style", ["behind", "halves", "covered"])
+def test_ellipses_of_which_half_is_seen_are_found(style: str, detector) -> None:
+    hits = found = there = 0
+    for seed in range(3):
+        picture, truth = bench_hidden.hidden(np.random.default_rng(seed), style)
+        seen = detector.detect(picture, None, None)
+        hits, found, there = hits + bench_patterns.matches(seen, truth), found + len(seen), there + len(truth)
+    assert there >= 20 and 2 * hits / (found + there) > 0.78
 
 
 def test_a_line_is_one_ellipse_and_a_ring_two(detector) -> None:
