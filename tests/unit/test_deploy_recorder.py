@@ -145,7 +145,9 @@ def test_recover_and_convert_are_commands(brokk: Callable[..., Any], machine: Ma
     write(tmp_path / "run", machine, seconds=6.5)
     content = (tmp_path / "run" / MCAP).read_bytes()
     (tmp_path / "run" / MCAP).write_bytes(content[:-200])
+    (tmp_path / "run/timing.json").write_text("{}")
     assert brokk("mode=recover", "recover.input=run/*", "session.out=whole").code == 0
+    assert brokk("mode=recover", "recover.input=run/*.json", "session.out=x").code == 2
     assert {path.name for path in (tmp_path / "whole").iterdir()} >= {"run_capture.mcap", "run_frames.blf"}
     done = brokk("mode=convert", "import=capture", "convert.input=whole/*.mcap", "session.out=made")
     assert done.code == 0 and len(record.read_all("made/recordings/*.parquet", machine)) == 1
