@@ -189,7 +189,7 @@ class ArcDetector:
         angle_limit = slack * (s.angle_rms_rad * seen**1.5 + s.angle_rms_small / size * seen)
         good = (coverage >= s.coverage) & (spread <= rms_limit) & (rms <= TAIL * rms_limit) & (angle <= angle_limit)
         wave_px, wave_rad = ellipse_support.waves(candidates, edges, support, off)
-        form = np.hypot(wave_px / s.wave_px, wave_rad / (s.wave_rad + s.wave_small / size))
+        form = np.hypot(wave_px / (s.wave_px + s.rms_relative * size * whole), wave_rad / (s.wave_rad + s.wave_small / size))
         good &= form <= slack * (1 + whole)
         good &= ellipse_support.evidence(coverage, angle, conic.perimeter(e[:, 2], e[:, 3]), s.angle_rad) >= s.evidence
         candidates, support, length = candidates[good], support[good], length[good]
