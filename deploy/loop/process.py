@@ -140,7 +140,7 @@ class Pace:
         next_s: The coming deadline.
         cycles: Deadlines kept.
         missed: Deadlines that were over before their turn.
-        lateness_s: How late each kept cycle began, the last `KEPT` of them.
+        lateness_s: How late cycles began, the last `KEPT` of them, in a ring.
     """
 
     KEPT = 100_000
@@ -148,17 +148,14 @@ class Pace:
     def __init__(self, period_s: float) -> None:
         self.period_s, self.next_s = period_s, time.monotonic() + period_s
         self.cycles, self.missed = 0, 0
-        self.lateness_s = array("d")  # numbers, not objects: memory that grows for a quarter of an hour looks like a leak
+        self.lateness_s = array("d", bytes(8 * self.KEPT))  # all at once: memory that grows for an hour looks like a leak
 
     def begin(self) -> int:
         """Marks that the cycle of `next_s` begins now, and moves on; returns the number of deadlines missed before it."""
         now_s = time.monotonic()
         skipped = int((now_s - self.next_s) // self.period_s) if now_s > self.next_s else 0
         late_s = now_s - self.next_s - skipped * self.period_s
-        if len(self.lateness_s) < self.KEPT:
-            self.lateness_s.append(now_s - self.next_s)
-        else:
-            self.lateness_s[self.cycles % self.KEPT] = now_s - self.next_s
+        self.lateness_s[self.cycles % self.KEPT] = now_s - self.next_s
         self.cycles += 1
         self.missed += skipped
         self.next_s = now_s - late_s + self.period_s
@@ -170,7 +167,7 @@ class Pace:
 
     def report(self) -> dict[str, float]:
         """Returns cycles, missed deadlines and lateness as plain data."""
-        ordered = sorted(self.lateness_s) or [0.0]
+        ordered = sorted(self.lateness_s[: self.cycles]) or [0.0]
 
         def quantile(part: float) -> float:
             return ordered[min(len(ordered) - 1, int(part * len(ordered)))]
