@@ -1,4 +1,4 @@
-"""From the command to an open bus and the first advice: [chrt -r 1] python benchmarks/deploy/start.py <file> <trials>.
+"""From the command to an open bus and the first cycle of the policy: [chrt -r 1] python benchmarks/deploy/start.py <file> <trials>.
 
 `brokk preset=machine` on a bus of datagrams, as nothing else is here. Wall time from the command on, and what each process computed
 until the bus was open. With `chrt -r 1` as on a computer that has nothing else to do. The first trial is not counted: modules are
@@ -51,13 +51,8 @@ def trial(folder: Path) -> dict[str, Any]:
     run.send_signal(signal.SIGINT)
     run.stderr.read()
     run.wait(PATIENCE_S)
-    advice_s = reading.read(folder / "capture.mcap").messages["advice"][0][0] - begun_s
-    return {
-        "bus_open_s": round(open_s, 3),
-        "first_advice_s": round(advice_s, 3),
-        "computed_s": computed,
-        "load": os.getloadavg()[0],
-    }
+    cycle_s = reading.read(folder / "capture.mcap").messages["advice"][0][0] - begun_s
+    return {"bus_open_s": round(open_s, 3), "policy_cycle_s": round(cycle_s, 3), "computed_s": computed, "load": os.getloadavg()[0]}
 
 
 def main(file: Path, trials: int) -> None:
@@ -71,7 +66,7 @@ def main(file: Path, trials: int) -> None:
     ahead = os.sched_getscheduler(0) != os.SCHED_OTHER
     summary = {
         key: {"median": statistics.median(one[key] for one in found), "worst": max(one[key] for one in found)}
-        for key in ("bus_open_s", "first_advice_s")
+        for key in ("bus_open_s", "policy_cycle_s")
     }
     file.write_text(
         json.dumps(
