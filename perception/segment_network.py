@@ -1,6 +1,7 @@
 """The block and the mouths of its holes by a network: in onnxruntime as shipped, or in torch as trained.
 
-The network looks twice: at the whole picture for the block, then at the block alone, where a mouth has several times the pixels.
+The network looks twice: at the whole picture for the block, then at the block alone, where a mouth has several times the pixels;
+once more if more of the block came to light then, and at parts of the picture where it saw none in the whole.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from brokk_rl.session import Session
 from brokk_rl.sight import Masks
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception.segment_window import around, block_box, whole
+from perception.segment_window import Window, around, block_box, halves, whole
 
 SHIPPED = Path(__file__).parent / "weights"
 """Folder of the networks that come with the package."""
@@ -26,6 +27,8 @@ PREFIX = "brokk."
 THRESHOLD = 0.5
 SMALLEST_PIECE = 0.2
 """Of the pieces of a block that something hides in part, those below this share of the largest do not move the second look."""
+CLOSER_LOOKS, STAYS = 2, 0.1
+"""Looks at the block alone, at most; and by how much of its size its box changes if there is to be another one."""
 
 Infer = Callable[[np.ndarray], np.ndarray]
 """From a picture `(3, h, w)` float32 in [0, 1] to the probabilities of block and mouth, `(2, h, w)`."""
@@ -121,21 +124,34 @@ class NetworkSegmenter:
 
     def segment(self, frame: Frame) -> Masks:
         """Returns both masks."""
-        shape = frame.color.shape[:2]
-        block, mouth = (np.zeros(shape, np.float32) for _ in range(2))
-        window = whole(shape, self._size_px)
+        window = whole(frame.color.shape, self._size_px)
+        block, mouth = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
+        self._look(frame, window, block, mouth)
+        if self._margin is None:
+            return Masks(block, mouth)
+        box = block_box(block, THRESHOLD, SMALLEST_PIECE)
+        if box is None:
+            part = np.zeros_like(block)
+            for half in halves(block.shape, self._size_px):
+                self._look(frame, half, part, np.zeros_like(part))
+                np.maximum(block, part, out=block)
+            box = block_box(block, THRESHOLD, SMALLEST_PIECE)
+        for _ in range(CLOSER_LOOKS):
+            closer = window if box is None else around(box, self._size_px, self._margin)
+            if box is None or closer.width >= window.width:
+                break
+            mouth[:] = 0.0
+            self._look(frame, closer, block, mouth)
+            before, box = box, block_box(block, THRESHOLD, SMALLEST_PIECE)
+            if box is not None and np.abs(np.subtract(box, before)).max() < STAYS * max(before[2:]):
+                break
+        return Masks(block, mouth)
+
+    def _look(self, frame: Frame, window: Window, block: np.ndarray, mouth: np.ndarray) -> None:
+        """Writes what the network says of a window where it belongs in both masks."""
         seen = self._infer(as_input(window.take(frame.color, self._size_px)))
         window.put(seen[0], block)
         window.put(seen[1], mouth)
-        box = block_box(block, THRESHOLD, SMALLEST_PIECE) if self._margin is not None else None
-        if box is not None and self._margin is not None:
-            closer = around(box, self._size_px, self._margin)
-            if closer.width < window.width:
-                seen = self._infer(as_input(closer.take(frame.color, self._size_px)))
-                mouth[:] = 0.0
-                closer.put(seen[0], block)
-                closer.put(seen[1], mouth)
-        return Masks(block, mouth)
 
 
 def as_input(picture: np.ndarray) -> np.ndarray:

@@ -68,6 +68,13 @@ def whole(shape: tuple[int, ...], size_px: tuple[int, int]) -> Window:
     return around((0, 0, shape[1], shape[0]), size_px, 0.0)
 
 
+def halves(shape: tuple[int, ...], size_px: tuple[int, int]) -> list[Window]:
+    """Returns six windows of half the size of a picture `(H, W)` that overlap and together hold nearly all of it."""
+    height, width = shape[:2]
+    corners = [(across * width, down * height) for down in (0.05, 0.45) for across in (0.0, 0.25, 0.5)]
+    return [around((*corner, 0.5 * width, 0.5 * height), size_px, 0.0) for corner in corners]
+
+
 def around(box: tuple[float, float, float, float], size_px: tuple[int, int], margin: float) -> Window:
     """Returns the window of the shape of `size_px` in whose middle a box lies.
 

@@ -12,6 +12,8 @@ CHANNELS = ("block", "mouth")
 """What the network tells apart; channels overlap: a mouth lies in its block."""
 DARKEST = 0.01
 """Contrast below which a picture is not stretched any more: a few grey levels of 255."""
+BRIGHTEST = 2.0
+"""Standard deviations from the mean beyond which nothing is any brighter or darker: a lit block on black ground is one of many then."""
 
 
 class UNet(nn.Module):
@@ -47,7 +49,7 @@ class UNet(nn.Module):
         picture = picture.sqrt()
         mean = picture.mean((1, 2, 3), keepdim=True)
         spread = (picture - mean).square().mean((1, 2, 3), keepdim=True).sqrt()
-        x, bridges = (picture - mean) / (spread + DARKEST), []
+        x, bridges = ((picture - mean) / (spread + DARKEST)).clamp(-BRIGHTEST, BRIGHTEST), []
         for number, pair in enumerate(self.down):
             x = pair(x if number == 0 else functional.max_pool2d(x, 2))
             bridges.append(x)
