@@ -13,6 +13,8 @@ from browser import TOKEN, Scripted, served
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from deploy.page.shown import Shown
+
 
 @pytest.fixture
 def feed() -> Scripted:
@@ -57,6 +59,21 @@ def test_strangers_are_refused(feed: Scripted, port: int) -> None:
     assert talk(port, "/control", [ours, "nonsense"]) == [{"ready": True}, {"refused": "malformed", "kind": ""}]
     assert talk(port, "/elsewhere", ["x"]) == 404
     assert feed.wishes == []
+
+
+def test_the_feed_is_asked_for_everything_no_faster_than_the_page_is_fed() -> None:
+    class Counted(Scripted):
+        asked = 0
+
+        def shown(self) -> Shown:
+            self.asked += 1
+            return super().shown()
+
+    feed = Counted()
+    with served(feed):
+        before = feed.asked
+        time.sleep(0.6)
+        assert 1 < feed.asked - before <= 0.7 * 50
 
 
 def test_who_never_reads_or_answers_costs_the_others_nothing(feed: Scripted, port: int) -> None:
