@@ -22,6 +22,8 @@ NUM_SEEDS = 28
 NOTHING = np.empty((0, 5))
 PART = 0.6
 """Coverage below which the limit of angles no longer shrinks: what is left is told by how they change along the arc."""
+FAINT, SMALL_PX = 0.12, 6.0
+"""Of the strongest edges: so strong the edge of an ellipse of this size must be, of a larger one less; faint stains are all round."""
 PIECE = 0.6
 """Of an arc, that may be an ellipse's where not all of it is."""
 STROKE_PX, SAME_AREA = 4.5, 0.6
@@ -198,6 +200,9 @@ class ArcDetector:
         good = ellipse_support.gap(support >= 0, length) <= s.gap
         good &= ellipse_support.purity(edges, support, length) >= s.purity / slack
         if limits.lowest_px == 0:
+            good &= ellipse_support.strength(edges, support) >= FAINT * np.percentile(edges.strength, 95.0) * np.minimum(
+                SMALL_PX / np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3]), 1.0
+            )
             good[good] &= ~ellipse_support.leaving(candidates[good], edges, support[good], length[good])
         good &= (
             ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses)) <= s.departure * slack

@@ -61,6 +61,12 @@ def gather(
     return np.where(good, found, -1), off, along
 
 
+def strength(edges: Edges, support: np.ndarray) -> np.ndarray:
+    """Returns the mean gradient of the edges that support each candidate, grey levels a pixel, `(C,)`."""
+    there = support >= 0
+    return (edges.strength[support] * there).sum(1) / np.maximum(there.sum(1), 1)
+
+
 def purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Returns how much of the runs that support each candidate lies on it, in the mean over the support, `(C,)`.
 
