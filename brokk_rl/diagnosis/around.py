@@ -40,9 +40,13 @@ Around = tuple[np.ndarray, dict[str, list[Ray]], Shapes]
 
 
 def is_needed(evidence: Evidence, repaired: Repair, promised: float) -> bool:
-    """Says whether a set earns something else than `promised`, what its effects add up to, or has sizes far beyond the typical."""
-    earned = float(loss(evidence.z) - loss(repaired.z))
-    return bool(np.abs(repaired.sizes).max() > LARGE or earned < ROUGH * promised)
+    """Says whether effects hardly add up: sizes are far beyond the typical, and some hide others, or earn far less than `promised`.
+
+    What acts on the command hides what else does: nothing shows within a dead band. A speed that is far off hides nothing.
+    """
+    far = [ray for ray, sizes in zip(repaired.rays, repaired.sizes, strict=True) if np.abs(sizes).max() > LARGE]
+    hides = any(ray.kind.target.side == "command" for ray in far)
+    return hides or (bool(far) and float(loss(evidence.z) - loss(repaired.z)) < ROUGH * promised)
 
 
 def simulated(evidence: Evidence, grown: Mapping[str, Sequence[Ray]], repaired: Repair) -> Around:
@@ -125,13 +129,18 @@ def best(evidence: Evidence, ways: Mapping[str, Sequence[Ray]], tried: Sequence[
 def paying(
     tables: Sequence[Table], subsets: Sequence[frozenset[str]], price: Price, name_price: float
 ) -> tuple[frozenset[str], ...]:
-    """Returns the sets without effects that add less than they cost."""
-    own = dict.fromkeys(frozenset().union(*subsets), -name_price)
-    for j, (table, subset) in enumerate(zip(tables, subsets, strict=True)):
-        for name in subset:
-            gain = table.score(subset).total - table.score(subset - {name}).total
-            own[name] += gain - (price(j, subset) - price(j, subset - {name}))
-    return tuple(frozenset(name for name in subset if own[name] > 0.0) for subset in subsets)
+    """Returns the sets without effects that add less than they cost, dropped one by one: of two that are alike one stays."""
+    while names := frozenset().union(*subsets):
+        own = dict.fromkeys(names, -name_price)
+        for j, (table, subset) in enumerate(zip(tables, subsets, strict=True)):
+            for name in subset:
+                gain = table.score(subset).total - table.score(subset - {name}).total
+                own[name] += gain - (price(j, subset) - price(j, subset - {name}))
+        least = min(own, key=own.__getitem__)
+        if own[least] > 0.0:
+            break
+        subsets = tuple(subset - {least} for subset in subsets)
+    return tuple(subsets)
 
 
 def without(evidence: Evidence, ways: Mapping[str, Sequence[Ray]], repaired: Repair, subsets: Sequence[frozenset[str]]) -> Repair:

@@ -133,11 +133,7 @@ class Search:
         scatter = np.ones(self.case.machine.num_joints)
         tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)
         wide = None
-        if (
-            repaired
-            and np.abs(repaired.sizes).max() > around.LARGE
-            and around.is_needed(evidence, repaired, _promised(tables, chosen))
-        ):
+        if repaired and around.is_needed(evidence, repaired, _promised(tables, chosen)):
             wide, tables, chosen, repaired = self._around(evidence, grown, chosen, repaired, price)
             grown = wide[1]
         self.tell("frames", 0.8)

@@ -91,7 +91,8 @@ class Table:
         """
         every = [shape for name in names for shape in self.shapes[name]]
         starts = [np.array([self.alone(shape) for shape in every]) * (1.0 if len(every) == 1 else 0.7)]
-        smaller = [(one, new) for new in names if len(names) > 1 and (one := self.scored.get(frozenset(names) - {new}))]
+        tried = self.score if len(names) == 2 else self.scored.get
+        smaller = [(one, new) for new in names if len(names) > 1 and (one := tried(frozenset(names) - {new}))]
         if smaller:
             best, new = max(smaller, key=lambda pair: pair[0].total)
             known = [shape for name in sorted(best.sizes) for shape in self.shapes[name]]

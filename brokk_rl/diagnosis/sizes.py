@@ -17,6 +17,8 @@ import numpy as np
 
 from brokk_rl.diagnosis.noise import FREEDOM, loss, weight
 
+PARTS = (0.25, 0.5, 0.75)
+"""Of the way between two simulated sizes: a fit also begins there."""
 STEPS = 10
 """Gauss-Newton steps at most."""
 ENOUGH = 0.02
@@ -111,11 +113,11 @@ def _slopes(shapes: Sequence[Shape], lines: np.ndarray, size: np.ndarray) -> np.
 
 
 def alone(z: np.ndarray, shape: Shape, used: np.ndarray | None = None) -> float:
-    """Returns the best of the simulated sizes and those in the middle between them."""
+    """Returns the best of the simulated sizes and those `PARTS` of the way between them: some begin just there."""
     used = np.ones(len(z)) if used is None else used
-    middle = (shape.change[1:] + shape.change[:-1]) / 2
-    trials = np.concatenate([shape.sizes, (shape.sizes[1:] + shape.sizes[:-1]) / 2])
-    left = z - np.concatenate([shape.change, middle])
+    between = [(1.0 - part) * shape.change[:-1] + part * shape.change[1:] for part in PARTS]
+    trials = np.concatenate([shape.sizes, *((1.0 - part) * shape.sizes[:-1] + part * shape.sizes[1:] for part in PARTS)])
+    left = z - np.concatenate([shape.change, *between])
     totals = 0.5 * (FREEDOM + 1.0) * np.log1p(np.square(left) / FREEDOM) @ used + 0.5 * np.square(trials / PRIOR)
     return float(trials[int(np.argmin(totals))])
 

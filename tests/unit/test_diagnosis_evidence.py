@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from actuators.valve import Pose
-from brokk_rl.diagnosis import gap, library, noise
+from brokk_rl.diagnosis import around, gap, library, noise
 from brokk_rl.diagnosis.evidence import rays
 from brokk_rl.diagnosis.noise import Noise
 from brokk_rl.diagnosis.search import Table, choose
@@ -203,3 +203,15 @@ def test_the_weight_of_a_planar_arm_by_sums_of_angles_is_that_of_the_mechanics(m
     force = torch.tensor([body.yield_force.value for body in machine.bodies])
     weight = Gravity(machine, torch.device("cpu")).load(q) / force
     torch.testing.assert_close(pose.features(q)[..., 0], weight.float(), atol=1e-3, rtol=1e-3)
+
+
+def test_of_two_effects_that_are_alike_one_stays() -> None:
+    random = np.random.default_rng(21)
+    a = 2.0 * random.standard_normal(800)
+    z = 1.0 * a + random.standard_normal(800)
+    table = joint(
+        z, {"a": [line(a)], "b": [line(a * 0.98 + 0.02 * random.standard_normal(800))], "c": [line(random.standard_normal(800))]}
+    )
+    kept = around.paying([table], [frozenset("abc")], lambda j, subset: 4.0 * len(subset), 5.0)
+    assert len(kept[0]) == 1 and kept[0] <= frozenset("ab")
+    assert around.paying([table], [frozenset("c")], lambda j, subset: 4.0 * len(subset), 5.0) == (frozenset(),)
