@@ -20,6 +20,8 @@ UNTOLD, UNTOLD_SCORE = 0.8, 0.5
 """Part of an inside without depth, hidden from the right camera, from which on nobody can tell it from a flat disc; the score of
 what nobody can, for dust or for this."""
 
+FORGIVEN = 0.55
+"""Part of the circle that must show where its ellipse alone was too small or too long for one."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which what stands before the rest of a rim is seen."""
 
@@ -152,10 +154,9 @@ class PlaneConicEstimator:
             if isinstance(shape, Rejection):
                 return shape
         circle = rim.circle(gray, row, frame.camera_matrix, face.m, s.radius_m, s.radius_tolerance, s.center_px)
-        if circle is None or circle.coverage < s.coverage:
-            return Rejection(
-                "pose", "part of a circle on the face with a rim", circle.coverage if circle else 0.0, s.coverage, ellipse
-            )
+        least = s.coverage if shape else max(s.coverage, FORGIVEN)
+        if circle is None or circle.coverage < least:
+            return Rejection("pose", "part of a circle on the face with a rim", circle.coverage if circle else 0.0, least, ellipse)
         if abs(circle.radius_m - s.radius_m) > s.radius_tolerance * s.radius_m:
             limit = s.radius_m * (1.0 + np.sign(circle.radius_m - s.radius_m) * s.radius_tolerance)
             return Rejection("pose", "radius, m", circle.radius_m, float(limit), ellipse)
@@ -187,15 +188,15 @@ class PlaneConicEstimator:
             self._seen = frame, masks, gray_of(frame), allowed
         return self._seen[2:]
 
-    def _shape(self, face: Plane, row: np.ndarray, frame: Frame, ellipse: Ellipse) -> tuple[np.ndarray, float] | Rejection:
-        """Returns centre and radius on the face, or which gate of geometry is not passed."""
+    def _shape(self, face: Plane, row: np.ndarray, frame: Frame, ellipse: Ellipse) -> bool | Rejection:
+        """Returns whether an ellipse has size and shape of a rim with nothing forgiven, or which gate it does not pass."""
         s = self.settings
         ray = np.linalg.solve(frame.camera_matrix, np.array([row[0], row[1], 1.0]))
         cosine = -float(face.normal @ ray) / float(np.linalg.norm(ray))
         tilt = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         if tilt > s.tilt_rad:
             return Rejection("pose", "tilt of the face, rad", tilt, s.tilt_rad, ellipse)
-        center, axes = conic.on_plane(row, frame.camera_matrix, face.m)
+        _, axes = conic.on_plane(row, frame.camera_matrix, face.m)
         if not np.isfinite(axes).all():
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
@@ -207,7 +208,7 @@ class PlaneConicEstimator:
         least = 1.0 - (1.0 - s.axis_ratio) / seen
         if ratio < least:
             return Rejection("pose", "axis ratio on the face", ratio, least, ellipse)
-        return center, radius
+        return abs(radius / s.radius_m - 1.0) <= s.radius_tolerance and ratio >= s.axis_ratio
 
     def _looks(
         self, inside: Interior, parallax: float, masks: Masks, row: np.ndarray, ellipse: Ellipse, untold: bool
