@@ -23,7 +23,7 @@ NOTHING = np.empty((0, 5))
 PART = 0.6
 """Coverage below which the limit of angles no longer shrinks: what is left is told by how they change along the arc."""
 FAINT, SMALL_PX = 0.12, 6.0
-"""Of the strongest edges: so strong the edge of an ellipse of this size must be, of a larger one less; faint stains are all round."""
+"""Of the strongest edges: so strong that of an ellipse of this size must be, of a larger one less; faint stains are all round."""
 PIECE = 0.6
 """Of an arc, that may be an ellipse's where not all of it is."""
 STROKE_PX, SAME_AREA = 4.5, 0.6
