@@ -17,6 +17,8 @@ OCTAVES = 5
 """Resolutions: the full one, half of it, and so on."""
 LEAST = 20
 """Pixels of that grid below which a region is an accident of depth."""
+AROUND = 1.6
+"""Sizes of an ellipse within which the face around it tells how large it may be."""
 UNSEEN = 3.0
 """Sizes of a hole across which a face may go on where nobody knows the depth: beside an arm, whose other side one camera sees."""
 
@@ -29,14 +31,31 @@ class Level:
         shrink: Pixels of the picture to one of this level.
         roi: Where to look, `(h, w)` bool, the whole picture.
         prior: How large a hole may look there, px of the picture; `None` for any size.
+        sizes_px: How large a hole would look at each place of the grid of `STEP`, NaN where nobody knows; `None` for nowhere.
+        slack: By how much the size may be off at a place, as a part of it.
     """
 
     shrink: int
     roi: np.ndarray
     prior: SizePrior | None
+    sizes_px: np.ndarray | None = None
+    slack: float = 0.0
 
     def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
-        """Returns the ellipses of this level, in px of the picture `(h, w)`."""
+        """Returns the ellipses of this level that have a possible size where they are, in px of the picture `(h, w)`."""
+        return [one for one in self._found(detector, gray) if self._fits(one)]
+
+    def _fits(self, one: Ellipse) -> bool:
+        """Says whether a circle of the face around an ellipse could look so large; it does if nobody knows the depth there."""
+        if self.sizes_px is None:
+            return True
+        reach = AROUND * one.a
+        rows, columns = (slice(max(0, int((at - reach) / STEP)), int((at + reach) / STEP) + 1) for at in (one.y, one.x))
+        near = self.sizes_px[rows, columns]
+        near = near[np.isfinite(near)]
+        return not near.size or near.min() / (1.0 + self.slack) <= one.a <= near.max() * (1.0 + self.slack)
+
+    def _found(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
         if self.shrink == 1:
             return detector.detect(gray, self.roi, self.prior)
         x, y, wide, high = cv2.boundingRect(self.roi.view(np.uint8))
@@ -72,6 +91,7 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
     if np.count_nonzero(known) < LEAST:
         return [Level(1, _full(_dilated(inside, 0.03 * inside.shape[1]), mask.shape), None)]
     size_px = np.divide(focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=known)
+    everywhere_px = np.where(known, size_px, np.nan)
     found, rest = [], known.copy()
     for _ in range(OCTAVES):  # the resolution next that suits most of what is left, the coarser one of two alike
         suited = [rest & _suited(size_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)]
@@ -85,11 +105,11 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
         count, pieces = cv2.connectedComponents(_dilated(here | hidden, reach))
         for piece in range(1, count):
             part = pieces == piece
-            sizes_px = size_px[part & here]
-            if len(sizes_px) >= LEAST:
-                low, high = np.percentile(sizes_px, (2.0, 98.0))
+            some_px = size_px[part & here]
+            if len(some_px) >= LEAST:
+                low, high = np.percentile(some_px, (2.0, 98.0))
                 prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
-                found.append(Level(2**number, _full(part.astype(np.uint8), mask.shape), prior))
+                found.append(Level(2**number, _full(part.astype(np.uint8), mask.shape), prior, everywhere_px, slack))
     return found
 
 

@@ -11,7 +11,7 @@ from composed import option
 from drawn import AXIS, CENTER, drawn
 
 from brokk_rl.errors import FrameError
-from brokk_rl.sight import HolePose, Masks
+from brokk_rl.sight import Ellipse, HolePose, Masks, SizePrior
 from perception import dataset, search
 from perception.bench import Tally, compare, judge
 from perception.finder import Finder, rectified
@@ -106,3 +106,27 @@ def test_beside_an_arm_a_face_is_searched_where_nobody_knows_its_depth() -> None
     (level,) = search.levels(frame, mask, 0.05, 0.25, 8.0)
     # a hole has 13 px there, 17 at most: the whole strip is searched, the arm no farther than a rim reaches, the ground likewise
     assert level.roi[110:390, 300:360].all() and not level.roi[:, 390:].any() and not level.roi[:, :70].any()
+
+
+class Drawn:
+    """An ellipse detector that always finds the same."""
+
+    def __init__(self, ellipses: list[Ellipse]) -> None:
+        self.ellipses = ellipses
+
+    def detect(self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None) -> list[Ellipse]:
+        """Returns them."""
+        return self.ellipses
+
+
+def test_an_ellipse_that_is_too_large_where_it_lies_is_none() -> None:
+    depth_m = np.full((480, 640), 2.0, np.float32)
+    depth_m[:, 320:] = 3.2  # two faces: holes of 26 and 16 px
+    frame = replace(drawn()[0], depth_m=depth_m, camera_matrix=np.array([[1056.0, 0, 319.5], [0, 1056.0, 239.5], [0, 0, 1]]))
+    seen = [Ellipse(x, 240.0, 25.0, 20.0, 0.0, rms_px=0.1, coverage=1.0, score=0.8) for x in (150.0, 500.0)]
+    found = [
+        one
+        for level in search.levels(frame, np.ones(depth_m.shape, bool), 0.05, 0.35, 10.0)
+        for one in level.detect(Drawn(seen), np.zeros(depth_m.shape, np.uint8))
+    ]
+    assert {one.x for one in found} == {150.0}
