@@ -38,7 +38,7 @@ class ContourArcs:
         purity: Least part of the supporting edges, from corner to corner, that lies on the ellipse.
         departure: Largest part of the circumference where the supporting chains run on beside the ellipse (spirals, hearts).
         evidence: Least decimal exponent by which the support is no accident.
-        score: Least score of an ellipse that is seen nearly all around; of half of one any will do.
+        score: Least score of an ellipse that is seen nearly all around; of half of one less than half of it will do.
         prior_slack: By how much wider the limits of residual, angle and departure are, and the one of purity lower, where a size is
             given: it shuts out most of what else they do, and rims are chipped.
         smallest_px: Least minor semi-axis.

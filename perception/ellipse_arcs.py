@@ -208,9 +208,8 @@ class ArcDetector:
             ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses)) <= s.departure * slack
         )
         score = coverage * np.clip(1 - 0.5 * spread / rms_limit, 0, 1) * np.clip(1 - 0.5 * angle / angle_limit, 0, 1)
-        good &= score * slack**2 >= s.score * np.clip(
-            3 * coverage - 1.5, 0.0, 1.0
-        )  # what is seen all around must fit well to count
+        # what is seen all around must fit well to count; of half of one little more is asked than its limits ask
+        good &= score * slack**2 >= s.score * np.maximum(np.clip(3 * coverage - 1.5, 0.0, 1.0), 0.9 * coverage)
         return Judged(candidates[good], support[good], rms[good], coverage[good], score[good])
 
     def _gather(
