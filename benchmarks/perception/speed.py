@@ -3,13 +3,15 @@
     taskset -c 0,1 python benchmarks/perception/speed.py <out.json> --count 6 --threads 2
 
 Renders scenes of several conditions at 1 to 4 m, looks at each several times and takes the shortest: what else runs on the machine
-makes the others longer. Writes the milliseconds of each stage, and the processor's name.
+makes the others longer. Writes the milliseconds of each stage, how much of the processor's time the whole took, which a busy machine
+changes less, the load that there was meanwhile, and the processor's name.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import time
 from pathlib import Path
@@ -26,7 +28,7 @@ from brokk_rl.signals import Frame
 from perception.render.drawing import compose
 
 CONDITIONS, DISTANCES_M, TIMES = ("clean", "haze", "hidden"), (1.0, 2.0, 3.0, 4.0), 7
-STAGES = ("segment", "ellipse", "pose", "total")
+STAGES = ("segment", "ellipse", "pose", "total", "processor_time")
 
 
 def main() -> None:
@@ -44,14 +46,15 @@ def main() -> None:
         frame = rendered(condition, distance_m, number)
         looks = []
         for _ in range(TIMES):
-            start = time.perf_counter()
+            start, busy = time.perf_counter(), time.process_time()
             ms = observer.look(frame).ms
-            looks.append([ms.get(stage, 0.0) for stage in STAGES[:-1]] + [1000.0 * (time.perf_counter() - start)])
-        shortest.append(min(looks, key=lambda look: look[-1]))
+            total, spent = time.perf_counter() - start, time.process_time() - busy
+            looks.append([ms.get(stage, 0.0) for stage in STAGES[:-2]] + [1000.0 * total, 1000.0 * spent])
+        shortest.append(min(looks, key=lambda look: look[-2]))
     table = {stage: {"median": float(np.median(ms)), "p95": float(np.percentile(ms, 95))}
              for stage, ms in zip(STAGES, np.array(shortest).T, strict=True)}  # fmt: skip
     told = {"option": given.option, "frames": len(shortest), "threads": given.threads, "processor": processor(),
-            "opencv": cv2.__version__, "ms": table}  # fmt: skip
+            "opencv": cv2.__version__, "load": round(os.getloadavg()[0], 1), "ms": table}  # fmt: skip
     given.out.write_text(json.dumps(told, indent=1) + "\n")
     Console().print(told)
 
