@@ -3,8 +3,8 @@
     taskset -c 0,1 python benchmarks/perception/speed.py <out.json> --count 6 --threads 2
 
 Renders scenes of several conditions at 1 to 4 m, looks at each several times and takes the shortest: what else runs on the machine
-makes the others longer. Writes the milliseconds of each stage, how much of the processor's time the whole took (which a busy machine
-changes less), the load that there was meanwhile, and the processor's name.
+makes the others longer. Writes the milliseconds of each stage, how much processor time the whole took (which a busy machine changes
+less), the load that there was meanwhile, and the processor's name.
 """
 
 from __future__ import annotations
