@@ -32,8 +32,8 @@ STEP = 0.2
 """Finite difference, of the typical size."""
 LEAST_M = 3e-4
 """No instrument is better."""
-LEAST = 0.15
-"""Smallest size, over the typical one, that is worth naming."""
+LEAST = 0.3
+"""Smallest size, over the typical one, that is worth naming: trackers see millimetres that no drawing and no zero hold."""
 
 
 Fit = tuple[float, np.ndarray, np.ndarray]
@@ -96,9 +96,11 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
         values = _split(causes, chosen, fits[chosen][1])
         bent = [_bent(causes[c], own, q, machine) for c, own in zip(chosen, values, strict=True)]
         straight = off - _untimed(np.sum(bent, 0), ways)
-    names = dict.fromkeys(causes[c].kind.name for c in chosen)
+    sizes = zip(chosen, _split(causes, chosen, fits[chosen][1]), strict=False)
+    large = tuple(c for c, own in sizes if _size(causes[c], own) >= LEAST)
+    names = dict.fromkeys(causes[c].kind.name for c in large)
     left = straight - np.concatenate([causes[c].columns for c in chosen], 1) @ fits[chosen][1] if chosen else straight
-    return Seen([_found(name, chosen, causes, fits, worth, machine) for name in names], float(np.std(left)) / usual_m)
+    return Seen([_found(name, large, causes, fits, worth, machine) for name in names], float(np.std(left)) / usual_m)
 
 
 def _compared(
@@ -111,9 +113,7 @@ def _compared(
         for chosen in combinations(range(len(causes)), count):
             fits[chosen] = _fit([causes[c] for c in chosen], off, size_m)
             names = {causes[c].kind.name for c in chosen}
-            split = zip(chosen, _split(causes, chosen, fits[chosen][1]), strict=True)
-            large = all(_size(causes[c], part) >= LEAST for c, part in split)
-            worth[chosen] = fits[chosen][0] - price * count - name_price * len(names) if large else -np.inf
+            worth[chosen] = fits[chosen][0] - price * count - name_price * len(names)
     return fits, worth
 
 

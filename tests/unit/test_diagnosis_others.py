@@ -74,6 +74,11 @@ def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Mac
     assert [found.kind.name for found in other.found] == ["base_tilt"]
     assert other.found[0].parameters["roll_rad"]["machine"].mean == pytest.approx(0.03, abs=0.003)
     assert not tool.search(Case(machine, [reference], [reference]), kinds, 8.0, 12.0).found
+    # two milliradians are seen, explained, and not worth a name; nothing else is named in their place
+    faint = tool.search(
+        Case(machine, [reference], [tracked(swept(machine, 120.0, 7), machine, bias / 7.5, 0.0, 8)]), kinds, 8.0, 12.0
+    )
+    assert not faint.found and faint.left < 1.2
 
 
 def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine: Machine) -> None:
