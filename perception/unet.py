@@ -13,7 +13,7 @@ CHANNELS = ("block", "mouth")
 DARKEST = 0.01
 """Contrast below which a picture is not stretched any more: a few grey levels of 255."""
 BRIGHTEST = 2.0
-"""Standard deviations from the mean beyond which nothing is any brighter or darker: a lit block on black ground is one of many then."""
+"""Standard deviations from the mean beyond which nothing is any brighter or darker: a lit block on black ground is one of many."""
 
 
 class UNet(nn.Module):
