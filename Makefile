@@ -2,7 +2,7 @@
 PYTHON ?= $(shell command -v python3.11 || echo python3)
 BIN := .venv/bin
 UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
-SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact
+SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact --compile-bytecode
 
 .PHONY: train test test-all check setup clean
 
@@ -10,7 +10,7 @@ train: setup            ## train the main job on whatever is there and leave a r
 	$(BIN)/brokk mode=train
 
 test: setup             ## the tests that run without a GPU, but for the slow ones
-	$(BIN)/python -m pytest -q -m "not gpu and not slow"
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile -m "not gpu and not slow"
 
 test-all: setup         ## the slow ones too
 	$(BIN)/python -m pytest -q -m "not gpu"
