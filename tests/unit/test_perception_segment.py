@@ -202,7 +202,6 @@ def test_a_network_that_ships_is_loaded_by_its_name(tmp_path: Path, monkeypatch:
     np.testing.assert_allclose(one.block, other.block, atol=1e-4)
 
 
-@pytest.mark.skipif(not (segment_network.SHIPPED / export.ONNX).is_file(), reason="no network ships yet")
 def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -> None:
     rig = option("rig", "zed_2i_720p")
     segmenters = [option("perception/segmenter", name).build() for name in ("onnx", "unet")]
