@@ -36,7 +36,7 @@ class Looks:
         darker: If something near it is darker by more than this, over the brightness of the face, it is no dust.
         contrast: Least contrast, in standard deviations of the face's grain, of what is veiled: a stain has less.
         mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives one.
-        sure_mouth: From which the mouth channel needs no other witness.
+        sure_mouth: From which the mouth channel needs no other witness, as long as none speaks against it.
         slope: Slope of brightness inside, see `Interior`, that alone would show a hole; less is as much less evidence, and adds up.
         deeper: Part of the depth inside that lies behind the face, likewise.
         parallax: Difference of left and right picture inside over that on the face, likewise; 1 is none.
@@ -216,13 +216,13 @@ class PlaneConicEstimator:
         looks = self.settings.looks
         if not inside.darkness <= looks.darkness:
             return Rejection("pose", "brightness inside over outside", inside.darkness, looks.darkness, ellipse)
-        if masks.mouth is not None:
-            mouth = inner_mean(masks.mouth, row)
-            if mouth < looks.mouth:
-                return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
-            if mouth >= looks.sure_mouth:
-                return None
+        mouth = 0.0 if masks.mouth is None else inner_mean(masks.mouth, row)
+        if masks.mouth is not None and mouth < looks.mouth:
+            return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
+        sure = mouth >= looks.sure_mouth
         if inside.darkness > looks.veiled:
+            if sure:
+                return None
             if inside.around < inside.darkness - looks.darker:
                 return Rejection("pose", "brightness inside over outside", inside.darkness, looks.veiled, ellipse)
             if inside.contrast >= looks.contrast:
@@ -235,7 +235,8 @@ class PlaneConicEstimator:
         if untold and not np.isfinite(against):
             return None
         evidence = sum(shown) + (against if np.isfinite(against) else 0.0)
-        return None if evidence >= 1.0 else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
+        least = 0.0 if sure else 1.0  # a network has learned from pictures; what two cameras see it does not overrule
+        return None if evidence >= least else Rejection("pose", "evidence of depth inside", evidence, least, ellipse)
 
 
 def covariance(face: Plane, circle: Circle, bias_per_m: float) -> np.ndarray:

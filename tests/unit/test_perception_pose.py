@@ -167,6 +167,8 @@ def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(arm
         assert isinstance(found, HolePose) and found.score == pytest.approx(0.5 * ellipse.score)
     else:
         assert isinstance(found, Rejection) and found.reason == "evidence of depth inside"
+        learned = estimator.estimate(frame, replace(masks, mouth=np.ones_like(masks.block)), ellipse)
+        assert isinstance(learned, Rejection) and learned.reason == found.reason, "no network overrules two cameras"
 
 
 def test_the_edge_of_a_shadow_across_the_face_is_no_grain() -> None:
