@@ -36,7 +36,7 @@ class Looks:
         darker: If something near it is darker by more than this, over the brightness of the face, it is no dust.
         contrast: Least contrast, in standard deviations of the face's grain, of what is veiled: a stain has less.
         mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives one.
-        sure_mouth: From which the mouth channel needs no other witness, as long as none speaks against it.
+        sure_mouth: From which the mouth channel decides where nobody sees how deep it is; where that is seen, it overrules nothing.
         slope: Slope of brightness inside, see `Interior`, that alone would show a hole; less is as much less evidence, and adds up.
         deeper: Part of the depth inside that lies behind the face, likewise.
         parallax: Difference of left and right picture inside over that on the face, likewise; 1 is none.
@@ -164,7 +164,7 @@ class PlaneConicEstimator:
         inside = appearance.interior(gray, frame.depth_m, row, frame.camera_matrix, face)
         parallax, covered = alignment.disagreement(both, face, frame.depth_m, row, *s.looks.parts) if both else (float("nan"), 0.0)
         # behind something that stands before it, or in dust, nobody can tell
-        untold = masks.mouth is None and (inside.darkness > s.looks.veiled or (covered > UNTOLD and inside.unknown > UNTOLD))
+        untold = inside.darkness > s.looks.veiled or (covered > UNTOLD and inside.unknown > UNTOLD)
         refused = self._looks(inside, parallax, masks, row, ellipse, untold)
         if refused:
             return refused
@@ -175,7 +175,7 @@ class PlaneConicEstimator:
             cov_m2=covariance(replace(face, cov=face.cov * s.depth_alike), circle, s.bias_per_m),
             axis_cov_rad2=face.normal_cov_rad2() * s.tilt_alike,
             frame="camera",
-            score=float(ellipse.score) * (UNTOLD_SCORE if untold else 1.0),
+            score=float(ellipse.score) * (UNTOLD_SCORE if untold and masks.mouth is None else 1.0),
             t_s=frame.t_s,
         )
 
@@ -229,14 +229,12 @@ class PlaneConicEstimator:
                 return None
             return Rejection("pose", "contrast to the grain of the face", inside.contrast, looks.contrast, ellipse)
         shown = [max(one, 0.0) for one in (inside.slope / looks.slope, inside.deeper / looks.deeper) if np.isfinite(one)]
-        against = (parallax - 1.0) / (
-            looks.parallax - 1.0
-        )  # a dark disc is noisier nowhere than the face: below 1 it speaks against
-        if untold and not np.isfinite(against):
+        # a dark disc is noisier nowhere than the face: below 1 it speaks against
+        against = (parallax - 1.0) / (looks.parallax - 1.0)
+        if untold and not np.isfinite(against) and (sure or masks.mouth is None):
             return None
         evidence = sum(shown) + (against if np.isfinite(against) else 0.0)
-        least = 0.0 if sure else 1.0  # a network has learned from pictures; what two cameras see it does not overrule
-        return None if evidence >= least else Rejection("pose", "evidence of depth inside", evidence, least, ellipse)
+        return None if evidence >= 1.0 else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
 
 
 def covariance(face: Plane, circle: Circle, bias_per_m: float) -> np.ndarray:

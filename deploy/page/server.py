@@ -130,16 +130,8 @@ class Server:
             silent = now_s - sent_s >= HEARTBEAT_S
             if number != advised or silent or (now_s - looked_s >= 1.0 / self._page.rate_hz and not expected):
                 looked_s, shown = now_s, self._feed.shown()
-                facts = (
-                    shown.advice,
-                    shown.own,
-                    shown.q,
-                    shown.safety,
-                    shown.alive,
-                    shown.guiding,
-                    shown.recording.on,
-                    shown.targets,
-                )
+                safe = (shown.safety, shown.alive, shown.guiding)
+                facts = (shown.advice, shown.own, shown.q, *safe, shown.recording.on, shown.targets)
                 number = shown.advice.number if shown.advice else None
                 if number != advised:
                     apart_s, advised_s = now_s - advised_s, now_s
