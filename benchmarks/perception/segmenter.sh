@@ -60,6 +60,14 @@ timeout -s KILL $(( TRAIN_S + 90 )) brokk mode=train_perception training.frames=
   training.validate_every=$(( ${#few[@]} ? 20 : 1500 )) session.device=$device session.out="$work/run" "${few[@]}" 2>&1 | tee -a "$work/log"
 say "trained: $(ls "$work/run" | tr '\n' ' ')"
 
+keep() {  # whatever is there by now: judging may be cut off
+  local file
+  for file in segmenter.safetensors segmenter.onnx training.json masks.json curve.png samples.png; do
+    [ -f "$work/run/$file" ] && cp "$work/run/$file" "$OUT/"
+  done
+  cp "$work/log" "$OUT/log"
+}
+keep
 kind=onnx file=segmenter.onnx; [ -f "$work/run/$file" ] || { kind=unet file=segmenter.safetensors; }
 if [ -f "$work/run/$file" ]; then
   # by condition: one folder of links to the frames of all processes
@@ -76,8 +84,5 @@ if [ -f "$work/run/$file" ]; then
   timeout 600 "$python" benchmarks/perception/masks.py "$work/run/masks.json" $kind segmenter.weights="$work/run/$file" \
     -- "$work"/judge/* 2>&1 | tee -a "$work/log"
 fi
-for file in segmenter.safetensors segmenter.onnx training.json masks.json curve.png samples.png; do
-  [ -f "$work/run/$file" ] && cp "$work/run/$file" "$OUT/"
-done
-tail -5 "$work/render.log" >>"$work/log"; say "done: $OUT"; cp "$work/log" "$OUT/log"
+tail -5 "$work/render.log" >>"$work/log"; say "done: $OUT"; keep
 rm -rf "$work"
