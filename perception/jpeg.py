@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
 
 import torch
 from torch.nn import functional
@@ -26,20 +26,22 @@ def recompressed(pictures: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
     """Returns RGB pictures in [0, 1], `(B, 3, h, w)`, as files of a quality, `(B, 1, 1, 1)` from 1 to 100, give them back."""
     height, width = pictures.shape[2:]
     percent = torch.where(quality < 50.0, 5000.0 / quality, 200.0 - 2.0 * quality) / 100.0
-    tables = _tensor((LUMINANCE_STEPS, COLOUR_STEPS, COLOUR_STEPS), pictures)
+    tables, matrix, inverse, middle, wave = _constants(pictures.device)
     steps = (tables * percent).round().clamp(1.0, 255.0)[:, :, None, None]  # (B, 3, 1, 1, 8, 8)
-    number = torch.arange(8.0, device=pictures.device)
-    wave = ((number + 0.5) * number[:, None] * (math.pi / 8.0)).cos()
-    wave = wave * torch.where(number > 0, 0.5, 0.125**0.5)[:, None]  # orthonormal
-    matrix = _tensor(YCC, pictures)
     ycc = torch.einsum("ij,bjhw->bihw", matrix, pictures.clamp(0.0, 1.0) * 255.0)
     ycc = functional.pad(ycc, (0, -width % 8, 0, -height % 8), mode="replicate")
     blocks = ycc.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)  # (B, 3, rows, columns, 8, 8)
-    middle = 128.0 * _tensor((1.0, 0.0, 0.0), pictures).reshape(3, 1, 1, 1, 1)
     kept = (wave @ (blocks - middle) @ wave.T / steps).round() * steps
     back = (wave.T @ kept @ wave + middle).transpose(3, 4).flatten(4, 5).flatten(2, 3)[..., :height, :width]
-    return torch.einsum("ij,bjhw->bihw", torch.linalg.inv(matrix), back) / 255.0
+    return torch.einsum("ij,bjhw->bihw", inverse, back) / 255.0
 
 
-def _tensor(values: Sequence, like: torch.Tensor) -> torch.Tensor:
-    return torch.tensor(values, dtype=like.dtype, device=like.device)
+@functools.cache
+def _constants(device: torch.device) -> tuple[torch.Tensor, ...]:
+    """Returns, on a device, the steps at quality 50, YCC of RGB and back, the middle of each channel and the cosines."""
+    number = torch.arange(8.0)
+    wave = ((number + 0.5) * number[:, None] * (math.pi / 8.0)).cos()
+    wave = wave * torch.where(number > 0, 0.5, 0.125**0.5)[:, None]  # orthonormal
+    matrix, middle = torch.tensor(YCC), torch.tensor([128.0, 0.0, 0.0]).reshape(3, 1, 1, 1, 1)
+    tables = torch.tensor([LUMINANCE_STEPS, COLOUR_STEPS, COLOUR_STEPS], dtype=torch.float32)
+    return tuple(one.to(device) for one in (tables, matrix, torch.linalg.inv(matrix), middle, wave))

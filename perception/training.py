@@ -109,7 +109,7 @@ class _Training:
         session.seed_all()
         self._train, self._unseen = self._views()
         self._network = self._begun().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._optimizer = torch.optim.AdamW(self._network.parameters(), lr=settings.rate, weight_decay=settings.decay)
+        self._optimizer = torch.optim.AdamW(self._network.parameters(), lr=settings.rate, weight_decay=settings.decay, fused=True)
         self._mean = {name: value.clone() for name, value in self._network.state_dict().items()}
         self._update, self._best, self._curve = 0, {"score": -1.0, "update": 0}, []
         self._seconds = 0.0
@@ -190,11 +190,10 @@ class _Training:
     @torch.no_grad()
     def _remember(self, part: float) -> None:
         """Moves the mean network by a part of the way to the one under training."""
-        for name, value in self._network.state_dict().items():
-            if value.is_floating_point():
-                self._mean[name].lerp_(value, part)
-            else:
-                self._mean[name].copy_(value)
+        now = self._network.state_dict()
+        moving = [name for name, value in now.items() if value.is_floating_point()]
+        # all at once: a graphics card takes longer to be told of each of a hundred small tensors than to move them
+        torch._foreach_lerp_([self._mean[name] for name in moving], [now[name] for name in moving], part)
 
     def _spent(self) -> float:
         """Returns which part of the training is over, by updates or by seconds, in [0, 1]."""

@@ -34,6 +34,8 @@ FINER = 2
 """Places at which a pixel of a sample is looked at, in each direction: it may be larger than one of the view."""
 PART_OF_MEMORY = 0.5
 """Views that take no more of a device's free memory are kept there."""
+THREADS = 16
+"""That read frames, at most: a machine may count more processors than it lends."""
 
 
 @spec
@@ -135,8 +137,11 @@ class Samples:
         frame = torch.randint(len(self._layers), (count,), generator=chance)
         look = (torch.rand(count, generator=chance) < self._closer).long()
         generator = torch.Generator(self._device).manual_seed(seed)
-        taken = self._layers[frame.to(self._layers.device), look.to(self._layers.device)].to(self._device)
-        seen = torch.tensor(SEEN)[look].to(self._device)
+        # nothing here asks the device for an answer, nor waits until it has taken something: it is to be told of the next batch
+        # while it works at this one
+        place = (index.to(self._layers.device, non_blocking=True) for index in (frame, look))
+        taken = self._layers[tuple(place)].to(self._device, non_blocking=True)
+        seen = torch.tensor(SEEN)[look].to(self._device, non_blocking=True)
         windows = self._crop.windows(seen, (taken.shape[2], taken.shape[3]), generator)
         layers = cut(taken, windows, self._size_px)
         return augmented(layers[:, :3], self._steps, chance, generator), layers[:, 3:]
@@ -196,9 +201,14 @@ def read(stems: Sequence[Path], size_px: tuple[int, int], margin: float, seed: i
             layers[number, look, 3:] = window.take(known, (width, height)).transpose(2, 0, 1)
         return condition
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        work = pool.map(fill, range(len(stems)))
-        conditions = list(track(work, "reading frames", total=len(stems), transient=True))
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # on each of many threads as many again get in each other's way: a minute instead of seconds
+    try:
+        with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
+            work = pool.map(fill, range(len(stems)))
+            conditions = list(track(work, "reading frames", total=len(stems), transient=True))
+    finally:
+        cv2.setNumThreads(threads)
     return Views(torch.from_numpy(layers), tuple(conditions), tuple(str(stem) for stem in stems))
 
 
