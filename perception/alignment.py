@@ -14,7 +14,7 @@ import numpy as np
 
 from brokk_rl.signals import Frame
 from perception import conic
-from perception.plane import Plane, sandwich
+from perception.plane import Plane, inverse_depth, parted, sandwich
 
 SMOOTH_PX = 1.0
 """Blur of both pictures: noise would shrink the slope."""
@@ -59,14 +59,18 @@ class Pair:
     camera_matrix: np.ndarray
     pull_px: float
 
-    def seen(self, u: np.ndarray, row: np.ndarray, rays: np.ndarray, m: np.ndarray, picture: np.ndarray) -> np.ndarray:
-        """Returns what the right one shows of the points of a plane on `rays`, `(h, w, 3)`, of columns `u` of the picture."""
-        x = (u - self.pull_px * (rays @ m) - self.right_column + 0.5) / self.shrink - 0.5
-        return cv2.remap(picture, x.astype(np.float32), row.astype(np.float32), cv2.INTER_CUBIC)
+    def places(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns columns `(1, w)` and rows `(h, 1)` in the picture of those of `left`, `(w,)` and `(h,)`."""
+        u, v = ((some + 0.5) * self.shrink - 0.5 + corner for some, corner in zip((columns, rows), self.corner, strict=True))
+        return u[None, :], v[:, None]
 
-    def pixel(self, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns column and row in the picture of places in `left`."""
-        return ((column + 0.5) * self.shrink - 0.5 + self.corner[0], (row + 0.5) * self.shrink - 0.5 + self.corner[1])
+    def on_plane(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
+        """Returns where `right` shows the points of a plane that the left one has at such places, columns `(h, w)`."""
+        return (u - self.pull_px * inverse_depth(m, self.camera_matrix, u, v) - self.right_column + 0.5) / self.shrink - 0.5
+
+    def seen(self, u: np.ndarray, v: np.ndarray, row: np.ndarray, m: np.ndarray, picture: np.ndarray) -> np.ndarray:
+        """Returns what a picture like `right`, of one channel or more, shows of the points of a plane; `row` as `remap` has it."""
+        return cv2.remap(picture, self.on_plane(u, v, m).astype(np.float32), row, cv2.INTER_CUBIC)
 
     def column(self, u: float) -> float:
         """Returns the column of `left` of a column of the picture."""
@@ -76,9 +80,9 @@ class Pair:
         """Returns the row of `left` of a row of the picture."""
         return (v - self.corner[1] + 0.5) / self.shrink - 0.5
 
-    def inside(self, u: np.ndarray, rays: np.ndarray, m: np.ndarray) -> np.ndarray:
+    def inside(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
         """Says which of these points the right one shows too, with room for the slope."""
-        x = (u - self.pull_px * (rays @ m) - self.right_column) / self.shrink
+        x = self.on_plane(u, v, m)
         return (x > 3) & (x < self.right.shape[1] - 4)
 
 
@@ -94,8 +98,7 @@ def pair(frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, out
         return None
     shrink = max(1, -(-(right - left) // WIDE_PX))
     pull_px = float(frame.camera_matrix[0, 0]) * frame.baseline_m
-    corners = _rays(np.array([left, right, left, right]), np.array([top, top, bottom, bottom]), frame.camera_matrix)
-    shift = pull_px * (corners @ m)
+    shift = pull_px * inverse_depth(m, frame.camera_matrix, np.array([[left, right]]), np.array([[top], [bottom]]))
     first = max(0, int(left - shift.max()) - 8 * shrink)
     last = min(width, int(right - shift.min()) + 8 * shrink)
     rows, columns = (bottom - top) // shrink, (right - left) // shrink
@@ -134,51 +137,60 @@ def aligned(
     """
     height, width = both.left.shape
     stride = max(1, round(height * width / MOST))
-    row, column = (np.ascontiguousarray(some, np.float64) for some in np.mgrid[0:height:stride, 0:width])
-    u, v = both.pixel(column, row)
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(both.camera_matrix).T
-    pixel = np.rint(v).astype(int).clip(0, allowed.shape[0] - 1), np.rint(u).astype(int).clip(0, allowed.shape[1] - 1)
+    lines = np.arange(0, height, stride)
+    u, v = both.places(np.arange(width), lines)
+    pixel = np.ix_(
+        np.rint(v[:, 0]).astype(int).clip(0, allowed.shape[0] - 1), np.rint(u[0]).astype(int).clip(0, allowed.shape[1] - 1)
+    )
     depth = frame.depth_m[pixel]
     radii = conic.radii(ellipse, u, v)
     with np.errstate(invalid="ignore"):
-        off = np.abs(1.0 / depth - rays @ face.m)
+        off = np.abs(1.0 / depth - face.inverse_depth(both.camera_matrix, u, v))
         on = allowed[pixel] & (off < 3.0 * face.sigma) & (radii > inner) & (radii < face.extent)
         other = (off > 8.0 * face.sigma).astype(np.uint8)
     other = cv2.morphologyEx(other, cv2.MORPH_OPEN, np.ones((1 if stride > 1 else 3, 3), np.uint8))
     margin = np.ones((2 * round(MARGIN_PX / stride) + 1, 2 * MARGIN_PX + 1), np.uint8)
-    on &= (cv2.dilate(np.asarray(other), margin) == 0) & both.inside(u, rays, face.m) & (both.left[::stride] < SATURATED)
+    on &= (cv2.dilate(np.asarray(other), margin) == 0) & both.inside(u, v, face.m) & (both.left[::stride] < SATURATED)
     whole = cv2.morphologyEx(on.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 5), np.uint8))
     on &= cv2.erode(whole, np.ones((2 * round(BORDER_PX / stride) + 1, 2 * BORDER_PX + 1), np.uint8)) > 0
-    if on.sum() < LEAST:
+    at = np.flatnonzero(on)
+    if len(at) < LEAST:
         return face
     weight = on.astype(np.float32)
     window = (WINDOW_PX, max(3, WINDOW_PX // stride | 1))
     counted = np.maximum(cv2.boxFilter(weight, -1, window), 1e-3)
+    weight, counted = weight[..., None], counted[..., None]
 
     def departing(values: np.ndarray) -> np.ndarray:
-        return (values - cv2.boxFilter(values * weight, -1, window) / counted)[on].astype(float)
+        """Returns what two pictures `(h, w, 2)` show on the face, less the mean of a window, `(2, P)`."""
+        departs = values - cv2.boxFilter(values * weight, -1, window) / counted
+        return departs.reshape(-1, 2)[at].T.astype(float)
 
-    mine = departing(both.left[::stride])
-    instrument, slope = (cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=3, scale=0.125) for picture in (both.left, both.right))
-    instrument = departing(instrument[::stride])
-    m, ray, seen = face.m, rays[on], mine
+    left, right = (
+        cv2.merge([picture, cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)]) for picture in (both.left, both.right)
+    )
+    mine, instrument = departing(left[::stride])
+    row = np.repeat(lines.astype(np.float32)[:, None], width, 1)
+    line, column = np.divmod(at, width)
+    u_on, v_on = u[0, column], v[line, 0]
+    ray = np.linalg.inv(both.camera_matrix) @ np.stack([u_on, v_on, np.ones(len(at))])
+    m, seen = face.m, mine
     for _ in range(ROUNDS):
-        seen, rise = (departing(both.seen(u, row, rays, m, picture)) for picture in (both.right, slope))
-        push, heavy = (np.column_stack([ray * (-both.pull_px / both.shrink * one)[:, None], -mine]) for one in (rise, instrument))
+        seen, rise = departing(both.seen(u, v, row, m, right))
+        push, heavy = (np.vstack([ray * (-both.pull_px / both.shrink * slope), -mine]) for slope in (rise, instrument))
         gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
         off = seen - gain * mine
         scale = 1.4826 * float(np.median(np.abs(off))) + 1e-6
-        trust = np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
-        heavy *= trust[:, None]
-        m = m - np.linalg.lstsq(heavy.T @ push, heavy.T @ off, rcond=1e-12)[0][:3]
+        heavy *= np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
+        m = m - np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
     likeness = float(seen @ mine) / max(float(np.sqrt((seen @ seen) * (mine @ mine))), 1e-9)
     if likeness < ALIKE:
         return None
-    moved_px = both.pull_px * np.abs(ray @ (m - face.m)).max()
+    moved_px = both.pull_px * np.abs((m - face.m) @ ray).max()
     if not np.isfinite(m).all() or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px:
         return face
-    cell = (v[on] // cell_px).astype(np.int64) * 10_000 + (u[on] // cell_px).astype(np.int64)
-    return merged(face, replace(face, m=m, cov=sandwich(push[:, :3], heavy[:, :3], off, cell)), bias_per_m)
+    cell = (v_on // cell_px).astype(np.int64) * 10_000 + (u_on // cell_px).astype(np.int64)
+    return merged(face, replace(face, m=m, cov=sandwich(push[:3].T, heavy[:3].T, off, parted(cell))), bias_per_m)
 
 
 def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:
@@ -187,10 +199,6 @@ def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:
     weights = [np.linalg.inv(cov) for cov in (doubt, second.cov)]
     cov = np.linalg.inv(weights[0] + weights[1])
     return replace(second, m=cov @ (weights[0] @ first.m + weights[1] @ second.m), cov=cov)
-
-
-def _rays(u: np.ndarray, v: np.ndarray, camera_matrix: np.ndarray) -> np.ndarray:
-    return np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera_matrix).T
 
 
 def disagreement(
@@ -215,23 +223,23 @@ def disagreement(
         for middle, size in zip((both.column(ellipse[0]), both.row(ellipse[1])), both.left.shape[::-1], strict=True)
     )
     part = np.s_[down[0] : down[1], across[0] : across[1]]
-    row, column = np.mgrid[part].astype(np.float64)
-    if not row.size:
+    if down[1] <= down[0] or across[1] <= across[0]:
         return float("nan"), 0.0
-    u, v = both.pixel(column, row)
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(both.camera_matrix).T
+    u, v = both.places(np.arange(*across), np.arange(*down))
     radii = conic.radii(ellipse, u, v)
-    depth = depth_m[np.rint(v).astype(int).clip(0, len(depth_m) - 1), np.rint(u).astype(int).clip(0, depth_m.shape[1] - 1)]
+    rows, columns = (np.rint(some).astype(int).clip(0, most - 1) for some, most in zip((v[:, 0], u[0]), depth_m.shape, strict=True))
+    depth = depth_m[np.ix_(rows, columns)]
     with np.errstate(invalid="ignore"):
-        before = (1.0 / depth - rays @ face.m > 4 * face.sigma).astype(np.uint8)
-    shown = both.inside(u, rays, face.m) & (cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0)
-    hidden = shown & (radii < inner) & _hidden(both, face, depth_m, u, v, rays)
+        before = (1.0 / depth - face.inverse_depth(both.camera_matrix, u, v) > 4 * face.sigma).astype(np.uint8)
+    shown = both.inside(u, v, face.m) & (cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0)
+    hidden = shown & (radii < inner) & _hidden(both, face, depth_m, u, v)
     covered = float(hidden.sum() / max(np.count_nonzero(shown & (radii < inner)), 1))
     shown &= ~hidden
     within, around = shown & (radii < inner), shown & (radii > ring[0]) & (radii < ring[1])
     if within.sum() < LEAST_INSIDE or around.sum() < LEAST_INSIDE:
         return float("nan"), covered
-    mine, seen = both.left[part], both.seen(u, row, rays, face.m, both.right)
+    row = np.repeat(np.arange(*down, dtype=np.float32)[:, None], across[1] - across[0], 1)
+    mine, seen = both.left[part], both.seen(u, v, row, face.m, both.right)
     within &= seen < np.median(seen[around])  # the right camera may see there what stands before a disc
     if within.sum() < LEAST_INSIDE:
         return float("nan"), covered
@@ -240,20 +248,18 @@ def disagreement(
     return float(np.std(off[within])) / max(usual, 0.1), covered
 
 
-def _hidden(both: Pair, face: Plane, depth_m: np.ndarray, u: np.ndarray, v: np.ndarray, rays: np.ndarray) -> np.ndarray:
+def _hidden(both: Pair, face: Plane, depth_m: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Says which points of a face, `(h, w)`, seen by the left camera, something nearer hides from the right one."""
     rows = np.rint(v[:, 0]).astype(int).clip(0, len(depth_m) - 1)
     columns = np.arange(max(0, int(u[0, 0])), depth_m.shape[1])  # what hides them from the right camera lies to their right
-    sight = _rays(columns, np.zeros(len(columns)), both.camera_matrix) @ (face.m * [1.0, 0.0, 1.0])
-    tilt = (rows - both.camera_matrix[1, 2]) / both.camera_matrix[1, 1] * face.m[1]
+    depth = depth_m[rows, columns[0] :]
+    here = face.inverse_depth(both.camera_matrix, columns[None, :], rows[:, None]).astype(np.float32)
     with np.errstate(invalid="ignore", divide="ignore"):
-        inverse = 1.0 / depth_m[np.ix_(rows, columns)]
-        nearer = inverse - (tilt[:, None] + sight) > 4 * face.sigma
+        row, column = np.nonzero(1.0 / depth - here > 4 * face.sigma)
     shadow = np.zeros((len(rows), depth_m.shape[1]), np.uint8)
-    row, column = np.nonzero(nearer)
-    place = np.rint(columns[column] - both.pull_px * inverse[row, column]).astype(int)
+    place = np.rint(columns[column] - both.pull_px / depth[row, column]).astype(int)
     on = (place >= 0) & (place < shadow.shape[1])
     shadow[row[on], place[on]] = 1
     shadow = cv2.dilate(shadow, np.ones((3, 2 * MARGIN_PX + 1), np.uint8))
-    seen = np.rint(u - both.pull_px * (rays @ face.m)).astype(int).clip(0, shadow.shape[1] - 1)
-    return np.take_along_axis(shadow, seen, 1) > 0
+    away = both.pull_px * face.inverse_depth(both.camera_matrix, u, v)
+    return np.take_along_axis(shadow, np.rint(u - away).astype(int).clip(0, shadow.shape[1] - 1), 1) > 0

@@ -51,8 +51,7 @@ def interior(
     top, left = max(0, int(y - reach)), max(0, int(x - reach))
     bottom, right = min(gray.shape[0], int(y + reach) + 2), min(gray.shape[1], int(x + reach) + 2)
     part = gray[top:bottom, left:right].astype(np.float32)
-    rows, columns = np.mgrid[top:bottom, left:right]
-    place = np.stack([columns, rows, np.ones_like(rows)], -1).astype(float)
+    rows, columns = np.ogrid[top:bottom, left:right]
     radii = conic.radii(ellipse, columns, rows)
     inside, ring = radii < INSIDE, (radii > RING[0]) & (radii < RING[1])
     if inside.sum() < 8 or ring.sum() < 8:
@@ -63,7 +62,7 @@ def interior(
     depth = depth_m[top:bottom, left:right]
     known = np.isfinite(depth)
     if plane is not None:
-        behind = (place @ np.linalg.inv(camera_matrix).T) @ plane.m - 1.0 / np.where(known, depth, np.inf)
+        behind = plane.inverse_depth(camera_matrix, columns, rows) - 1.0 / np.where(known, depth, np.inf)
         before = (known & (behind < -4 * plane.sigma)).astype(np.uint8)  # an arm that hides a part of it
         inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
     if inside.sum() < 8:
@@ -77,9 +76,10 @@ def interior(
         clearly = max(4 * plane.sigma, CLEARLY_M * float(plane.m @ middle) ** 2)
         deeper = float(np.mean(behind[inside & known] > clearly)) if (inside & known).any() else 0.0
         into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
-        along = (place[inside][:, :2] - (x, y)) @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
-        drift = _gradient(part, place, ring, ellipse) * min(darkness, 1.0)  # of dust, which lies over hole and face alike
-        values = values - (place[inside][:, :2] - (x, y)) @ drift
+        away = _places(inside, left, top) - (x, y)
+        along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
+        drift = _gradient(part[ring], _places(ring, left, top) - (x, y)) * min(darkness, 1.0)  # of dust, over hole and face alike
+        values = values - away @ drift
         slope = float(np.polyfit(along, values, 1)[0]) / max(face * (1.0 - darkness), 1.0)
     around = _darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
     return Interior(darkness, slope, deeper, unknown, around, _contrast(smooth[ring], face * darkness))
@@ -112,17 +112,24 @@ def _darkest_around(
     )
     near = gray[np.ix_(rows, columns)]
     if plane is not None:
-        down, across = np.meshgrid(rows, columns, indexing="ij")
-        place = np.stack([across, down, np.ones_like(down)], -1) @ np.linalg.inv(camera_matrix).T
-        behind = place @ plane.m - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma  # false where depth is unknown
+        here = plane.inverse_depth(camera_matrix, columns[None, :], rows[:, None])
+        behind = here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma  # false where depth is unknown
         near = near[cv2.erode(behind.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0]
     return float(np.percentile(near, 1.0)) if near.size else 0.0
 
 
-def _gradient(part: np.ndarray, place: np.ndarray, ring: np.ndarray, ellipse: np.ndarray) -> np.ndarray:
-    """Returns the mean slope of brightness over a ring, `(2,)` grey levels a pixel; what departs much from it does not count."""
-    away = np.column_stack([place[ring][:, :2] - ellipse[:2], np.ones(int(ring.sum()))])
-    values = part[ring].astype(float)
+def _places(there: np.ndarray, left: int, top: int) -> np.ndarray:
+    """Returns column and row of the pixels of a part of a picture, `(P, 2)`."""
+    line, column = np.nonzero(there)
+    return np.column_stack([column + left, line + top])
+
+
+def _gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """Returns the mean slope of brightness `(P,)` over places of a ring `(P, 2)`, `(2,)` grey levels a pixel.
+
+    What departs much from it does not count.
+    """
+    away, values = np.column_stack([away, np.ones(len(away))]), values.astype(float)
     weight = np.ones(len(values))
     fitted = np.zeros(3)
     for _ in range(3):

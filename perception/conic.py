@@ -19,16 +19,17 @@ def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         weights: `(C, P)`, 0 for points that do not count.
     """
     total = np.maximum(weights.sum(1), 1e-12)
-    center = np.einsum("cpk,cp->ck", points, weights) / total[:, None]
-    moved = np.where(weights[..., None] > 0, points - center[:, None], 0.0)
-    scale = np.sqrt(np.einsum("cpk,cpk,cp->c", moved, moved, weights) / total) + 1e-12
-    x, y = np.moveaxis(moved / scale[:, None, None], -1, 0)
-    powers = np.empty((*x.shape, 6))
+    center = (weights[:, None] @ points)[:, 0] / total[:, None]
+    counts = weights > 0
+    x, y = (np.where(counts, points[..., k] - center[:, k, None], 0.0) for k in (0, 1))
+    scale = np.sqrt(((x * x + y * y) * weights).sum(1) / total) + 1e-12
+    x, y = x / scale[:, None], y / scale[:, None]
+    powers = np.empty((len(x), 6, x.shape[1]))
     for k, power in enumerate((x * x, x * y, y * y, x, y, 1.0)):
-        powers[..., k] = power
-    scatter = (powers * weights[..., None]).transpose(0, 2, 1) @ powers
+        powers[:, k] = power
+    scatter = (powers * weights[:, None]) @ powers.transpose(0, 2, 1)
     s1, s2, s3 = scatter[:, :3, :3], scatter[:, :3, 3:], scatter[:, 3:, 3:]
-    known = ((weights > 0).sum(1) >= 6) & np.isfinite(s1).all((1, 2)) & (np.linalg.det(s3) > 1e-9)
+    known = (counts.sum(1) >= 6) & np.isfinite(s1).all((1, 2)) & (np.linalg.det(s3) > 1e-9)
     result = np.full((len(points), 5), np.nan)
     if not known.any():
         return result
@@ -112,21 +113,25 @@ def ellipse_of(forms: np.ndarray) -> np.ndarray:
     return np.where(known[:, None], result, np.nan)
 
 
-def distance(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Returns Sampson's distance of points `(C, P, 2)` from their ellipses `(C, 5)`, negative inside, `(C, P)`."""
+def beside(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns Sampson's distance of points `(C, P, 2)` from their ellipses `(C, 5)`, negative inside, `(C, P)`.
+
+    With it, the outward unit normals of the ellipses there, `(C, P, 2)`.
+    """
     value, slope = _value(ellipses, points)
-    return value / np.maximum(np.linalg.norm(slope, axis=-1), 1e-12)
-
-
-def normals(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Returns the outward unit normals of ellipses `(C, 5)` at points near them `(C, P, 2)`, `(C, P, 2)`."""
-    slope = _value(ellipses, points)[1]
-    return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
+    length = np.maximum(np.sqrt(dot(slope, slope)), 1e-12)
+    return value / length, slope / length[..., None]
 
 
 def slopes(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Returns the length of the gradient of each ellipse's form at its points, `(C, P)`: turns algebraic into geometric error."""
-    return np.linalg.norm(_value(ellipses, points)[1], axis=-1)
+    slope = _value(ellipses, points)[1]
+    return np.sqrt(dot(slope, slope))
+
+
+def dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Returns the products of vectors of the picture, `(…, 2)`; much faster than a sum over so short an axis."""
+    return one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1]
 
 
 def sample(ellipses: np.ndarray, angles_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -134,10 +139,12 @@ def sample(ellipses: np.ndarray, angles_rad: np.ndarray) -> tuple[np.ndarray, np
     x, y, a, b, theta = (column[:, None] for column in ellipses.T)
     cos, sin, c, s = np.cos(angles_rad), np.sin(angles_rad), np.cos(theta), np.sin(theta)
     u, v = a * cos, b * sin
-    points = np.stack([x + c * u - s * v, y + s * u + c * v], -1)
+    points, outward = np.empty((*u.shape, 2)), np.empty((*u.shape, 2))
+    points[..., 0], points[..., 1] = x + c * u - s * v, y + s * u + c * v
     nu, nv = b * cos, a * sin
-    length = np.hypot(nu, nv)
-    outward = np.stack([c * nu - s * nv, s * nu + c * nv], -1) / np.maximum(length, 1e-12)[..., None]
+    length = np.sqrt(nu * nu + nv * nv)
+    unit = 1.0 / np.maximum(length, 1e-12)
+    outward[..., 0], outward[..., 1] = (c * nu - s * nv) * unit, (s * nu + c * nv) * unit
     return points, outward, length
 
 
@@ -158,7 +165,9 @@ def _value(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
     c, s = np.cos(theta), np.sin(theta)
     dx, dy = points[..., 0] - x, points[..., 1] - y
     u, v = (c * dx + s * dy) / a, (c * dy - s * dx) / b
-    slope = 2 * np.stack([c * u / a - s * v / b, s * u / a + c * v / b], -1)
+    slope = np.empty((*u.shape, 2))
+    p, q = 2 * u / a, 2 * v / b
+    slope[..., 0], slope[..., 1] = c * p - s * q, s * p + c * q
     return u * u + v * v - 1.0, slope
 
 

@@ -24,6 +24,8 @@ PART = 0.6
 """Coverage below which the limit of angles no longer shrinks: what is left is told by how they change along the arc."""
 FAINT, SMALL_PX = 0.12, 6.0
 """Of the strongest edges: so strong that of an ellipse of this size must be, of a larger one less; faint stains are all round."""
+BESIDE_PX = 2
+"""By how much farther than within reach the nearest edge is known."""
 PIECE = 0.6
 """Of an arc, that may be an ellipse's where not all of it is."""
 STROKE_PX, SAME_AREA = 4.5, 0.6
@@ -71,7 +73,7 @@ class ArcDetector:
             return []
         limits = prior or SizePrior(0.0, float(max(part.shape)))
         where = None if roi is None else roi[top:bottom, left:right]
-        edges = ellipse_edges.find(part, where, s.sigma_px, s.percentile, s.noise, s.low, s.arc_points)
+        edges = ellipse_edges.find(part, where, s.sigma_px, s.percentile, s.noise, s.low, s.arc_points, self._near(limits))
         if not len(edges.points):
             return []
         edges = edges.cut(s.arc_tolerance_px, s.corner_rad, max(s.arc_points, int(0.5 * limits.lowest_px)))
@@ -139,8 +141,8 @@ class ArcDetector:
         possible = self._sized(ellipses, limits, 1.5)
         possible &= lengths >= LEAST_ARC * np.nan_to_num(conic.perimeter(ellipses[:, 2], ellipses[:, 3]))
         ellipses, points, seeds = ellipses[possible], points[possible], seeds[possible]
-        off = conic.distance(ellipses, points)
-        outward = (conic.normals(ellipses, points) * edges.directions[seeds]).sum(-1)
+        off, outward = conic.beside(ellipses, points)
+        outward = conic.dot(outward, edges.directions[seeds])
         reach = self._reach(ellipses)
         near = (np.abs(off) < reach[:, None]).mean(1) > 0.5
         keep = near & (np.abs(outward.mean(1)) > 0.5)
@@ -247,8 +249,14 @@ class ArcDetector:
         return spans[(extent.max(1) <= 2.2 * limits.highest_px) & (np.hypot(*extent.T) >= 0.5 * limits.lowest_px)]
 
     def _reach(self, ellipses: np.ndarray) -> np.ndarray:
-        size = np.sqrt(ellipses[:, 2] * ellipses[:, 3])
-        return np.clip(self.settings.reach_relative * size, self.settings.reach_px, 4.0 * self.settings.reach_px)
+        return self._within_reach(np.sqrt(ellipses[:, 2] * ellipses[:, 3]))
+
+    def _within_reach(self, size_px: np.ndarray | float) -> np.ndarray:
+        return np.clip(self.settings.reach_relative * size_px, self.settings.reach_px, 4.0 * self.settings.reach_px)
+
+    def _near(self, limits: SizePrior) -> int:
+        """Returns how far from an edge an ellipse is asked for it: its reach, and what rounding to pixels takes off."""
+        return int(np.ceil(self._within_reach(limits.highest_px))) + BESIDE_PX
 
 
 def _other_side(ellipse: np.ndarray, others: list[np.ndarray]) -> bool:

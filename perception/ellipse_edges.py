@@ -35,7 +35,7 @@ class Edges:
         directions: Unit gradients `(E, 2)`, from dark to bright.
         strength: Length of the gradient `(E,)`, grey levels a pixel.
         chain: Number of the connected chain of each point, `(E,)`.
-        nearest: Number of the edge point nearest to each pixel, `(h, w)`.
+        nearest: Number of the edge point nearest to each pixel, `(h, w)`, -1 where none is near.
         spans: Pieces of chains without a branch, `(S, 2)`: first point and one past the last.
         arcs: Convex arcs, spans too, `(A, 2)`.
         run: Number of the piece between two corners of each point, `(E,)`, -1 for a short one.
@@ -69,6 +69,14 @@ class Edges:
                 length[first] += length[last]
         return replace(self, arcs=arcs, run=run, run_length=np.maximum(length, 1.0))
 
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Returns the number of the edge point nearest to each place `(…, 2)`, -1 where none is near."""
+        height, width = self.nearest.shape
+        x, y = np.rint(points[..., 0]), np.rint(points[..., 1])
+        place = (y * width + x).astype(np.intp)
+        place[(x < 0) | (y < 0) | (x >= width) | (y >= height)] = 0  # the picture's border has no edges
+        return self.nearest.ravel().take(place)
+
     def _closed(self) -> np.ndarray:
         """Returns the spans that end where they begin, without a corner there, `(S, 2)`."""
         start, stop = self.spans[self.spans[:, 1] - self.spans[:, 0] > 4 * CLOSE].T
@@ -78,7 +86,7 @@ class Edges:
 
 
 def find(
-    gray: np.ndarray, roi: np.ndarray | None, sigma_px: float, percentile: float, noise: float, low: float, least: int
+    gray: np.ndarray, roi: np.ndarray | None, sigma_px: float, percentile: float, noise: float, low: float, least: int, near_px: int
 ) -> Edges:
     """Returns the edges of a picture.
 
@@ -93,6 +101,7 @@ def find(
         noise: Upper threshold in standard deviations of the gradient of noise, as the median magnitude tells it.
         low: Lower threshold as a part of the upper one.
         least: Contours with fewer points are left out.
+        near_px: How far from its edge points a picture knows the nearest one.
     """
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma_px)
     gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0))
@@ -119,8 +128,9 @@ def find(
     points, directions = _refined(pixels, gx, gy, magnitude)
     strength = magnitude[pixels[:, 1], pixels[:, 0]]
     return Edges(
-        points, directions, strength, chain, _nearest(pixels, gray.shape), spans, NO_SPANS, np.full(len(points), -1), np.empty(0)
-    )
+        points, directions, strength, chain, _nearest(pixels, gray.shape, near_px), spans, NO_SPANS,
+        np.full(len(points), -1), np.empty(0),
+    )  # fmt: skip
 
 
 def _pieces(edges: Edges, tolerance_px: float, corner_rad: float, least: int) -> tuple[np.ndarray, np.ndarray]:
@@ -228,26 +238,35 @@ def _refined(pixels: np.ndarray, gx: np.ndarray, gy: np.ndarray, magnitude: np.n
     return pixels + np.clip(shift, -0.75, 0.75)[:, None] * direction, direction
 
 
-def _nearest(pixels: np.ndarray, shape: tuple) -> np.ndarray:
-    """Returns the number of the edge pixel nearest to each pixel, `(h, w)`."""
-    blank = np.ones(shape, np.uint8)
-    blank[pixels[:, 1], pixels[:, 0]] = 0
-    labels = np.asarray(cv2.distanceTransformWithLabels(blank, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)[1], np.int32)
-    number = np.zeros(len(pixels) + 1, np.int32)
-    number[labels[pixels[:, 1], pixels[:, 0]]] = np.arange(len(pixels))
-    return number.take(labels)
+def _nearest(pixels: np.ndarray, shape: tuple, near_px: int) -> np.ndarray:
+    """Returns the number of the edge pixel nearest to each pixel not farther from one than that, `(h, w)`, -1 elsewhere.
+
+    Each edge pixel writes its number around itself, the farthest place first: a distance transform costs by the picture, not by
+    its edges.
+    """
+    height, width = shape[0] + 2 * near_px, shape[1] + 2 * near_px
+    number = np.full(height * width, -1, np.int32)
+    down, across = np.mgrid[-near_px : near_px + 1, -near_px : near_px + 1].reshape(2, -1)
+    away = down**2 + across**2
+    place = (pixels[:, 1].astype(np.intp) + near_px) * width + pixels[:, 0] + near_px
+    mine = np.arange(len(pixels), dtype=np.int32)
+    for k in np.argsort(-away, kind="stable")[np.count_nonzero(away > near_px**2) :].tolist():
+        number[place + (down[k] * width + across[k])] = mine
+    return np.ascontiguousarray(number.reshape(height, width)[near_px:-near_px, near_px:-near_px])
 
 
 def _bilinear(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Returns the picture between its pixels, at `(E, 2)` points away from its border."""
-    x0, y0 = (np.clip(np.floor(points[:, k]).astype(int), 0, picture.shape[1 - k] - 2) for k in (0, 1))
+    height, width = picture.shape
+    x0, y0 = (np.floor(points[:, k]).astype(np.intp).clip(0, size - 2) for k, size in ((0, width), (1, height)))
     fx, fy = points[:, 0] - x0, points[:, 1] - y0
-    top = picture[y0, x0] * (1 - fx) + picture[y0, x0 + 1] * fx
-    bottom = picture[y0 + 1, x0] * (1 - fx) + picture[y0 + 1, x0 + 1] * fx
+    flat, here = picture.ravel(), y0 * width + x0
+    top = flat.take(here) * (1 - fx) + flat.take(here + 1) * fx
+    bottom = flat.take(here + width) * (1 - fx) + flat.take(here + width + 1) * fx
     return top * (1 - fy) + bottom * fy
 
 
 def _none(shape: tuple) -> Edges:
     empty = np.empty((0, 2))
     none = np.empty(0, int)
-    return Edges(empty, empty, np.empty(0), none, np.zeros(shape, np.int32), NO_SPANS, NO_SPANS, none, np.empty(0))
+    return Edges(empty, empty, np.empty(0), none, np.full(shape, -1, np.int32), NO_SPANS, NO_SPANS, none, np.empty(0))

@@ -51,10 +51,10 @@ def gather(
     of the point, -1 where there is none, its distance along the normal, and the cosine between gradient and normal.
     """
     points, outward, _ = conic.sample(candidates.ellipses, angles_rad)
-    found = edges.nearest[_pixels(points, edges.nearest.shape)]
+    found = edges.at(points)
     apart = edges.points[found] - points
-    off = (apart * outward).sum(-1)
-    along = (edges.directions[found] * outward).sum(-1) * candidates.polarity[:, None]
+    off = conic.dot(apart, outward)
+    along = conic.dot(edges.directions[found], outward) * candidates.polarity[:, None]
     side = np.abs(apart[..., 0] * outward[..., 1] - apart[..., 1] * outward[..., 0])
     good = (np.abs(off) < reach_px[:, None]) & (side < 2.0)
     good &= along > np.cos(angle_rad)
@@ -97,12 +97,12 @@ def departure(candidates: Candidates, edges: Edges, support: np.ndarray, length:
     reach, wide = reach_px[:, None], np.clip(0.3 * np.sqrt(e[:, 2] * e[:, 3]), 3.0, 12.0)[:, None]
     beside = np.zeros(support.shape, bool)
     for part in (-1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0):
-        found = edges.nearest[_pixels(points + (part * wide)[..., None] * outward, edges.nearest.shape)]
-        off = np.abs(((edges.points[found] - points) * outward).sum(-1))
-        along = (edges.directions[found] * outward).sum(-1) * candidates.polarity[:, None]
-        hit = (along > 0.85) & (off > reach) & (off <= wide)
-        beside |= hit & np.isin(rows * number + edges.chain[found], mine)
-    return (length * (beside & (support < 0))).sum(1) / length.sum(1)
+        found = edges.at(points + (part * wide)[..., None] * outward)
+        off = np.abs(conic.dot(edges.points[found] - points, outward))
+        along = conic.dot(edges.directions[found], outward) * candidates.polarity[:, None]
+        hit = (found >= 0) & (along > 0.85) & (off > reach) & (off <= wide) & (support < 0) & ~beside
+        beside[hit] = np.isin((rows * number + edges.chain[found])[hit], mine)
+    return (length * beside).sum(1) / length.sum(1)
 
 
 def waves(candidates: Candidates, edges: Edges, support: np.ndarray, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,7 +113,7 @@ def waves(candidates: Candidates, edges: Edges, support: np.ndarray, off: np.nda
     there = support >= 0
     outward = conic.sample(candidates.ellipses, ANGLES)[1]
     bright = edges.directions[support] * candidates.polarity[:, None, None]
-    turn = np.arctan2(outward[..., 0] * bright[..., 1] - outward[..., 1] * bright[..., 0], (outward * bright).sum(-1))
+    turn = np.arctan2(outward[..., 0] * bright[..., 1] - outward[..., 1] * bright[..., 0], conic.dot(outward, bright))
     known = _around(there)
     enough = known >= 0.6 * WINDOW
     return tuple(
@@ -145,7 +145,7 @@ def leaving(candidates: Candidates, edges: Edges, support: np.ndarray, length: n
         back = (end - side * np.ceil(BACK_PX / ds[row, end]).astype(int)) % NUM_SAMPLES
         start = np.where(support[row, back] >= 0, back, end)
         e = candidates.ellipses[row]
-        outward = conic.normals(e, edges.points[support[row, start]][:, None])[:, 0]
+        outward = conic.beside(e, edges.points[support[row, start]][:, None])[1][:, 0]
         onward = side * np.column_stack([-outward[:, 1], outward[:, 0]])
         size = np.sqrt(e[:, 2] * e[:, 3])
         reach = np.clip(0.35 * size, 6.0, 16.0) + BACK_PX
@@ -172,7 +172,7 @@ def _followed(edges: Edges, start: np.ndarray, onward: np.ndarray, reach_px: np.
     strength = np.zeros(len(start))
     for step in range(int(np.ceil(reach_px.max(initial=0.0) / STRIDE_PX))):
         onto = place + STRIDE_PX * along
-        number = edges.nearest[_pixels(onto, edges.nearest.shape)]
+        number = edges.at(onto)
         came, place, bright = ((edges.points[number] - place) * along).sum(1), edges.points[number], edges.directions[number]
         along = np.column_stack([bright[:, 1], -bright[:, 0]]) * hand[:, None]
         needed = step * STRIDE_PX < reach_px
@@ -207,10 +207,3 @@ def evidence(coverage: np.ndarray, angle_rms_rad: np.ndarray, perimeter_px: np.n
     with np.errstate(divide="ignore", invalid="ignore"):
         absent = np.where(coverage < 1, (1 - coverage) * np.log10((1 - coverage) / (1 - chance)), 0.0)
         return np.where(coverage > chance, (coverage * np.log10(coverage / chance) + absent) * perimeter_px / 2, 0.0)
-
-
-def _pixels(points: np.ndarray, shape: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """Returns row and column of the pixel of each point; those outside the picture get its corner, which has no edge."""
-    x, y = np.rint(points[..., 0]).astype(int), np.rint(points[..., 1]).astype(int)
-    inside = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
-    return np.where(inside, y, 0), np.where(inside, x, 0)

@@ -53,6 +53,10 @@ class Plane:
         project = (np.eye(3) - np.outer(self.normal, self.normal)) / length
         return project @ self.cov @ project
 
+    def inverse_depth(self, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Returns its inverse depth at columns and rows of a picture, of broadcast shapes; see `inverse_depth`."""
+        return inverse_depth(self.m, camera_matrix, u, v)
+
     def point(self, ray: np.ndarray) -> np.ndarray:
         """Returns where a ray `(3,)` with z = 1 meets it."""
         return ray / float(self.m @ ray)
@@ -60,12 +64,12 @@ class Plane:
 
 @dataclass(frozen=True)
 class Support:
-    """Pixels of the face around an ellipse.
+    """Pixels of the face around an ellipse, outwards.
 
     Attributes:
         rays: `(P, 3)`, z = 1.
         inverse: Inverse depth, `(P,)` 1/m.
-        radii: Distance from the ellipse's centre in its own radii, `(P,)`.
+        radii: Distance from the ellipse's centre in its own radii, `(P,)`, increasing.
         cell: Number of the square of the picture in which a pixel lies, `(P,)`; noise is alike within one.
         known: Part of the surroundings whose depth is known, whatever it is.
     """
@@ -75,6 +79,12 @@ class Support:
     radii: np.ndarray
     cell: np.ndarray
     known: float
+
+
+def inverse_depth(m: np.ndarray, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Returns inverse depth on a plane `m · P = 1` at columns and rows of a picture: linear in both, so of whole rows at once."""
+    across, down, middle = np.linalg.solve(camera_matrix.T, m)
+    return across * u + (down * v + middle)
 
 
 def support(
@@ -112,7 +122,7 @@ def support(
     top, bottom = max(0, int(y - a)), min(height, int(y + a) + 2)
     area = max(right - left, 0) * max(bottom - top, 0)
     step = max(1, int(np.sqrt(area / most)))
-    rows, columns = np.mgrid[top:bottom:step, left:right:step]
+    rows, columns = np.ogrid[top:bottom:step, left:right:step]
     depth = depth_m[top:bottom:step, left:right:step]
     radii = conic.radii(ellipse, columns, rows)
     good = (allowed[top:bottom:step, left:right:step] | (radii < certain)) & np.isfinite(depth) & (depth > 0)
@@ -123,10 +133,14 @@ def support(
     ring = (radii > inner) & (radii < certain)
     known = float(np.isfinite(depth[ring]).mean()) if ring.any() else 0.0
     good &= (radii > inner) & (radii < outer)
-    u, v = columns[good].astype(float), rows[good].astype(float)
-    rays = np.column_stack([u, v, np.ones_like(u)]) @ np.linalg.inv(camera_matrix).T
-    cell = (v // cell_px).astype(np.int64) * (width // cell_px + 1) + (u // cell_px).astype(np.int64)
-    return Support(rays, 1.0 / depth[good].astype(float), radii[good], cell, known)
+    line, place = np.nonzero(good)
+    radii, inverse = radii[good], 1.0 / depth[good].astype(float)
+    v, u = top + step * line, left + step * place
+    cell = parted(v // cell_px * (width // cell_px + 1) + u // cell_px)
+    outwards = np.argsort(radii)
+    u, v, radii, inverse, cell = (some[outwards] for some in (u, v, radii, inverse, cell))
+    rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera_matrix).T
+    return Support(rays, inverse, radii, cell, known)
 
 
 def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.random.Generator) -> Plane | None:
@@ -138,33 +152,33 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
         floor: Least standard deviation of inverse depth, 1/m: of a matcher that repeats itself.
         generator: Draws the triples of the first guess.
     """
-    rings = tuple(ring for ring in rings if (points.radii < ring).sum() >= LEAST)  # near what hides it a matcher sees nothing
+    rings = tuple(ring for ring in rings if np.searchsorted(points.radii, ring) >= LEAST)  # near what hides it a matcher is blind
     if not rings:
         return None
-    near = points.radii < rings[0]
-    m = _guess(points.rays[near], points.inverse[near], generator)
+    number = int(np.searchsorted(points.radii, rings[0]))
+    m = _guess(points.rays[:number], points.inverse[:number], generator)
     extent = rings[0]
     first = sigma = floor
-    weight = np.zeros(len(points.inverse))
+    rays = weight = points.rays[:0]
     for ring in rings:
-        inside = points.radii < ring
+        number = int(np.searchsorted(points.radii, ring))
+        rays, inverse = points.rays[:number], points.inverse[:number]
         for _ in range(3):
-            residual = points.inverse - points.rays @ m
-            tight = np.abs(residual[inside])
+            residual = inverse - rays @ m
+            tight = np.abs(residual)
             scale = max(1.4826 * float(np.median(tight[tight < max(8 * sigma, np.median(tight) * 1.5)])), floor)
             sigma = scale if ring == rings[0] else min(scale, 1.2 * first)  # what else comes into sight is no noise
             reach = (TUKEY if ring == rings[0] else GROWING) * sigma
-            weight = np.where(inside, np.maximum(1 - (residual / reach) ** 2, 0.0) ** 2, 0.0)
-            if (weight > 0).sum() < LEAST // 2:
+            weight = np.maximum(1 - (residual / reach) ** 2, 0.0) ** 2
+            if np.count_nonzero(weight) < LEAST // 2:
                 return None
-            heavy = points.rays * weight[:, None]
-            m = np.linalg.solve(heavy.T @ points.rays, heavy.T @ points.inverse)
+            heavy = rays.T * weight
+            m = np.linalg.solve(heavy @ rays, heavy @ inverse)
         first = sigma if ring == rings[0] else first
         extent = ring
-    residual = points.inverse - points.rays @ m
-    return Plane(
-        m, sandwich(points.rays, points.rays * weight[:, None], residual, points.cell), sigma, int((weight > 0).sum()), extent
-    )
+    residual = points.inverse[:number] - rays @ m
+    cov = sandwich(rays, rays * weight[:, None], residual, points.cell[:number])
+    return Plane(m, cov, sigma, int(np.count_nonzero(weight)), extent)
 
 
 def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40) -> np.ndarray:
@@ -180,6 +194,12 @@ def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator
     return planes[np.argmin(np.partition(off, middle, axis=0)[middle])]
 
 
+def parted(cell: np.ndarray) -> np.ndarray:
+    """Returns the numbers of cells `(P,)` from 0 on, of points row by row; where there are too few, of bands of rows instead."""
+    cell = np.unique(cell, return_inverse=True)[1]
+    return cell if cell.max(initial=0) >= FEWEST else np.arange(len(cell)) * FEWEST // max(len(cell), 1)
+
+
 def sandwich(slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """Returns the covariance of a fit of three numbers, `(3, 3)`, by how it changes without each cell, in which noise may be alike.
 
@@ -190,11 +210,8 @@ def sandwich(slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: 
         slopes: Of the residuals for each number, `(P, 3)`.
         heavy: What the residuals are held against to find them, `(P, 3)`: the weighted slopes, or instruments in their place.
         residual: `(P,)`.
-        cell: Number of each point's cell, `(P,)`.
+        cell: Number of each point's cell, from 0 on, `(P,)`.
     """
-    _, cell = np.unique(cell, return_inverse=True)
-    if cell.max() < FEWEST:
-        cell = np.arange(len(cell)) * FEWEST // len(cell)
     sums = np.stack([np.bincount(cell, heavy[:, k] * residual) for k in range(3)], -1)
     parts = np.stack([np.bincount(cell, heavy[:, j] * slopes[:, k]) for j in range(3) for k in range(3)], -1)
     without = parts.sum(0) - parts

@@ -138,7 +138,8 @@ def _edges(gray: np.ndarray, ellipse: np.ndarray, reach_px: float, chart: Chart)
     map_x, map_y = ((some - max(corner, 0)).astype(np.float32) for some, corner in ((x, left), (y, top)))
     profile = cv2.remap(part, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
     smooth = cv2.GaussianBlur(profile, (0, 0), SIGMA_PX / STEP_PX, sigmaY=SIGMA_Y)
-    slope = np.gradient(smooth, axis=1)
+    slope = np.zeros_like(smooth)
+    slope[:, 1:-1] = 0.5 * (smooth[:, 2:] - smooth[:, :-2])
     inner = slope[:, 1:-1]
     peak = (inner >= slope[:, :-2]) & (inner > slope[:, 2:]) & (np.abs(offset[1:-1]) <= reach_px)
     peak &= ((x > 1) & (y > 1) & (x < width - 2) & (y < height - 2))[:, 1:-1]
@@ -178,8 +179,9 @@ def _agreed(edges: np.ndarray, pixel_m: np.ndarray, radius_m: float, tolerance: 
     circles = circles[np.isfinite(circles).all(1) & (np.abs(radius - radius_m) < tolerance * radius_m)]
     if not len(circles):
         return None
-    off = np.abs(np.linalg.norm(edges[None] - circles[:, None, None, :2], axis=-1) - circles[:, 2, None, None]) / pixel_m[:, None]
-    near = np.min(np.where(np.isfinite(off), off, np.inf), 2)
+    dx, dy = (edges[None, ..., k] - circles[:, k, None, None] for k in (0, 1))
+    off = np.abs(np.sqrt(dx * dx + dy * dy) - circles[:, 2, None, None])
+    near = np.fmin.reduce(off, 2, initial=np.inf) / pixel_m  # where there are fewer edges, the others count
     return circles[np.argmax(np.maximum(1 - (near / NEAR_PX) ** 2, 0.0).sum(1))]
 
 
@@ -190,7 +192,7 @@ def _fitted(
     found = start
     for scale_px in (NARROW_PX, INLIER_PX, 0.6 * INLIER_PX):
         away = edges - found[:2]
-        distance = np.linalg.norm(away, axis=-1)
+        distance = np.sqrt(conic.dot(away, away))
         off = (distance - found[2]) / pixel_m[:, None]
         best = np.argmin(np.where(np.isfinite(off), np.abs(off), np.inf), 1)
         rows = np.arange(len(edges))

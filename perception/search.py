@@ -29,14 +29,14 @@ class Level:
 
     Attributes:
         shrink: Pixels of the picture to one of this level.
-        roi: Where to look, `(h, w)` bool, the whole picture.
+        region: Where to look, of the whole picture, on the grid of `STEP`, uint8 of 0 and 1.
         prior: How large a hole may look there, px of the picture; `None` for any size.
         sizes_px: How large a hole would look at each place of the grid of `STEP`, NaN where nobody knows; `None` for nowhere.
         slack: By how much the size may be off at a place, as a part of it.
     """
 
     shrink: int
-    roi: np.ndarray
+    region: np.ndarray
     prior: SizePrior | None
     sizes_px: np.ndarray | None = None
     slack: float = 0.0
@@ -56,18 +56,22 @@ class Level:
         return not near.size or near.min() / (1.0 + self.slack) <= one.a <= near.max() * (1.0 + self.slack)
 
     def _found(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
-        if self.shrink == 1:
-            return detector.detect(gray, self.roi, self.prior)
-        x, y, wide, high = cv2.boundingRect(self.roi.view(np.uint8))
-        top, left = (start // self.shrink * self.shrink for start in (y, x))
-        height, width = (y + high - top) // self.shrink, (x + wide - left) // self.shrink
+        x, y, wide, high = cv2.boundingRect(self.region)
+        left, top = x * STEP, y * STEP
+        height, width = (
+            min(size * STEP, whole - start) // self.shrink
+            for size, whole, start in ((high, len(gray), top), (wide, len(gray[0]), left))
+        )
         if min(height, width) < 1:
             return []
-        part = np.s_[top : top + height * self.shrink, left : left + width * self.shrink]
-        small = cv2.resize(gray[part], (width, height), interpolation=cv2.INTER_AREA)
-        roi = np.ascontiguousarray(self.roi[part][self.shrink // 2 :: self.shrink, self.shrink // 2 :: self.shrink])
+        part = gray[top : top + height * self.shrink, left : left + width * self.shrink]
+        small = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA) if self.shrink > 1 else part
+        finer = (-(-wide * STEP // self.shrink), -(-high * STEP // self.shrink))
+        roi = cv2.resize(self.region[y : y + high, x : x + wide], finer, interpolation=cv2.INTER_NEAREST)[:height, :width]
         prior = self.prior and SizePrior(self.prior.lowest_px / self.shrink, self.prior.highest_px / self.shrink)
-        return [_enlarged(one, self.shrink, left, top) for one in detector.detect(small, roi, prior)]
+        return [
+            _enlarged(one, self.shrink, left, top) for one in detector.detect(small, np.ascontiguousarray(roi).view(bool), prior)
+        ]
 
 
 def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfortable_px: float) -> list[Level]:
@@ -89,19 +93,19 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
     inside = mask[STEP // 2 :: STEP, STEP // 2 :: STEP]
     known = inside & np.isfinite(depth)
     if np.count_nonzero(known) < LEAST:
-        return [Level(1, _full(_dilated(inside, 0.03 * inside.shape[1]), mask.shape), None)]
+        return [Level(1, _dilated(inside, 0.03 * inside.shape[1]), None)]
     size_px = np.divide(focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=known)
-    everywhere_px = np.where(known, size_px, np.nan)
+    everywhere_px, unknown = np.where(known, size_px, np.nan), ~np.isfinite(depth)
     found, rest = [], known.copy()
+    suited = [_suited(size_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)]
     for _ in range(OCTAVES):  # the resolution next that suits most of what is left, the coarser one of two alike
-        suited = [rest & _suited(size_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)]
-        number = max(range(OCTAVES), key=lambda octave: (np.count_nonzero(suited[octave]), octave))
-        here = suited[number]
+        number = max(range(OCTAVES), key=lambda octave: (np.count_nonzero(rest & suited[octave]), octave))
+        here = rest & suited[number]
         if np.count_nonzero(here) < LEAST:
             break
         rest &= ~here
         reach = float(np.percentile(size_px[here], 98.0)) * (1.0 + slack) / STEP
-        hidden = (_dilated(here, UNSEEN * reach) > 0) & ~np.isfinite(depth)
+        hidden = (_dilated(here, UNSEEN * reach) > 0) & unknown
         count, pieces = cv2.connectedComponents(_dilated(here | hidden, reach))
         for piece in range(1, count):
             part = pieces == piece
@@ -109,18 +113,18 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
             if len(some_px) >= LEAST:
                 low, high = np.percentile(some_px, (2.0, 98.0))
                 prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
-                found.append(Level(2**number, _full(part.astype(np.uint8), mask.shape), prior, everywhere_px, slack))
+                found.append(Level(2**number, part.astype(np.uint8), prior, everywhere_px, slack))
     return found
 
 
 def box(mask: np.ndarray, whole: Sequence[Level]) -> list[Level]:
     """Returns one level instead, in full resolution: the bounding box of the mask, as large as a hole may be anywhere."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    roi = np.zeros(mask.shape, bool)
-    roi[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
+    x, y, wide, high = cv2.boundingRect(mask.view(np.uint8))
+    region = np.zeros([-(-size // STEP) for size in mask.shape], np.uint8)
+    region[y // STEP : (y + high - 1) // STEP + 1, x // STEP : (x + wide - 1) // STEP + 1] = 1
     priors = [level.prior for level in whole if level.prior]
     prior = SizePrior(min(p.lowest_px for p in priors), max(p.highest_px for p in priors)) if priors else None
-    return [Level(1, roi, prior)]
+    return [Level(1, region, prior)]
 
 
 def _suited(size_px: np.ndarray, comfortable_px: float, octave: int) -> np.ndarray:
@@ -132,10 +136,6 @@ def _suited(size_px: np.ndarray, comfortable_px: float, octave: int) -> np.ndarr
 def _dilated(small: np.ndarray, reach: float) -> np.ndarray:
     size = 2 * max(1, round(reach)) + 1
     return cv2.dilate(small.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
-
-
-def _full(small: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    return np.asarray(cv2.resize(np.minimum(small, 1), shape[::-1], interpolation=cv2.INTER_NEAREST)).view(bool)
 
 
 def _enlarged(one: Ellipse, factor: int, left: int, top: int) -> Ellipse:

@@ -105,7 +105,8 @@ def test_beside_an_arm_a_face_is_searched_where_nobody_knows_its_depth() -> None
     frame = replace(drawn()[0], depth_m=depth_m)
     (level,) = search.levels(frame, mask, 0.05, 0.25, 8.0)
     # a hole has 13 px there, 17 at most: the whole strip is searched, the arm no farther than a rim reaches, the ground likewise
-    assert level.roi[110:390, 300:360].all() and not level.roi[:, 390:].any() and not level.roi[:, :70].any()
+    seen = np.repeat(np.repeat(level.region > 0, search.STEP, 0), search.STEP, 1)
+    assert seen[110:390, 300:360].all() and not seen[:, 390:].any() and not seen[:, :70].any()
 
 
 class Drawn:
