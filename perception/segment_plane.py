@@ -6,6 +6,8 @@ Inverse depth is the natural coordinate: on a plane `n · P = d` it is linear in
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -13,6 +15,9 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.sight import Masks
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
+
+ONE, X, Y, XX, XY, YY = (0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)
+"""Powers of y and x, in which sums over pixels are kept."""
 
 
 @spec
@@ -91,69 +96,77 @@ class PlaneSegmenter:
                 f"{frame.name or 'frame'}: depth is known in {known.mean():.1%} of the pixels, depth_plane needs "
                 f"{self._settings.min_known:.0%}; check the depth camera, or segment by colour (perception/segmenter=onnx)"
             )
-        grid = _directions(frame.camera_matrix, inverse.shape, step)
+        grid = Grid.of(frame.camera_matrix, inverse.shape, step)
         face = np.zeros(inverse.shape, np.uint8)
         for plane in self._planes(grid, inverse, known):
             face |= self._faces(plane, grid, inverse, known)
-        gray = cv2.cvtColor(cv2.resize(frame.color, (width // 2, height // 2), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
-        mask = onto_edges(face.astype(np.float32), gray, self._settings.edge_px, self._settings.edge_contrast)
-        return Masks(cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR), None)
+        mask = np.zeros((height, width), np.float32)
+        left, top, wide, high = cv2.boundingRect(face)
+        if wide:
+            rim = 3 * self._settings.edge_px + 1  # beyond, its edges move nothing
+            right, bottom = min(left + wide + rim, len(face[0])), min(top + high + rim, len(face))
+            left, top = max(0, left - rim), max(0, top - rim)
+            part = np.s_[top * step : bottom * step, left * step : right * step]  # the last cells may be smaller ones
+            size = (min(right * step, width) - left * step, min(bottom * step, height) - top * step)
+            color = cv2.resize(frame.color[part], (size[0] // 2, size[1] // 2), interpolation=cv2.INTER_AREA)
+            gray, small = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), face[top:bottom, left:right].astype(np.float32)
+            sharp = onto_edges(small, gray, self._settings.edge_px, self._settings.edge_contrast)
+            mask[part] = cv2.resize(sharp, size, interpolation=cv2.INTER_LINEAR)
+        return Masks(mask, None)
 
-    def _planes(self, grid: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
+    def _planes(self, grid: Grid, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
         """Returns planes `n / d`, `(3,)`, the best supported first: each explains pixels that those before it do not."""
         settings, generator = self._settings, np.random.default_rng(self._settings.seed)
         found, rest = [], known.copy()
         for _ in range(settings.num_planes):
-            rows, columns = np.nonzero(rest)
-            if len(rows) < settings.min_area * known.size:
+            there = np.flatnonzero(rest)
+            if len(there) < settings.min_area * known.size:
                 break
-            trials = self._trials(grid, inverse, rest, rows, columns, generator)
-            judge = generator.integers(len(rows), size=settings.num_samples)
-            there, value = grid[rows[judge], columns[judge]], inverse[rows[judge], columns[judge]]
-            votes = (np.abs(trials @ there.T - value) < self._tolerance).sum(1)
+            trials = self._trials(grid, inverse, rest, there, generator)
+            judge = there[generator.integers(len(there), size=settings.num_samples)]
+            rows, columns = np.divmod(judge, inverse.shape[1])
+            votes = np.count_nonzero(
+                np.abs(trials @ grid.sight(rows, columns).T - inverse[rows, columns]) < self._tolerance, axis=1
+            )
             best = int(votes.argmax()) if len(votes) else 0
-            if not len(votes) or votes[best] / settings.num_samples * len(rows) < settings.min_area * known.size:
+            if not len(votes) or votes[best] / settings.num_samples * len(there) < settings.min_area * known.size:
                 break
             found.append(self._refined(trials[best], grid, inverse, rest))
-            rest &= np.abs(grid @ found[-1] - inverse) >= self._tolerance
+            rest &= np.abs(grid.inverse(found[-1]) - inverse) >= self._tolerance
         return found
 
     def _trials(
-        self,
-        grid: np.ndarray,
-        inverse: np.ndarray,
-        rest: np.ndarray,
-        rows: np.ndarray,
-        columns: np.ndarray,
-        generator: np.random.Generator,
+        self, grid: Grid, inverse: np.ndarray, rest: np.ndarray, there: np.ndarray, generator: np.random.Generator
     ) -> np.ndarray:
         """Returns planes through three pixels of `rest` that lie near each other, at many scales, `(trials, 3)`."""
         count, (height, width) = self._settings.num_trials, inverse.shape
-        first = generator.integers(len(rows), size=count)
+        row, column = np.divmod(there[generator.integers(len(there), size=count)], width)
         reach = width * self._settings.neighbourhood * generator.uniform(0.2, 1.0, count)
         shift = np.rint(generator.uniform(-1.0, 1.0, (2, 2, count)) * reach).astype(int)
-        corner_rows = np.stack([rows[first], *np.clip(rows[first] + shift[0], 0, height - 1)])
-        corner_columns = np.stack([columns[first], *np.clip(columns[first] + shift[1], 0, width - 1)])
-        corners = grid[corner_rows, corner_columns].transpose(1, 0, 2)  # (trials, 3 pixels, 3)
+        corner_rows = np.stack([row, *np.clip(row + shift[0], 0, height - 1)])
+        corner_columns = np.stack([column, *np.clip(column + shift[1], 0, width - 1)])
+        corners = grid.sight(corner_rows, corner_columns).transpose(1, 0, 2)  # (trials, 3 pixels, 3)
         usable = rest[corner_rows, corner_columns].all(0) & (np.abs(np.linalg.det(corners)) > 1e-5)
         values = inverse[corner_rows, corner_columns].T[usable]
         return np.linalg.solve(corners[usable], values[..., None].astype(float))[..., 0].astype(np.float32)
 
-    def _refined(self, plane: np.ndarray, grid: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
+    def _refined(self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Returns the least-squares plane of the pixels that agree with `plane`."""
-        grid, inverse, known = grid[::2, ::2], inverse[::2, ::2], known[::2, ::2]
+        grid, inverse, known = Grid(grid.x[::2], grid.y[::2]), inverse[::2, ::2], known[::2, ::2]
+        across, down = grid.powers()
         for _ in range(2):
-            inside = known & (np.abs(grid @ plane - inverse) < self._tolerance)
+            inside = (known & (np.abs(grid.inverse(plane) - inverse) < self._tolerance)).astype(np.float32)
             if inside.sum() < 3:
                 break
-            sight = grid[inside]
-            plane = np.linalg.solve(sight.T @ sight, sight.T @ inverse[inside])
+            sums = down @ inside @ across.T  # of x^i y^j over the pixels, [j, i]
+            held = down[:2] @ (inside * inverse) @ across[:2].T
+            plane = np.linalg.solve(_squares(sums), np.array([held[0, 1], held[1, 0], held[0, 0]]))
         return plane
 
-    def _faces(self, plane: np.ndarray, grid: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
+    def _faces(self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Returns where connected pieces of a plane look like a face of a block, `(h, w)` uint8 of 0 and 1."""
         settings = self._settings
-        excess = inverse - grid @ plane  # > 0: nearer than the plane
+        excess = inverse - grid.inverse(plane)  # > 0: nearer than the plane
         support = (known & (np.abs(excess) < self._tolerance)).astype(np.uint8)
         support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
@@ -176,15 +189,14 @@ class PlaneSegmenter:
                 faces |= piece
         return faces
 
-    def _fits(self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, grid: np.ndarray) -> bool:
+    def _fits(self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, grid: Grid) -> bool:
         """Says whether a piece of a plane has the size of a face and looks at the camera."""
-        settings = self._settings
-        if extents_m.min() < settings.min_extent_m or extents_m.max() > settings.max_extent_m:
+        if extents_m.min() < self._settings.min_extent_m or extents_m.max() > self._settings.max_extent_m:
             return False
-        rows, columns = np.nonzero(piece)
-        sight = grid[round(float(rows.mean())), round(float(columns.mean()))]
+        sums = cv2.moments(piece, binaryImage=True)
+        sight = grid.sight(np.array(round(sums["m01"] / sums["m00"])), np.array(round(sums["m10"] / sums["m00"])))
         tilt_rad = np.arccos(np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0))
-        return bool(tilt_rad <= settings.max_tilt_rad)
+        return bool(tilt_rad <= self._settings.max_tilt_rad)
 
     def _front(self, piece: np.ndarray, excess: np.ndarray, known: np.ndarray) -> float:
         """Returns which part of what surrounds a piece lies behind its plane, a half where nothing speaks for either side."""
@@ -226,12 +238,45 @@ def _shrunk(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
     return np.divide(1.0, depth, out=np.zeros(depth.shape, np.float32), where=known), known
 
 
-def _directions(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> np.ndarray:
-    """Returns `(x, y, 1)` of the pixels that `_shrunk` keeps, `(h, w, 3)`: the line of sight at depth 1."""
-    rows, columns = (np.arange(count) * step + step // 2 for count in shape)
-    x = (columns - camera_matrix[0, 2]) / camera_matrix[0, 0]
-    y = (rows - camera_matrix[1, 2]) / camera_matrix[1, 1]
-    return np.stack([*np.meshgrid(x, y), np.ones(shape)], axis=-1).astype(np.float32)
+@dataclass(frozen=True)
+class Grid:
+    """The pixels that `_shrunk` keeps: the line of sight `(x, y, 1)` at depth 1 of each, by column and by row.
+
+    Attributes:
+        x: `(w,)`.
+        y: `(h,)`.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+
+    @staticmethod
+    def of(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> Grid:
+        """Returns that of the middles of cells of `step` x `step` px."""
+        y, x = (
+            ((np.arange(count) * step + step // 2 - camera_matrix[k, 2]) / camera_matrix[k, k]).astype(np.float32)
+            for count, k in zip(shape, (1, 0), strict=True)
+        )
+        return Grid(x, y)
+
+    def sight(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Returns the lines of sight of some of them, `(…, 3)`."""
+        return np.stack([self.x[columns], self.y[rows], np.ones(rows.shape, np.float32)], -1)
+
+    def powers(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns 1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: what sums over pixels are made of, by rows and columns."""
+        across, down = (np.stack([np.ones_like(some), some, some * some]) for some in (self.x, self.y))
+        return across, down
+
+    def inverse(self, plane: np.ndarray) -> np.ndarray:
+        """Returns inverse depth on a plane, `(h, w)`."""
+        plane = plane.astype(self.x.dtype)
+        return plane[0] * self.x + (plane[1] * self.y + plane[2])[:, None]
+
+
+def _squares(sums: np.ndarray) -> np.ndarray:
+    """Returns the sums of the products of x, y and 1 with each other, `(3, 3)`, among those of `x^i y^j`, `[j, i]`."""
+    return np.array([[sums[j, i] for j, i in row] for row in ((XX, XY, X), (XY, YY, Y), (X, Y, ONE))])
 
 
 def _filled(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
@@ -241,10 +286,15 @@ def _filled(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
     return np.where(nearer > 0, np.uint8(0), np.asarray(whole, np.uint8))
 
 
-def _extents(piece: np.ndarray, plane: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _extents(piece: np.ndarray, plane: np.ndarray, grid: Grid) -> np.ndarray:
     """Returns the two extents in m that a rectangle with the piece's second moments would have."""
-    sight = grid[::2, ::2][piece[::2, ::2] > 0]
-    points = sight / np.maximum(sight @ plane, 1e-6)[:, None]
-    away = points - points.mean(0)
-    spread = np.linalg.eigvalsh(away.T @ away / len(away))[1:]  # the smallest is the plane's own thickness
+    grid = Grid(grid.x[::2].astype(float), grid.y[::2].astype(float))
+    depth = piece[::2, ::2] / np.maximum(grid.inverse(plane.astype(float)), 1e-6)
+    across, down = grid.powers()
+    first, second = down[:2] @ depth @ across[:2].T, down @ (depth * depth) @ across.T  # of x^i y^j, [j, i]
+    number = np.count_nonzero(depth)
+    middle = np.array([first[0, 1], first[1, 0], first[0, 0]]) / number
+    spread = np.linalg.eigvalsh(_squares(second) / number - np.outer(middle, middle))[
+        1:
+    ]  # the smallest is the plane's own thickness
     return np.sqrt(12.0 * np.maximum(spread, 0.0))
