@@ -24,7 +24,8 @@ MOST = 30_000
 """Pixels that are compared; of more, whole rows are left out."""
 WIDE_PX = 1000
 """A part of the picture that is wider than this is looked at in a coarser resolution."""
-ROUNDS = 3
+ROUNDS, SETTLED_PX = 3, 0.004
+"""Steps at most, and the last one's length, px: each is a fifth of the one before."""
 TUKEY = 4.685
 MARGIN_PX, BORDER_PX, SATURATED = 6, 4, 248.0
 """Around what stands before the face, where a matcher bleeds; within its border, where blur mixes it with what lies behind; and
@@ -182,7 +183,10 @@ def aligned(
         off = seen - gain * mine
         scale = 1.4826 * float(np.median(np.abs(off))) + 1e-6
         heavy *= np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
-        m = m - np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
+        step = np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
+        m = m - step
+        if both.pull_px * np.abs(step @ ray).max() < SETTLED_PX:
+            break
     likeness = float(seen @ mine) / max(float(np.sqrt((seen @ seen) * (mine @ mine))), 1e-9)
     if likeness < ALIKE:
         return None

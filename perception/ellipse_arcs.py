@@ -30,8 +30,8 @@ PIECE = 0.6
 """Of an arc, that may be an ellipse's where not all of it is."""
 STROKE_PX, SAME_AREA = 4.5, 0.6
 """Two ellipses that differ by no more than this, and in area by no more than this part, are the two edges of a line."""
-LEAST_ARC = 0.2
-"""Part of an ellipse from which the rest of it can be told."""
+LEAST_ARC, HALFWAY = 0.2, 0.3
+"""Part of an ellipse from which the rest of it can be told; part that must support it once it was refined."""
 ROUNDS_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
 """Rounds of refinement: the distance at which a point counts a quarter; the rougher ones where the size is known beforehand."""
 TAIL = 1.6
@@ -154,7 +154,7 @@ class ArcDetector:
         Points are weighted so that distances count, not form values, and so that those beside the ellipse, where the edge of
         something else meets it, count less from round to round.
         """
-        for scale_px in rounds_px:
+        for number, scale_px in enumerate(rounds_px):
             if not len(candidates.ellipses):
                 break
             e = candidates.ellipses
@@ -164,7 +164,7 @@ class ArcDetector:
             robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / 0.05) ** 2) ** 2
             weights = np.where(support >= 0, robust / np.maximum(slope, 1e-3) ** 2, 0.0)
             ellipses = conic.fit(edges.points[support], weights)
-            keep = np.isfinite(ellipses).all(1) & ((support >= 0).mean(1) >= LEAST_ARC)
+            keep = np.isfinite(ellipses).all(1) & ((support >= 0).mean(1) >= (HALFWAY if number else LEAST_ARC))
             candidates = Candidates(ellipses[keep], candidates.polarity[keep])
         return candidates
 
