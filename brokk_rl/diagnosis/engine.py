@@ -150,9 +150,7 @@ class Search:
         scatter = np.maximum(1.0, self._scatter(evidence.whitened(error[None])[:, 0]))
         for _ in range(2 if late else int(scatter.max() > SCATTERED)):
             if late:  # what delays change depends on when commands act, and so on what else delays them
-                steady = [*evidence.candidates.fixed, *(repaired.effects() if repaired else [])]
-                mean = frames.mean_change(replace(evidence.candidates, fixed=steady), late)
-                evidence = replace(evidence, mean=mean)
+                evidence = frames.expected(evidence, late, repaired.effects() if repaired else [])
                 wide = around.simulated(evidence, grown, repaired) if wide and repaired else None
             z, grown, shapes = wide or (None, grown, shapes)
             tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter, z)

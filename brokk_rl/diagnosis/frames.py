@@ -16,11 +16,13 @@ import numpy as np
 from scipy import stats
 
 from brokk_rl.diagnosis.answer import Estimate
-from brokk_rl.diagnosis.candidates import Candidates
+from brokk_rl.diagnosis.candidates import Values
 from brokk_rl.diagnosis.evidence import Evidence
 from brokk_rl.diagnosis.found import Found, interval
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.noise import FREEDOM, increments
+from brokk_rl.diagnosis.sizes import fitted
+from brokk_rl.diagnosis.tied import median
 
 CHANGE = 0.06
 """Smaller changes of a command tell nothing about when it arrived."""
@@ -37,6 +39,8 @@ DRAWN = 3
 """Times that the chances of each window are drawn."""
 MOST = 300
 """Delays drawn by which those seen are judged."""
+BEYOND = 2.0
+"""The mean of delays by chance is off by so much of itself at most; what joints are late by beyond is an effect of its own."""
 WIDER = 1.2
 """Scatter of the delays, over that of reference recordings, below which nothing is looked for."""
 
@@ -170,10 +174,32 @@ def search(
     return Found(best, every, parameters, worth[best.name], float(gains[best.name].max()), _explained(seen, scale), rest)
 
 
-def mean_change(candidates: Candidates, found: Found) -> np.ndarray:
-    """Returns what the found effect changes about free runs on average, `(W, K, J)`."""
-    count = 4 * DRAWN
-    return candidates.paths([(found.kind, found.values(count))], count).mean(0) - candidates.paths([])[0]
+def expected(evidence: Evidence, found: Found, steady: Sequence[tuple[Kind, Values]]) -> Evidence:
+    """Returns the evidence with what the found effect changes on average, and the mean delay that joints share beyond it.
+
+    How delays scatter does not tell their mean: frames that may not overtake each other wait twice as long as others that scatter
+    alike. Frames are late for all joints alike, so that what one joint alone is late by is left for an effect of its own.
+
+    Args:
+        evidence: The simulator against the field.
+        found: The effect.
+        steady: Other effects that are there.
+    """
+    count, candidates = 4 * DRAWN, replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady])
+    mean = candidates.paths([(found.kind, found.values(count))], count).mean(0) - candidates.paths([])[0]
+    u = evidence.candidates.cut.u
+    late = replace(evidence.candidates.cut, u=np.concatenate([u[:, :1], u[:, :-1]], 1))
+    later = replace(evidence.candidates, cut=late).paths([])[0] - evidence.base
+    known = replace(evidence, mean=mean)
+    moved, usual = (known.whitened(increments(one, np.zeros_like(evidence.start))[None])[:, 0] for one in (later, mean))
+    shares = [
+        fitted(z, [], faults=np.concatenate([faults, WIDE * line[None]]))[-1] * WIDE
+        for z, faults, line in zip(known.z, known.faults, moved, strict=True)
+    ]
+    told = np.square(moved).sum(1)
+    own = median((moved * usual).sum(1) / np.maximum(told, 1e-9), told)
+    more = median(np.array(shares), told)
+    return replace(evidence, mean=mean + more * later) if abs(more) <= BEYOND * abs(own) else known
 
 
 def _drawn(changes: Changes, kind: Kind) -> list[np.ndarray]:

@@ -101,7 +101,8 @@ def repair(
 ) -> Repair:
     """Fits a set of effects by simulation, all sizes of a joint at once.
 
-    The fit to all entries begins at the best of several multiples of `start`; those to all but one half begin where it ended.
+    The fit to all entries begins at the best of several multiples of `start`; those to all but one half begin where it ended, and
+    stay there where their half says nothing: a pump shows its limit only in those parts where many joints move at once.
 
     Args:
         evidence: Errors of the simulator without them.
@@ -114,7 +115,7 @@ def repair(
     every, halves = np.ones((1, len(evidence.fold))), np.stack([evidence.fold != 0, evidence.fold != 1]).astype(float)
     fit = _Fit(evidence, found, mask)
     whole = fit.descended(fit.nearest(sizes)[None], every, steps)
-    apart = fit.descended(np.repeat(whole, 2, 0), halves, max(1, steps // 2))
+    apart = fit.descended(np.repeat(whole, 2, 0), halves, max(1, steps // 2), whole)
     z, slopes, _ = _linear(evidence, found, whole)
     z_apart, paths = fit.simulated(apart)
     half = evidence.fold.reshape(len(evidence.way), -1)[:, 0]
@@ -192,16 +193,16 @@ class _Fit:
         best = _totals(self.simulated(trials)[0], trials, 1.0).argmin(0)
         return np.where(self.mask, np.take_along_axis(trials, best[None, None], 0)[0], 0.0)
 
-    def descended(self, now: np.ndarray, used: np.ndarray, steps: int) -> np.ndarray:
-        """Returns the best sizes from `now` `(F, R, J)` on, with entries weighed by `used` `(F, E)`."""
+    def descended(self, now: np.ndarray, used: np.ndarray, steps: int, about: np.ndarray | float = 0.0) -> np.ndarray:
+        """Returns the best sizes from `now` `(F, R, J)` on, entries weighed by `used` `(F, E)`, sizes a priori `about` so large."""
         damping, weights = np.full((len(now), now.shape[2]), 1e-2), used[:, None]
         for _ in range(steps):
             z, slopes, _ = _linear(self.evidence, self.rays, now)
-            least = _totals(z, now, weights)
-            trials = np.stack([now + self._step(z, slopes, now, used, by * damping) for by in DAMPING])
+            least = _totals(z, now - about, weights)
+            trials = np.stack([now + self._step(z, slopes, now - about, used, by * damping) for by in DAMPING])
             trials = np.clip(trials, *self.bounds) * self.mask
             tried = self.simulated(trials.reshape(-1, *now.shape[1:]))[0].reshape(len(DAMPING), *z.shape)
-            totals = np.stack([_totals(one, sizes, weights) for one, sizes in zip(tried, trials, strict=True)])  # (D, F, J)
+            totals = np.stack([_totals(one, sizes - about, weights) for one, sizes in zip(tried, trials, strict=True)])  # (D, F, J)
             best = totals.argmin(0)
             gained = least - totals.min(0)
             better = gained > 0.0
@@ -211,15 +212,15 @@ class _Fit:
                 break
         return now
 
-    def _step(self, z: np.ndarray, slopes: np.ndarray, now: np.ndarray, used: np.ndarray, damping: np.ndarray) -> np.ndarray:
-        """Returns how far sizes should change, `(F, R, J)`."""
-        step = np.zeros_like(now)
+    def _step(self, z: np.ndarray, slopes: np.ndarray, off: np.ndarray, used: np.ndarray, damping: np.ndarray) -> np.ndarray:
+        """Returns how far sizes should change, `(F, R, J)`; `off`: how far they are from what they are a priori."""
+        step = np.zeros_like(off)
         for f, j in np.ndindex(damping.shape):
             rows = self.mask[:, j]
             weighted = slopes[f, j][rows] * (weight(z[f, j]) * used[f])
             normal = weighted @ slopes[f, j][rows].T + np.eye(rows.sum()) / PRIOR**2
             damped = normal + damping[f, j] * np.diag(np.diag(normal))
-            step[f, rows, j] = np.linalg.solve(damped, weighted @ z[f, j] - now[f, rows, j] / PRIOR**2)
+            step[f, rows, j] = np.linalg.solve(damped, weighted @ z[f, j] - off[f, rows, j] / PRIOR**2)
         return step
 
 

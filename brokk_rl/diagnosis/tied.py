@@ -33,7 +33,7 @@ def tied(
         for place, ray in enumerate(rays[name]):
             size = np.array([one.sizes[name][place] for one in scored])
             told = np.array([max(one.total, 0.0) for one in scored]) / np.maximum(np.square(size), 1e-6)
-            common = _median(size, told)
+            common = median(size, told)
             if common == 0.0:
                 continue
             ends = np.sort(common * np.array([1.0 - PLAY, 1.0, 1.0 + PLAY]))
@@ -45,7 +45,7 @@ def tied(
     return rays, narrow
 
 
-def _median(values: np.ndarray, weights: np.ndarray) -> float:
+def median(values: np.ndarray, weights: np.ndarray) -> float:
     """Returns the weighted median: a joint that has another effect too is far off."""
     order = np.argsort(values)
     below = np.cumsum(weights[order])

@@ -10,8 +10,11 @@ import torch
 
 from actuators.lag import Lag
 from brokk_rl.diagnosis import frames, library, sensors, simulator, tool
+from brokk_rl.diagnosis.answer import Estimate
 from brokk_rl.diagnosis.case import Case
-from brokk_rl.diagnosis.found import interval
+from brokk_rl.diagnosis.evidence import Evidence, rays
+from brokk_rl.diagnosis.found import Found, interval
+from brokk_rl.diagnosis.sizes import Shape, fitted
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -107,14 +110,18 @@ def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) ->
     assert tool.search(Case(machine, [one], [one]), library.load(machine), 8.0, 12.0) == tool.Seen([], 1.0)
 
 
-def held_over(machine: Machine, lost: float, seed: int) -> Recording:
-    """Returns two minutes of a lag plant under levels to and fro, each lost frame holding the level before for a period more."""
+def held_over(machine: Machine, lost: float, seed: int, late: tuple[int, ...] = (0,) * 5) -> Recording:
+    """Returns two minutes of a lag plant under levels to and fro, each lost frame holding the level before for a period more.
+
+    `late`: periods by which all commands of each joint come later still.
+    """
     random = np.random.default_rng(seed)
     levels = random.uniform(0.3, 0.8, (120, 5)) * np.where(np.arange(120) % 2, -1.0, 1.0)[:, None]
     u = np.repeat(levels, 20, 0)
     sent, missing = u.copy(), random.random(len(u)) < lost
     for t in range(1, len(u)):
         sent[t] = sent[t - 1] if missing[t] else u[t]
+    sent = np.stack([np.roll(column, by) for column, by in zip(sent.T, late, strict=True)], 1)
     model, size = PLANT.build(machine, 1, CPU), machine.num_history
     known = torch.as_tensor(np.concatenate([np.zeros((size - 1, 5)), sent])[None], dtype=torch.float32)
     q = torch.as_tensor(machine.home, dtype=torch.float32)[None]
@@ -149,6 +156,30 @@ def test_frames_that_were_lost_are_counted_by_where_joints_end_up(machine: Machi
     assert before > 5.0 and after < 0.4 * before
     for j in range(2):
         np.testing.assert_allclose(chancy.rewhitened(lossy, lossy.z[j : j + 1], j)[0], chancy.z[j], atol=1e-6)
+
+
+def test_the_mean_of_delays_by_chance_is_what_all_joints_are_late_by(machine: Machine) -> None:
+    rows = [held_over(machine, 0.0, 10), held_over(machine, 0.2, 12, (1, 1, 1, 4, 1))]
+    held = [simulator.held(PLANT, [(one, 0.0)], machine, 0) for one in rows]
+    evidence = dataclasses.replace(held[1].evidence, noise=simulator.noises(held[:1], machine))
+    loss, late = library.load(machine, ["frame_loss", "dead_time"])
+    (ray,) = rays(late)
+
+    def late_s(evidence: Evidence) -> list[float]:
+        shapes = [Shape(ray.sizes, change) for change in evidence.response(ray)]
+        return [late.size("dead_time_s") * fitted(z, [shape])[0] for z, shape in zip(evidence.z, shapes, strict=True)]
+
+    def expected(lost: float) -> list[float]:
+        every = {"probability": {name: Estimate(lost, (lost, lost)) for name in machine.joint_names}}
+        found = Found(loss, np.ones(5, bool), every, 0.0, 0.0, 0.0, {})
+        return late_s(frames.expected(evidence, found, []))
+
+    assert late_s(evidence) == pytest.approx([0.05, 0.05, 0.05, 0.2, 0.05], abs=0.012)
+    # where half of the frames are lost, these wait a period on average, and may two; what one joint has alone is left
+    shared = np.array(expected(0.5))
+    assert (np.abs(np.delete(shared, 3)) < 0.02).all() and shared[3] > 0.08
+    # one in ten lost does not make all late by a period
+    assert expected(0.1) == pytest.approx([0.045, 0.045, 0.045, 0.195, 0.045], abs=0.012)
 
 
 def test_the_interval_of_a_gaussian_likelihood_is_its_own() -> None:

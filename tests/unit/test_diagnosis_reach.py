@@ -18,6 +18,7 @@ from actuators.lag import Lag
 from brokk_rl.diagnosis import gap, library, repair, simulator
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.evidence import rays
+from brokk_rl.diagnosis.noise import Noise
 from brokk_rl.diagnosis.reach import Reach
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -75,16 +76,23 @@ def axis(machine: Machine) -> Machine:
     return replace(machine, name="axis", mjcf=None, tool_m=None, joints=(joint,), exclusive=(), levers=())
 
 
-def driven(machine: Machine, seed: int) -> Recording:
-    """Returns two minutes of an axis with a dead band of 0.35 and a saturation at 0.7 under random levels."""
-    effects = {"dead_band": DeadBand(joints="all", extend=0.35, retract=0.35), "saturation": Saturation(joints="all", level=0.7)}
+def driven(machine: Machine, seed: int, dead_band: float = 0.35, gentle: bool = False) -> Recording:
+    """Returns two minutes of an axis with a dead band and a saturation at 0.7 under random levels.
+
+    `gentle`: these are beyond 0.6 only in the middle of every other 20 s.
+    """
+    effects = {
+        "dead_band": DeadBand(joints="all", extend=dead_band, retract=dead_band),
+        "saturation": Saturation(joints="all", level=0.7),
+    }
     model, random = Affected(actuator=LINEAR, effects=effects).build(machine, 1, CPU), np.random.default_rng(seed)
     history = History(q=torch.zeros(1, machine.num_history, 1), u=torch.zeros(1, machine.num_history, 1))
     history.reset(torch.ones(1, dtype=torch.bool), torch.as_tensor(machine.home, dtype=torch.float32)[None])
     u, q, level, left = [], [], 0.0, 0
-    for _ in range(round(120 / machine.period_s)):
+    for k in range(round(120 / machine.period_s)):
         if left == 0:
-            level, left = random.uniform(-1.0, 1.0), int(random.integers(10, 50))
+            most = 0.6 if gentle and not 26.0 < k * machine.period_s % 40.0 < 36.0 else 1.0
+            level, left = random.uniform(-most, most), int(random.integers(10, 50))
         here = float(history.q[0, -1, 0])
         level = -abs(level) if here > machine.upper[0] - 0.3 else abs(level) if here < machine.lower[0] + 0.3 else level
         left -= 1
@@ -115,3 +123,14 @@ def test_a_dead_band_and_a_saturation_far_beyond_the_typical_are_fitted_together
     assert saturation == pytest.approx(0.7, abs=0.03)
     measured = evidence.candidates.cut.measured
     assert np.std(found.after - measured) < 0.15 * np.std(evidence.base - measured)
+
+
+def test_a_half_of_the_recordings_that_says_nothing_of_a_size_does_not_deny_it(axis: Machine) -> None:
+    held = simulator.held(LINEAR, [(driven(axis, 3, 0.0, gentle=True), 0.0)], axis, 0)
+    evidence = replace(held.evidence, noise=[Noise(sensor=4e-4, change=0.01, wander=0.01, memory=10.0)])
+    told = [float(np.square(evidence.z[:, evidence.fold == half]).mean()) for half in (0, 1)]
+    assert 10.0 * min(told) < max(told)  # the saturation shows in one half only
+    ways = {kind.name: rays(kind) for kind in library.load(axis, ["saturation"])}
+    found = repair.repair(evidence, [frozenset(ways)], ways, [{"saturation": np.array([1.0])}])
+    np.testing.assert_allclose(found.halves[:, 0, 0], (1.0 - 0.7) / 0.25, atol=0.1)
+    assert np.square(found.z).mean() < 0.2 * np.square(evidence.z).mean()
