@@ -156,10 +156,11 @@ class Search:
             tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter, z)
         self.tell("what is left", 0.92)
         others = [*on_sensors, *on_tool.found, *([late] if late else [])]
-        left, left_null = self._left(evidence, repaired)
+        beside = remainder.repaired(evidence, repaired)
+        left, left_null = self._left(beside)
         return Findings(
             evidence, tables, grown, price, chosen, repaired, others, left, left_null,
-            self._scatter(repaired.z if repaired else evidence.z), self._strays(evidence, repaired), on_tool.left,
+            self._scatter(beside.z), self._strays(beside), on_tool.left,
         )  # fmt: skip
 
     @property
@@ -262,17 +263,14 @@ class Search:
         usual = np.mean(np.minimum(np.concatenate(nulls, 1) ** 2, CUT), 1) if nulls else np.ones(len(z))
         return np.mean(np.minimum(z**2, CUT), 1) / usual
 
-    def _left(self, evidence: Evidence, repaired: Repair | None) -> tuple[np.ndarray, np.ndarray]:
+    def _left(self, beside: Evidence) -> tuple[np.ndarray, np.ndarray]:
         """Returns what clues earn on what is left and, at most, on reference recordings, both `(clues, J)`."""
-        z = repaired.z if repaired else evidence.z
         nulls = [one.evidence for one in self.base.nulls]
-        earned = remainder.predictable(evidence, z)
-        on_nulls = [remainder.predictable(one, one.z) for one in nulls]
-        return earned, remainder.beyond(earned, on_nulls, [z.shape[1] / one.z.shape[1] for one in nulls])
+        earned, on_nulls = remainder.predictable(beside, beside.z), [remainder.predictable(one, one.z) for one in nulls]
+        return earned, remainder.beyond(earned, on_nulls, [beside.z.shape[1] / one.z.shape[1] for one in nulls])
 
-    def _strays(self, evidence: Evidence, repaired: Repair | None) -> np.ndarray:
-        mean = 0.0 if evidence.mean is None else evidence.mean  # `after` has it in, errors have it out
-        own = remainder.strayed(evidence, evidence.error_of(repaired.after - mean) if repaired else evidence.error)
+    def _strays(self, beside: Evidence) -> np.ndarray:
+        own = remainder.strayed(beside, beside.error)
         nulls = [remainder.strayed(one.evidence, one.evidence.error) for one in self.base.nulls]
         return np.sqrt(own / np.maximum(np.mean(nulls, 0), 1e-9)) if nulls else np.ones_like(own)
 

@@ -92,6 +92,7 @@ class Evidence:
         bias: Increments that the simulator misses already on the reference, `(W, I, J)`; see `discrepancy`.
         widths: How large faults of the simulator's own numbers are, over the usual, `(P,)`; see `discrepancy`.
         late: What each change of a command does when it comes a standard deviation late, `(W, C, I, J)`, where that is by chance.
+        runs: Its free runs without any effect, `(W, K, J)`, where they are known already.
     """
 
     candidates: Candidates
@@ -101,11 +102,12 @@ class Evidence:
     bias: np.ndarray | None = None
     widths: np.ndarray | None = None
     late: np.ndarray | None = None
+    runs: np.ndarray | None = None
 
     @cached_property
     def base(self) -> np.ndarray:
         """Positions without any effect, `(W, K, J)`."""
-        return self.candidates.paths([])[0]
+        return self.candidates.paths([])[0] if self.runs is None else self.runs
 
     @cached_property
     def start(self) -> np.ndarray:

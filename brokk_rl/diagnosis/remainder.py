@@ -1,23 +1,27 @@
 """Whether a flexible model still predicts what is left, and from what: then something is there, and the library has no name for it.
 
+What is left is judged against the simulator with the effects that were found, and by its motion: a joint that a dead band makes
+slow wanders by a part of that slow speed, not of the fast one that the simulator had before.
 Each clue is a small ridge regression of increments on one thing that a machine could depend on: where it stands, the other joints,
-the time it has run, the work it did just before. Small models find what a large one drowns. `FORM` comes first, and the others
-explain what it leaves: how speed follows commands, starts and stops is where real forms of known effects differ from the library's
-as well. Like an effect, a clue earns the logarithm of a Bayes factor, and is judged by what it earns on reference recordings.
+the time it has run, the work it did just before. Small models find what a large one drowns. `FORMS` come first, and the others
+explain what they leave: in starts and stops, and in how speed follows commands, real forms of known effects differ from the
+library's as well. Like an effect, a clue earns the logarithm of a Bayes factor, and is judged by what it earns on the reference.
 Axes: `W` windows, `I` increments, `J` joints, `E` entries, `F` features.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.signal import lfilter
 
 from brokk_rl.diagnosis.discrepancy import WARM_S, ridge
 from brokk_rl.diagnosis.evidence import Evidence
-from brokk_rl.diagnosis.noise import SPAN, loss, weight
+from brokk_rl.diagnosis.noise import SPAN, increments, loss, weight
+from brokk_rl.diagnosis.repair import Repair
 
 RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """Pulls towards nothing, in features of unit size over the noise; that which makes the errors most likely is used."""
@@ -40,6 +44,12 @@ class Motion:
     def own(self) -> np.ndarray:
         """Increments."""
         return self.evidence.way[..., self.j]
+
+    @cached_property
+    def slip(self) -> np.ndarray:
+        """What increments lose where motion comes a sample late."""
+        q, start = self.evidence.base[..., self.j], self.evidence.start[:, None, self.j]
+        return increments(np.diff(q, axis=1, prepend=start)[..., None], np.zeros((len(q), 1)))[..., 0]
 
     @cached_property
     def share(self) -> np.ndarray:
@@ -65,6 +75,14 @@ class Motion:
         """Demand of all joints, over full speed."""
         return np.abs(self.share).sum(-1)
 
+    def faded(self, column: np.ndarray, kept: float) -> np.ndarray:
+        """Returns the mean of what came before in the recording, the longer ago the less; windows follow one another."""
+        runs, found = self.evidence.candidates.cut.run, np.empty_like(column)
+        for run in np.unique(runs):
+            mine = runs == run
+            found[mine] = np.asarray(lfilter([0.0, 1.0 - kept], [1.0, -kept], column[mine].ravel())).reshape(-1, column.shape[1])
+        return found
+
     @cached_property
     def time(self) -> list[np.ndarray]:
         """Courses of the running time, `(W, 1)`: even, bent, to and fro, warming up."""
@@ -74,11 +92,23 @@ class Motion:
         return [*slow, (warm - warm.mean()) / max(float(warm.std()), 1e-9)]
 
 
-def _form(m: Motion) -> list[np.ndarray]:
-    """Speed against command; starts and stops, just before and after."""
+def repaired(evidence: Evidence, repair: Repair | None) -> Evidence:
+    """Returns the evidence of the simulator with the effects that were found, sizes from the half that they were not fitted to."""
+    if repair is None:
+        return evidence
+    candidates, mean = evidence.candidates, 0.0 if evidence.mean is None else evidence.mean  # `after` has it in, errors have it out
+    fixed = [*candidates.fixed, *repair.effects()]
+    return replace(evidence, candidates=replace(candidates, fixed=fixed), runs=repair.after - mean)
+
+
+def _changes(m: Motion) -> list[np.ndarray]:
+    """Starts and stops, just before and after."""
     turn, faster = np.diff(m.own, axis=1, prepend=m.own[:, :1]), np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0
-    changes = [_late(turn * when * side, by) for by in (-1, 0, 1, 2, 3) for when in (faster, ~faster) for side in m.sides]
-    return [m.own * hat * side for hat in _hats(np.abs(m.share[..., m.j]), 1.0, 8) for side in m.sides] + changes
+    return [_late(turn * when * side, by) for by in (-1, 0, 1, 2, 3) for when in (faster, ~faster) for side in m.sides]
+
+
+def _curve(m: Motion) -> list[np.ndarray]:
+    return [m.own * hat * side for hat in _hats(np.abs(m.share[..., m.j]), 1.0, 8) for side in m.sides]
 
 
 def _position(m: Motion) -> list[np.ndarray]:
@@ -105,8 +135,7 @@ def _time(m: Motion) -> list[np.ndarray]:
 
 
 def _delay_over_time(m: Motion) -> list[np.ndarray]:
-    turn = np.diff(m.own, axis=1, prepend=m.own[:, :1])
-    return [_late(turn, by) * m.time[k] for by in (0, 1, 2) for k in (0, 1, -1)]
+    return [m.slip * m.time[k] for k in (0, 1, -1)]
 
 
 def _past(m: Motion) -> list[np.ndarray]:
@@ -115,34 +144,37 @@ def _past(m: Motion) -> list[np.ndarray]:
     went = np.sign(m.own) * (np.abs(m.share[..., m.j]) > 0.03)
     for past_s in PAST_S:
         kept = np.exp(-SPAN * machine.period_s / past_s)
-        tired, own, way = (_faded(one, kept) for one in (np.minimum(m.work, 1.0), np.abs(m.share[..., m.j]), went))
-        columns += [m.own * tired, m.own * own, np.abs(m.own) * way]
+        tired, own, way = (m.faded(one, kept) for one in (np.minimum(m.work, 1.0), np.abs(m.share[..., m.j]), went))
+        columns += [m.own * (tired - tired.mean()), m.own * (own - own.mean()), np.abs(m.own) * way]  # the mean is another gain
     return columns
 
 
-FORM = "how speed follows commands"
+STARTS, CURVE = "how it starts and stops", "how speed follows commands"
 CLUES: Mapping[str, Callable[[Motion], list[np.ndarray]]] = {
-    FORM: _form,
+    STARTS: _changes,
     "its position": _position,
     "the angle that the sensor reads": _sensor,
     "the other joints": _joints,
     "running time": _time,
     "timing over the running time": _delay_over_time,
     "what it did before": _past,
+    CURVE: _curve,
 }
-"""By what they are about, `FORM` first."""
+"""By what they are about."""
+FORMS = (STARTS, CURVE)
+"""Clues that explain first, one after the other, what the rest may not."""
 
 
 def predictable(evidence: Evidence, z: np.ndarray) -> np.ndarray:
     """Returns what each clue earns on errors over the noise `z` `(J, E)`, `(clues, J)`."""
-    found = np.zeros((len(CLUES), len(z)))
+    found, order = np.zeros((len(CLUES), len(z))), [*FORMS, *(name for name in CLUES if name not in FORMS)]
     for j, errors in enumerate(z):
         motion = Motion(evidence, j)
-        for row, columns in zip(found, CLUES.values(), strict=True):
-            x = evidence.whitened_joint(np.stack(columns(motion), -1), j)
+        for name in order:
+            x = evidence.whitened_joint(np.stack(CLUES[name](motion), -1), j)
             size = np.sqrt(np.mean(np.square(x), 0))
-            row[j], left = _earned(x / np.where(size > 1e-9, size, np.inf), errors)
-            errors = left if columns is _form else errors
+            found[list(CLUES).index(name), j], left = _earned(x / np.where(size > 1e-9, size, np.inf), errors)
+            errors = left if name in FORMS else errors
     return found
 
 
@@ -196,11 +228,3 @@ def _late(column: np.ndarray, by: int) -> np.ndarray:
     if by < 0:
         moved[:, by:] = 0.0
     return moved
-
-
-def _faded(column: np.ndarray, kept: float) -> np.ndarray:
-    """Returns the mean of what came before in each window, the longer ago the less."""
-    found = np.zeros_like(column)
-    for i in range(1, column.shape[1]):
-        found[:, i] = kept * found[:, i - 1] + (1.0 - kept) * column[:, i - 1]
-    return found

@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 from composed import option
 
+from brokk_rl.contracts import Actuator
 from brokk_rl.diagnosis import certainty, remainder
+from brokk_rl.diagnosis.candidates import Candidates
 from brokk_rl.diagnosis.certainty import Certainty
 from brokk_rl.diagnosis.evidence import Evidence
 from brokk_rl.diagnosis.exam.calibration import Item, halves, logistic
 from brokk_rl.diagnosis.noise import Noise
+from brokk_rl.diagnosis.repair import Repair
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.open_loop import Windows
 
 
 @pytest.fixture
@@ -30,9 +34,11 @@ def moving(machine: Machine, random: np.random.Generator, windows: int = 60, ste
     way = np.repeat(random.uniform(-0.4, 0.4, (windows, steps // 5, machine.num_joints)), 5, 1) * full
     middle, travel = (machine.lower + machine.upper) / 2, machine.upper - machine.lower
     start = middle + random.uniform(-0.4, 0.4, (windows, machine.num_joints)) * travel
-    candidates = SimpleNamespace(machine=machine, running_s=np.linspace(0.0, 1800.0, windows))
+    cut = SimpleNamespace(run=np.repeat(["first", "second"], [windows // 2, windows - windows // 2]))
+    candidates = SimpleNamespace(machine=machine, running_s=np.linspace(0.0, 1800.0, windows), cut=cut)
     white = {"whitened_joint": lambda columns, j: columns.reshape(-1, columns.shape[-1])}
-    return cast(Evidence, SimpleNamespace(way=way, start=start, candidates=candidates, **white))
+    base = start[:, None] + np.cumsum(np.repeat(way, remainder.SPAN, 1) / remainder.SPAN, 1)
+    return cast(Evidence, SimpleNamespace(way=way, base=base, start=start, candidates=candidates, **white))
 
 
 @pytest.mark.parametrize(
@@ -42,8 +48,10 @@ def moving(machine: Machine, random: np.random.Generator, windows: int = 60, ste
         ("the angle that the sensor reads", lambda m: np.diff(np.sin(6 * np.pi * m.place), axis=0)[0]),
         ("the other joints", lambda m: np.maximum(m.share[..., 3], 0.0)),
         ("running time", lambda m: m.own * m.time[-1]),
-        ("what it did before", lambda m: m.own * remainder._faded(np.minimum(m.work, 1.0), 0.94)),
-        (remainder.FORM, lambda m: np.sign(m.own) * np.maximum(np.abs(m.share[..., m.j]) - 0.2, 0.0)),
+        ("timing over the running time", lambda m: m.slip * m.time[0]),
+        ("what it did before", lambda m: m.own * m.faded(np.minimum(m.work, 1.0), 0.94)),
+        (remainder.STARTS, lambda m: np.diff(m.own, axis=1, prepend=m.own[:, :1])),
+        (remainder.CURVE, lambda m: np.sign(m.own) * np.maximum(np.abs(m.share[..., m.j]) - 0.2, 0.0)),
     ],
 )
 def test_what_is_left_is_traced_to_what_it_depends_on(machine: Machine, clue: str, error: remainder.Callable) -> None:
@@ -51,13 +59,43 @@ def test_what_is_left_is_traced_to_what_it_depends_on(machine: Machine, clue: st
     evidence = moving(machine, random)
     motion = remainder.Motion(evidence, 2)
     column, own = error(motion).ravel(), motion.own.ravel()
-    column = column if clue == remainder.FORM else column - own * (own @ column) / (own @ own)  # another gain is form
+    column = column if clue in remainder.FORMS else column - own * (own @ column) / (own @ own)  # another gain is form
     z = random.standard_normal((machine.num_joints, column.size))
     z[2] += 0.5 * column / column.std()
     earned = remainder.predictable(evidence, z)
     best = list(remainder.CLUES)[int(earned[:, 2].argmax())]
     assert best == clue and earned[:, 2].max() > 30.0
     assert np.delete(earned, 2, 1).max() < 6.0, "chance earns little on the other joints"
+
+
+def test_work_is_remembered_from_window_to_window_of_a_recording_and_no_further(machine: Machine) -> None:
+    motion = remainder.Motion(moving(machine, np.random.default_rng(6), windows=4), 2)  # two windows a recording
+    worked = np.zeros((4, 20))
+    worked[0, 19] = 1.0
+    found = motion.faded(worked, 0.5)
+    np.testing.assert_allclose(found[1], 0.5 ** np.arange(1, 21), rtol=1e-12)  # half is new, and half of that is kept
+    assert not found[[0, 2, 3]].any()
+
+
+def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> None:
+    # a dead band halves all speeds: errors of 5 % of what is left are 2.5 % of what was simulated before
+    random, noise = np.random.default_rng(7), Noise(sensor=1e-5, change=0.0, wander=0.05, memory=0.01)
+    windows, joints = 120, machine.num_joints
+    way = np.repeat(random.uniform(0.02, 0.05, (windows, 20, joints)), remainder.SPAN, 1) / remainder.SPAN
+    before, start = np.cumsum(way, 1), np.zeros((windows, joints))
+    steady = np.repeat(0.05 * random.standard_normal((windows, 20, joints)), remainder.SPAN, 1)
+    measured = 0.5 * np.cumsum(way * (1.0 + steady), 1)
+    q = np.concatenate([start[:, None], measured], 1)
+    cut = Windows(np.zeros((windows, 100, joints)), q, np.repeat("one", windows), 1, 1)
+    candidates = Candidates(cast(Actuator, None), machine, cut, np.zeros(windows), 0)
+    evidence = Evidence(candidates, [noise] * joints, np.ones((windows, joints), dtype=bool), runs=before)
+    none = np.zeros((0, joints))
+    repair = Repair([], none.astype(bool), none, none[None], 0.5 * before, 0.5 * before, evidence.z, none)
+    left = remainder.repaired(evidence, repair)
+    np.testing.assert_allclose(left.z.std(1), 1.0, atol=0.06)
+    np.testing.assert_allclose(remainder.strayed(left, left.error), 1.0, atol=0.25)
+    assert evidence.whitened(left.error[None]).std() == pytest.approx(0.5, abs=0.03)
+    assert remainder.repaired(evidence, None) is evidence
 
 
 def test_free_runs_stray_as_far_as_their_noise_says() -> None:
