@@ -14,7 +14,7 @@ import numpy as np
 
 from brokk_rl.signals import Frame
 from perception import conic
-from perception.plane import Plane, inverse_depth, parted, sandwich
+from perception.plane import Plane, inverse_depth, middle, parted, sandwich
 
 SMOOTH_PX = 1.0
 """Blur of both pictures: noise would shrink the slope."""
@@ -181,7 +181,7 @@ def aligned(
         push, heavy = (np.vstack([ray * (-both.pull_px / both.shrink * slope), -mine]) for slope in (rise, instrument))
         gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
         off = seen - gain * mine
-        scale = 1.4826 * float(np.median(np.abs(off))) + 1e-6
+        scale = 1.4826 * middle(np.abs(off)) + 1e-6
         heavy *= np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
         step = np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
         m = m - step

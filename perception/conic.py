@@ -35,11 +35,10 @@ def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         return result
     t = -np.linalg.solve(s3[known], s2[known].transpose(0, 2, 1))
     m = s1[known] + s2[known] @ t
-    m = np.stack([m[:, 2] / 2, -m[:, 1], m[:, 0] / 2], 1)
-    a1 = _largest(m)
-    a2 = np.einsum("cij,cj->ci", t, a1)
-    fitted = ellipse_of(form_of_coefficients(np.concatenate([a1, a2], 1)))
-    fitted[4 * a1[:, 0] * a1[:, 2] - a1[:, 1] ** 2 <= 0] = np.nan
+    a, b, c = a1 = _largest(m[:, [2, 1, 0]] * np.array([0.5, -1.0, 0.5])[:, None])
+    d, e, f = (t @ a1.T[:, :, None])[:, :, 0].T
+    fitted = _ellipse(a, b / 2, c, d / 2, e / 2, f)
+    fitted[4 * a * c - b * b <= 0] = np.nan
     fitted[:, :4] *= scale[known][:, None]
     fitted[:, :2] += center[known]
     result[known] = fitted
@@ -47,14 +46,15 @@ def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _largest(m: np.ndarray) -> np.ndarray:
-    """Returns the eigenvectors to the largest eigenvalues of matrices `(C, 3, 3)` whose eigenvalues are real, `(C, 3)`.
+    """Returns the eigenvectors to the largest eigenvalues of matrices `(C, 3, 3)` whose eigenvalues are real, `(3, C)`.
 
     Of a direct fit it is the only positive one, which belongs to the ellipse. By the cubic's roots: a thousand at once.
     """
     m = np.ascontiguousarray((m / np.maximum(np.abs(m).max((1, 2), keepdims=True), 1e-300)).transpose(1, 2, 0))
     trace = m[0, 0] + m[1, 1] + m[2, 2]
     minors = sum(m[i, i] * m[j, j] - m[i, j] * m[j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
-    det = (m[0] * _cross(m[1], m[2])).sum(0)
+    det = m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]) - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+    det += m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
     spread = np.sqrt(np.maximum(trace**2 - 3 * minors, 0.0)) / 3
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = np.clip(np.nan_to_num((2 * trace**3 - 9 * trace * minors + 27 * det) / (54 * spread**3)), -1.0, 1.0)
@@ -62,23 +62,12 @@ def _largest(m: np.ndarray) -> np.ndarray:
         step = (((value - trace) * value + minors) * value - det) / (3 * value**2 - 2 * trace * value + minors)
         value = value - np.where(np.abs(step) < 1e-6, step, 0.0)
     m[[0, 1, 2], [0, 1, 2]] -= value
-    normals = np.stack([_cross(m[0], m[1]), _cross(m[0], m[2]), _cross(m[1], m[2])])
+    normals = np.empty_like(m)
+    for k, (one, other) in enumerate(((m[0], m[1]), (m[0], m[2]), (m[1], m[2]))):
+        for i, j, n in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            normals[k, i] = one[j] * other[n] - one[n] * other[j]
     best = (normals**2).sum(1).argmax(0)
-    return normals[best, :, np.arange(len(best))]
-
-
-def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Returns the cross products of vectors `(3, C)`."""
-    return np.stack(
-        [one[1] * other[2] - one[2] * other[1], one[2] * other[0] - one[0] * other[2], one[0] * other[1] - one[1] * other[0]]
-    )
-
-
-def form_of_coefficients(coefficients: np.ndarray) -> np.ndarray:
-    """Returns the forms `(C, 3, 3)` of `A x² + B xy + C y² + D x + E y + F`, coefficients `(C, 6)`."""
-    a, b, c, d, e, f = np.moveaxis(coefficients, -1, 0)
-    rows = [np.stack([a, b / 2, d / 2], -1), np.stack([b / 2, c, e / 2], -1), np.stack([d / 2, e / 2, f], -1)]
-    return np.stack(rows, -2)
+    return normals[best, :, np.arange(len(best))].T
 
 
 def form(ellipses: np.ndarray) -> np.ndarray:
@@ -96,8 +85,12 @@ def form(ellipses: np.ndarray) -> np.ndarray:
 
 def ellipse_of(forms: np.ndarray) -> np.ndarray:
     """Returns the ellipses `(C, 5)` of forms `(C, 3, 3)`, rows of NaN where a form is no ellipse."""
-    a, b, c = forms[:, 0, 0], forms[:, 0, 1], forms[:, 1, 1]
-    d, e, last = forms[:, 0, 2], forms[:, 1, 2], forms[:, 2, 2]
+    return _ellipse(forms[:, 0, 0], forms[:, 0, 1], forms[:, 1, 1], forms[:, 0, 2], forms[:, 1, 2], forms[:, 2, 2])
+
+
+def _ellipse(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, e: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Returns the ellipses `(C, 5)` of `a x² + 2 b xy + c y² + 2 d x + 2 e y + last`, rows of NaN where that is none."""
+    result = np.empty((len(a), 5))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         det = a * c - b * b
         x, y = (b * e - c * d) / det, (b * d - a * e) / det
@@ -106,11 +99,12 @@ def ellipse_of(forms: np.ndarray) -> np.ndarray:
         apart = np.hypot(half, skew)
         flat = mean - apart
         flat = np.where(flat < 0.5 * mean, det / level**2 / (mean + apart), flat)  # their product, where they cancel
-        axes = 1.0 / np.sqrt(np.stack([flat, mean + apart], -1))
-        theta = np.arctan2(-skew, -half) / 2 % np.pi
-        result = np.column_stack([x, y, axes, theta])
-        known = (det > 1e-15 * np.maximum(np.abs(forms[:, :2, :2]).max((1, 2)), 1e-300) ** 2) & np.isfinite(result).all(1)
-    return np.where(known[:, None], result, np.nan)
+        result[:, 0], result[:, 1], result[:, 2], result[:, 3] = x, y, 1.0 / np.sqrt(flat), 1.0 / np.sqrt(mean + apart)
+        result[:, 4] = np.arctan2(-skew, -half) / 2 % np.pi
+        largest = np.maximum(np.maximum(np.abs(a), np.abs(c)), np.abs(b))
+        known = (det > 1e-15 * np.maximum(largest, 1e-300) ** 2) & np.isfinite(result).all(1)
+    result[~known] = np.nan
+    return result
 
 
 def beside(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -110,7 +110,8 @@ def find(
     looked = magnitude[some].ravel() if roi is None else magnitude[some][roi[some]]
     if not looked.size:
         return _none(gray.shape)
-    median, upper = np.percentile(looked, (50.0, percentile))
+    ranks = [round(part / 100.0 * (looked.size - 1)) for part in (50.0, percentile)]
+    median, upper = np.partition(looked, ranks)[ranks]
     sigma = float(median) / 1.18  # of a Rayleigh distribution
     upper = max(float(upper), noise * sigma, 1.0)
     weak = max(low * upper, WEAK * sigma)
@@ -167,9 +168,9 @@ def _pieces(edges: Edges, tolerance_px: float, corner_rad: float, least: int) ->
     )
     back = np.concatenate([[False], (turn[1:] * turn[:-1] < 0) & inner[1:] & inner[:-1]])
     found = []
+    place = _places(fine, spans, corners, owner)
     for cuts in ((sharp | back | straight) & inner, (sharp | straight) & inner):
-        cut = np.flatnonzero(cuts) + 1
-        bounds = np.unique(np.concatenate([spans.ravel(), _places(fine, spans, corners[cut], owner[cut])]))
+        bounds = np.unique(np.concatenate([spans.ravel(), place[np.flatnonzero(cuts) + 1]]))
         pieces = np.column_stack([bounds[:-1], bounds[1:]])
         within = np.searchsorted(spans[:, 0], pieces[:, 0], side="right") - 1
         found.append(pieces[(pieces[:, 1] <= spans[within, 1]) & (pieces[:, 1] - pieces[:, 0] >= least)])

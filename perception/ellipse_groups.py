@@ -31,7 +31,9 @@ def find(arcs: np.ndarray, edges: Edges, numbers: Sequence[int]) -> list[np.ndar
             groups = groups[following[groups[:, -1]] >= 0]
             groups = np.column_stack([groups, following[groups[:, -1]]])
         groups = np.sort(groups, 1)
-        found.append(np.unique(groups[(np.diff(groups, axis=1) > 0).all(1)], axis=0).reshape(-1, number))
+        groups = groups[(groups[:, 1:] > groups[:, :-1]).all(1)]
+        key = groups @ (len(arcs) ** np.arange(number)[::-1])
+        found.append(groups[np.unique(key, return_index=True)[1]])
     return found
 
 

@@ -166,7 +166,7 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
         for _ in range(3):
             residual = inverse - rays @ m
             tight = np.abs(residual)
-            scale = max(1.4826 * float(np.median(tight[tight < max(8 * sigma, np.median(tight) * 1.5)])), floor)
+            scale = max(1.4826 * middle(tight[tight < max(8 * sigma, middle(tight) * 1.5)]), floor)
             sigma = scale if ring == rings[0] else min(scale, 1.2 * first)  # what else comes into sight is no noise
             reach = (TUKEY if ring == rings[0] else GROWING) * sigma
             weight = np.maximum(1 - (residual / reach) ** 2, 0.0) ** 2
@@ -179,6 +179,12 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
     residual = points.inverse[:number] - rays @ m
     cov = sandwich(rays, rays * weight[:, None], residual, points.cell[:number])
     return Plane(m, cov, sigma, int(np.count_nonzero(weight)), extent)
+
+
+def middle(values: np.ndarray) -> float:
+    """Returns the median of many values `(P,)`, of an even number the larger one in the middle."""
+    half = len(values) // 2
+    return float(np.partition(values, half)[half])
 
 
 def _guess(rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40) -> np.ndarray:

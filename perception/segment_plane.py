@@ -6,8 +6,6 @@ Inverse depth is the natural coordinate: on a plane `n · P = d` it is linear in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -15,9 +13,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.sight import Masks
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-
-ONE, X, Y, XX, XY, YY = (0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)
-"""Powers of y and x, in which sums over pixels are kept."""
+from perception.segment_grid import Grid, squares
 
 
 @spec
@@ -152,15 +148,15 @@ class PlaneSegmenter:
 
     def _refined(self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Returns the least-squares plane of the pixels that agree with `plane`."""
-        grid, inverse, known = Grid(grid.x[::2], grid.y[::2]), inverse[::2, ::2], known[::2, ::2]
-        across, down = grid.powers()
+        grid, inverse, known = grid.half, inverse[::2, ::2], known[::2, ::2]
+        across, down = grid.powers
         for _ in range(2):
-            inside = (known & (np.abs(grid.inverse(plane) - inverse) < self._tolerance)).astype(np.float32)
+            inside = (known & (np.abs(grid.inverse(plane) - inverse) < self._tolerance)).astype(float)
             if inside.sum() < 3:
                 break
             sums = down @ inside @ across.T  # of x^i y^j over the pixels, [j, i]
             held = down[:2] @ (inside * inverse) @ across[:2].T
-            plane = np.linalg.solve(_squares(sums), np.array([held[0, 1], held[1, 0], held[0, 0]]))
+            plane = np.linalg.solve(squares(sums), np.array([held[0, 1], held[1, 0], held[0, 0]]))
         return plane
 
     def _faces(self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -238,47 +234,6 @@ def _shrunk(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
     return np.divide(1.0, depth, out=np.zeros(depth.shape, np.float32), where=known), known
 
 
-@dataclass(frozen=True)
-class Grid:
-    """The pixels that `_shrunk` keeps: the line of sight `(x, y, 1)` at depth 1 of each, by column and by row.
-
-    Attributes:
-        x: `(w,)`.
-        y: `(h,)`.
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-
-    @staticmethod
-    def of(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> Grid:
-        """Returns that of the middles of cells of `step` x `step` px."""
-        y, x = (
-            ((np.arange(count) * step + step // 2 - camera_matrix[k, 2]) / camera_matrix[k, k]).astype(np.float32)
-            for count, k in zip(shape, (1, 0), strict=True)
-        )
-        return Grid(x, y)
-
-    def sight(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Returns the lines of sight of some of them, `(…, 3)`."""
-        return np.stack([self.x[columns], self.y[rows], np.ones(rows.shape, np.float32)], -1)
-
-    def powers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns 1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: what sums over pixels are made of, by rows and columns."""
-        across, down = (np.stack([np.ones_like(some), some, some * some]) for some in (self.x, self.y))
-        return across, down
-
-    def inverse(self, plane: np.ndarray) -> np.ndarray:
-        """Returns inverse depth on a plane, `(h, w)`."""
-        plane = plane.astype(self.x.dtype)
-        return plane[0] * self.x + (plane[1] * self.y + plane[2])[:, None]
-
-
-def _squares(sums: np.ndarray) -> np.ndarray:
-    """Returns the sums of the products of x, y and 1 with each other, `(3, 3)`, among those of `x^i y^j`, `[j, i]`."""
-    return np.array([[sums[j, i] for j, i in row] for row in ((XX, XY, X), (XY, YY, Y), (X, Y, ONE))])
-
-
 def _filled(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
     """Fills a piece's holes (a mouth, lost depth), except where something stands in front of it."""
     outlines, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -288,13 +243,12 @@ def _filled(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
 
 def _extents(piece: np.ndarray, plane: np.ndarray, grid: Grid) -> np.ndarray:
     """Returns the two extents in m that a rectangle with the piece's second moments would have."""
-    grid = Grid(grid.x[::2].astype(float), grid.y[::2].astype(float))
-    depth = piece[::2, ::2] / np.maximum(grid.inverse(plane.astype(float)), 1e-6)
-    across, down = grid.powers()
+    depth = piece[::2, ::2] / np.maximum(grid.half.inverse(plane), 1e-6)
+    across, down = grid.half.powers
     first, second = down[:2] @ depth @ across[:2].T, down @ (depth * depth) @ across.T  # of x^i y^j, [j, i]
     number = np.count_nonzero(depth)
     middle = np.array([first[0, 1], first[1, 0], first[0, 0]]) / number
-    spread = np.linalg.eigvalsh(_squares(second) / number - np.outer(middle, middle))[
+    spread = np.linalg.eigvalsh(squares(second) / number - np.outer(middle, middle))[
         1:
     ]  # the smallest is the plane's own thickness
     return np.sqrt(12.0 * np.maximum(spread, 0.0))
