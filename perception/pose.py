@@ -20,8 +20,9 @@ UNTOLD, UNTOLD_SCORE = 0.8, 0.5
 """Part of an inside without depth, hidden from the right camera, from which on nobody can tell it from a flat disc; the score of
 what nobody can, for dust or for this."""
 
-FORGIVEN = 0.55
-"""Part of the circle that must show where its ellipse alone was too small or too long for one."""
+FORGIVEN, AT_FIRST = 0.55, 1.4
+"""Part of the circle that must show where its ellipse alone was too small or too long for one; and how many times as far off as the
+circle an ellipse may be, which follows the shade within a rim where that is the steeper edge."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which what stands before the rest of a rim is seen."""
 
@@ -73,13 +74,14 @@ class PlaneConic:
         noise_floor_per_m: Least standard deviation of inverse depth, 1/m.
         noise_limit_per_m: Largest standard deviation of inverse depth on the face, 1/m.
         matcher_alike: By how much the covariance of the plane from depth alone is larger than its residuals say: what a matcher
-            gets wrong is alike over wide stretches.
-        depth_alike: The same of the plane's depth, in the end.
-        tilt_alike: The same of its normal.
+            gets wrong is alike over wide stretches, and in part what alignment gets wrong.
+        tilt_alike: The same of the normal in the end, aligned or not.
         matcher_bias_per_m: Standard deviation of inverse depth by which a matcher is off all over a face, 1/m; with a right picture
             the face is aligned anew.
         bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual shows, 1/m.
         center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
+        shape_px: Standard deviation by which a rim departs from a circle at each of its first waves, px: it moves the centre of
+            what is left of one.
         looks: What it must look like.
         without_depth: What is tried where the face has no depth; `null` for nothing.
         blind: Part of the face around a hole with known depth below which it has none.
@@ -97,11 +99,11 @@ class PlaneConic:
     noise_floor_per_m: float
     noise_limit_per_m: float
     matcher_alike: float
-    depth_alike: float
     tilt_alike: float
     matcher_bias_per_m: float
     bias_per_m: float
     center_px: float
+    shape_px: float
     looks: Looks
     without_depth: PoseSpec | None
     blind: float
@@ -153,7 +155,7 @@ class PlaneConicEstimator:
             shape = self._shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
-        circle = rim.circle(gray, row, frame.camera_matrix, face.m, s.radius_m, s.radius_tolerance, s.center_px)
+        circle = rim.circle(gray, row, frame.camera_matrix, face.m, s.radius_m, s.radius_tolerance, s.center_px, s.shape_px)
         least = s.coverage if shape else max(s.coverage, FORGIVEN)
         if circle is None or circle.coverage < least:
             return Rejection("pose", "part of a circle on the face with a rim", circle.coverage if circle else 0.0, least, ellipse)
@@ -172,7 +174,7 @@ class PlaneConicEstimator:
             center_m=circle.center_m,
             axis=face.normal,
             radius_m=circle.radius_m,
-            cov_m2=covariance(replace(face, cov=face.cov * s.depth_alike), circle, s.bias_per_m),
+            cov_m2=covariance(face, circle, s.bias_per_m),
             axis_cov_rad2=face.normal_cov_rad2() * s.tilt_alike,
             frame="camera",
             score=float(ellipse.score) * (UNTOLD_SCORE if untold and masks.mouth is None else 1.0),
@@ -201,11 +203,11 @@ class PlaneConicEstimator:
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
         seen = max(1.0 - hidden_part(face, row, frame), s.coverage)  # the less of a rim there is, the less it tells
-        tolerance = s.radius_tolerance / seen * s.radius_m
+        tolerance = AT_FIRST * s.radius_tolerance / seen * s.radius_m
         if abs(radius - s.radius_m) > tolerance:
             limit = s.radius_m + np.sign(radius - s.radius_m) * tolerance
             return Rejection("pose", "radius, m", radius, float(limit), ellipse)
-        least = 1.0 - (1.0 - s.axis_ratio) / seen
+        least = 1.0 - AT_FIRST * (1.0 - s.axis_ratio) / seen
         if ratio < least:
             return Rejection("pose", "axis ratio on the face", ratio, least, ellipse)
         return abs(radius / s.radius_m - 1.0) <= s.radius_tolerance and ratio >= s.axis_ratio

@@ -24,9 +24,14 @@ NEAR_PX, INLIER_PX = 0.7, 1.0
 """A profile speaks for a circle that has an edge so near to it; of the final one."""
 NARROW_PX = 2.0
 """Reach of the profiles across a circle that is known already."""
-ALIKE_PX = 10.0
-"""Points of a rim are alike over this length: the chips of it, and the blur."""
+ALIKE_PX, ALIKE_M = 8.0, 0.006
+"""Points of a rim are alike over both lengths together: that of blur and profiles, and that of chips and grain."""
 LEAST = 12
+WAVES = (2, 3, 4)
+"""Waves around a rim by which it is no circle, of light, chips and blur; they move the centre of one that is not whole."""
+GAP, BESIDE = 5, 5
+"""Profiles in a row without an edge of the circle that are a gap, where something stands before it; and beside one, those whose
+edge is drawn towards what stands there by the blur across profiles."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,7 @@ def circle(
     radius_m: float,
     tolerance: float,
     center_px: float,
+    shape_px: float,
 ) -> Circle | None:
     """Returns the circle on the plane `m · P = 1` whose rim has the most edges of dark to bright; `None` where nothing agrees.
 
@@ -92,6 +98,7 @@ def circle(
         radius_m: About how large it is.
         tolerance: By how much it may be larger or smaller, as a part of that.
         center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
+        shape_px: Standard deviation by which a rim departs from a circle at each of its `WAVES`, px.
     """
     ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
     normal = m / np.linalg.norm(m)
@@ -110,7 +117,7 @@ def circle(
         profiles = _edges(gray, seen, NARROW_PX, chart) if np.isfinite(seen).all() else None
         if profiles is None:
             return None
-        found, cov, rms_px, coverage = _fitted(found, *profiles, center_px)
+        found, cov, rms_px, coverage = _fitted(found, *profiles, center_px, shape_px)
         if found is not None and abs(found[2] - radius_m) > 1.5 * tolerance * radius_m:
             return None
     if found is None:
@@ -186,7 +193,7 @@ def _agreed(edges: np.ndarray, pixel_m: np.ndarray, radius_m: float, tolerance: 
 
 
 def _fitted(
-    start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray, center_px: float
+    start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray, center_px: float, shape_px: float
 ) -> tuple[np.ndarray | None, np.ndarray, float, float]:
     """Returns the circle that fits the edges nearest to one, the covariance of its centre, its residual in px and its coverage."""
     found = start
@@ -199,6 +206,10 @@ def _fitted(
         off, away, distance = off[rows, best], away[rows, best], distance[rows, best]
         off = np.where(np.isfinite(off), off, np.inf)
         weight = np.maximum(1 - (off / scale_px) ** 2, 0.0) ** 2
+        coverage = float(np.mean(weight > 0))
+        beside = _beside_gaps(weight > 0)
+        if np.count_nonzero(weight[~beside]) >= LEAST:
+            weight[beside] = 0.0
         on = weight > 0
         if on.sum() < LEAST:
             return None, np.zeros((2, 2)), 0.0, 0.0
@@ -209,9 +220,17 @@ def _fitted(
             return None, np.zeros((2, 2)), 0.0, 0.0
         found = found - np.linalg.solve(normal, heavy.T @ off[on])
     rms_px = float(np.sqrt(np.average(off[on] ** 2, weights=weight[on])))
-    spacing_px = float(2 * np.pi * found[2] / len(rows) / np.median(pixel_m))
-    alike = max(ALIKE_PX / spacing_px, 1.0)
-    # a whole rim of n profiles knows its centre by 2 / n of a profile's variance; what is left of one, by its own geometry less
-    unseen = 0.5 * len(rows) * center_px**2
-    cov = np.linalg.inv(normal)[:2, :2] * (rms_px**2 * alike + unseen)
-    return found, cov, rms_px, float(np.mean(on))
+    spacing_m = 2 * np.pi * float(found[2]) / len(rows)
+    alike = max((ALIKE_PX * float(np.median(pixel_m)) + ALIKE_M) / spacing_m, 1.0)
+    angle = np.arctan2(away[on, 1], away[on, 0])
+    waves = [(center_px, 1.0)] + [(shape_px, number) for number in WAVES]
+    moves = np.column_stack([size * wave(number * angle) for size, number in waves for wave in (np.cos, np.sin)])
+    moved = np.linalg.solve(normal, heavy.T @ moves)[:2]
+    cov = np.linalg.inv(normal)[:2, :2] * rms_px**2 * alike + moved @ moved.T
+    return found, cov, rms_px, coverage
+
+
+def _beside_gaps(on: np.ndarray) -> np.ndarray:
+    """Says which of the profiles around a circle, `(P,)` bool, lie in gaps of it or beside one."""
+    gap = np.all([np.roll(~on, shift) for shift in range(GAP)], axis=0)  # the last ones of as many without an edge
+    return np.any([np.roll(gap, -shift) for shift in range(-BESIDE, GAP + BESIDE)], axis=0)
