@@ -14,7 +14,7 @@ import numpy as np
 
 from brokk_rl.signals import Frame
 from perception import conic
-from perception.plane import Plane, inverse_depth, middle, parted, sandwich
+from perception.plane import Plane, inverse_depth, middle, parted, sandwich, yielding
 
 SMOOTH_PX = 1.0
 """Blur of both pictures: noise would shrink the slope."""
@@ -194,7 +194,8 @@ def aligned(
     if not np.isfinite(m).all() or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px:
         return face
     cell = (v_on // cell_px).astype(np.int64) * 10_000 + (u_on // cell_px).astype(np.int64)
-    return merged(face, replace(face, m=m, cov=sandwich(push[:3].T, heavy[:3].T, off, parted(cell))), bias_per_m)
+    slopes = (push[:3] * yielding(off / (TUKEY * scale))).T
+    return merged(face, replace(face, m=m, cov=sandwich(slopes, heavy[:3].T, off, parted(cell))), bias_per_m)
 
 
 def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:

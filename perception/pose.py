@@ -74,8 +74,7 @@ class PlaneConic:
         noise_floor_per_m: Least standard deviation of inverse depth, 1/m.
         noise_limit_per_m: Largest standard deviation of inverse depth on the face, 1/m.
         matcher_alike: By how much the covariance of the plane from depth alone is larger than its residuals say: what a matcher
-            gets wrong is alike over wide stretches, and in part what alignment gets wrong.
-        tilt_alike: The same of the normal in the end, aligned or not.
+            gets wrong is alike over wide stretches.
         matcher_bias_per_m: Standard deviation of inverse depth by which a matcher is off all over a face, 1/m; with a right picture
             the face is aligned anew.
         bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual shows, 1/m.
@@ -99,7 +98,6 @@ class PlaneConic:
     noise_floor_per_m: float
     noise_limit_per_m: float
     matcher_alike: float
-    tilt_alike: float
     matcher_bias_per_m: float
     bias_per_m: float
     center_px: float
@@ -175,7 +173,7 @@ class PlaneConicEstimator:
             axis=face.normal,
             radius_m=circle.radius_m,
             cov_m2=covariance(face, circle, s.bias_per_m),
-            axis_cov_rad2=face.normal_cov_rad2() * s.tilt_alike,
+            axis_cov_rad2=face.normal_cov_rad2(),
             frame="camera",
             score=float(ellipse.score) * (UNTOLD_SCORE if untold and masks.mouth is None else 1.0),
             t_s=frame.t_s,
