@@ -219,7 +219,7 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
             either[k] += (said | known).sum()
     assert (shared / either > [0.9, 0.6]).all()
     for name in (export.ONNX, export.TENSORS):
-        assert (segment_network.SHIPPED / name).stat().st_size < 2_000_000
+        assert (segment_network.SHIPPED / name).stat().st_size < 5_000_000
 
 
 def test_files_that_are_no_network_of_ours_are_refused(tmp_path: Path) -> None:
