@@ -57,7 +57,8 @@ def simulated(evidence: Evidence, grown: Mapping[str, Sequence[Ray]], repaired: 
     wide: dict[str, list[Ray]] = {}
     mine = {(ray.kind.name, ray.name): place for place, ray in enumerate(repaired.rays)}
     for name, ways in grown.items():
-        wide[name] = [replace(ray, shape=ways[0].shape) for ray in rays(ways[0].kind, WIDE)]
+        grid = sorted({*WIDE, *ways[0].sizes[ways[0].sizes > 0.0].tolist()})  # as close as they were before
+        wide[name] = [replace(ray, shape=ways[0].shape) for ray in rays(ways[0].kind, grid)]
         responses = [_response(evidence, ray, wide[name], repaired) for ray in wide[name]]
         for j in range(joints):
             if max(np.abs(response[j]).max() for response in responses) >= FELT:

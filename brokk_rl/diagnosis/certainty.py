@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from brokk_rl.diagnosis.engine import Findings
-from brokk_rl.diagnosis.remainder import CLUES, CURVE, FORMS, STARTS
+from brokk_rl.diagnosis.remainder import CLUES, CURVE, FORMS, LATER, STARTS, TIME
 from brokk_rl.errors import ConfigError, choices
 from brokk_rl.spec import spec
 
@@ -28,9 +28,9 @@ NATS = 10.0
 MUCH = 50.0
 """What effects explain is much beyond: then a part that they leave says less, as no form is exactly that of the library."""
 MOST = 100.0
-"""The same for what they leave that is about something else than form."""
-PLENTY = 500.0
-"""The same for what they leave of how speed follows commands: there real forms differ least."""
+"""The same of a clue's evidence."""
+TELLING = {STARTS: 50.0, CURVE: 1000.0, TIME: 1000.0, LATER: 1000.0}
+"""The same of single clues: real forms differ most in starts and stops, little in their curve, and not with the running time."""
 
 
 @spec
@@ -86,13 +86,15 @@ def outside(findings: Findings) -> dict[str, float]:
     explained = 1.0 + float(np.log1p(gained.sum() / MUCH))
     late = "timing" in stages  # frames that come late scatter errors, whatever else is there
     seen = bool(stages & {"kinematics", "sensing"})
-    of = dict(zip(CLUES, left, strict=False))
-    others = np.array([row for name, row in of.items() if name not in FORMS])
+    clues = {
+        name: float(np.log1p((row / (1.0 + gained / TELLING.get(name, MOST))).max() / NATS))
+        for name, row in zip(CLUES, left, strict=False)  # the curve has not always been a clue of its own
+    }
     return {
         "constant": 1.0,
-        "clue": float(np.log1p((others / (1.0 + gained / MOST)).max(initial=0.0) / NATS)),
-        "form": float(np.log1p((of[STARTS] / (1.0 + gained / MUCH)).max(initial=0.0) / NATS)),
-        "curve": float(np.log1p((of.get(CURVE, 0.0) / (1.0 + gained / PLENTY)).max(initial=0.0) / NATS)),
+        "clue": max(value for name, value in clues.items() if name not in FORMS),
+        "form": clues[STARTS],
+        "curve": clues.get(CURVE, 0.0),
         "scatter": 0.0 if late else _log(findings.scatter) / explained,
         "strays": _log(findings.strays) / explained,
         "tool": 0.0 if seen else _log(np.array(findings.tool_left)),

@@ -18,7 +18,7 @@ from brokk_rl.diagnosis.found import Found
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.repair import Repair, repair
 from brokk_rl.diagnosis.search import MOST, Chosen, Price, Table, choose
-from brokk_rl.diagnosis.shapes import SMALL, Nulls, add, plain_joints
+from brokk_rl.diagnosis.shapes import SMALL, Nulls, add, plain_joints, rays_of
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.sizes import Shape
 from brokk_rl.diagnosis.tied import tied
@@ -177,7 +177,7 @@ class Search:
             if kind.target.stochastic or kind.target.side == "kinematics" or measured:
                 continue
             self.tell(f"simulating {kind.name}", 0.35 + 0.2 * number / len(self.kinds))
-            grown[kind.name] = add(shapes, kind.name, rays(kind), evidence)
+            grown[kind.name] = add(shapes, kind.name, rays_of(kind), evidence)
         return grown, shapes
 
     def _round(

@@ -150,13 +150,14 @@ def _past(m: Motion) -> list[np.ndarray]:
 
 
 STARTS, CURVE = "how it starts and stops", "how speed follows commands"
+TIME, LATER = "running time", "timing over the running time"
 CLUES: Mapping[str, Callable[[Motion], list[np.ndarray]]] = {
     STARTS: _changes,
     "its position": _position,
     "the angle that the sensor reads": _sensor,
     "the other joints": _joints,
-    "running time": _time,
-    "timing over the running time": _delay_over_time,
+    TIME: _time,
+    LATER: _delay_over_time,
     "what it did before": _past,
     CURVE: _curve,
 }

@@ -10,20 +10,28 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from brokk_rl.diagnosis.evidence import GRID, Evidence, Ray
+from brokk_rl.diagnosis.evidence import GRID, Evidence, Ray, rays
+from brokk_rl.diagnosis.library import Kind, shared
 from brokk_rl.diagnosis.noise import loss
 from brokk_rl.diagnosis.search import Scored, Table
 from brokk_rl.diagnosis.simulator import Base
 from brokk_rl.diagnosis.sizes import Plain, Shape, fitted, plain, predicted
 
-SHAPES = (0.4, 2.0)
+SHAPES = (0.35, 0.5, 0.7, 1.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
+FINE = tuple(np.geomspace(GRID[0], GRID[-1], 20).round(3).tolist())
+"""Sizes at which an effect is simulated that rings: between those of `GRID` it would be out of step, and only a dull one fits."""
 SMALL = GRID[:4]
 """Sizes at which effects are simulated on the reference: small ones of the field's, as many effects begin at a threshold."""
 THERE = 3.0
 """Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be there already."""
 FELT = 1e-3
 """An effect that changes errors over the noise by less does nothing to a joint."""
+
+
+def rays_of(kind: Kind) -> list[Ray]:
+    """Returns the ways in which an effect can grow, at the sizes at which it has to be simulated."""
+    return rays(kind, FINE if kind.shaping and not shared([kind]) else GRID)
 
 
 def add(shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray], evidence: Evidence) -> list[Ray]:

@@ -11,6 +11,7 @@ from brokk_rl.diagnosis import around, gap, library, noise
 from brokk_rl.diagnosis.evidence import rays
 from brokk_rl.diagnosis.noise import Noise
 from brokk_rl.diagnosis.search import Table, choose
+from brokk_rl.diagnosis.shapes import rays_of
 from brokk_rl.diagnosis.sizes import Shape, earned, fitted, plain
 from brokk_rl.diagnosis.tied import tied
 from brokk_rl.gravity import Gravity
@@ -215,3 +216,22 @@ def test_of_two_effects_that_are_alike_one_stays() -> None:
     kept = around.paying([table], [frozenset("abc")], lambda j, subset: 4.0 * len(subset), 5.0)
     assert len(kept[0]) == 1 and kept[0] <= frozenset("ab")
     assert around.paying([table], [frozenset("c")], lambda j, subset: 4.0 * len(subset), 5.0) == (frozenset(),)
+
+
+def test_an_effect_that_rings_is_simulated_at_sizes_so_close_that_those_between_are_in_step(machine: Machine) -> None:
+    kind = next(kind for kind in library.load(machine) if kind.name == "compliance")
+    number, t_s = kind.numbers["ringing_s"], np.arange(0.0, 1.5, machine.period_s)
+
+    def ringing(sizes: np.ndarray) -> np.ndarray:
+        w = 2.0 * np.pi / (number.typical * sizes[:, None])
+        return np.exp(-0.12 * w * t_s) * np.sin(w * t_s)
+
+    def in_step(sizes: np.ndarray) -> float:
+        between = np.sqrt(sizes[1:] * sizes[:-1])  # what is shorter than four samples cannot be seen to ring
+        seen = number.typical * between > 4 * machine.period_s
+        told = (ringing(sizes)[1:] + ringing(sizes)[:-1]) / 2.0
+        return min(np.corrcoef(a, b)[0, 1] for a, b in zip(told[seen], ringing(between)[seen], strict=True))
+
+    (found,), (coarse,) = rays_of(kind), rays(kind)
+    assert in_step(found.sizes[found.sizes > 0.0]) > 0.95
+    assert in_step(coarse.sizes[coarse.sizes > 0.0]) < 0.8
