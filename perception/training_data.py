@@ -32,6 +32,9 @@ SEEN = (1.0, 1.0 / ROOM)
 """Part of the width of each view that the segmenter sees."""
 FINER = 2
 """Places at which a pixel of a sample is looked at, in each direction: it may be larger than one of the view."""
+ENLARGED = 1.5
+"""By how much a closer view is larger than its frame, at most: of a small one it shows more than the block instead, as sharp as the
+segmenter sees one in a large frame."""
 PART_OF_MEMORY = 0.5
 """Views that take no more of a device's free memory are kept there."""
 THREADS = 16
@@ -234,4 +237,7 @@ def _looks(known: np.ndarray, size_px: tuple[int, int], margin: float, generator
         side = generator.uniform(0.2, 0.8) * np.array([known.shape[1], known.shape[0]])
         corner = generator.uniform(0.0, 1.0, 2) * (np.array([known.shape[1], known.shape[0]]) - side)
         box = (*corner, *side)
-    return [first, around(box, size_px, (ROOM * (1.0 + 2.0 * margin) - 1.0) / 2.0)]
+    room = ROOM * (1.0 + 2.0 * margin)
+    closer = around(box, size_px, (room - 1.0) / 2.0)
+    room *= max(1.0, size_px[0] / ENLARGED / closer.width)
+    return [first, around(box, size_px, (room - 1.0) / 2.0)]

@@ -25,8 +25,8 @@ wide="$small rig.focal_px=264.0"
 middle="$small rig.focal_px=528.0 scene.sight.distance_m=[1.0,3.0]"
 long="$small rig.focal_px=1056.0 scene.sight.distance_m=[2.0,4.5]"
 full="rig.width=1280 rig.height=720 rig.focal_px=704.0"; [ -n "$SMALL" ] && full=$wide
-drawn=(varied:long varied:wide decoy:middle varied:middle hidden:middle varied:wide varied:long clean:wide varied:middle
-       varied:wide decoy:long varied:long hidden:wide varied:middle haze:middle)
+drawn=(varied:wide varied:long hidden:wide varied:middle decoy:middle varied:wide varied:long clean:wide varied:middle
+       decoy:long varied:wide hidden:middle varied:long haze:wide varied:middle)
 
 # One process a core. Of each eight (four, if there are few) one draws scenes to judge by, a condition at a time, unless there are
 # some from before; the others draw varied scenes and, two in five, the conditions of the table, by other seeds; each begins

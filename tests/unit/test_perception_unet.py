@@ -167,3 +167,12 @@ def test_folders_without_masks_are_refused(brokk: Callable[..., Any], tmp_path: 
     assert done.code == 2 and "mode=render" in done.err and not Path("run").exists()
     done = brokk("mode=train_perception", "training.frames=x", "training.size_px=[100,48]", "session.out=run")
     assert done.code == 2 and "multiples of 32" in done.err
+
+
+@pytest.mark.parametrize(("side_px", "width_px"), [(200, 1.5 * 1.3 * 200 * 480 / 288), (40, 480 / 1.5)])
+def test_a_small_block_is_not_enlarged_beyond_what_its_frame_shows(side_px: int, width_px: float) -> None:
+    known = np.zeros((270, 480, 2), np.uint8)
+    known[50 : 50 + side_px, 60 : 60 + side_px, 0] = 255
+    _, closer = training_data._looks(known, (480, 288), 0.15, np.random.default_rng(0))
+    assert closer.width == pytest.approx(width_px, abs=2)
+    assert closer.left + closer.width / 2 == pytest.approx(60 + side_px / 2, abs=2)
