@@ -15,7 +15,7 @@ import yaml
 from safetensors.torch import load_file
 
 import conf
-from perception import dataset, training, training_report
+from perception import dataset, training, training_data, training_report
 from perception.dataset import Label
 from perception.unet import UNet, loss
 
