@@ -36,7 +36,8 @@ class ContourArcs:
             in px; for an ellipse seen in part, as large a part of that.
         angle_rms_small: See `angle_rms_rad`.
         purity: Least part of the supporting edges, from corner to corner, that lies on the ellipse.
-        departure: Largest part of the circumference where the supporting chains run on beside the ellipse (spirals, hearts).
+        departure: Largest part of the circumference where the supporting edges run on beside the ellipse, up to their corners
+            (spirals, hearts).
         evidence: Least decimal exponent by which the support is no accident.
         score: Least score of an ellipse that is seen nearly all around; of half of one less than half of it will do.
         prior_slack: By how much wider the limits of residual, angle and departure are, and the one of purity lower, where a size is

@@ -12,7 +12,7 @@ import numpy as np
 from brokk_rl.sight import Ellipse, SizePrior
 from perception import conic, ellipse_edges, ellipse_groups, ellipse_support
 from perception.ellipse_edges import Edges
-from perception.ellipse_support import ANGLES, NUM_SAMPLES, Candidates
+from perception.ellipse_support import ANGLES, NUM_SAMPLES, STROKE_PX, Candidates
 
 if TYPE_CHECKING:
     from perception.ellipse import ContourArcs
@@ -28,8 +28,8 @@ BESIDE_PX = 2
 """By how much farther than within reach the nearest edge is known."""
 PIECE = 0.6
 """Of an arc, that may be an ellipse's where not all of it is."""
-STROKE_PX, SAME_AREA = 4.5, 0.6
-"""Two ellipses that differ by no more than this, and in area by no more than this part, are the two edges of a line."""
+SAME_AREA = 0.6
+"""Two ellipses that differ by no more than a line is wide, and in area by no more than this part, are its two edges."""
 LEAST_ARC, HALFWAY = 0.2, 0.3
 """Part of an ellipse from which the rest of it can be told; part that must support it once it was refined."""
 ROUNDS_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
@@ -200,15 +200,15 @@ class ArcDetector:
         rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
         rms_limit, angle_limit = rms_limit[good], angle_limit[good]
         good = ellipse_support.gap(support >= 0, length) <= s.gap
-        good &= ellipse_support.purity(edges, support, length) >= s.purity / slack
+        screened = ellipse_support.screened(candidates, edges, support, length)
+        good &= screened | (ellipse_support.purity(edges, support, length) >= s.purity / slack)
         if limits.lowest_px == 0:
             good &= ellipse_support.strength(edges, support) >= FAINT * np.percentile(edges.strength, 95.0) * np.minimum(
                 SMALL_PX / np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3]), 1.0
             )
             good[good] &= ~ellipse_support.leaving(candidates[good], edges, support[good], length[good])
-        good &= (
-            ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses)) <= s.departure * slack
-        )
+        departure = ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses))
+        good &= screened | (departure <= s.departure * slack)
         score = coverage * np.clip(1 - 0.5 * spread / rms_limit, 0, 1) * np.clip(1 - 0.5 * angle / angle_limit, 0, 1)
         # what is seen all around must fit well to count; of half of one little more is asked than its limits ask
         good &= score * slack**2 >= s.score * np.maximum(np.clip(3 * coverage - 1.5, 0.0, 1.0), 0.9 * coverage)

@@ -34,7 +34,6 @@ class Edges:
         points: Sub-pixel places `(E, 2)`.
         directions: Unit gradients `(E, 2)`, from dark to bright.
         strength: Length of the gradient `(E,)`, grey levels a pixel.
-        chain: Number of the connected chain of each point, `(E,)`.
         nearest: Number of the edge point nearest to each pixel, `(h, w)`, -1 where none is near.
         spans: Pieces of chains without a branch, `(S, 2)`: first point and one past the last.
         arcs: Convex arcs, spans too, `(A, 2)`.
@@ -45,7 +44,6 @@ class Edges:
     points: np.ndarray
     directions: np.ndarray
     strength: np.ndarray
-    chain: np.ndarray
     nearest: np.ndarray
     spans: np.ndarray
     arcs: np.ndarray
@@ -123,13 +121,13 @@ def find(
     contours = [c for c in cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0] if len(c) >= least]
     if not contours:
         return _none(gray.shape)
-    pixels, chain, spans = _chains(contours, gray.shape, canny, least)
+    pixels, spans = _chains(contours, gray.shape, least)
     if not len(pixels):
         return _none(gray.shape)
     points, directions = _refined(pixels, gx, gy, magnitude)
     strength = magnitude[pixels[:, 1], pixels[:, 0]]
     return Edges(
-        points, directions, strength, chain, _nearest(pixels, gray.shape, near_px), spans, NO_SPANS,
+        points, directions, strength, _nearest(pixels, gray.shape, near_px), spans, NO_SPANS,
         np.full(len(points), -1), np.empty(0),
     )  # fmt: skip
 
@@ -190,8 +188,8 @@ def _places(fine: np.ndarray, spans: np.ndarray, corners: np.ndarray, owner: np.
     return member[order[np.searchsorted(keys[order], key(owner, corners))]]
 
 
-def _chains(contours: Sequence, shape: tuple, canny: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns edge pixels `(E, 2)` in order, each once, their chains, and unbranched spans.
+def _chains(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns edge pixels `(E, 2)` in order, each once, and unbranched spans.
 
     A contour runs around a line of edge pixels: along both sides of an open one, inside and outside of a closed one. Taking each
     pixel where it comes first leaves the line, cut at its ends and branches. An open line whose topmost pixel lies within it comes
@@ -223,8 +221,7 @@ def _chains(contours: Sequence, shape: tuple, canny: np.ndarray, least: int) -> 
     pixels = pixels[place][np.repeat(long, length)]
     ends = np.cumsum(length[long])
     joined = np.column_stack([ends - length[long], ends])
-    chain = cv2.connectedComponents(canny, connectivity=8, ltype=cv2.CV_32S)[1][pixels[:, 1], pixels[:, 0]]
-    return pixels, chain, joined
+    return pixels, joined
 
 
 def _refined(pixels: np.ndarray, gx: np.ndarray, gy: np.ndarray, magnitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -269,5 +266,5 @@ def _bilinear(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _none(shape: tuple) -> Edges:
     empty = np.empty((0, 2))
-    none = np.empty(0, int)
-    return Edges(empty, empty, np.empty(0), none, np.full(shape, -1, np.int32), NO_SPANS, NO_SPANS, none, np.empty(0))
+    run = np.empty(0, int)
+    return Edges(empty, empty, np.empty(0), np.full(shape, -1, np.int32), NO_SPANS, NO_SPANS, run, np.empty(0))

@@ -123,6 +123,14 @@ def test_a_round_end_is_no_ellipse_and_as_much_of_a_covered_disc_is(detector) ->
         assert len(found) == 1 and np.hypot(found[0].x - 90, found[0].y - 120) < 1.5
 
 
+def test_what_hides_half_of_a_disc_may_be_as_dark_and_as_wide(detector) -> None:
+    gray = np.full((240, 320), 200, np.uint8)
+    cv2.ellipse(gray, (100, 120), (30, 22), 0, 0, 360, 40, -1, cv2.LINE_AA)
+    cv2.rectangle(gray, (100, 95), (136, 145), 70, -1)
+    found = detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
+    assert [bench_patterns.overlap(row(one), np.array([100.0, 120, 30, 22, 0])) > 0.9 for one in found] == [True]
+
+
 def test_half_of_an_ellipse_tells_the_whole(detector) -> None:
     picture = np.full((200, 240), 180, np.uint8)
     cv2.ellipse(picture, (120, 100), (60, 45), 20, 0, 360, 40, -1, cv2.LINE_AA)
