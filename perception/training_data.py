@@ -205,7 +205,7 @@ def read(stems: Sequence[Path], size_px: tuple[int, int], margin: float, seed: i
         return condition
 
     threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # on each of many threads as many again get in each other's way: a minute instead of seconds
+    cv2.setNumThreads(1)  # on each of many threads as many again would get in each other's way
     try:
         with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
             work = pool.map(fill, range(len(stems)))

@@ -9,7 +9,7 @@
 set -u
 CORES=${CORES:-$(nproc)} RENDER_S=${RENDER_S:-600} TRAIN_S=${TRAIN_S:-600} GPU=${GPU-0} SMALL=${SMALL:-}
 START=${START:-null} SEED=${SEED:-1000} WIDTHS=${WIDTHS:-16,24,40,64,72,64} FRAMES=${FRAMES:-}
-# a graphics card takes as long to be told what to do with 48 samples as to do it with 192
+# telling a graphics card what to do with 48 samples took longer than doing it
 BATCH=192 RATE=0.003; [ "$START" != null ] && RATE=0.0015  # what was learned is not to be shaken out
 mkdir -p "$OUT"
 work=$(mktemp -d "${TMPDIR:-/tmp}/segmenter.XXXX"); mkdir -p "${FRAMES:-$work}"
