@@ -92,7 +92,7 @@ def outside(findings: Findings) -> dict[str, float]:
     }
     return {
         "constant": 1.0,
-        "clue": max(value for name, value in clues.items() if name not in FORMS),
+        "clue": max((value for name, value in clues.items() if name not in FORMS), default=0.0),
         "form": clues[STARTS],
         "curve": clues.get(CURVE, 0.0),
         "scatter": 0.0 if late else _log(findings.scatter) / explained,

@@ -24,6 +24,9 @@ AS_GOOD = 3.0
 LISTED = 8
 NAMED = 0.5
 """Probability from which a further effect is named: one that is missed costs what a wrong one does."""
+SAID = 0.27
+"""Probability from which an unknown cause is told in the place of effects. Causes outside the library are about a fifth of all,
+effects more than half: at this, a share of the one kind that is missed costs as much as the same share of the other."""
 LEFT = 15.0
 """Evidence of a clue, beyond that on the reference, from which the report says that something is left on a joint."""
 TOLD = 0.9
@@ -164,10 +167,11 @@ def named_chances(findings: Findings, prices: Prices, weights: Certainty) -> dic
 
 
 def is_unknown(findings: Findings, prices: Prices, weights: Certainty) -> bool:
-    """Says whether an unknown cause is probable, or more so than every effect that was found and than that there is nothing."""
-    chances = list(named_chances(findings, prices, weights).values())
-    chances = chances or [certainty.chance(weights.none, none_signs(findings, prices, weights))]
-    return unknown_chance(findings, prices, weights) > min(0.5, max(chances))
+    """Says whether an unknown cause is told: where effects were found from `SAID` on, else where it is more probable than none."""
+    chances, least = list(named_chances(findings, prices, weights).values()), SAID
+    if not chances:
+        chances, least = [certainty.chance(weights.none, none_signs(findings, prices, weights))], 0.5
+    return unknown_chance(findings, prices, weights) > min(least, max(chances))
 
 
 def likely(findings: Findings, prices: Prices, weights: Certainty) -> Findings:
@@ -210,18 +214,21 @@ def _widened(one: Estimate, none: float, form: float) -> Estimate:
 def ranking(
     findings: Findings, selected: Sequence[Selected], prices: Prices, weights: Certainty, machine: Machine, unknown: float
 ) -> list[Ranked]:
-    """Returns all rivals worth naming, most probable first; `none` and `unknown` among them."""
+    """Returns all rivals worth naming, most probable first; `none` and `unknown` among them, none above an unknown that is told."""
     named = {one.effect: Ranked(one.effect, one.joints, one.probability) for one in selected}
+    is_told = is_unknown(findings, prices, weights)
+    most = min(unknown, 1.0 - unknown) if is_told else 1.0 - unknown
     over = max(findings.chosen.worth, 0.0)
     for name in findings.rays:
         worth, places = _alone(findings, prices, name)
         if name not in named and places:
             odds = float(np.clip((worth - over) / weights.temperature, -30.0, 30.0))
             joints = tuple(machine.joint_names[j] for j in places)
-            named[name] = Ranked(name, joints, min(float(1.0 / (1.0 + np.exp(-odds))), 1.0 - unknown))
+            named[name] = Ranked(name, joints, min(float(1.0 / (1.0 + np.exp(-odds))), most))
     chances = [one.probability for one in selected]
     nothing = certainty.chance(weights.none, none_signs(findings, prices, weights))
-    none = min(nothing, 1.0 - max([*chances, unknown if unknown > 0.5 else 0.0]))
+    least = 1.0 - max([*chances, unknown if unknown > 0.5 else 0.0])
+    none = min(nothing, least, most if is_told else 1.0)
     rows = [*named.values(), Ranked("none", (), none), Ranked("unknown", (), unknown)]
     return sorted(rows, key=lambda one: -one.probability)[:LISTED]
 

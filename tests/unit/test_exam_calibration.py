@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.diagnosis import library, weighing
+from brokk_rl.diagnosis import library, verdict, weighing
 from brokk_rl.diagnosis.certainty import Certainty
 from brokk_rl.diagnosis.engine import Findings, Prices
 from brokk_rl.diagnosis.evidence import Evidence
@@ -92,6 +92,19 @@ def test_prices_are_found_that_name_what_is_there_and_nothing_else(machine: Mach
     assert fit.value(cases, cheap, weights) < 0.8
     best = fit.fitted(cases, cheap, weights, lambda: None)
     assert fit.value(cases, *best) == pytest.approx(1.0)
+
+
+def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothing_stands_above_it(
+    machine: Machine, prices: Prices, weights: Certainty
+) -> None:
+    outside = {**dict.fromkeys(weights.outside, 0.0), "constant": float(np.log(0.4 / 0.6))}  # odds of 2 to 3, whatever is seen
+    weights = dataclasses.replace(weights, outside=outside, none={"constant": 2.0, "nearest": 0.0, "outside": 0.0})
+    named, silent = found(machine, prices, 0.5, 0), found(machine, prices, 0.0, 1)
+    assert verdict.is_unknown(named, prices, weights), "a fifth of causes lies outside, so few are missed only so"
+    assert not verdict.is_unknown(silent, prices, weights)
+    rows = verdict.ranking(named, [], prices, weights, machine, 0.4)
+    assert max(rows, key=lambda row: row.probability).probability == pytest.approx(0.4)
+    assert {row.effect for row in rows} >= {"lag", "unknown", "none"}
 
 
 def test_nothing_is_tuned_to_a_sealed_exam(tmp_path: Path) -> None:
