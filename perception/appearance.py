@@ -80,7 +80,8 @@ def interior(
         along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
         drift = _gradient(part[ring], _places(ring, left, top) - (x, y)) * min(darkness, 1.0)  # of dust, over hole and face alike
         values = values - away @ drift
-        slope = float(np.polyfit(along, values, 1)[0]) / max(face * (1.0 - darkness), 1.0)
+        apart = along - along.mean()
+        slope = float(apart @ values / max(float(apart @ apart), 1e-9)) / max(face * (1.0 - darkness), 1.0)
     around = _darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
     return Interior(darkness, slope, deeper, unknown, around, _contrast(smooth[ring], face * darkness))
 

@@ -232,5 +232,6 @@ def _fitted(
 
 def _beside_gaps(on: np.ndarray) -> np.ndarray:
     """Says which of the profiles around a circle, `(P,)` bool, lie in gaps of it or beside one."""
-    gap = np.all([np.roll(~on, shift) for shift in range(GAP)], axis=0)  # the last ones of as many without an edge
-    return np.any([np.roll(gap, -shift) for shift in range(-BESIDE, GAP + BESIDE)], axis=0)
+    place = np.arange(len(on))[:, None]
+    gap = ~on[(place - np.arange(GAP)) % len(on)].any(1)  # the last ones of as many without an edge
+    return gap[(place + np.arange(-BESIDE, GAP + BESIDE)) % len(on)].any(1)
