@@ -141,10 +141,16 @@ class PlaneSegmenter:
         shift = np.rint(generator.uniform(-1.0, 1.0, (2, 2, count)) * reach).astype(int)
         corner_rows = np.stack([row, *np.clip(row + shift[0], 0, height - 1)])
         corner_columns = np.stack([column, *np.clip(column + shift[1], 0, width - 1)])
-        corners = grid.sight(corner_rows, corner_columns).transpose(1, 0, 2)  # (trials, 3 pixels, 3)
-        usable = rest[corner_rows, corner_columns].all(0) & (np.abs(np.linalg.det(corners)) > 1e-5)
-        values = inverse[corner_rows, corner_columns].T[usable]
-        return np.linalg.solve(corners[usable], values[..., None].astype(float))[..., 0].astype(np.float32)
+        x, y, value = grid.x[corner_columns], grid.y[corner_rows], inverse[corner_rows, corner_columns]  # (3 pixels, trials)
+        usable = rest[corner_rows, corner_columns].all(0)
+        dx, dy = (some[1:] - some[0] for some in (x, y))
+        rise = value[1:] - value[0]
+        area = dx[0] * dy[1] - dx[1] * dy[0]
+        usable &= np.abs(area) > 1e-5
+        dx, dy, rise, area = dx[:, usable], dy[:, usable], rise[:, usable], area[usable]
+        across = (rise[0] * dy[1] - rise[1] * dy[0]) / area
+        down = (dx[0] * rise[1] - dx[1] * rise[0]) / area
+        return np.stack([across, down, value[0, usable] - across * x[0, usable] - down * y[0, usable]], -1)
 
     def _refined(self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Returns the least-squares plane of the pixels that agree with `plane`."""
