@@ -13,7 +13,7 @@ import numpy as np
 
 from brokk_rl.diagnosis import around, frames, holding, library, remainder, sensors, tool
 from brokk_rl.diagnosis.case import Case
-from brokk_rl.diagnosis.evidence import Evidence, Ray, rays
+from brokk_rl.diagnosis.evidence import Evidence, Ray
 from brokk_rl.diagnosis.found import Found
 from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.repair import Repair, repair
@@ -123,7 +123,7 @@ class Search:
         on_tool = tool.search(self.case, self.kinds, prices.joint, prices.name)
         evidence = _adjusted(self.base.field.evidence, self.case, [*on_sensors, *on_tool.found])
         grown, shapes = self._simulated(evidence, tool.is_tracked(self.case.field, self.case.machine))
-        small = {name: rays(ways[0].kind, SMALL) for name, ways in grown.items()}
+        small = {name: rays_of(ways[0].kind, SMALL) for name, ways in grown.items()}
         known = Nulls(self.base, small, grown, plain_joints(evidence), shapes, self.shared)
 
         def price(j: int, subset: frozenset[str]) -> float:

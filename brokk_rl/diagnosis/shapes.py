@@ -29,9 +29,10 @@ FELT = 1e-3
 """An effect that changes errors over the noise by less does nothing to a joint."""
 
 
-def rays_of(kind: Kind) -> list[Ray]:
-    """Returns the ways in which an effect can grow, at the sizes at which it has to be simulated."""
-    return rays(kind, FINE if kind.shaping and not shared([kind]) else GRID)
+def rays_of(kind: Kind, grid: Sequence[float] = GRID) -> list[Ray]:
+    """Returns the ways in which an effect can grow, at sizes as close as it has to be simulated; none beyond those of `grid`."""
+    fine = [size for size in FINE if size <= grid[-1]]
+    return rays(kind, fine if kind.shaping and not shared([kind]) else grid)
 
 
 def add(shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray], evidence: Evidence) -> list[Ray]:
