@@ -233,5 +233,5 @@ def _fitted(
 def _beside_gaps(on: np.ndarray) -> np.ndarray:
     """Says which of the profiles around a circle, `(P,)` bool, lie in gaps of it or beside one."""
     place = np.arange(len(on))[:, None]
-    gap = ~on[(place - np.arange(GAP)) % len(on)].any(1)  # the last ones of as many without an edge
-    return gap[(place + np.arange(-BESIDE, GAP + BESIDE)) % len(on)].any(1)
+    gap = np.count_nonzero(on[(place - np.arange(GAP)) % len(on)], axis=1) == 0  # the last ones of as many without an edge
+    return np.count_nonzero(gap[(place + np.arange(-BESIDE, GAP + BESIDE)) % len(on)], axis=1) > 0
