@@ -195,7 +195,8 @@ def aligned(
         return face
     cell = (v_on // cell_px).astype(np.int64) * 10_000 + (u_on // cell_px).astype(np.int64)
     slopes = (push[:3] * yielding(off / (TUKEY * scale))).T
-    return merged(face, replace(face, m=m, cov=sandwich(slopes, heavy[:3].T, off, parted(cell))), bias_per_m)
+    cov = sandwich(slopes, heavy[:3].T, off, parted(cell))
+    return face if cov is None else merged(face, replace(face, m=m, cov=cov), bias_per_m)
 
 
 def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:

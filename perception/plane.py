@@ -20,6 +20,8 @@ GROWING = 3.0
 """The same while the plane is grown: beyond an edge of the block another face begins at the same depth."""
 NEARNESS, LEAN = 0.3, 0.4
 """How far inverse depth may be off what a circle's size says, as a part of it; its slope, off what its shape says."""
+DEGENERATE = 1e12
+"""Condition of the sums of squares of a plane's fit from which on its points lie on a line."""
 LEAST, FEWEST = 60, 8
 """Points in which a plane is looked for; cells from which its covariance is taken, of fewer ones bands of rows instead."""
 
@@ -144,7 +146,9 @@ def support(
 
 
 def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.random.Generator) -> Plane | None:
-    """Returns the plane that the points around the ellipse lie on, grown from the ring near it outwards; `None` for too few points.
+    """Returns the plane that the points around the ellipse lie on, grown from the ring near it outwards.
+
+    `None` where they determine none: there are too few, they lie on a line, or nearly all that agree in one cell.
 
     Args:
         points: Support.
@@ -173,11 +177,16 @@ def fit(points: Support, rings: tuple[float, ...], floor: float, generator: np.r
             if np.count_nonzero(weight) < LEAST // 2:
                 return None
             heavy = rays.T * weight
-            m = np.linalg.solve(heavy @ rays, heavy @ inverse)
+            sums = heavy @ rays
+            if np.linalg.cond(sums) > DEGENERATE:
+                return None
+            m = np.linalg.solve(sums, heavy @ inverse)
         first = sigma if ring == rings[0] else first
         extent = ring
     residual = points.inverse[:number] - rays @ m
     cov = sandwich(rays * yielding(residual / reach)[:, None], rays * weight[:, None], residual, points.cell[:number])
+    if cov is None:
+        return None
     return Plane(m, cov, sigma, int(np.count_nonzero(weight)), extent)
 
 
@@ -216,8 +225,10 @@ def yielding(off: np.ndarray) -> np.ndarray:
     return (1.0 - 5.0 * square) / (1.0 - square)
 
 
-def sandwich(slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: np.ndarray) -> np.ndarray:
+def sandwich(slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: np.ndarray) -> np.ndarray | None:
     """Returns the covariance of a fit of three numbers, `(3, 3)`, by how it changes without each cell, in which noise may be alike.
+
+    `None` where it is none without one of them.
 
     The jackknife over cells, or the sandwich estimate as CR3 (Bell and McCaffrey 2002): a cell that decides much leaves a small
     residual, the more so the fewer there are.
@@ -230,6 +241,9 @@ def sandwich(slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: 
     """
     sums = np.stack([np.bincount(cell, heavy[:, k] * residual) for k in range(3)], -1)
     parts = np.stack([np.bincount(cell, heavy[:, j] * slopes[:, k]) for j in range(3) for k in range(3)], -1)
-    without = parts.sum(0) - parts
-    moved = np.linalg.solve(without.reshape(-1, 3, 3), sums[..., None])[..., 0]
+    without = (parts.sum(0) - parts).reshape(-1, 3, 3)
+    try:
+        moved = np.linalg.solve(without, sums[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        return None
     return moved.T @ moved * (1.0 - 1.0 / len(moved))

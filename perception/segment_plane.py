@@ -13,6 +13,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.sight import Masks
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
+from perception.plane import DEGENERATE
 from perception.segment_grid import Grid, squares
 
 
@@ -158,11 +159,11 @@ class PlaneSegmenter:
         across, down = grid.powers
         for _ in range(2):
             inside = (known & (np.abs(grid.inverse(plane) - inverse) < self._tolerance)).astype(float)
-            if inside.sum() < 3:
+            sums = squares(down @ inside @ across.T)  # of x^i y^j over the pixels, [j, i]
+            if np.linalg.cond(sums) > DEGENERATE:
                 break
-            sums = down @ inside @ across.T  # of x^i y^j over the pixels, [j, i]
             held = down[:2] @ (inside * inverse) @ across[:2].T
-            plane = np.linalg.solve(squares(sums), np.array([held[0, 1], held[1, 0], held[0, 0]]))
+            plane = np.linalg.solve(sums, np.array([held[0, 1], held[1, 0], held[0, 0]]))
         return plane
 
     def _faces(self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -276,9 +276,23 @@ def test_what_few_cells_say_of_a_plane_is_not_taken_for_sure() -> None:
         off = generator.normal(0, 1, 50)[cell] + generator.normal(0, 0.3, len(x))
         m = bread @ rays.T @ off
         fits.append(m)
-        claims.append(np.diag(plane.sandwich(rays, rays, off - rays @ m, cell)))
+        cov = plane.sandwich(rays, rays, off - rays @ m, cell)
+        assert cov is not None
+        claims.append(np.diag(cov))
     spread, claimed = np.std(fits, axis=0), np.sqrt(np.mean(claims, axis=0))
     assert (claimed / spread > 0.95).all() and (claimed / spread < 1.6).all(), claimed / spread
+
+
+def test_points_on_a_line_or_of_one_patch_alone_determine_no_plane() -> None:
+    generator, m = np.random.default_rng(5), np.array([0.1, 0.4, 0.7])
+    line = np.column_stack([np.full(400, 0.25), np.linspace(-0.2, 0.2, 400), np.ones(400)])
+    for rays in (line, np.ones((400, 3))):
+        support = plane.Support(rays, rays @ m, np.full(400, 2.0), np.arange(400) // 20, 1.0)
+        assert plane.fit(support, (2.6,), 2e-4, generator) is None
+    rays = np.column_stack([generator.uniform(-0.1, 0.1, (400, 2)), np.ones(400)])
+    lonely = np.where(np.arange(400) < 240, rays @ m, rays @ m + generator.uniform(1.0, 9.0, 400))  # the rest agrees with nothing
+    cell = np.maximum(np.arange(400) - 240, 0) // 10
+    assert plane.fit(plane.Support(rays, lonely, np.full(400, 2.0), cell, 1.0), (2.6,), 2e-4, generator) is None
 
 
 def test_a_plane_ignores_another_face() -> None:
