@@ -25,11 +25,11 @@ wide="$small rig.focal_px=264.0"
 middle="$small rig.focal_px=528.0 scene.sight.distance_m=[1.0,3.0]"
 long="$small rig.focal_px=1056.0 scene.sight.distance_m=[2.0,4.5]"
 full="rig.width=1280 rig.height=720 rig.focal_px=704.0"; [ -n "$SMALL" ] && full=$wide
-drawn=(varied:wide varied:long hidden:wide varied:middle decoy:middle varied:wide varied:long clean:wide varied:middle
-       decoy:long varied:wide hidden:middle varied:long haze:wide varied:middle)
+drawn=(varied:wide varied:long hidden:wide empty:long varied:middle decoy:middle varied:wide varied:long empty:wide clean:wide
+       varied:middle decoy:long empty:middle varied:wide hidden:middle varied:long empty:long haze:wide varied:middle)
 
 # One process a core. Of each eight (four, if there are few) one draws scenes to judge by, a condition at a time, unless there are
-# some from before; the others draw varied scenes and, two in five, the conditions of the table, by other seeds; each begins
+# some from before; the others draw varied scenes and, half of the time, the conditions of the table, by other seeds; each begins
 # elsewhere in the list, since none may come to its end.
 each=8; (( CORES < 16 )) && each=4
 judged=; [ -d "$frames/test" ] && judged=there

@@ -53,6 +53,8 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
         page.on("requestfinished", lambda request: None if f":{port}/" in request.url else complaints.append(request.url))
         page.goto(f"http://localhost:{port}/{query}" + (f"#token={token}" if token else ""))
         until(page, "() => window.measured?.drawn > 0")
+        if token:  # what is wished before the page was let in is refused
+            until(page, "() => window.measured.allowed !== null")
         return page
 
     yield open_page
@@ -264,7 +266,7 @@ def test_the_token_leaves_the_address_bar(port: int, opened: Callable[..., Any])
     page = opened(port)
     assert TOKEN not in page.url
     page.reload()
-    until(page, "() => window.measured?.drawn > 0")
+    until(page, "() => window.measured?.allowed === true")
     page.keyboard.press("Escape")
     until(page, "document.getElementById('answer').textContent === ''")
 

@@ -12,8 +12,8 @@ if (token) sessionStorage.setItem("token", token);
 history.replaceState(null, "", location.pathname + location.search);  // the key stays out of the history and of screenshots
 
 const views = { left: new LeverView($("left"), "left", setup), right: new LeverView($("right"), "right", setup) };
-const measured = window.measured = { drawn: 0, number: 0, fps: 0, points: 0, frames: 0, frame_ms: 0 };
-let newest = null, came = 0, asked = false, allowed = null;
+const measured = window.measured = { drawn: 0, number: 0, fps: 0, points: 0, frames: 0, frame_ms: 0, allowed: null };
+let newest = null, came = 0, asked = false;
 
 // ---- state in, drawn back
 const painted = new MessageChannel();
@@ -145,20 +145,20 @@ const control = token ? new Socket("/control", {
   opened: socket => socket.send(JSON.stringify({ token })),
   heard: text => answered(JSON.parse(text)),
   closed: event => {
-    if (event.reason === "token") { allowed = false; control.end(); answer("refused token"); } else allowed = null;
+    if (event.reason === "token") { measured.allowed = false; control.end(); answer("refused token"); } else measured.allowed = null;
   },
 }) : null;
 
 function answered(said) {
-  if (said.ready) { allowed = true; answer(""); } else answer(said.refused ? `refused ${said.refused}` : "");
+  if (said.ready) { measured.allowed = true; answer(""); } else answer(said.refused ? `refused ${said.refused}` : "");
 }
 
 let answerKey = "";
 function answer(key) { answerKey = key; put($("answer"), key ? say(key) : ""); }
 
 function wish(kind, value = "") {
-  if (!control || allowed === false) answer("refused token");
-  else if (!allowed || !control.ready) answer("refused lost");
+  if (!control || measured.allowed === false) answer("refused token");
+  else if (!measured.allowed || !control.ready) answer("refused lost");
   else control.send(JSON.stringify({ kind, value }));
 }
 
