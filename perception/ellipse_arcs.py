@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 
 from brokk_rl.sight import Ellipse, SizePrior
-from perception import conic, ellipse_edges, ellipse_groups, ellipse_support
+from perception import conic, ellipse_edges, ellipse_ends, ellipse_groups, ellipse_support
 from perception.ellipse_edges import Edges
-from perception.ellipse_support import ANGLES, NUM_SAMPLES, STROKE_PX, Candidates
+from perception.ellipse_ends import STROKE_PX
+from perception.ellipse_support import ANGLES, NUM_SAMPLES, Candidates
 
 if TYPE_CHECKING:
     from perception.ellipse import ContourArcs
@@ -200,13 +201,14 @@ class ArcDetector:
         rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
         rms_limit, angle_limit = rms_limit[good], angle_limit[good]
         good = ellipse_support.gap(support >= 0, length) <= s.gap
-        screened = ellipse_support.screened(candidates, edges, support, length)
+        screened = ellipse_ends.screened(candidates, edges, support, length)
         good &= screened | (ellipse_support.purity(edges, support, length) >= s.purity / slack)
         if limits.lowest_px == 0:
             good &= ellipse_support.strength(edges, support) >= FAINT * np.percentile(edges.strength, 95.0) * np.minimum(
                 SMALL_PX / np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3]), 1.0
             )
-            good[good] &= ~ellipse_support.leaving(candidates[good], edges, support[good], length[good])
+            good[good] &= ~ellipse_ends.leaving(candidates[good], edges, support[good], length[good])
+            good &= screened | ~ellipse_ends.crossed(candidates, edges, support, length)
         departure = ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses))
         good &= screened | (departure <= s.departure * slack)
         score = coverage * np.clip(1 - 0.5 * spread / rms_limit, 0, 1) * np.clip(1 - 0.5 * angle / angle_limit, 0, 1)

@@ -96,6 +96,14 @@ def test_shapes_like_parts_of_ellipses_are_none(kind: str, detector) -> None:
     assert not detector.detect(bench_hidden.shapes(np.random.default_rng(3), kind), None, None)
 
 
+def test_hearts_of_curves_are_none(detector) -> None:
+    found = [
+        detector.detect(bench_hidden.shapes(np.random.default_rng(seed), "hearts of curves"), None, None)
+        for seed in range(1000, 1008)
+    ]
+    assert sum(map(len, found)) <= 1  # of 96 hearts
+
+
 @pytest.mark.parametrize("style", ["behind", "halves", "covered"])
 def test_ellipses_of_which_half_is_seen_are_found(style: str, detector) -> None:
     hits = found = there = 0
