@@ -71,7 +71,8 @@ class Probabilities(nn.Module):
 
 
 def over_picture(values: torch.Tensor) -> torch.Tensor:
-    """Returns the mean of each picture, `(B, 1, 1, 1)`, of means of rows: ONNX Runtime adds 184,320 numbers one after the other otherwise."""
+    """Returns the mean of each picture, `(B, 1, 1, 1)`."""
+    # of means of rows: ONNX Runtime would add all 184,320 numbers of a picture one after the other
     return values.mean(3, keepdim=True).mean((1, 2), keepdim=True)
 
 
