@@ -166,7 +166,7 @@ def sizes(table: Mapping[str, Any]) -> Figure | None:
         labels = [f"{one['from'] * scale:g} to {one['to'] * scale:g}\n({one['right']['of']})" for one in bins]
         axes.set_xticks(places, labels, fontsize=7)
         axes.set(xlabel=words, ylim=(-0.03, 1.03))
-    figure.axes[0].legend(frameon=False)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     return figure
 
 
