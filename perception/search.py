@@ -19,6 +19,18 @@ LEAST = 20
 """Pixels of that grid below which a region is an accident of depth."""
 AROUND = 1.6
 """Sizes of an ellipse within which the face around it tells how large it may be."""
+BEFORE = 1.05
+"""By how many times as near as the face beside it something is that stands before it."""
+NEAR = 2
+"""Cells of the grid across which one sees that."""
+NOWHERE = 1e6
+"""As large as no hole looks, px."""
+SPREAD_PX = 8
+"""By how much larger than it is a stereo matcher makes what stands before something: its edge lies within."""
+DRAWN_PX = 1
+"""Beside what stands before a face: its own edge is there, and those of the face are bent towards it by the blur."""
+HALF = 2.0
+"""What shows half of itself must look so many times larger to be known."""
 UNSEEN = 3.0
 """Sizes of a hole across which a face may go on where nobody knows the depth: beside an arm, whose other side one camera sees."""
 
@@ -33,6 +45,8 @@ class Level:
         prior: How large a hole may look there, px of the picture; `None` for any size.
         sizes_px: How large a hole would look at each place of the grid of `STEP`, NaN where nobody knows; `None` for nowhere.
         slack: By how much the size may be off at a place, as a part of it.
+        depth_m: Of the picture, `(h, w)`; `None` if nobody knows.
+        nearest_m: Depth before which things stand before the face, at each place of the grid of `STEP`, 0 where nothing does.
     """
 
     shrink: int
@@ -40,6 +54,8 @@ class Level:
     prior: SizePrior | None
     sizes_px: np.ndarray | None = None
     slack: float = 0.0
+    depth_m: np.ndarray | None = None
+    nearest_m: np.ndarray | None = None
 
     def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
         """Returns the ellipses of this level that have a possible size where they are, in px of the picture `(h, w)`."""
@@ -68,9 +84,20 @@ class Level:
         small = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA) if self.shrink > 1 else part
         finer = (-(-wide * STEP // self.shrink), -(-high * STEP // self.shrink))
         roi = cv2.resize(self.region[y : y + high, x : x + wide], finer, interpolation=cv2.INTER_NEAREST)[:height, :width]
+        if self.depth_m is not None and self.nearest_m is not None:
+            nearest = cv2.resize(self.nearest_m[y : y + high, x : x + wide], finer, interpolation=cv2.INTER_NEAREST)[
+                :height, :width
+            ]
+            half = self.shrink // 2
+            depth = self.depth_m[
+                top + half : top + height * self.shrink : self.shrink, left + half : left + width * self.shrink : self.shrink
+            ]
+            before = cv2.morphologyEx((depth < nearest).view(np.uint8), cv2.MORPH_OPEN, _square(1))  # not where it is unknown
+            inner = cv2.erode(before, _square(-(-SPREAD_PX // self.shrink)))
+            roi = roi & ((cv2.dilate(before, _square(DRAWN_PX)) == 0) | (inner > 0))
         prior = self.prior and SizePrior(self.prior.lowest_px / self.shrink, self.prior.highest_px / self.shrink)
         return [
-            _enlarged(one, self.shrink, left, top) for one in detector.detect(small, np.ascontiguousarray(roi).view(bool), prior)
+            _enlarged(one, self.shrink, left, top) for one in detector.detect(small, np.ascontiguousarray(roi).astype(bool), prior)
         ]
 
 
@@ -96,8 +123,12 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
         return [Level(1, _dilated(inside, 0.03 * inside.shape[1]), None)]
     size_px = np.divide(focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=known)
     everywhere_px, unknown = np.where(known, size_px, np.nan), ~np.isfinite(depth)
+    before_px = _before(np.divide(focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=~unknown), known)
+    behind = size_px < cv2.dilate(np.where(before_px < NOWHERE, before_px, np.float32(0.0)), _square(1))
+    nearest_m = focal_px * radius_m / before_px  # about 0 where nothing stands before a face
     found, rest = [], known.copy()
-    suited = [_suited(size_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)]
+    shown_px = np.where(behind, size_px / HALF, size_px)
+    suited = [_suited(shown_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)]
     for _ in range(OCTAVES):  # the resolution next that suits most of what is left, the coarser one of two alike
         number = max(range(OCTAVES), key=lambda octave: (np.count_nonzero(rest & suited[octave]), octave))
         here = rest & suited[number]
@@ -113,7 +144,7 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
             if len(some_px) >= LEAST:
                 low, high = np.percentile(some_px, (2.0, 98.0))
                 prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
-                found.append(Level(2**number, part.astype(np.uint8), prior, everywhere_px, slack))
+                found.append(Level(2**number, part.astype(np.uint8), prior, everywhere_px, slack, frame.depth_m, nearest_m))
     return found
 
 
@@ -125,6 +156,26 @@ def box(mask: np.ndarray, whole: Sequence[Level]) -> list[Level]:
     priors = [level.prior for level in whole if level.prior]
     prior = SizePrior(min(p.lowest_px for p in priors), max(p.highest_px for p in priors)) if priors else None
     return [Level(1, region, prior)]
+
+
+def _before(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Returns how large a hole looks at least on what stands before a face, `(h, w)`, `NOWHERE` where nothing does.
+
+    Args:
+        seen_px: How large it would look at each place, 0 where nobody knows.
+        face: Where the faces are, bool.
+    """
+    reach = _square(round(float(np.percentile(seen_px[face], 98.0)) / STEP))
+    seen_px = cv2.medianBlur(seen_px, 5)
+    around = cv2.dilate(np.where(face, seen_px, np.float32(0.0)), reach)  # depth within a mouth is no face's
+    around = cv2.erode(np.where(around > 0, around, np.float32(NOWHERE)), reach)
+    least = np.float32(BEFORE) * cv2.erode(np.where(face | (seen_px == 0), around, np.float32(NOWHERE)), _square(NEAR))
+    there = cv2.dilate((seen_px > least).view(np.uint8), _square(1))
+    return np.where(there > 0, least, np.float32(NOWHERE))
+
+
+def _square(reach: int) -> np.ndarray:
+    return np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
 
 
 def _suited(size_px: np.ndarray, comfortable_px: float, octave: int) -> np.ndarray:

@@ -114,9 +114,11 @@ class Drawn:
 
     def __init__(self, ellipses: list[Ellipse]) -> None:
         self.ellipses = ellipses
+        self.roi = np.empty((0, 0), bool)
 
     def detect(self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None) -> list[Ellipse]:
-        """Returns them."""
+        """Returns them, and keeps where it was to look."""
+        self.roi = self.roi if roi is None else roi
         return self.ellipses
 
 
@@ -131,3 +133,31 @@ def test_an_ellipse_that_is_too_large_where_it_lies_is_none() -> None:
         for one in level.detect(Drawn(seen), np.zeros(depth_m.shape, np.uint8))
     ]
     assert {one.x for one in found} == {150.0}
+
+
+def test_the_edge_of_what_stands_before_a_face_is_no_rim_and_beside_it_one_looks_closer() -> None:
+    columns, rows = np.meshgrid(np.arange(640), np.arange(480))
+    mask = (columns > 120) & (columns < 520) & (rows > 80) & (rows < 400)
+    inverse = 0.52 + 0.00005 * (columns - 320)  # a face that leans, on which a hole has 27 px
+    arm = np.abs(rows - 300) < 40
+    matrix = np.array([[1056.0, 0.0, 320.0], [0.0, 1056.0, 240.0], [0.0, 0.0, 1.0]])
+
+    def looked(depth_m: np.ndarray) -> tuple[int, np.ndarray]:
+        """Returns the finest resolution, and what of the whole one is looked at in it."""
+        frame = replace(drawn()[0], depth_m=depth_m.astype(np.float32), camera_matrix=matrix)
+        found = search.levels(frame, mask, 0.05, 0.35, 6.5)
+        level = min(found, key=lambda level: level.shrink)
+        detector = Drawn([])
+        level.detect(detector, np.zeros(mask.shape, np.uint8))
+        where = np.zeros(mask.shape, bool)
+        top, left = (np.flatnonzero(level.region.any(1 - k))[0] * search.STEP for k in (0, 1))
+        part = np.kron(detector.roi, np.ones((level.shrink, level.shrink))) > 0
+        where[top : top + part.shape[0], left : left + part.shape[1]] = part[: 480 - top, : 640 - left]
+        return level.shrink, where
+
+    plain, everywhere = looked(1 / inverse)
+    closer, beside = looked(np.where(arm, 1.5, 1 / inverse))
+    assert everywhere[120:360, 160:480].all()
+    assert closer < plain
+    assert not beside[[260, 261, 262, 338, 339, 340]][:, 160:480].any()  # its edges
+    assert beside[240:257, 160:480].all() and beside[344:360, 160:480].all()
