@@ -19,8 +19,8 @@ LEAST = 20
 """Pixels of that grid below which a region is an accident of depth."""
 AROUND = 1.6
 """Sizes of an ellipse within which the face around it tells how large it may be."""
-BEFORE = 1.05
-"""By how many times as near as the face beside it something is that stands before it."""
+BEFORE, NOISES = 1.04, 3.0
+"""By how many times as near as the face beside it something is that stands before it, and standard deviations of noise on top."""
 NEAR = 2
 """Cells of the grid across which one sees that."""
 NOWHERE = 1e6
@@ -84,16 +84,13 @@ class Level:
         small = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA) if self.shrink > 1 else part
         finer = (-(-wide * STEP // self.shrink), -(-high * STEP // self.shrink))
         roi = cv2.resize(self.region[y : y + high, x : x + wide], finer, interpolation=cv2.INTER_NEAREST)[:height, :width]
-        if self.depth_m is not None and self.nearest_m is not None:
-            nearest = cv2.resize(self.nearest_m[y : y + high, x : x + wide], finer, interpolation=cv2.INTER_NEAREST)[
-                :height, :width
-            ]
-            half = self.shrink // 2
-            depth = self.depth_m[
-                top + half : top + height * self.shrink : self.shrink, left + half : left + width * self.shrink : self.shrink
-            ]
+        part_m = None if self.nearest_m is None else self.nearest_m[y : y + high, x : x + wide]
+        if self.depth_m is not None and part_m is not None and part_m.any():
+            nearest = cv2.resize(part_m, finer, interpolation=cv2.INTER_NEAREST)[:height, :width]
+            middle, step = self.shrink // 2, self.shrink
+            depth = self.depth_m[top + middle : top + height * step : step, left + middle : left + width * step : step]
             before = cv2.morphologyEx((depth < nearest).view(np.uint8), cv2.MORPH_OPEN, _square(1))  # not where it is unknown
-            inner = cv2.erode(before, _square(-(-SPREAD_PX // self.shrink)))
+            inner = cv2.erode(before, _square(-(-SPREAD_PX // step)))
             roi = roi & ((cv2.dilate(before, _square(DRAWN_PX)) == 0) | (inner > 0))
         prior = self.prior and SizePrior(self.prior.lowest_px / self.shrink, self.prior.highest_px / self.shrink)
         return [
@@ -125,7 +122,7 @@ def levels(frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfor
     everywhere_px, unknown = np.where(known, size_px, np.nan), ~np.isfinite(depth)
     before_px = _before(np.divide(focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=~unknown), known)
     behind = size_px < cv2.dilate(np.where(before_px < NOWHERE, before_px, np.float32(0.0)), _square(1))
-    nearest_m = focal_px * radius_m / before_px  # about 0 where nothing stands before a face
+    nearest_m = np.where(before_px < NOWHERE, focal_px * radius_m / before_px, np.float32(0.0))
     found, rest = [], known.copy()
     shown_px = np.where(behind, size_px / HALF, size_px)
     suited = [_suited(shown_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)]
@@ -166,10 +163,13 @@ def _before(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
         face: Where the faces are, bool.
     """
     reach = _square(round(float(np.percentile(seen_px[face], 98.0)) / STEP))
-    seen_px = cv2.medianBlur(seen_px, 5)
+    rough_px, seen_px = seen_px, cv2.medianBlur(seen_px, 5)
+    noise = 1.4826 * float(np.median(np.abs(rough_px[face] / np.maximum(seen_px[face], 1.0) - 1.0)))
     around = cv2.dilate(np.where(face, seen_px, np.float32(0.0)), reach)  # depth within a mouth is no face's
     around = cv2.erode(np.where(around > 0, around, np.float32(NOWHERE)), reach)
-    least = np.float32(BEFORE) * cv2.erode(np.where(face | (seen_px == 0), around, np.float32(NOWHERE)), _square(NEAR))
+    least = np.float32(BEFORE + NOISES * noise) * cv2.erode(
+        np.where(face | (seen_px == 0), around, np.float32(NOWHERE)), _square(NEAR)
+    )
     there = cv2.dilate((seen_px > least).view(np.uint8), _square(1))
     return np.where(there > 0, least, np.float32(NOWHERE))
 
