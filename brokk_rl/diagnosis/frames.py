@@ -1,8 +1,9 @@
 """Frames that are late or lost: hidden delays of single commands, each measured by where its joint ends up.
 
-A command that changes acts a little earlier or later; what one period later would do is simulated. The delays that explain the
-errors best, one for each change of a command, scatter no more than their own errors where all frames arrive in time; how they
-scatter tells lost frames (whole periods, seldom) from jitter (parts of periods, always).
+A command that changes acts a little earlier or later; what one period later would do is simulated. A frame carries the commands of
+all joints: the delays that explain the errors of all of them best, one for each frame that changes a command, scatter no more than
+on the reference where all frames arrive in time; how they scatter tells lost frames (whole periods, seldom) from jitter (parts of
+periods, always).
 Axes: `W` windows, `K` steps, `I` increments, `J` joints, `D` changes of a command, `C` candidates.
 """
 
@@ -20,7 +21,7 @@ from brokk_rl.diagnosis.candidates import Values
 from brokk_rl.diagnosis.evidence import Evidence
 from brokk_rl.diagnosis.found import Found, interval
 from brokk_rl.diagnosis.library import Kind
-from brokk_rl.diagnosis.noise import FREEDOM, increments
+from brokk_rl.diagnosis.noise import increments
 from brokk_rl.diagnosis.sizes import fitted
 from brokk_rl.diagnosis.tied import median
 
@@ -28,6 +29,8 @@ CHANGE = 0.06
 """Smaller changes of a command tell nothing about when it arrived."""
 WIDE = 1.5
 """Prior standard deviation of a delay, periods."""
+LEAST = 0.3
+"""A delay of one period that changes no error over the noise by more tells nothing."""
 NEAR = 0.1
 """Delays that differ by so few periods are the same: a simulator's own timing is no better."""
 SURE = 0.4
@@ -41,18 +44,20 @@ MOST = 300
 """Delays drawn by which those seen are judged."""
 BEYOND = 2.0
 """The mean of delays by chance is off by so much of itself at most; what joints are late by beyond is an effect of its own."""
-WIDER = 1.2
+SCALES, FREEDOMS = np.linspace(0.7, 1.5, 9), (3.0, 5.0, 7.0, 10.0)
+"""Among which the distribution of the errors of delays is found."""
+WIDER = 1.1
 """Scatter of the delays, over that of reference recordings, below which nothing is looked for."""
 
 
 @dataclass(frozen=True)
 class Delays:
-    """Hidden delays that could be measured, each less the mean of its joint.
+    """Hidden delays of frames that could be measured, less what is late always.
 
     Attributes:
         value: In periods, `(D,)`.
         error: Their standard errors, `(D,)`.
-        joint: Number of the joint of each, `(D,)`.
+        joint: Number of the joint that tells most of each, `(D,)`.
     """
 
     value: np.ndarray
@@ -66,18 +71,54 @@ class Delays:
 
 
 @dataclass(frozen=True)
+class Usual:
+    """How delays err where all frames arrive in time: a t distribution.
+
+    Attributes:
+        scale: Their errors over the standard errors.
+        freedom: Degrees of freedom: how seldom they err by much.
+    """
+
+    scale: float
+    freedom: float
+
+    @classmethod
+    def of(cls, known: Sequence[Delays]) -> Usual:
+        """Returns the most likely one for the delays of recordings in which no frame is late."""
+        tried = [cls(scale, freedom) for scale in SCALES for freedom in FREEDOMS]
+        return max(tried, key=lambda one: sum(float(one.log(seen.value, seen.error).sum()) for seen in known))
+
+    def log(self, off: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """Returns the logarithm of the density of what delays with these standard errors are off by."""
+        width = np.hypot(self.scale * error, NEAR)
+        return stats.t.logpdf(off / width, self.freedom) - np.log(width)
+
+    def gain(self, seen: Delays, drawn: np.ndarray) -> float:
+        """Returns the log likelihood of the delays seen, where true ones are like those `drawn`, over that without any."""
+        if not len(seen.value):
+            return 0.0
+        among = np.exp(self.log(seen.value[:, None] - drawn[None], seen.error[:, None])).mean(1)
+        return float((np.log(among + 1e-12) - self.log(seen.value, seen.error)).sum())
+
+
+@dataclass(frozen=True)
 class Changes:
     """The changes of commands in some windows, and what it would do if they came one period later."""
 
     evidence: Evidence
 
     @cached_property
-    def responses(self) -> np.ndarray:
-        """Increments that change where the n-th change of each joint's command in a window comes late, `(C, W, I, J)`."""
+    def _ranks(self) -> np.ndarray:
+        """Which of a joint's changes in a window a sample is, from 1 on; 0 where its command stays, `(W, L, J)`."""
         cut = self.evidence.candidates.cut
         jump = np.abs(np.diff(cut.u, axis=1)) > CHANGE
         jump[:, : cut.num_before - cut.num_history] = False  # over when the free run begins
-        rank = np.cumsum(jump, 1) * jump
+        return np.cumsum(jump, 1) * jump
+
+    @cached_property
+    def responses(self) -> np.ndarray:
+        """Increments that change where the n-th change of each joint's command in a window comes late, `(C, W, I, J)`."""
+        cut, rank = self.evidence.candidates.cut, self._ranks
         count, windows = int(rank.max(initial=0)), len(cut.u)
         if not count:
             return np.zeros((0, *self.evidence.way.shape))
@@ -90,35 +131,60 @@ class Changes:
         return increments(paths, self.evidence.start) - self.evidence.way
 
     @cached_property
-    def _solutions(self) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
-        """Window, joint, matrix from increments to delays, and standard errors, for each window and joint with changes."""
+    def _told(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per window: what each frame that changes a command does to errors over the noise when it comes a period late, `(J I, D)`.
+
+        With the number of the joint that tells most of each, `(D,)`.
+        """
         assert self.evidence.noise is not None, "noise is known by now"
-        found = []
-        for j, noise in enumerate(self.evidence.noise):
-            whiteners = noise.whitener(self.evidence.way[..., j])
-            for w, whitener in enumerate(whiteners):
-                x = whitener @ self.responses[:, w, :, j].T
-                x = x[:, np.abs(x).max(0) > 0.3] if x.size else x
-                if x.size and self.evidence.claims[w, j]:
-                    inverse = np.linalg.inv(x.T @ x + np.eye(x.shape[1]) / WIDE**2)
-                    found.append((w, j, inverse @ x.T @ whitener, np.sqrt(np.diag(inverse))))
+        found, joints = [], self.evidence.way.shape[2]
+        for w, ranks in enumerate(self._ranks):
+            frames = np.flatnonzero(ranks.any(1))
+            columns = np.zeros((joints, self.evidence.way.shape[1], len(frames)))
+            for j, whiteners in enumerate(self._whiteners if len(frames) else ()):
+                rank = ranks[frames, j]
+                columns[j][:, rank > 0] = whiteners[w] @ self.responses[rank[rank > 0] - 1, w, :, j].T * self.evidence.claims[w, j]
+            telling = np.abs(columns).max((0, 1)) > LEAST
+            columns = columns[..., telling]
+            found.append((columns.reshape(joints * columns.shape[1], telling.sum()), np.square(columns).sum(1).argmax(0)))
         return found
 
-    def delays(self, error: np.ndarray) -> Delays:
-        """Returns the delays that explain errors `(W, I, J)` (measured less simulated increments) best."""
+    @cached_property
+    def _whiteners(self) -> list[np.ndarray]:
+        assert self.evidence.noise is not None, "noise is known by now"
+        return [noise.whitener(self.evidence.way[..., j]) for j, noise in enumerate(self.evidence.noise)]
+
+    @cached_property
+    def _every(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        return self._solved(None)
+
+    def _solved(self, without: int | None) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per window: matrix from errors over the noise to delays, and their standard errors."""
+        found, steps = [], self.evidence.way.shape[1]
+        for x, _ in self._told:
+            counted = x * np.repeat(np.arange(len(x) // steps) != without, steps)[:, None]
+            inverse = np.linalg.inv(counted.T @ counted + np.eye(x.shape[1]) / WIDE**2)
+            found.append((inverse @ counted.T, np.sqrt(np.diag(inverse))))
+        return found
+
+    def delays(self, error: np.ndarray, without: int | None = None) -> Delays:
+        """Returns the delays that explain errors `(W, I, J)` (measured less simulated increments) best.
+
+        What a joint alone is late by on average is none of them; `without`: a joint whose errors do not count.
+        """
+        z = np.stack([(w @ error[..., j, None])[..., 0] for j, w in enumerate(self._whiteners)], 1)  # (W, J, I)
+        always = np.stack([x.sum(1).reshape(z.shape[1:]) for x, _ in self._told])
+        share = (always * z).sum((0, 2)) / (np.square(always).sum((0, 2)) + WIDE**-2)
+        z = z - share[:, None] * always
         value, deviation, joint = [], [], []
-        for w, j, matrix, errors in self._solutions:
+        solutions = self._every if without is None else self._solved(without)
+        for row, (matrix, errors), (_, most) in zip(z, solutions, self._told, strict=True):
             sure = errors < SURE
-            value.append((matrix @ error[w, :, j])[sure])
+            value.append((matrix @ row.ravel())[sure])
             deviation.append(errors[sure])
-            joint.append(np.full(sure.sum(), j))
-        if not value:
-            return Delays(np.zeros(0), np.zeros(0), np.zeros(0))
+            joint.append(most[sure])
         value, deviation, joint = np.concatenate(value), np.concatenate(deviation), np.concatenate(joint)
-        for j in np.unique(joint):
-            mine = joint == j
-            value[mine] -= np.average(value[mine], weights=deviation[mine] ** -2)
-        return Delays(value, deviation, joint)
+        return Delays(value - np.average(value, weights=deviation**-2) if len(value) else value, deviation, joint)
 
     def spread(self, error: np.ndarray) -> np.ndarray:
         """Returns what each change does when it comes late by the standard deviation of the delays seen, `(W, C, I, J)`."""
@@ -145,20 +211,20 @@ def search(
     seen, known = changes.delays(error), [one.delays(one.evidence.error) for one in others]
     if not kinds or len(seen.value) < FEWEST or sum(len(one.value) for one in known) < FEWEST:
         return None
-    # how much larger errors are than the noise says: found where frames arrive in time
-    normal = np.concatenate([one.value / one.error for one in known])
-    scale = max(1.0, 1.4826 * float(np.median(np.abs(normal))))
-    if _scatter(seen.value / seen.error) < WIDER * _scatter(normal):
+    usual = Usual.of(known)
+    if _scatter(seen.value / seen.error) < WIDER * _scatter(np.concatenate([one.value / one.error for one in known])):
         return None
     gains, earned = {}, {}
     for kind in kinds:
         drawn = [_thinned(one) for one in _drawn(changes, kind)]
-        gains[kind.name] = np.array([_gain(seen, one, scale) for one in drawn])
+        gains[kind.name] = np.array([usual.gain(seen, one) for one in drawn])
         best = drawn[int(np.argmax(gains[kind.name]))]
-        if any(_gain(one, best, scale) < -price for one in map(seen.of, np.unique(seen.joint)) if len(one.value) >= FEWEST):
+        by_joint = {int(j): usual.gain(seen.of(j), best) for j in np.unique(seen.joint) if len(seen.of(j).value) >= FEWEST}
+        rest = changes.delays(error, max(by_joint, key=by_joint.__getitem__)) if len(by_joint) > 1 else seen
+        if min(by_joint.values(), default=0.0) < -price or usual.gain(rest, best) < price:
             gains[kind.name] = gains[kind.name] * 0.0  # frames are late for all joints or for none
         share = [len(seen.value) / max(1, len(one.value)) for one in known]
-        earned[kind.name] = max(0.0, *(_gain(one, best, scale) * part for one, part in zip(known, share, strict=True)))
+        earned[kind.name] = max(0.0, *(usual.gain(one, best) * part for one, part in zip(known, share, strict=True)))
     worth = {name: float(gain.max()) - price - 1.5 * earned[name] - name_price for name, gain in gains.items()}
     best = max(kinds, key=lambda kind: worth[kind.name])
     if worth[best.name] <= 0:
@@ -171,7 +237,7 @@ def search(
         parameters[name] = {joint: Estimate(mean, (low, high)) for joint in machine.joint_names}
     rest = {name: float(gain.max()) for name, gain in gains.items() if name != best.name}
     every = np.ones(machine.num_joints, dtype=bool)
-    return Found(best, every, parameters, worth[best.name], float(gains[best.name].max()), _explained(seen, scale), rest)
+    return Found(best, every, parameters, worth[best.name], float(gains[best.name].max()), _explained(seen, usual.scale), rest)
 
 
 def expected(evidence: Evidence, found: Found, steady: Sequence[tuple[Kind, Values]]) -> Evidence:
@@ -221,17 +287,8 @@ def _scatter(values: np.ndarray) -> float:
 
 
 def _thinned(drawn: np.ndarray) -> np.ndarray:
-    return drawn[np.linspace(0, len(drawn) - 1, min(MOST, len(drawn))).astype(int)]
-
-
-def _gain(seen: Delays, drawn: np.ndarray, scale: float) -> float:
-    """Returns the log likelihood of the delays seen, where true ones are like those drawn, over that without any."""
-    if not len(seen.value):
-        return 0.0
-    width = np.hypot(scale * seen.error, NEAR)[:, None]
-    off = (seen.value[:, None] - drawn[None]) / width
-    likely = stats.t.pdf(off, FREEDOM).mean(1)
-    return float(np.log(likely + 1e-12).sum() - stats.t.logpdf(seen.value / width[:, 0], FREEDOM).sum())
+    """Returns delays that are distributed alike, at most `MOST`."""
+    return np.sort(drawn)[np.linspace(0, len(drawn) - 1, min(MOST, len(drawn))).astype(int)]
 
 
 def _explained(seen: Delays, scale: float) -> float:

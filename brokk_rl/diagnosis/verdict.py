@@ -175,16 +175,22 @@ def is_unknown(findings: Findings, prices: Prices, weights: Certainty) -> bool:
 
 
 def likely(findings: Findings, prices: Prices, weights: Certainty) -> Findings:
-    """Returns the findings without effects that are more probably not there; the most probable one stays."""
-    chances = named_chances(findings, prices, weights)
-    best = max(chances, key=chances.__getitem__, default=None)
-    kept = {name for name, chance in chances.items() if chance >= NAMED or name == best}
-    subsets = tuple(subset & kept for subset in findings.chosen.subsets)
-    others, repaired = [one for one in findings.others if one.kind.name in kept], findings.repair
+    """Returns the findings without effects that are more probably not there, dropped one by one; the most probable one stays.
+
+    What is left is judged anew each time: an effect may have been named only for what it was worth beside another.
+    """
+    kept = findings
+    while len(chances := named_chances(kept, prices, weights)) > 1:
+        least = min(chances, key=chances.__getitem__)
+        if chances[least] >= NAMED:
+            break
+        chosen = Chosen(tuple(subset - {least} for subset in kept.chosen.subsets), kept.chosen.worth)
+        kept = replace(kept, chosen=chosen, others=[one for one in kept.others if one.kind.name != least])
+    subsets, repaired = kept.chosen.subsets, findings.repair
     if repaired and subsets != findings.chosen.subsets:
         ways = {name: [ray for ray in repaired.rays if ray.kind.name == name] for name in findings.chosen.names}
-        repaired = without(findings.evidence, ways, repaired, subsets) if any(subsets) else None
-    return replace(findings, chosen=Chosen(subsets, findings.chosen.worth), others=others, repair=repaired)
+        kept = replace(kept, repair=without(findings.evidence, ways, repaired, subsets) if any(subsets) else None)
+    return kept
 
 
 def other(findings: Findings, found: Found, weights: Certainty, machine: Machine) -> Selected:

@@ -11,13 +11,15 @@ import pytest
 from composed import option
 
 from brokk_rl.contracts import Actuator
-from brokk_rl.diagnosis import certainty, remainder
+from brokk_rl.diagnosis import certainty, remainder, verdict
 from brokk_rl.diagnosis.candidates import Candidates
 from brokk_rl.diagnosis.certainty import Certainty
+from brokk_rl.diagnosis.engine import Findings, Prices
 from brokk_rl.diagnosis.evidence import Evidence
 from brokk_rl.diagnosis.exam.calibration import Item, halves, logistic
 from brokk_rl.diagnosis.noise import Noise
 from brokk_rl.diagnosis.repair import Repair
+from brokk_rl.diagnosis.search import Chosen
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.open_loop import Windows
@@ -120,6 +122,25 @@ def test_weights_of_signs_are_those_that_made_the_truth() -> None:
     assert found == pytest.approx({"constant": -1.0, "margin": 2.0, "names": 0.0}, abs=0.15)
     few = logistic(signs[:4], true[:4], begin)  # a handful of answers changes little but how often anything is true
     assert [few[name] for name in ("margin", "names")] == pytest.approx([0.5, 1.0], abs=0.2)
+
+
+def test_what_was_named_only_beside_another_goes_with_it(monkeypatch: pytest.MonkeyPatch, weights: Certainty) -> None:
+    beside = {
+        frozenset("abc"): {"a": 0.9, "b": 0.6, "c": 0.4},
+        frozenset("ab"): {"a": 0.9, "b": 0.2},
+        frozenset("de"): {"d": 0.45, "e": 0.4},
+        frozenset("d"): {"d": 0.3},
+    }
+    monkeypatch.setattr(verdict, "named_chances", lambda found, *_: beside.get(found.chosen.names, {"a": 0.9}))
+
+    def kept(subsets: tuple[str, ...]) -> tuple[set[str], ...]:
+        fields = {field.name: None for field in dataclasses.fields(Findings)}
+        chosen = Chosen(tuple(frozenset(one) for one in subsets), 50.0)
+        found = Findings(**cast(dict, {**fields, "chosen": chosen, "others": []}))
+        return tuple(set(one) for one in verdict.likely(found, cast(Prices, None), weights).chosen.subsets)
+
+    assert kept(("ab", "c", "")) == ({"a"}, set(), set())
+    assert kept(("de", "d")) == ({"d"}, {"d"}), "the most probable one stays"
 
 
 def test_no_answer_is_surer_than_answers_can_tell(weights: Certainty) -> None:

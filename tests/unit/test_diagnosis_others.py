@@ -110,17 +110,17 @@ def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) ->
     assert tool.search(Case(machine, [one], [one]), library.load(machine), 8.0, 12.0) == tool.Seen([], 1.0)
 
 
-def held_over(machine: Machine, lost: float, seed: int, late: tuple[int, ...] = (0,) * 5) -> Recording:
+def held_over(machine: Machine, lost: float, seed: int, late: tuple[int, ...] = (0,) * 5, only: slice = slice(None)) -> Recording:
     """Returns two minutes of a lag plant under levels to and fro, each lost frame holding the level before for a period more.
 
-    `late`: periods by which all commands of each joint come later still.
+    `late`: periods by which all commands of each joint come later still; `only`: joints whose commands get lost.
     """
     random = np.random.default_rng(seed)
     levels = random.uniform(0.3, 0.8, (120, 5)) * np.where(np.arange(120) % 2, -1.0, 1.0)[:, None]
     u = np.repeat(levels, 20, 0)
     sent, missing = u.copy(), random.random(len(u)) < lost
     for t in range(1, len(u)):
-        sent[t] = sent[t - 1] if missing[t] else u[t]
+        sent[t, only] = sent[t - 1, only] if missing[t] else u[t, only]
     sent = np.stack([np.roll(column, by) for column, by in zip(sent.T, late, strict=True)], 1)
     model, size = PLANT.build(machine, 1, CPU), machine.num_history
     known = torch.as_tensor(np.concatenate([np.zeros((size - 1, 5)), sent])[None], dtype=torch.float32)
@@ -156,6 +156,28 @@ def test_frames_that_were_lost_are_counted_by_where_joints_end_up(machine: Machi
     assert before > 5.0 and after < 0.4 * before
     for j in range(2):
         np.testing.assert_allclose(chancy.rewhitened(lossy, lossy.z[j : j + 1], j)[0], chancy.z[j], atol=1e-6)
+
+
+def test_what_one_joint_alone_is_late_by_is_no_lost_frame(machine: Machine) -> None:
+    rows = [held_over(machine, 0.0, 10), held_over(machine, 0.2, 12, only=slice(2, 3)), held_over(machine, 0.05, 13)]
+    held = [simulator.held(PLANT, [(one, 0.0)], machine, 0) for one in rows]
+    noises = simulator.noises(held[:1], machine)
+    whole, alone, seldom = (dataclasses.replace(one.evidence, noise=noises) for one in held)
+    kinds = library.load(machine, ["frame_loss", "delay_jitter"])
+    assert frames.search(frames.Changes(alone), alone.error, [whole], kinds, 4.0, 12.0) is None
+    # a frame carries the commands of all joints: one in twenty that is lost shows in all of them
+    found = frames.search(frames.Changes(seldom), seldom.error, [whole], kinds, 4.0, 12.0)
+    assert found and found.kind.name == "frame_loss"
+    low, high = found.parameters["probability"]["q1"].ci95
+    assert low < 0.05 < high
+
+
+def test_delays_err_as_they_do_where_no_frame_is_late() -> None:
+    random, error = np.random.default_rng(3), np.full(4000, 0.3)
+    found = frames.Usual.of([frames.Delays(1.2 * error * random.standard_t(5.0, 4000), error, np.zeros(4000))])
+    assert found.scale == pytest.approx(1.15, abs=0.11) and found.freedom in (5.0, 7.0)  # a little is what all timing is off by
+    seen = frames.Delays(np.repeat([0.0, 1.0], [90, 10]), np.full(100, 0.1), np.zeros(100))
+    assert found.gain(seen, np.repeat([0.0, 1.0], [9, 1])) > 0.0 > found.gain(seen, np.repeat([0.0, 1.0], [1, 9]))
 
 
 def test_the_mean_of_delays_by_chance_is_what_all_joints_are_late_by(machine: Machine) -> None:
