@@ -35,7 +35,8 @@ class Looks:
         darkness: Largest brightness of the darkest quarter inside over that of the face.
         veiled: From which on something lies over both: dust, behind which nobody sees how deep a hole is; or it is a stain.
         darker: If something near it is darker by more than this, over the brightness of the face, it is no dust.
-        contrast: Least contrast, in standard deviations of the face's grain, of what is veiled: a stain has less.
+        contrast: Least contrast, in standard deviations of the face's grain, of what is veiled: a stain has less; unless both
+            cameras see that it is deep.
         mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives one.
         sure_mouth: From which the mouth channel decides where nobody sees how deep it is; where that is seen, it overrules nothing.
         slope: Slope of brightness inside, see `Interior`, that alone would show a hole; less is as much less evidence, and adds up.
@@ -220,20 +221,20 @@ class PlaneConicEstimator:
         if masks.mouth is not None and mouth < looks.mouth:
             return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
         sure = mouth >= looks.sure_mouth
+        shown = [max(one, 0.0) for one in (inside.slope / looks.slope, inside.deeper / looks.deeper) if np.isfinite(one)]
+        # a dark disc is noisier nowhere than the face: below 1 it speaks against
+        against = (parallax - 1.0) / (looks.parallax - 1.0)
+        evidence = sum(shown) + (against if np.isfinite(against) else 0.0)
         if inside.darkness > looks.veiled:
             if sure:
                 return None
             if inside.around < inside.darkness - looks.darker:
                 return Rejection("pose", "brightness inside over outside", inside.darkness, looks.veiled, ellipse)
-            if inside.contrast >= looks.contrast:
+            if inside.contrast >= looks.contrast or (np.isfinite(against) and evidence >= 1.0):
                 return None
             return Rejection("pose", "contrast to the grain of the face", inside.contrast, looks.contrast, ellipse)
-        shown = [max(one, 0.0) for one in (inside.slope / looks.slope, inside.deeper / looks.deeper) if np.isfinite(one)]
-        # a dark disc is noisier nowhere than the face: below 1 it speaks against
-        against = (parallax - 1.0) / (looks.parallax - 1.0)
         if untold and not np.isfinite(against) and (sure or masks.mouth is None):
             return None
-        evidence = sum(shown) + (against if np.isfinite(against) else 0.0)
         return None if evidence >= 1.0 else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
 
 
