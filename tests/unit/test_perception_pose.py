@@ -132,6 +132,19 @@ def test_in_dust_a_disc_may_be_a_hole_for_half_the_score_and_in_clear_air_a_pale
     assert isinstance(stain, Rejection) and stain.reason == "brightness inside over outside"
 
 
+def test_in_dust_a_spot_no_darker_than_the_grain_is_a_hole_if_two_cameras_see_it_deep(estimator) -> None:
+    _, masks, ellipse = drawn()
+    faint = appearance.Interior(darkness=0.9, slope=0.0, deeper=0.2, unknown=0.4, around=0.9, contrast=2.0)
+    for inside, parallax, passes in (
+        (faint, 1.0, True),
+        (faint, float("nan"), False),  # depth by one camera's guess
+        (faint, 0.2, False),  # they see the same
+        (replace(faint, deeper=0.0), 1.0, False),
+        (replace(faint, deeper=0.0, contrast=3.0), 1.0, True),
+    ):
+        assert (estimator._looks(inside, parallax, masks, pose_row(ellipse), ellipse, True) is None) == passes
+
+
 @pytest.mark.parametrize("arm", [True, False])
 def test_an_arc_may_be_taken_for_a_smaller_rim_where_something_hides_the_rest(arm: bool, estimator) -> None:
     frame, masks, ellipse = drawn()
