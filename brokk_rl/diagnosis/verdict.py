@@ -27,6 +27,8 @@ NAMED = 0.5
 SAID = 0.27
 """Probability from which an unknown cause is told in the place of effects. Causes outside the library are about a fifth of all,
 effects more than half: at this, a share of the one kind that is missed costs as much as the same share of the other."""
+STANDS = 0.9
+"""Probability from which what sensors, frames or tool points show is told, however probable an unknown cause is beside it."""
 LEFT = 15.0
 """Evidence of a clue, beyond that on the reference, from which the report says that something is left on a joint."""
 TOLD = 0.9
@@ -167,8 +169,14 @@ def named_chances(findings: Findings, prices: Prices, weights: Certainty) -> dic
 
 
 def is_unknown(findings: Findings, prices: Prices, weights: Certainty) -> bool:
-    """Says whether an unknown cause is told: where effects were found from `SAID` on, else where it is more probable than none."""
-    chances, least = list(named_chances(findings, prices, weights).values()), SAID
+    """Says whether an unknown cause is told: where effects were found from `SAID` on, else where it is more probable than none.
+
+    What sensors, frames or tool points show for sure is there whatever moves a joint besides: that is then a remainder.
+    """
+    named = named_chances(findings, prices, weights)
+    if any(named[one.kind.name] >= STANDS for one in findings.others):
+        return False
+    chances, least = list(named.values()), SAID
     if not chances:
         chances, least = [certainty.chance(weights.none, none_signs(findings, prices, weights))], 0.5
     return unknown_chance(findings, prices, weights) > min(least, max(chances))

@@ -124,6 +124,23 @@ def test_weights_of_signs_are_those_that_made_the_truth() -> None:
     assert [few[name] for name in ("margin", "names")] == pytest.approx([0.5, 1.0], abs=0.2)
 
 
+def found(subsets: tuple[str, ...], others: tuple[str, ...] = ()) -> Findings:
+    """Returns effects by joint, named by a letter each, and what sensors, frames and tool points show."""
+    fields = {field.name: None for field in dataclasses.fields(Findings)}
+    chosen = Chosen(tuple(frozenset(one) for one in subsets), 50.0)
+    shown = [SimpleNamespace(kind=SimpleNamespace(name=name, stage="kinematics")) for name in others]
+    return Findings(**cast(dict, {**fields, "chosen": chosen, "others": shown}))
+
+
+@pytest.mark.parametrize(("shown", "unknown"), [(0.95, False), (0.6, True)])
+def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
+    monkeypatch: pytest.MonkeyPatch, weights: Certainty, shown: float, unknown: bool
+) -> None:
+    monkeypatch.setattr(verdict, "named_chances", lambda *_: {"t": shown, "a": 0.4})
+    monkeypatch.setattr(verdict, "unknown_chance", lambda *_: 0.7)
+    assert verdict.is_unknown(found(("a", ""), ("t",)), cast(Prices, None), weights) is unknown
+
+
 def test_what_was_named_only_beside_another_goes_with_it(monkeypatch: pytest.MonkeyPatch, weights: Certainty) -> None:
     beside = {
         frozenset("abc"): {"a": 0.9, "b": 0.6, "c": 0.4},
@@ -134,10 +151,7 @@ def test_what_was_named_only_beside_another_goes_with_it(monkeypatch: pytest.Mon
     monkeypatch.setattr(verdict, "named_chances", lambda found, *_: beside.get(found.chosen.names, {"a": 0.9}))
 
     def kept(subsets: tuple[str, ...]) -> tuple[set[str], ...]:
-        fields = {field.name: None for field in dataclasses.fields(Findings)}
-        chosen = Chosen(tuple(frozenset(one) for one in subsets), 50.0)
-        found = Findings(**cast(dict, {**fields, "chosen": chosen, "others": []}))
-        return tuple(set(one) for one in verdict.likely(found, cast(Prices, None), weights).chosen.subsets)
+        return tuple(set(one) for one in verdict.likely(found(subsets), cast(Prices, None), weights).chosen.subsets)
 
     assert kept(("ab", "c", "")) == ({"a"}, set(), set())
     assert kept(("de", "d")) == ({"d"}, {"d"}), "the most probable one stays"
