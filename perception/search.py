@@ -29,7 +29,7 @@ SPREAD_PX = 8
 """By how much larger than it is a stereo matcher makes what stands before something: its edge lies within."""
 DRAWN_PX = 1
 """Beside what stands before a face: its own edge is there, and those of the face are bent towards it by the blur."""
-HALF = 2.0
+HALF = 1.5
 """What shows half of itself must look so many times larger to be known."""
 UNSEEN = 3.0
 """Sizes of a hole across which a face may go on where nobody knows the depth: beside an arm, whose other side one camera sees."""
