@@ -167,7 +167,7 @@ def _before(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
     noise = 1.4826 * float(np.median(np.abs(rough_px[face] / np.maximum(seen_px[face], 1.0) - 1.0)))
     around = cv2.dilate(np.where(face, seen_px, np.float32(0.0)), reach)  # depth within a mouth is no face's
     # where there is a face alone: beyond it, where something hides half of a mouth, nothing but the mouth's depth may be in reach
-    around = cv2.erode(np.where(face, around, np.float32(NOWHERE)), reach)
+    around = cv2.erode(np.where(face & (around > 0), around, np.float32(NOWHERE)), reach)
     least = np.float32(BEFORE + NOISES * noise) * cv2.erode(
         np.where(face | (seen_px == 0), around, np.float32(NOWHERE)), _square(NEAR)
     )

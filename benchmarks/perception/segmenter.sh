@@ -8,7 +8,7 @@
 # To try it: CORES=1 RENDER_S=90 TRAIN_S=40 SMALL=1 GPU= .
 set -u
 CORES=${CORES:-$(nproc)} RENDER_S=${RENDER_S:-600} TRAIN_S=${TRAIN_S:-600} GPU=${GPU-0} SMALL=${SMALL:-}
-START=${START:-null} SEED=${SEED:-1000} WIDTHS=${WIDTHS:-16,24,40,64,72,64} FRAMES=${FRAMES:-}
+START=${START:-null} SEED=${SEED:-1000} WIDTHS=${WIDTHS:-24,36,56,88,112,112} FRAMES=${FRAMES:-}
 # telling a graphics card what to do with 48 samples took longer than doing it
 BATCH=192 RATE=0.003; [ "$START" != null ] && RATE=0.0015  # what was learned is not to be shaken out
 mkdir -p "$OUT"

@@ -45,10 +45,10 @@ def test_the_loss_of_a_worked_example_is_right() -> None:
     assert float(loss(logits, target)) == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_shipped_widths_make_less_than_two_megabytes() -> None:
+def test_the_shipped_widths_make_less_than_five_megabytes() -> None:
     shipped = yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())["training"]
     network = UNet(shipped["widths"])
-    assert 0.3e6 < sum(value.numel() for value in network.parameters()) < 0.49e6  # of four bytes
+    assert 0.3e6 < sum(value.numel() for value in network.parameters()) < 1.25e6  # of four bytes
     assert network(torch.zeros(1, 3, 32, 64)).shape == (1, 2, 32, 64)
 
 
