@@ -64,7 +64,7 @@ device=cuda; [ -z "$GPU" ] && device=cpu; export CUDA_VISIBLE_DEVICES=$GPU
 few=("training.widths=[$WIDTHS]" training.batch=$BATCH)
 [ -n "$SMALL" ] && few=("training.size_px=[160,96]" training.batch=8)
 say "trains for $TRAIN_S s on $device from $START"
-timeout -s KILL $(( TRAIN_S + 90 )) brokk mode=train_perception training.frames="$frames/train" "training.validation=[$folders]" \
+timeout -s INT -k 60 $(( TRAIN_S + 180 )) brokk mode=train_perception training.frames="$frames/train" "training.validation=[$folders]" \
   training.updates=1000000 training.start="$START" training.max_seconds="$TRAIN_S" training.rate=$RATE \
   training.validate_every=$([ -n "$SMALL" ] && echo 20 || echo 1200) session.device=$device session.out="$work/run" "${few[@]}" 2>&1 | tee -a "$work/log"
 say "trained, $(count train) frames there now: $(ls "$work/run" | tr '\n' ' ')"
