@@ -19,6 +19,7 @@ def headline(answer: Answer) -> tuple[str, Tone]:
         told = f" Error over 5 s free runs: {size(gap.before, gap.unit)} before"
         told += f", {size(gap.after, gap.unit)} after" if answer.selected else ""
         told += "; " + _floor(gap) + "."
+    told += _tool(answer)
     if answer.verdict == "none":
         return f"No gap: the simulator is as right about these recordings as about its own.{told}", "good"
     if answer.verdict == "unknown":
@@ -41,6 +42,15 @@ def headline(answer: Answer) -> tuple[str, Tone]:
 def size(value: float, unit: str) -> str:
     """Returns an error as a person reads it: in mrad, mm, or in percent of the joints' travel where units differ."""
     return f"{100 * value:.1f} % of travel" if unit == "travel" else f"{1e3 * value:.1f} m{unit}"
+
+
+def _tool(answer: Answer) -> str:
+    """Returns how far off the tool is, where that is what a named effect moves: free runs of joints show nothing of it."""
+    cause = str((answer.more.get("geometry") or {}).get("cause") or "").split(" ")[0]
+    if cause not in {one.effect for one in answer.selected}:
+        return ""
+    texts = [stage["text"] for stage in answer.more.get("stages", ()) if stage["stage"] == "kinematics"]
+    return "".join(f" {text[0].upper()}{text[1:]}." for text in texts)
 
 
 def _floor(gap: Gap) -> str:

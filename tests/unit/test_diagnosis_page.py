@@ -109,6 +109,15 @@ def test_an_answer_without_effects_is_said_in_plain_words(
     assert "12.0 mrad before; the floor is 10.0 mrad" in (tmp_path / "report.html").read_text()
 
 
+def test_what_moves_the_tool_alone_is_told_where_the_tool_is(seen: tuple[Outcome, Survey]) -> None:
+    one = replace(seen[0].answer.selected[0], effect="link_length")
+    said = "measured tool points lie 32.9 mm from forward kinematics"
+    more = {"geometry": {"cause": "link_length q1"}, "stages": [{"stage": "kinematics", "part": None, "text": said}]}
+    answer = replace(seen[0].answer, selected=(one,), more=more)
+    assert f" M{said[1:]}." in wording.headline(answer)[0]
+    assert "tool" not in wording.headline(replace(answer, selected=seen[0].answer.selected))[0]
+
+
 def test_an_answer_that_cannot_tell_says_why(machine: Machine, seen: tuple[Outcome, Survey]) -> None:
     bare = Answer(
         verdict="unknown", selected=(), ranking=(), where=Where({}, (), None), gap=Gap(0.01, 0.01, 0.01, None),
