@@ -208,7 +208,7 @@ class ArcDetector:
                 SMALL_PX / np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3]), 1.0
             )
             good[good] &= ~ellipse_ends.leaving(candidates[good], edges, support[good], length[good])
-            good &= screened | ~ellipse_ends.crossed(candidates, edges, support, length)
+            good[good] &= screened[good] | ~ellipse_ends.crossed(candidates[good], edges, support[good], length[good])
         departure = ellipse_support.departure(candidates, edges, support, length, self._reach(candidates.ellipses))
         good &= screened | (departure <= s.departure * slack)
         score = coverage * np.clip(1 - 0.5 * spread / rms_limit, 0, 1) * np.clip(1 - 0.5 * angle / angle_limit, 0, 1)

@@ -135,6 +135,19 @@ def test_an_ellipse_that_is_too_large_where_it_lies_is_none() -> None:
     assert {one.x for one in found} == {150.0}
 
 
+def test_the_rim_of_a_mouth_that_something_of_unknown_depth_cuts_is_looked_at() -> None:
+    columns, rows = np.meshgrid(np.arange(640), np.arange(480))
+    depth_m = np.full((480, 640), 1.0, np.float32)
+    mouth = np.hypot(columns - 320, rows - 250) < 53
+    depth_m[mouth] = 1.3
+    depth_m[rows > 260] = np.nan  # beside the mouth's lower half nothing is in reach of it but its own depth
+    mask = (columns > 120) & (columns < 520) & (rows > 80) & (rows <= 260)
+    matrix = np.array([[1056.0, 0.0, 320.0], [0.0, 1056.0, 240.0], [0.0, 0.0, 1.0]])
+    frame = replace(drawn()[0], depth_m=depth_m, camera_matrix=matrix)
+    found = search.levels(frame, mask, 0.05, 0.35, 6.5)
+    assert found and not any(level.nearest_m is None or level.nearest_m.any() for level in found)  # nothing stands before the face
+
+
 def test_the_edge_of_what_stands_before_a_face_is_no_rim_and_beside_it_one_looks_closer() -> None:
     columns, rows = np.meshgrid(np.arange(640), np.arange(480))
     mask = (columns > 120) & (columns < 520) & (rows > 80) & (rows < 400)

@@ -15,9 +15,10 @@ import yaml
 from safetensors.torch import load_file
 
 import conf
-from perception import dataset, training, training_data, training_report
+import perception
+from perception import dataset, export, training, training_data, training_report
 from perception.dataset import Label
-from perception.unet import UNet, loss
+from perception.unet import loss
 
 SMALL = (
     "training.size_px=[64,40]", "training.widths=[6,12,16]", "training.batch=6", "training.rate=0.01",
@@ -45,10 +46,11 @@ def test_the_loss_of_a_worked_example_is_right() -> None:
     assert float(loss(logits, target)) == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_shipped_widths_make_less_than_five_megabytes() -> None:
-    shipped = yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())["training"]
-    network = UNet(shipped["widths"])
-    assert 0.3e6 < sum(value.numel() for value in network.parameters()) < 1.25e6  # of four bytes
+def test_what_is_trained_by_default_goes_on_from_the_network_that_ships() -> None:
+    default = yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())["training"]
+    network, header = export.read(Path(next(iter(perception.__path__)), "weights/segmenter.safetensors"))
+    assert default["widths"] == header["widths"] and default["size_px"] == header["size_px"]
+    assert 4 * sum(value.numel() for value in network.parameters()) < 4.5e6  # small: bytes
     assert network(torch.zeros(1, 3, 32, 64)).shape == (1, 2, 32, 64)
 
 
