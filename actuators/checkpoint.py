@@ -34,7 +34,13 @@ def found(checkpoint: str) -> Path:
     )
 
 
-def write(path: Path, kind: str, machine: Machine, tensors: Mapping[str, torch.Tensor], facts: Mapping[str, Any]) -> None:
+def write(
+    path: Path,
+    kind: str,
+    machine: Machine,
+    tensors: Mapping[str, torch.Tensor],
+    facts: Mapping[str, Any],
+) -> None:
     """Writes a checkpoint in one step.
 
     Args:
@@ -73,7 +79,8 @@ def read(path: Path, kind: str, machine: Machine) -> tuple[dict[str, torch.Tenso
     """Returns the tensors and the header of a checkpoint made for `machine`.
 
     Raises:
-        CheckpointError: it is corrupt, of another kind, made for another machine, or holds numbers that are not finite.
+        CheckpointError: it is corrupt, of another kind, made for another machine, or holds numbers
+            that are not finite.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -84,7 +91,9 @@ def read(path: Path, kind: str, machine: Machine) -> tuple[dict[str, torch.Tenso
             f"{path}: corrupt or truncated ({error}); copy it again or make a new one with `brokk mode=identify`"
         ) from error
     except (KeyError, ValueError) as error:
-        raise CheckpointError(f"{path}: a safetensors file, but not an actuator of ours (no 'brokk' header)") from error
+        raise CheckpointError(
+            f"{path}: a safetensors file, but not an actuator of ours (no 'brokk' header)"
+        ) from error
     if header.get("schema") != SCHEMA or header.get("kind") != kind:
         raise CheckpointError(
             f"{path}: holds a '{header.get('kind')}' of schema {header.get('schema')}, expected a '{kind}' of schema {SCHEMA}; "

@@ -21,6 +21,7 @@ class Coupled:
         """Returns a model for any number of environments on `device`.
 
         Raises:
-            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds NaN.
+            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
+                NaN.
         """
         return NetworkModel(load(self.checkpoint, "coupled", machine).to(device), machine, device)

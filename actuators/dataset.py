@@ -28,19 +28,35 @@ class Windows:
         starts: Samples at which a window may begin, `(S,)`.
 
     Raises:
-        RecordingError: no recording is long enough for a single window, or a joint is never commanded.
+        RecordingError: no recording is long enough for a single window, or a joint is never
+            commanded.
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], machine: Machine, horizon: int, device: torch.device, purpose: str = "to fit to"
+        self,
+        recordings: Sequence[Recording],
+        machine: Machine,
+        horizon: int,
+        device: torch.device,
+        purpose: str = "to fit to",
     ) -> None:
-        self.u = torch.cat([torch.as_tensor(recording.u) for recording in recordings]).T.contiguous().to(device)
-        self.q = torch.cat([torch.as_tensor(recording.q) for recording in recordings]).T.contiguous().to(device)
+        self.u = (
+            torch.cat([torch.as_tensor(recording.u) for recording in recordings])
+            .T.contiguous()
+            .to(device)
+        )
+        self.q = (
+            torch.cat([torch.as_tensor(recording.q) for recording in recordings])
+            .T.contiguous()
+            .to(device)
+        )
         self.num_history, self.horizon = machine.num_history, horizon
         self._length = machine.num_history + horizon
         starts, begin = [], 0
         for recording in recordings:
-            starts.append(torch.arange(begin, begin + max(0, recording.num_samples - self._length + 1)))
+            starts.append(
+                torch.arange(begin, begin + max(0, recording.num_samples - self._length + 1))
+            )
             begin += recording.num_samples
         self.starts = torch.cat(starts).to(device)
         if not len(self.starts):
@@ -61,7 +77,12 @@ class Windows:
         self._joint = torch.arange(len(self.u), device=device)[:, None]
 
     def draw(
-        self, batch: int, still_share: float, busy_share: float, key: torch.Tensor, together: bool = False
+        self,
+        batch: int,
+        still_share: float,
+        busy_share: float,
+        key: torch.Tensor,
+        together: bool = False,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draws windows for each joint, mostly of times at which it is commanded. Fixed shapes, no host: a CUDA graph may hold it.
 
@@ -70,16 +91,22 @@ class Windows:
             still_share: Part drawn from all times instead.
             busy_share: Part drawn from the tenth of all times in which most is commanded at once.
             key: Names the draw, int64 of shape `()`: the same key gives the same windows.
-            together: Each joint gets the windows of all, so that `B` is `J` times `batch`; else its own ones.
+            together: Each joint gets the windows of all, so that `B` is `J` times `batch`; else its
+                own ones.
 
         Returns:
             Commands and positions, each `(J, B, H + K)`.
         """
         index = self._index(batch, still_share, busy_share, key)
         index = index.flatten()[None] if together else index
-        return (self.u.unfold(1, self._length, 1)[self._joint, index], self.q.unfold(1, self._length, 1)[self._joint, index])
+        return (
+            self.u.unfold(1, self._length, 1)[self._joint, index],
+            self.q.unfold(1, self._length, 1)[self._joint, index],
+        )
 
-    def _index(self, batch: int, still_share: float, busy_share: float, key: torch.Tensor) -> torch.Tensor:
+    def _index(
+        self, batch: int, still_share: float, busy_share: float, key: torch.Tensor
+    ) -> torch.Tensor:
         still, busy = round(batch * still_share), round(batch * busy_share)
         place = torch.arange(len(self.u) * batch, device=key.device)
         chance = hashed(key * 1_048_576 + place).view(-1, batch)
@@ -96,7 +123,9 @@ class Windows:
 
     def _within(self, condition: torch.Tensor) -> torch.Tensor:
         """Returns the starts of windows in which `condition`, `(T,)` bool, holds at some time."""
-        count = torch.cat([torch.zeros(1, dtype=torch.int64, device=condition.device), condition.cumsum(0)])
+        count = torch.cat(
+            [torch.zeros(1, dtype=torch.int64, device=condition.device), condition.cumsum(0)]
+        )
         return self.starts[count[self.starts + self._length] > count[self.starts]]
 
     def _busiest(self) -> torch.Tensor:

@@ -1,6 +1,7 @@
 """One update of a fit, with everything it changes: on a GPU captured in a CUDA graph, on the CPU the same code called step by step.
 
-A free run of 60 steps is some thousand tiny kernels forth and back; launched one by one they take far longer than they run.
+A free run of 60 steps is some thousand tiny kernels forth and back; launched one by one they take
+far longer than they run.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from brokk_rl.rl.graph import capture
 class Descent:
     """Adam on free runs, with a running average of the weights.
 
-    The windows of an update are named by a counter (`Windows.draw`), so that there is no generator with a state to keep. Rates are
-    tensors that the host fills before an update, so that a captured update can be steered.
+    The windows of an update are named by a counter (`Windows.draw`), so that there is no generator
+    with a state to keep. Rates are tensors that the host fills before an update, so that a captured
+    update can be steered.
 
     Args:
         networks: What is fitted, on its device.
@@ -43,22 +45,35 @@ class Descent:
         self._share_of_new = torch.zeros((), device=self._device)
         self._parameters = list(networks.parameters())
         on_gpu = self._device.type == "cuda"
-        self._adam = torch.optim.Adam(self._parameters, lr=self._rate, fused=True, capturable=on_gpu)
+        self._adam = torch.optim.Adam(
+            self._parameters, lr=self._rate, fused=True, capturable=on_gpu
+        )
         self._begin_adam()
 
     def state(self) -> dict[str, torch.Tensor]:
         """Returns all that an update changes, by name; the tensors themselves, to be copied from and into."""
-        found = {f"networks.{name}": value.detach() for name, value in self.networks.named_parameters()}
+        found = {
+            f"networks.{name}": value.detach() for name, value in self.networks.named_parameters()
+        }
         found |= {f"averaged.{name}": value for name, value in self.averaged.named_parameters()}
         for number, parameter in enumerate(self._parameters):
-            found |= {f"adam.{number}.{name}": value for name, value in self._adam.state[parameter].items()}
+            found |= {
+                f"adam.{number}.{name}": value
+                for name, value in self._adam.state[parameter].items()
+            }
         return found
 
-    def updater(self, windows: Windows, batch: int, still_share: float, busy_share: float) -> Callable[[], None]:
+    def updater(
+        self, windows: Windows, batch: int, still_share: float, busy_share: float
+    ) -> Callable[[], None]:
         """Returns one update on `batch` windows a joint as a function; capturing it, on a GPU, leaves the state as it was."""
 
         def update() -> None:
-            self._update(*windows.draw(batch, still_share, busy_share, self._key, together=self.networks.coupled))
+            self._update(
+                *windows.draw(
+                    batch, still_share, busy_share, self._key, together=self.networks.coupled
+                )
+            )
 
         if self._device.type != "cuda":
             return update
@@ -77,7 +92,9 @@ class Descent:
     @torch.no_grad()
     def run(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Returns the free runs of the averaged networks through windows `(J, B, H + K)`, shape `(J, B, K)`."""
-        return self.averaged.roll_out(u[..., :-1], q[..., : self.averaged.num_history], self._lower, self._upper)
+        return self.averaged.roll_out(
+            u[..., :-1], q[..., : self.averaged.num_history], self._lower, self._upper
+        )
 
     def _update(self, u: torch.Tensor, q: torch.Tensor) -> None:
         networks, size = self.networks, self.networks.num_history
@@ -86,7 +103,9 @@ class Descent:
         if horizon == 1:
             # before the dead zone, whose gradient is zero where it acts
             output = networks(networks.inputs(u[..., :size], q[..., :size]))
-            loss = (output - (q[..., size] - q[..., size - 1]) / scale[..., 0]).square().mean(1).sum()
+            loss = (
+                (output - (q[..., size] - q[..., size - 1]) / scale[..., 0]).square().mean(1).sum()
+            )
         else:
             path = networks.roll_out(u[..., :-1], q[..., :size], self._lower, self._upper)
             ahead = torch.arange(1, horizon + 1, device=q.device)

@@ -1,7 +1,8 @@
 """Random numbers from a counter in the state instead of a generator.
 
-No host is involved, a CUDA graph may hold the draws, and a run that is restored from its state goes on exactly; a generator would
-be memory outside the state, which the contract of an actuator model forbids.
+No host is involved, a CUDA graph may hold the draws, and a run that is restored from its state goes
+on exactly; a generator would be memory outside the state, which the contract of an actuator model
+forbids.
 """
 
 import math

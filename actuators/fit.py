@@ -43,17 +43,19 @@ class NetworkFit:
         network: `mlp`, a network a joint, or `coupled`, in which each joint sees all.
         loss: `rollout` or `one_step`.
         width: Units a joint in each of the two hidden layers.
-        quiet: Increments up to this size are none (rad or m in a control period); `null`: the noise of the resting sensor,
-            estimated from the recordings joint by joint.
+        quiet: Increments up to this size are none (rad or m in a control period); `null`: the noise
+            of the resting sensor, estimated from the recordings joint by joint.
         one_step_updates: Updates on single steps, before the free runs.
         one_step_batch: Windows a joint in each of them.
         horizons_s: Horizons of the free runs, one after another.
         updates: Updates at each of the horizons.
         batch: Windows a joint in each of them; with `coupled` each window is one of all joints.
         learning_rate: Of Adam, at the start; falls along a cosine.
-        still_share: Part of the windows drawn from all times; most others are times at which the joint is commanded.
-        busy_share: Part of the windows drawn from the tenth of all times in which most is commanded at once: joints hinder each
-            other rarely, and where recordings of single joints abound hardly ever.
+        still_share: Part of the windows drawn from all times; most others are times at which the
+            joint is commanded.
+        busy_share: Part of the windows drawn from the tenth of all times in which most is commanded
+            at once: joints hinder each other rarely, and where recordings of single joints abound
+                hardly ever.
         average: Decay of the running average of the weights, which is what is validated and kept.
         validate_every: Updates between two validations.
         validation_s: Horizon of the free run on which the weights are chosen.
@@ -86,7 +88,9 @@ class NetworkFit:
         if min(self.width, self.batch, self.one_step_batch, self.validate_every, self.patience) < 1:
             raise ConfigError("fit: width, batches, validate_every and patience must be 1 or more")
         if min(self.still_share, self.busy_share) < 0 or self.still_share + self.busy_share >= 1:
-            raise ConfigError("fit: still_share and busy_share must leave room for times at which a joint is commanded")
+            raise ConfigError(
+                "fit: still_share and busy_share must leave room for times at which a joint is commanded"
+            )
 
     def fit(
         self,
@@ -99,8 +103,8 @@ class NetworkFit:
     ) -> Mlp | Coupled:
         """Fits to `train`, keeps the weights that run freely best on `validation`, writes `<name>.safetensors` into `folder`.
 
-        A fit that was interrupted goes on from `<name>.partial.safetensors`, saved every `save_every_s` seconds: on a CPU
-        bit for bit as if it had never stopped.
+        A fit that was interrupted goes on from `<name>.partial.safetensors`, saved every
+        `save_every_s` seconds: on a CPU bit for bit as if it had never stopped.
 
         Raises:
             RecordingError: too little data.
@@ -124,9 +128,15 @@ class NetworkFit:
                 "recordings": len(train),
                 "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
                 "commanded_minutes": dict(
-                    zip(machine.joint_names, (survey.commanded_s(train).sum(0) / 60.0).round(1).tolist(), strict=True)
+                    zip(
+                        machine.joint_names,
+                        (survey.commanded_s(train).sum(0) / 60.0).round(1).tolist(),
+                        strict=True,
+                    )
                 ),
-                "sources": sorted({recording.metadata.get("source", "unknown") for recording in train}),
+                "sources": sorted(
+                    {recording.metadata.get("source", "unknown") for recording in train}
+                ),
             },
             "fit": {
                 "loss": self.loss,
@@ -180,14 +190,30 @@ class _Fitting:
         networks = JointNetworks(joints, machine.num_history, config.width, coupled, generator)
         self._normalise(networks)
         self._descent = Descent(networks.to(device), machine, seed)
-        self._kept = {name: value.clone() for name, value in self._descent.averaged.named_parameters()}
+        self._kept = {
+            name: value.clone() for name, value in self._descent.averaged.named_parameters()
+        }
         self._best = torch.full((joints,), math.inf, device=device)
-        held = Windows(validation, machine, self._steps(config.validation_s), device, "held out to stop the fit by")
+        held = Windows(
+            validation,
+            machine,
+            self._steps(config.validation_s),
+            device,
+            "held out to stop the fit by",
+        )
         batch = max(1, VALIDATED // joints) if coupled else VALIDATED
-        self._held = held.draw(batch, 0.2, config.busy_share, torch.zeros((), dtype=torch.int64, device=device), together=coupled)
+        self._held = held.draw(
+            batch,
+            0.2,
+            config.busy_share,
+            torch.zeros((), dtype=torch.int64, device=device),
+            together=coupled,
+        )
         self._stages = [_Stage(0.0, config.one_step_updates, config.one_step_batch)]
         if config.loss == "rollout":
-            self._stages += [_Stage(horizon_s, config.updates, config.batch) for horizon_s in config.horizons_s]
+            self._stages += [
+                _Stage(horizon_s, config.updates, config.batch) for horizon_s in config.horizons_s
+            ]
 
     def run(self, interruption: Interruption) -> float:
         """Fits, going on from `interruption` if there is one; returns the time it took in all, s."""
@@ -207,17 +233,26 @@ class _Fitting:
         """The best averaged networks, normalisation included, and the error of each joint on the recordings held out."""
         return {**self._descent.averaged.state_dict(), **self._kept}, self._best.tolist()
 
-    def _run_stage(self, place: _Place, interruption: Interruption, progress: Progress, task: TaskID) -> None:
+    def _run_stage(
+        self, place: _Place, interruption: Interruption, progress: Progress, task: TaskID
+    ) -> None:
         """Runs what is left of the stage at `place`."""
         config, stage = self._config, self._stages[place.stage]
-        windows = Windows(self._train, self._machine, max(1, self._steps(stage.horizon_s)), self._device)
+        windows = Windows(
+            self._train, self._machine, max(1, self._steps(stage.horizon_s)), self._device
+        )
         update = self._descent.updater(windows, stage.batch, config.still_share, config.busy_share)
-        before, total = sum(earlier.updates for earlier in self._stages[: place.stage]), progress.tasks[task].total or 1
+        before, total = (
+            sum(earlier.updates for earlier in self._stages[: place.stage]),
+            progress.tasks[task].total or 1,
+        )
         began = saved = time.monotonic()
         spent_s = place.seconds
         while place.update < stage.updates and place.stale < config.patience:
             number = before + place.update
-            rate = config.learning_rate * (0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * number / total)))
+            rate = config.learning_rate * (
+                0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * number / total))
+            )
             self._descent.steer(number, rate, min(config.average, (number + 1.0) / (number + 11.0)))
             update()
             place.update += 1
@@ -242,7 +277,9 @@ class _Fitting:
             raise BrokkError("the fit diverged (NaN in the validation); lower fit.learning_rate")
         better = error < self._best
         if averaged.coupled:
-            mean, best = ((value / averaged.increment_scale).mean() for value in (error, self._best))
+            mean, best = (
+                (value / averaged.increment_scale).mean() for value in (error, self._best)
+            )
             better = (mean < best).expand_as(error)
         self._best.copy_(torch.where(better, error, self._best))
         for name, value in averaged.named_parameters():
@@ -251,7 +288,11 @@ class _Fitting:
         return bool(better.any())
 
     def _state(self) -> dict[str, torch.Tensor]:
-        return {**self._descent.state(), **{f"kept.{name}": value for name, value in self._kept.items()}, "best": self._best}
+        return {
+            **self._descent.state(),
+            **{f"kept.{name}": value for name, value in self._kept.items()},
+            "best": self._best,
+        }
 
     def _normalise(self, networks: JointNetworks) -> None:
         """Sets the normalisation from the training data (increments, commands, noise) and from the machine (positions)."""
@@ -259,10 +300,17 @@ class _Fitting:
             commands = np.concatenate([r.u[1:, joint] for r in self._train])
             moved = np.concatenate([np.diff(r.q[:, joint]) for r in self._train])
             moved = moved[np.abs(commands) > min(BEYOND_DEAD_BAND, 0.5 * np.abs(commands).max())]
-            networks.increment_scale[joint] = max(1e-6, float(np.sqrt(np.mean(np.square(moved, dtype=np.float64)))))
+            networks.increment_scale[joint] = max(
+                1e-6, float(np.sqrt(np.mean(np.square(moved, dtype=np.float64))))
+            )
             commands = commands[np.abs(commands) > COMMANDED]
-            networks.command_scale[joint] = float(np.sqrt(np.mean(np.square(commands, dtype=np.float64))))
-        lower, upper = (torch.as_tensor(bound, dtype=torch.float32) for bound in (self._machine.lower, self._machine.upper))
+            networks.command_scale[joint] = float(
+                np.sqrt(np.mean(np.square(commands, dtype=np.float64)))
+            )
+        lower, upper = (
+            torch.as_tensor(bound, dtype=torch.float32)
+            for bound in (self._machine.lower, self._machine.upper)
+        )
         networks.position_center.copy_((lower + upper) / 2.0)
         networks.position_scale.copy_((upper - lower) / 2.0)
         if self._config.quiet is None:

@@ -1,8 +1,9 @@
 """Numbers of an actuator model by free runs: errors of candidates side by side, Gauss-Newton steps, and how sure the result is.
 
-Candidates are written into the environments of one batch, so that a Jacobian by finite differences is one simulation. Numbers are
-in units of their range, `x` in [0, 1].
-Axes: `C` candidates, `P` numbers, `J` joints, `W` windows, `K` steps, `D` columns of a Jacobian, `P` times `J`.
+Candidates are written into the environments of one batch, so that a Jacobian by finite differences
+is one simulation. Numbers are in units of their range, `x` in [0, 1].
+Axes: `C` candidates, `P` numbers, `J` joints, `W` windows, `K` steps, `D` columns of a Jacobian,
+`P` times `J`.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,9 +23,11 @@ from brokk_rl.machine import Machine
 WORLDS = 2048
 """Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""
 STEP = 0.004
-"""Finite difference, of the range: far above the rounding of float32, below the bends of dead bands and delays."""
+"""Finite difference, of the range: far above the rounding of float32, below the bends of dead bands
+and delays."""
 SECANT = 0.04
-"""Difference for intervals: a time constant near 0 acts like a delay to first order, over a hundredth of a second it does not."""
+"""Difference for intervals: a time constant near 0 acts like a delay to first order, over a
+hundredth of a second it does not."""
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Levenberg-Marquardt dampings tried side by side, relative to the diagonal."""
 
@@ -49,7 +52,9 @@ class _Candidates:
         model = self.actuator.build(machine, num_envs, device)
         parameters = parameters_of(model, self.names)
         for p, name in enumerate(self.names):
-            parameters[name].copy_(torch.as_tensor(self.values[:, p], dtype=torch.float32, device=device))
+            parameters[name].copy_(
+                torch.as_tensor(self.values[:, p], dtype=torch.float32, device=device)
+            )
         return model
 
 
@@ -61,10 +66,14 @@ def parameters_of(model: ActuatorModel, names: tuple[str, ...]) -> dict[str, tor
     """
     parameters: dict[str, torch.Tensor] | None = getattr(model, "parameters", None)
     if parameters is None:
-        raise ConfigError(f"fit.actuator: {type(model).__name__} has no numbers to fit (no `parameters`); choose lag or hydraulic")
+        raise ConfigError(
+            f"fit.actuator: {type(model).__name__} has no numbers to fit (no `parameters`); choose lag or hydraulic"
+        )
     for name in names:
         if name not in parameters:
-            raise ConfigError(f"fit.free: '{name}' is no number of {type(model).__name__}; {choices(name, parameters)}")
+            raise ConfigError(
+                f"fit.free: '{name}' is no number of {type(model).__name__}; {choices(name, parameters)}"
+            )
     return parameters
 
 
@@ -77,7 +86,8 @@ class FreeRuns:
         coupled: Whether a joint's numbers change how the others move.
         machine: The machine.
         cut: Windows.
-        active: Which joints each window says something about, `(W, J)`; the others neither count nor are varied there.
+        active: Which joints each window says something about, `(W, J)`; the others neither count
+            nor are varied there.
         device: Where to simulate.
     """
 
@@ -100,10 +110,13 @@ class FreeRuns:
         """Returns the numbers, in their own units, at `x` `(…, P, J)`."""
         return self._low + (self._high - self._low) * x
 
-    def errors(self, x: np.ndarray, window: np.ndarray, advance: Callable[[int], None] | None = None) -> np.ndarray:
+    def errors(
+        self, x: np.ndarray, window: np.ndarray, advance: Callable[[int], None] | None = None
+    ) -> np.ndarray:
         """Returns predicted less measured positions, over the root of time and of `K`, for each row of `x` `(C, P, J)`.
 
-        An error that grows with the root of time counts the same early and late; sums of squares over `K` are means over time.
+        An error that grows with the root of time counts the same early and late; sums of squares
+        over `K` are means over time.
 
         Args:
             x: Candidates.
@@ -118,7 +131,9 @@ class FreeRuns:
             rows = window[start : start + WORLDS]
             part = replace(self.cut, u=self.cut.u[rows], q=self.cut.q[rows], run=self.cut.run[rows])
             values = self.values(x[start : start + WORLDS])
-            path = open_loop.free_run(_Candidates(self._actuator, self.names, values), self._machine, part, self._device)
+            path = open_loop.free_run(
+                _Candidates(self._actuator, self.names, values), self._machine, part, self._device
+            )
             scaled = (path - part.measured) / np.sqrt(self._ahead * len(self._ahead))
             found[start : start + WORLDS] = np.where(self.active[rows][:, None], scaled, 0.0)
             if advance:
@@ -135,18 +150,25 @@ class FreeRuns:
     def end_rmse(self, x: np.ndarray) -> list[float | None]:
         """Returns the root mean square error at the end of the windows, rad or m, at `x` `(P, J)`; `None`: joint never active."""
         steps = self.cut.measured.shape[1]
-        last = self.errors(np.repeat(x[None], len(self.active), 0), np.arange(len(self.active)))[:, -1]
+        last = self.errors(np.repeat(x[None], len(self.active), 0), np.arange(len(self.active)))[
+            :, -1
+        ]
         square = np.square(last, dtype=np.float64).sum(0) * steps * self._ahead[-1]
-        return [float(np.sqrt(s / n)) if n else None for s, n in zip(square, self.active.sum(0), strict=True)]
+        return [
+            float(np.sqrt(s / n)) if n else None
+            for s, n in zip(square, self.active.sum(0), strict=True)
+        ]
 
     def jacobian(self, x: np.ndarray, size: float = STEP) -> tuple[np.ndarray, np.ndarray]:
         """Returns errors `(W, K, J)` at `x` `(P, J)` and their derivatives `(W, K, J, D)` by finite differences of `size`.
 
-        One free run of a window serves a number of all joints at once where joints do not influence each other; only joints that
-        are active there are varied.
+        One free run of a window serves a number of all joints at once where joints do not influence
+        each other; only joints that are active there are varied.
         """
         num, joints = x.shape
-        columns = [(p, j) for p in range(num) for j in (range(joints) if self.coupled else [slice(None)])]
+        columns = [
+            (p, j) for p in range(num) for j in (range(joints) if self.coupled else [slice(None)])
+        ]
         pairs = [
             (w, column)
             for column, (_, j) in enumerate(columns)
@@ -159,7 +181,8 @@ class FreeRuns:
         rows = np.array(pairs)
         base = np.arange(len(self.active))
         error = self.errors(
-            np.concatenate([np.repeat(x[None], len(base), 0), varied[rows[:, 1]]]), np.concatenate([base, rows[:, 0]])
+            np.concatenate([np.repeat(x[None], len(base), 0), varied[rows[:, 1]]]),
+            np.concatenate([base, rows[:, 0]]),
         )
         error, moved = error[: len(base)], error[len(base) :]
         slopes = np.zeros((*error.shape, num, joints), dtype=np.float32)
@@ -186,7 +209,10 @@ class Loss:
     @classmethod
     def around(cls, squares: np.ndarray, active: np.ndarray, robust: float) -> "Loss":
         """Returns the loss whose scale is `robust` times the typical (median) error of the active windows, `squares` `(W, J)`."""
-        typical = [np.median(column[rows]) if rows.any() else 0.0 for column, rows in zip(squares.T, active.T, strict=True)]
+        typical = [
+            np.median(column[rows]) if rows.any() else 0.0
+            for column, rows in zip(squares.T, active.T, strict=True)
+        ]
         return cls(np.maximum(robust**2 * np.array(typical), 1e-14))
 
     def weights(self, squares: np.ndarray) -> np.ndarray:
@@ -245,9 +271,10 @@ class Certainty:
 def certainty(runs: FreeRuns, x: np.ndarray, robust: float) -> Certainty:
     """Returns standard errors by the sandwich of whole runs, whose windows are not independent, at the fitted `x` `(P, J)`.
 
-    The errors of a model that is not quite right are no white noise: the spread of the runs' own gradients says how far a number
-    would move with other runs (Liang and Zeger 1986). It is never taken for less than white errors would give, and what the data
-    say nothing about keeps its range as standard error.
+    The errors of a model that is not quite right are no white noise: the spread of the runs' own
+    gradients says how far a number would move with other runs (Liang and Zeger 1986). It is never
+    taken for less than white errors would give, and what the data say nothing about keeps its range
+    as standard error.
     """
     error, slopes = runs.jacobian(x, SECANT)
     squares = np.square(error, dtype=np.float64).sum(1)

@@ -1,20 +1,23 @@
 """The rich plant that stands in for the machine: valves, one pump, cylinders, friction, weight and warm oil.
 
-Equations, per joint, with time step `substep_s` (symplectic Euler; friction implicit, so that it can never drive a joint):
+Equations, per joint, with time step `substep_s` (symplectic Euler; friction implicit, so that it
+can never drive a joint):
 
     u        command of `transport_s` ago, exact to the fraction of a sample
     pilot    play operator of width `hysteresis` on u
     spool    second order, `spool_hz`, `spool_damping`; slower in cold oil
     opening  spool beyond the overlap of its side, progressive notch s (1 - c + c |s|)
-    flow     opening * min(1, pump / sum of flows over joints) * sqrt(1 - sign(opening) force / supply)
-    speed    flow * max_speed * (1 extending | `retract_ratio` retracting) * (1 + `thermal_gain` (oil - reference))
-    force'   stiffness * (flow speed - joint speed) - leak
+    flow     opening * min(1, pump / sum of flows over joints) * sqrt(1 - sign(opening) force /
+    supply) speed    flow * max_speed * (1 extending | `retract_ratio` retracting) * (1 +
+    `thermal_gain` (oil - reference)) force'   stiffness * (flow speed - joint speed) - leak
     joint'   inertia * joint speed' = force + weight(q) - Coulomb, Stribeck and viscous friction
 
-Reduced, and why: the two chamber pressures are one load force, and the oil's stiffness does not depend on the piston's position (at
-20 Hz only the first mode of the joint is visible, and the machine's YAML knows one stiffness); inertia is constant, `stiffness /
-(2 pi mode_hz)^2` (coupling through the arm's inertia is small against the 5 to 10 Hz of the oil column); pressure compensation is
-imperfect in one number, `load_sensitivity`; supply pressure is constant and the pump is limited by flow. Contact reaches the plant
+Reduced, and why: the two chamber pressures are one load force, and the oil's stiffness does not
+depend on the piston's position (at 20 Hz only the first mode of the joint is visible, and the
+machine's YAML knows one stiffness); inertia is constant, `stiffness / (2 pi mode_hz)^2` (coupling
+through the arm's inertia is small against the 5 to 10 Hz of the oil column); pressure compensation
+is imperfect in one number, `load_sensitivity`; supply pressure is constant and the pump is limited
+by flow. Contact reaches the plant
 through the measured position only: a blocked joint keeps pushing, and the simulator's drive yields.
 """
 
@@ -37,23 +40,28 @@ class Hydraulic:
     """Valve spools, shared pump, oil compliance, friction, load, leak and oil temperature (stands in for the machine).
 
     Attributes:
-        transport_s: Pure delay of radio, bus and pilot stage. Spool and oil add to it until the joint moves.
+        transport_s: Pure delay of radio, bus and pilot stage. Spool and oil add to it until the
+            joint moves.
         hysteresis: Width of the play between command and spool, of full command.
         spool_hz: Natural frequency of the spool in oil at the reference temperature.
         spool_damping: Damping ratio of the spool.
-        overlap_extend: Spool stroke up to which no oil flows in the positive direction, of full stroke.
+        overlap_extend: Spool stroke up to which no oil flows in the positive direction, of full
+            stroke.
         overlap_retract: The same for the negative direction.
         notch: Progressiveness `c` of the flow curve: 0 linear, 1 quadratic.
         speed_scale: Speed at full command without load, extending, over the machine's `max_speed`.
-        retract_ratio: Retracting speed over extending speed at equal flow: bore area over rod-side area, 1 for a motor.
+        retract_ratio: Retracting speed over extending speed at equal flow: bore area over rod-side
+            area, 1 for a motor.
         flow_share: Flow at full opening over the flow of the pump.
         supply_ratio: Force at supply pressure over the machine's `yield_force`.
         load_sensitivity: 0 ideal pressure compensator (speed free of load), 1 none.
-        mode_hz: First mode of the joint on its closed cylinder; with the machine's `stiffness` this gives the inertia.
+        mode_hz: First mode of the joint on its closed cylinder; with the machine's `stiffness` this
+            gives the inertia.
         leak_hz: Rate at which a held force bleeds off through the closed valve.
         coulomb: Friction force in motion over the supply force.
         breakaway: Friction force at the onset of motion over the supply force, at least `coulomb`.
-        stribeck_speed: Speed, of full speed, at which break-away friction has fallen to a third of its excess.
+        stribeck_speed: Speed, of full speed, at which break-away friction has fallen to a third of
+            its excess.
         viscous: Friction force proportional to speed, at full speed, over the supply force.
         oil_start_c: Oil temperature after a reset.
         oil_ambient_c: Temperature to which resting oil cools.
@@ -61,8 +69,10 @@ class Hydraulic:
         oil_time_s: Time constant of warming and cooling.
         oil_reference_c: Temperature at which speeds and spool frequencies hold.
         thermal_gain: Relative change of speed and spool frequency per kelvin.
-        substep_s: Own time step; the control period is divided into the nearest whole number of them.
-        spread: Relative half width, by field name, of what is drawn per environment and joint at reset.
+        substep_s: Own time step; the control period is divided into the nearest whole number of
+            them.
+        spread: Relative half width, by field name, of what is drawn per environment and joint at
+            reset.
     """
 
     transport_s: PerJoint
@@ -94,7 +104,9 @@ class Hydraulic:
 
     def check(self) -> None:
         if not 0 < self.substep_s <= 0.01:
-            raise ConfigError(f"actuator.substep_s: expected (0, 0.01] s, where the plant is stable, got {self.substep_s}")
+            raise ConfigError(
+                f"actuator.substep_s: expected (0, 0.01] s, where the plant is stable, got {self.substep_s}"
+            )
         if self.oil_time_s <= 0:
             raise ConfigError(f"actuator.oil_time_s: expected more than 0, got {self.oil_time_s}")
 
@@ -114,11 +126,17 @@ class HydraulicModel:
     """The plant at work in `N` environments; see the module for its equations.
 
     Attributes:
-        parameters: Numbers by name, `(N, J)`; write in place to simulate `N` candidates side by side.
+        parameters: Numbers by name, `(N, J)`; write in place to simulate `N` candidates side by
+            side.
     """
 
-    def __init__(self, config: Hydraulic, machine: Machine, num_envs: int, device: torch.device) -> None:
-        nominal = {name: per_joint(getattr(config, name), machine, f"actuator.{name}") for name in PER_JOINT}
+    def __init__(
+        self, config: Hydraulic, machine: Machine, num_envs: int, device: torch.device
+    ) -> None:
+        nominal = {
+            name: per_joint(getattr(config, name), machine, f"actuator.{name}")
+            for name in PER_JOINT
+        }
         _check(nominal)
         longest_s = nominal["transport_s"].max() * (1.0 + config.spread.get("transport_s", 0.0))
         check_dead_time(float(longest_s), machine, "actuator.transport_s")
@@ -137,7 +155,10 @@ class HydraulicModel:
         self._stiffness = tensor(np.array([body.stiffness.value for body in machine.bodies]))
         self._yield_force = tensor(np.array([body.yield_force.value for body in machine.bodies]))
         shape = (num_envs, machine.num_joints)
-        self._state = {name: torch.zeros(shape, device=device) for name in ("pilot", "spool", "spool_rate", "speed", "force")}
+        self._state = {
+            name: torch.zeros(shape, device=device)
+            for name in ("pilot", "spool", "spool_rate", "speed", "force")
+        }
         self._state["oil_c"] = torch.zeros(num_envs, device=device)
         self._state["fresh"] = torch.ones(num_envs, dtype=torch.bool, device=device)
         self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
@@ -185,11 +206,17 @@ class HydraulicModel:
             fast = speed.abs()
             return (p["coulomb"] + excess * torch.exp(-fast / knee)) / (fast + still) + viscous
 
-        # a free run may begin in the middle of a motion, which the history shows; the spool trails its command by 2 damping / omega
+        # a free run may begin in the middle of a motion, which the history shows; the spool trails
+        # its command by 2 damping / omega
         trail_s = p["spool_damping"] / (math.pi * p["spool_hz"])
         trailing, _, _ = commands_in_force(history.u, (p["transport_s"] + trail_s) / self._period_s)
         measured = (q - history.q[:, -2]) / self._period_s
-        begun = {"pilot": earlier, "spool": trailing, "spool_rate": torch.zeros_like(q), "speed": measured}
+        begun = {
+            "pilot": earlier,
+            "spool": trailing,
+            "spool_rate": torch.zeros_like(q),
+            "speed": measured,
+        }
         begun["force"] = supply * rubbing(measured) * measured - weight
         pilot, spool, spool_rate, speed, force = (
             torch.where(state["fresh"][:, None], begun[name], state[name])
@@ -197,7 +224,9 @@ class HydraulicModel:
         )
         demand = torch.zeros_like(q)
         for i in range(self._num_substeps):
-            u = torch.lerp(later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0))  # smooth in the delay
+            u = torch.lerp(
+                later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0)
+            )  # smooth in the delay
             pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
             spool_rate = spool_rate + pull[0] * (pilot - spool) - pull[1] * spool_rate
             spool = (spool + dt * spool_rate).clamp(-1.0, 1.0)
@@ -205,7 +234,11 @@ class HydraulicModel:
             opening = opening * (1.0 - p["notch"] + p["notch"] * opening.abs())
             demand = opening.abs() * p["flow_share"]
             opening = opening / demand.sum(1, keepdim=True).clamp(min=1.0)
-            head = (1.0 - p["load_sensitivity"] * opening.sign() * force / supply).clamp(0.0, 2.0).sqrt()
+            head = (
+                (1.0 - p["load_sensitivity"] * opening.sign() * force / supply)
+                .clamp(0.0, 2.0)
+                .sqrt()
+            )
             flow_speed = opening * head * torch.where(opening > 0, extend_speed, retract_speed)
             force = force + dt * (self._stiffness * (flow_speed - speed) - p["leak_hz"] * force)
             force = torch.minimum(torch.maximum(force, -supply), supply)  # relief valves
@@ -214,12 +247,20 @@ class HydraulicModel:
             q = moved.clamp(self._lower, self._upper)
             speed = speed.masked_fill(q != moved, 0.0)
 
-        for name, value in (("pilot", pilot), ("spool", spool), ("spool_rate", spool_rate), ("speed", speed), ("force", force)):
+        for name, value in (
+            ("pilot", pilot),
+            ("spool", spool),
+            ("spool_rate", spool_rate),
+            ("speed", speed),
+            ("force", force),
+        ):
             state[name].copy_(value)
         state["fresh"].fill_(False)
         work = demand.sum(1).clamp(max=1.0)
         settled_c = config.oil_ambient_c + config.oil_rise_c * work
-        state["oil_c"].add_((settled_c - state["oil_c"]) * (1.0 - math.exp(-self._period_s / config.oil_time_s)))
+        state["oil_c"].add_(
+            (settled_c - state["oil_c"]) * (1.0 - math.exp(-self._period_s / config.oil_time_s))
+        )
         return q
 
 
@@ -238,11 +279,15 @@ def _check(nominal: dict[str, np.ndarray]) -> None:
     for name, value in nominal.items():
         low = 1e-6 if name in positive else 0.0
         if (value < low).any():
-            raise ConfigError(f"actuator.{name}: expected {'more than 0' if low else '0 or more'}, got {value.tolist()}")
+            raise ConfigError(
+                f"actuator.{name}: expected {'more than 0' if low else '0 or more'}, got {value.tolist()}"
+            )
     for name in ("overlap_extend", "overlap_retract", "hysteresis", "notch", "load_sensitivity"):
         if (nominal[name] > (0.9 if name.startswith("overlap") else 1.0)).any():
             raise ConfigError(
                 f"actuator.{name}: expected at most {0.9 if name.startswith('overlap') else 1.0}, got {nominal[name].tolist()}"
             )
     if (nominal["breakaway"] < nominal["coulomb"]).any():
-        raise ConfigError("actuator.breakaway: expected at least actuator.coulomb (friction at rest is no smaller than in motion)")
+        raise ConfigError(
+            "actuator.breakaway: expected at least actuator.coulomb (friction at rest is no smaller than in motion)"
+        )

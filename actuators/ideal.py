@@ -27,7 +27,9 @@ class IdealModel:
 
     def __init__(self, config: Ideal, machine: Machine, device: torch.device) -> None:
         self._step_at_full = torch.as_tensor(
-            machine.max_speed * machine.period_s * config.speed_scale, dtype=torch.float32, device=device
+            machine.max_speed * machine.period_s * config.speed_scale,
+            dtype=torch.float32,
+            device=device,
         )
         self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
         self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
@@ -42,4 +44,6 @@ class IdealModel:
 
     def step(self, history: History) -> torch.Tensor:
         """Returns the joint positions one control period later, shape `(N, J)`."""
-        return (history.q[:, -1] + history.u[:, -1] * self._step_at_full).clamp(self._lower, self._upper)
+        return (history.q[:, -1] + history.u[:, -1] * self._step_at_full).clamp(
+            self._lower, self._upper
+        )

@@ -42,7 +42,8 @@ class Interruption:
         """Restores `state` in place and returns the place that was saved with it; `None` where there is nothing to go on from.
 
         Raises:
-            CheckpointError: the file is corrupt, or belongs to a fit with other settings or data; says which.
+            CheckpointError: the file is corrupt, or belongs to a fit with other settings or data;
+                says which.
         """
         if not self._path.is_file():
             return None
@@ -52,9 +53,13 @@ class Interruption:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
             stamp, place = header["stamp"], header["place"]
         except (SafetensorError, OSError, KeyError, ValueError) as error:
-            raise CheckpointError(f"{self._path}: corrupt ({error}); delete it to begin the fit again") from error
+            raise CheckpointError(
+                f"{self._path}: corrupt ({error}); delete it to begin the fit again"
+            ) from error
         differing = list(_differences(stamp, self._stamp))
-        if differing or {name: value.shape for name, value in tensors.items()} != {n: v.shape for n, v in state.items()}:
+        if differing or {name: value.shape for name, value in tensors.items()} != {
+            n: v.shape for n, v in state.items()
+        }:
             raise CheckpointError(
                 f"{self._path}: an interrupted fit that cannot go on; these differ: {'; '.join(differing) or 'its tensors'}. "
                 "Fit with what it began with, choose another folder (session.out=…), or delete the file to begin again."
@@ -80,7 +85,9 @@ class Interruption:
             part.write_bytes(content)
             part.replace(self._path)
         except OSError as error:
-            raise StorageError(f"cannot write {self._path}: {error.strerror or error}; the one before it is untouched") from error
+            raise StorageError(
+                f"cannot write {self._path}: {error.strerror or error}; the one before it is untouched"
+            ) from error
         finally:
             part.unlink(missing_ok=True)
 
@@ -93,5 +100,9 @@ def _differences(then: Any, now: Any, name: str = "") -> list[str]:
     """Returns where two stamps differ, e.g. `fit.width (was 32, is 64)`."""
     if isinstance(then, dict) and isinstance(now, dict):
         keys = sorted({*then, *now})
-        return [found for key in keys for found in _differences(then.get(key), now.get(key), f"{name}.{key}".strip("."))]
+        return [
+            found
+            for key in keys
+            for found in _differences(then.get(key), now.get(key), f"{name}.{key}".strip("."))
+        ]
     return [] if then == now else [f"{name} (was {then}, is {now})"]

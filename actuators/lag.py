@@ -15,12 +15,14 @@ class Lag:
     """Dead time, dead band on each side, gain and first-order lag, joint by joint.
 
     Attributes:
-        dead_time_s: Pure transport delay of the command; `null` takes the machine's. Need not be a multiple of the period.
+        dead_time_s: Pure transport delay of the command; `null` takes the machine's. Need not be a
+            multiple of the period.
         dead_band_extend: Command up to which nothing moves in the positive direction, in [0, 1).
         dead_band_retract: The same for the negative direction.
         gain: Speed at full command over the machine's `max_speed`.
         time_constant_s: Time constant with which the speed follows the command; 0 for none.
-        spread: Relative half width, by field name, of what is drawn per environment and joint at reset.
+        spread: Relative half width, by field name, of what is drawn per environment and joint at
+            reset.
     """
 
     dead_time_s: PerJoint | None
@@ -34,7 +36,8 @@ class Lag:
         """Returns a model for `num_envs` environments on `device`.
 
         Raises:
-            ConfigError: the dead time does not fit the machine's history, or a number makes no sense.
+            ConfigError: the dead time does not fit the machine's history, or a number makes no
+                sense.
         """
         return LagModel(self, machine, num_envs, device)
 
@@ -43,20 +46,27 @@ class LagModel:
     """Exact solution of `time_constant * v' + v = v_full * opened(u(t - dead_time))` over each part of the control period.
 
     Attributes:
-        parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N` candidates side by side; gradients
-            flow to an entry that wants them until the next `reset`.
+        parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
+            candidates side by side; gradients flow to an entry that wants them until the next
+            `reset`.
     """
 
     def __init__(self, config: Lag, machine: Machine, num_envs: int, device: torch.device) -> None:
         names = ("dead_band_extend", "dead_band_retract", "gain", "time_constant_s")
-        nominal = {name: per_joint(getattr(config, name), machine, f"actuator.{name}") for name in names}
+        nominal = {
+            name: per_joint(getattr(config, name), machine, f"actuator.{name}") for name in names
+        }
         dead_time_s = machine.dead_time_s if config.dead_time_s is None else config.dead_time_s
         nominal["dead_time_s"] = per_joint(dead_time_s, machine, "actuator.dead_time_s")
         for name in names[:2]:
             if ((nominal[name] < 0) | (nominal[name] >= 1)).any():
-                raise ConfigError(f"actuator.{name}: expected dead bands in [0, 1), got {nominal[name].tolist()}")
+                raise ConfigError(
+                    f"actuator.{name}: expected dead bands in [0, 1), got {nominal[name].tolist()}"
+                )
         if (nominal["time_constant_s"] < 0).any():
-            raise ConfigError(f"actuator.time_constant_s: expected 0 or more, got {nominal['time_constant_s'].tolist()}")
+            raise ConfigError(
+                f"actuator.time_constant_s: expected 0 or more, got {nominal['time_constant_s'].tolist()}"
+            )
         longest_s = nominal["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
         check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
         self._parameters = Parameters(nominal, config.spread, num_envs, device, "actuator.spread")
@@ -88,14 +98,27 @@ class LagModel:
         earlier, later, part = commands_in_force(history.u, value["dead_time_s"] / self._period_s)
         q = history.q[:, -1]
         # a free run may begin in the middle of a motion; at rest the history is level
-        speed = torch.where(self._fresh.clone()[:, None], (q - history.q[:, -2]) / self._period_s, self._speed)
-        for u, duration_s in ((earlier, part * self._period_s), (later, (1.0 - part) * self._period_s)):
-            target = opened(u, value["dead_band_extend"], value["dead_band_retract"]) * value["gain"] * self._max_speed
-            time_constant_s = value["time_constant_s"].clamp(min=1e-6)  # 0 would divide by zero; a microsecond is as good
+        speed = torch.where(
+            self._fresh.clone()[:, None], (q - history.q[:, -2]) / self._period_s, self._speed
+        )
+        for u, duration_s in (
+            (earlier, part * self._period_s),
+            (later, (1.0 - part) * self._period_s),
+        ):
+            target = (
+                opened(u, value["dead_band_extend"], value["dead_band_retract"])
+                * value["gain"]
+                * self._max_speed
+            )
+            time_constant_s = value["time_constant_s"].clamp(
+                min=1e-6
+            )  # 0 would divide by zero; a microsecond is as good
             decay = torch.exp(-duration_s / time_constant_s)
             q = q + target * duration_s + (speed - target) * time_constant_s * (1.0 - decay)
             speed = target + (speed - target) * decay
         held = q.clamp(self._lower, self._upper)
-        self._speed.copy_(speed.masked_fill(held != q, 0.0))  # a joint at its stop has no speed left
+        self._speed.copy_(
+            speed.masked_fill(held != q, 0.0)
+        )  # a joint at its stop has no speed left
         self._fresh.fill_(False)
         return held

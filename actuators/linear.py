@@ -76,7 +76,8 @@ class Arx:
         """Returns the model.
 
         Raises:
-            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds NaN.
+            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
+                NaN.
         """
         path = checkpoint.found(self.checkpoint)
         tensors, _ = checkpoint.read(path, "arx", machine)
@@ -146,12 +147,19 @@ class ArxFit:
             if recording.num_samples <= size:
                 continue
             u, q = recording.u.astype(np.float64), recording.q.astype(np.float64)
-            views = [np.lib.stride_tricks.sliding_window_view(x, size, 0)[:-1] for x in (u, np.abs(u) * u)]  # (T - H, J, H)
-            increments = np.lib.stride_tricks.sliding_window_view(np.diff(q, axis=0), size - 1, 0)[:-1]
+            views = [
+                np.lib.stride_tricks.sliding_window_view(x, size, 0)[:-1]
+                for x in (u, np.abs(u) * u)
+            ]  # (T - H, J, H)
+            increments = np.lib.stride_tricks.sliding_window_view(np.diff(q, axis=0), size - 1, 0)[
+                :-1
+            ]
             rows.append(np.concatenate([*views, increments], 2))
             targets.append(q[size:] - q[size - 1 : -1])
         if not rows:
-            raise RecordingError(f"too little data: none of {len(train)} recordings is longer than the history of {size} samples")
+            raise RecordingError(
+                f"too little data: none of {len(train)} recordings is longer than the history of {size} samples"
+            )
         inputs, target = np.concatenate(rows), np.concatenate(targets)
         weight = np.zeros((machine.num_joints, inputs.shape[2]))
         for j in range(machine.num_joints):
@@ -160,5 +168,11 @@ class ArxFit:
             gram = (x / scale).T @ (x / scale) / len(x) + self.ridge * np.eye(x.shape[1])
             weight[j] = np.linalg.solve(gram, (x / scale).T @ target[:, j] / len(x)) / scale
         path = folder / f"{self.name}.safetensors"
-        checkpoint.write(path, "arx", machine, {"weight": torch.as_tensor(weight, dtype=torch.float32)}, {"ridge": self.ridge})
+        checkpoint.write(
+            path,
+            "arx",
+            machine,
+            {"weight": torch.as_tensor(weight, dtype=torch.float32)},
+            {"ridge": self.ridge},
+        )
         return Arx(checkpoint=str(path))

@@ -24,7 +24,8 @@ class Mlp:
         """Returns a model for any number of environments on `device`.
 
         Raises:
-            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds NaN.
+            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
+                NaN.
         """
         return NetworkModel(load(self.checkpoint, "mlp", machine).to(device), machine, device)
 
@@ -60,9 +61,16 @@ def load(name: str, kind: str, machine: Machine) -> JointNetworks:
     """
     path = checkpoint.found(name)
     tensors, header = checkpoint.read(path, kind, machine)
-    networks = JointNetworks(machine.num_joints, machine.num_history, int(header.get("width", 0)), coupled=kind == "coupled")
+    networks = JointNetworks(
+        machine.num_joints,
+        machine.num_history,
+        int(header.get("width", 0)),
+        coupled=kind == "coupled",
+    )
     try:
         networks.load_state_dict(tensors)
     except RuntimeError as error:
-        raise CheckpointError(f"{path}: the tensors do not fit the network that its header describes ({error})") from error
+        raise CheckpointError(
+            f"{path}: the tensors do not fit the network that its header describes ({error})"
+        ) from error
     return networks

@@ -1,8 +1,10 @@
 """Actuator networks: a perceptron a joint, all joints computed as one.
 
-The paper feeds 13 commands and 13 positions. Here the 13 positions of a joint enter as its newest position and the 12 increments
-between them: the same information in another basis, so that the network sees speeds at full resolution instead of small
-differences of large numbers, and what it learns in one place holds in another unless the data say otherwise.
+The paper feeds 13 commands and 13 positions. Here the 13 positions of a joint enter as its newest
+position and the 12 increments
+between them: the same information in another basis, so that the network sees speeds at full
+resolution instead of small differences of large numbers, and what it learns in one place holds in
+another unless the data say otherwise.
 
 Axes: `J` joints, `B` batch, `H` history, `K` steps.
 """
@@ -14,16 +16,19 @@ import torch
 from torch import nn
 
 COUPLING_WIDTH = 16
-"""Hidden units a joint of `SharedFlow` and `Load`: a delayed curve of the command and a smooth function of the pose need few."""
+"""Hidden units a joint of `SharedFlow` and `Load`: a delayed curve of the command and a smooth
+function of the pose need few."""
 
 
 class SharedFlow(nn.Module):
     """What is left of each joint's flow when together they ask for more than the pump gives.
 
-    Each joint's demand is a small perceptron of its own commands, in units of the pump's flow. Its last weights are positive (by
-    their logarithm): a ReLU in their place dies where recordings of single joints, which never lack flow, abound. All joints get
-    the part `min(1, 1 / sum of demands)`, with a rounded corner whose sharpness is learned. A bottleneck like that of the machine:
-    from few moments of shortage, in which only some joints take part, it holds for all combinations of joints.
+    Each joint's demand is a small perceptron of its own commands, in units of the pump's flow. Its
+    last weights are positive (by their logarithm): a ReLU in their place dies where recordings of
+    single joints, which never lack flow, abound. All joints get the part `min(1, 1 / sum of
+    demands)`, with a rounded corner whose sharpness is learned. A bottleneck like that of the
+    machine: from few moments of shortage, in which only some joints take part, it holds for all
+    combinations of joints.
 
     Args:
         num_joints: Number of joints, `J`.
@@ -31,12 +36,21 @@ class SharedFlow(nn.Module):
         generator: Draws the initial weights.
     """
 
-    def __init__(self, num_joints: int, num_history: int, generator: torch.Generator | None = None) -> None:
+    def __init__(
+        self, num_joints: int, num_history: int, generator: torch.Generator | None = None
+    ) -> None:
         super().__init__()
-        self.weight = nn.Parameter(_uniform(num_joints, num_history, COUPLING_WIDTH, generator=generator))
-        self.bias = nn.Parameter(_uniform(num_joints, 1, COUPLING_WIDTH, fan_in=num_history, generator=generator))
-        # summed up, a full command asks for about half of the pump: close enough to a shortage to learn from it
-        self.log_share = nn.Parameter(torch.full((num_joints, COUPLING_WIDTH, 1), math.log(2.0 / COUPLING_WIDTH)))
+        self.weight = nn.Parameter(
+            _uniform(num_joints, num_history, COUPLING_WIDTH, generator=generator)
+        )
+        self.bias = nn.Parameter(
+            _uniform(num_joints, 1, COUPLING_WIDTH, fan_in=num_history, generator=generator)
+        )
+        # summed up, a full command asks for about half of the pump: close enough to a shortage to
+        # learn from it
+        self.log_share = nn.Parameter(
+            torch.full((num_joints, COUPLING_WIDTH, 1), math.log(2.0 / COUPLING_WIDTH))
+        )
         self.log_sharpness = nn.Parameter(torch.full((1, 1, 1), 1.6))
 
     def forward(self, commands: torch.Tensor) -> torch.Tensor:
@@ -60,24 +74,31 @@ class Load(nn.Module):
 
     def __init__(self, num_joints: int, generator: torch.Generator | None = None) -> None:
         super().__init__()
-        self.weight = nn.Parameter(_uniform(num_joints, num_joints, COUPLING_WIDTH, generator=generator))
-        self.bias = nn.Parameter(_uniform(num_joints, 1, COUPLING_WIDTH, fan_in=num_joints, generator=generator))
+        self.weight = nn.Parameter(
+            _uniform(num_joints, num_joints, COUPLING_WIDTH, generator=generator)
+        )
+        self.bias = nn.Parameter(
+            _uniform(num_joints, 1, COUPLING_WIDTH, fan_in=num_joints, generator=generator)
+        )
         self.out = nn.Parameter(torch.zeros(num_joints, COUPLING_WIDTH, 2))
 
     def forward(self, position: torch.Tensor) -> torch.Tensor:
         """Returns the factors forth and back, `(J, B, 2)` in (0, 2), for normalised positions `(J, B)`."""
         seen = position.T.expand(len(position), -1, -1)
-        return 2.0 * torch.sigmoid(torch.bmm(torch.tanh(torch.baddbmm(self.bias, seen, self.weight)), self.out))
+        return 2.0 * torch.sigmoid(
+            torch.bmm(torch.tanh(torch.baddbmm(self.bias, seen, self.weight)), self.out)
+        )
 
 
 class JointNetworks(nn.Module):
     """For each joint a perceptron with two hidden ReLU layers, from `2 H` inputs to the next increment (paper, section III-A).
 
-    Where they are coupled, their outputs are multiplied by what `SharedFlow` makes of the commands of all joints, and by what
-    `Load` makes of the positions of all.
+    Where they are coupled, their outputs are multiplied by what `SharedFlow` makes of the commands
+    of all joints, and by what `Load` makes of the positions of all.
 
-    The last layer is followed by a dead zone of half width `quiet`: an increment smaller than the noise of the measurement is none.
-    A machine at rest therefore stays at rest, however long the model runs on its own predictions.
+    The last layer is followed by a dead zone of half width `quiet`: an increment smaller than the
+    noise of the measurement is none. A machine at rest therefore stays at rest, however long the
+    model runs on its own predictions.
 
     Args:
         num_joints: Number of joints, `J`.
@@ -87,7 +108,8 @@ class JointNetworks(nn.Module):
         generator: Draws the initial weights.
 
     Buffers:
-        command_scale, increment_scale, position_center, position_scale: normalisation, each `(J,)`; `quiet` `(J,)` in rad or m.
+        command_scale, increment_scale, position_center, position_scale: normalisation, each `(J,)`;
+        `quiet` `(J,)` in rad or m.
     """
 
     command_scale: torch.Tensor
@@ -97,19 +119,37 @@ class JointNetworks(nn.Module):
     quiet: torch.Tensor
 
     def __init__(
-        self, num_joints: int, num_history: int, width: int, coupled: bool = False, generator: torch.Generator | None = None
+        self,
+        num_joints: int,
+        num_history: int,
+        width: int,
+        coupled: bool = False,
+        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.num_history, self.coupled = num_history, coupled
         sizes = (2 * num_history, width, width, 1)
         weight = [_uniform(num_joints, m, n, generator=generator) for m, n in pairwise(sizes)]
-        bias = [_uniform(num_joints, 1, n, fan_in=m, generator=generator) for m, n in pairwise(sizes)]
+        bias = [
+            _uniform(num_joints, 1, n, fan_in=m, generator=generator) for m, n in pairwise(sizes)
+        ]
         self.weight = nn.ParameterList([nn.Parameter(value) for value in weight])
         self.bias = nn.ParameterList([nn.Parameter(value) for value in bias])
         self.flow = SharedFlow(num_joints, num_history, generator) if coupled else None
         self.load = Load(num_joints, generator) if coupled else None
-        for name in ("command_scale", "increment_scale", "position_center", "position_scale", "quiet"):
-            self.register_buffer(name, torch.zeros(num_joints) if name in ("position_center", "quiet") else torch.ones(num_joints))
+        for name in (
+            "command_scale",
+            "increment_scale",
+            "position_center",
+            "position_scale",
+            "quiet",
+        ):
+            self.register_buffer(
+                name,
+                torch.zeros(num_joints)
+                if name in ("position_center", "quiet")
+                else torch.ones(num_joints),
+            )
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """Returns normalised increments `(J, B)` before the dead zone, for normalised inputs `(J, B, 2 H)`."""
@@ -127,7 +167,9 @@ class JointNetworks(nn.Module):
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
         return torch.cat([commands, increments, self._position(q[..., -1])[..., None]], 2)
 
-    def roll_out(self, u: torch.Tensor, q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
+    def roll_out(
+        self, u: torch.Tensor, q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor
+    ) -> torch.Tensor:
         """Runs freely on its own predictions.
 
         The part of the first layer that sees commands is computed for all steps at once.
@@ -146,7 +188,11 @@ class JointNetworks(nn.Module):
         seen = (u / self.command_scale[:, None, None]).unfold(2, size, 1)  # (J, B, K, H)
         steps = seen.shape[2]
         seen = seen.reshape(num_joints, batch * steps, size)
-        from_commands = torch.baddbmm(self.bias[0], seen, of_command).view(num_joints, batch, steps, -1).unbind(2)
+        from_commands = (
+            torch.baddbmm(self.bias[0], seen, of_command)
+            .view(num_joints, batch, steps, -1)
+            .unbind(2)
+        )
         shares = None if self.flow is None else self.flow(seen).view(batch, steps).unbind(1)
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
         at, path = q[..., -1], []
@@ -154,8 +200,12 @@ class JointNetworks(nn.Module):
             position = self._position(at)
             state = torch.cat([increments, position[..., None]], 2)
             output = self._head(torch.baddbmm(from_commands[k], state, of_state))
-            moved = self._moved(self._hindered(output, position, None if shares is None else shares[k]))
-            at = torch.addcmul(at, moved, self.increment_scale[:, None]).clamp(lower[:, None], upper[:, None])
+            moved = self._moved(
+                self._hindered(output, position, None if shares is None else shares[k])
+            )
+            at = torch.addcmul(at, moved, self.increment_scale[:, None]).clamp(
+                lower[:, None], upper[:, None]
+            )
             increments = torch.cat([increments[..., 1:], moved[..., None]], 2)
             path.append(at)
         return torch.stack(path, 2)
@@ -165,7 +215,9 @@ class JointNetworks(nn.Module):
         hidden = torch.relu(torch.baddbmm(self.bias[1], torch.relu(hidden), self.weight[1]))
         return torch.baddbmm(self.bias[2], hidden, self.weight[2]).squeeze(2)
 
-    def _hindered(self, output: torch.Tensor, position: torch.Tensor, share: torch.Tensor | None) -> torch.Tensor:
+    def _hindered(
+        self, output: torch.Tensor, position: torch.Tensor, share: torch.Tensor | None
+    ) -> torch.Tensor:
         """Returns what flow (`share`, `(B,)`) and load leave of outputs `(J, B)` at normalised positions `(J, B)`."""
         if self.load is None:
             return output
@@ -182,6 +234,10 @@ class JointNetworks(nn.Module):
         return (q - self.position_center[:, None]) / self.position_scale[:, None]
 
 
-def _uniform(num_joints: int, *shape: int, fan_in: int | None = None, generator: torch.Generator | None) -> torch.Tensor:
+def _uniform(
+    num_joints: int, *shape: int, fan_in: int | None = None, generator: torch.Generator | None
+) -> torch.Tensor:
     """Draws weights `(J, …)` as `torch.nn.Linear` does."""
-    return (torch.rand(num_joints, *shape, generator=generator) * 2.0 - 1.0) / (fan_in or shape[0]) ** 0.5
+    return (torch.rand(num_joints, *shape, generator=generator) * 2.0 - 1.0) / (
+        fan_in or shape[0]
+    ) ** 0.5

@@ -3,15 +3,17 @@
 One control period, for a proposal `p` that is shown during it:
 
     attention    looks at the display every `attention_s` and goes on with what was seen last
-    reaction     what was seen acts `delay_s` later; within the period where it changes, to the fraction
-    choice       an exclusive joint or the others, whichever is asked for more; of those the `joints_at_once` largest, and a lever
+    reaction     what was seen acts `delay_s` later; within the period where it changes, to the
+    fraction choice       an exclusive joint or the others, whichever is asked for more; of those
+    the `joints_at_once` largest, and a lever
                  once taken is kept for `grip_s`: nobody changes hands twenty times a second
-    hand         first-order lag `lag_s` towards it, integrated exactly; a lever that is let go springs back
-    amplitude    gain, tremor, the lever's dead zone, the lever's stops
+    hand         first-order lag `lag_s` towards it, integrated exactly; a lever that is let go
+    springs back amplitude    gain, tremor, the lever's dead zone, the lever's stops
 
-The command of a period is the lever's mean over it, as a logger of 20 Hz would have it. Delay and lag are the usual range of
-compensatory tracking (McRuer et al., AFFDL-TR-65-15, 1965: 0.1 to 0.4 s and 0.1 to 0.2 s), intermittent attention is that of Loram
-et al. (J. Physiol. 589, 2011), tremor in proportion to what is done that of Harris and Wolpert (Nature 394, 1998).
+The command of a period is the lever's mean over it, as a logger of 20 Hz would have it. Delay and
+lag are the usual range of compensatory tracking (McRuer et al., AFFDL-TR-65-15, 1965: 0.1 to 0.4 s
+and 0.1 to 0.2 s), intermittent attention is that of Loram et al. (J. Physiol. 589, 2011), tremor in
+proportion to what is done that of Harris and Wolpert (Nature 394, 1998).
 """
 
 from __future__ import annotations
@@ -46,9 +48,11 @@ class Person:
         attention_s: Time between two looks at the display; 0: never looks away.
         gain: Deflection over the one asked for.
         tremor: Standard deviation of the deflection, as a part of it; new in each control period.
-        dead_zone: Deflection below which a lever commands nothing; a full one still commands fully. May be given by joint.
+        dead_zone: Deflection below which a lever commands nothing; a full one still commands fully.
+            May be given by joint.
         joints_at_once: Levers moved at the same time, the largest first; `null`: all.
-        grip_s: Time for which a lever once taken is kept, as long as it is asked for, before a larger request draws the hand away.
+        grip_s: Time for which a lever once taken is kept, as long as it is asked for, before a
+            larger request draws the hand away.
     """
 
     delay_s: Range
@@ -74,7 +78,9 @@ class Person:
     def check(self) -> None:
         low, high = self.levers(1)
         if not 1 <= low <= high:
-            raise ConfigError(f"follower.joints_at_once: expected 1 or more, a range of it, or null, got {self.joints_at_once}")
+            raise ConfigError(
+                f"follower.joints_at_once: expected 1 or more, a range of it, or null, got {self.joints_at_once}"
+            )
 
     def levers(self, num_joints: int) -> tuple[int, int]:
         """Returns the smallest and largest number of levers moved at once, on a machine of `num_joints`."""
@@ -97,20 +103,28 @@ class PersonModel:
         state: What each person has seen and holds, who it is, and where its draws stand.
     """
 
-    def __init__(self, person: Person, machine: Machine, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self, person: Person, machine: Machine, num_envs: int, device: torch.device
+    ) -> None:
         self._period_s = machine.period_s
         self._exclusive = torch.as_tensor(machine.is_exclusive, device=device)
         self._levers = person.levers(machine.num_joints)
         fields = {name: getattr(person, name) for name in person.numbers}
         low, high = self._levers
-        if low < high:  # the whole numbers are equally likely: each is the middle of an interval of its own
+        if (
+            low < high
+        ):  # the whole numbers are equally likely: each is the middle of an interval of its own
             fields["joints_at_once"] = (low - 0.5, high + 0.5)
         else:
             fields["joints_at_once"] = float(low)
-        numbers = person.numbers | {"joints_at_once": Number("1", None, 2.0, (0.0, math.inf), per_joint=False)}
+        numbers = person.numbers | {
+            "joints_at_once": Number("1", None, 2.0, (0.0, math.inf), per_joint=False)
+        }
         self._trembles = person.tremor not in (0.0, (0.0, 0.0))
         salt = zlib.crc32(b"follower")
-        self._ranges = Ranges(fields, numbers, "all", machine, num_envs, device, self._trembles, salt, "follower")
+        self._ranges = Ranges(
+            fields, numbers, "all", machine, num_envs, device, self._trembles, salt, "follower"
+        )
         longest_s = person.delay_s[1] if isinstance(person.delay_s, tuple) else person.delay_s
         num_seen = math.ceil(longest_s / machine.period_s - 1e-6) + 2
         shape = (num_envs, machine.num_joints)
@@ -130,7 +144,9 @@ class PersonModel:
         self.state["hand"].masked_fill_(mask[:, None], 0.0)
         self.state["held_s"].masked_fill_(mask[:, None], 0.0)
         looking = self._ranges.value["attention_s"] / self._period_s
-        self.state["since_look"].copy_(torch.where(mask[:, None], looking, self.state["since_look"]))
+        self.state["since_look"].copy_(
+            torch.where(mask[:, None], looking, self.state["since_look"])
+        )
 
     def step(self, proposed: torch.Tensor) -> torch.Tensor:
         """Returns the command given during the coming period, `(N, J)`, where `proposed`, `(N, J)`, is shown."""
@@ -146,7 +162,9 @@ class PersonModel:
         if self._trembles:
             counter = self._ranges.advance()
             assert counter is not None
-            deflection = deflection * (1.0 + value["tremor"] * draw.normal(counter, CHANCE, proposed.shape[1]))
+            deflection = deflection * (
+                1.0 + value["tremor"] * draw.normal(counter, CHANCE, proposed.shape[1])
+            )
         return opened(deflection.clamp(-1.0, 1.0), value["dead_zone"], value["dead_zone"])
 
     def _look(self, proposed: torch.Tensor) -> None:
@@ -154,7 +172,8 @@ class PersonModel:
         seen, since = self.state["seen"], self.state["since_look"]
         between = self._ranges.value["attention_s"] / self._period_s
         looks = since >= between - 1e-4
-        # what is over counts towards the next look, so that looks are `attention_s` apart on average
+        # what is over counts towards the next look, so that looks are `attention_s` apart on
+        # average
         since.copy_(torch.where(looks, (since - between).clamp(0.0, 1.0), since) + 1.0)
         newest = torch.where(looks, proposed, seen[:, -1])
         seen.copy_(seen.roll(-1, 1))
@@ -176,7 +195,9 @@ class PersonModel:
         held_s.copy_(torch.where(held & taken, held_s + self._period_s, 0.0))
         return held
 
-    def _reach(self, hand: torch.Tensor, target: torch.Tensor, part: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _reach(
+        self, hand: torch.Tensor, target: torch.Tensor, part: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns where the hand is after `part` of a period on its way to `target`, and what that adds to the period's mean."""
         lag = self._ranges.value["lag_s"] / self._period_s
         left = torch.exp(-part / lag.clamp(min=1e-9))

@@ -16,18 +16,23 @@ def check_dead_time(longest_s: float, machine: Machine, where: str) -> None:
         )
 
 
-def commands_in_force(u: torch.Tensor, delay_periods: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def commands_in_force(
+    u: torch.Tensor, delay_periods: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Splits the coming control period at the moment when the delayed command changes.
 
-    A command is held for one period, so with a dead time of `n + f` periods the valve sees the command of `n + 1` periods ago for
-    the first part `f` of the period and that of `n` periods ago for the rest. Nothing is interpolated: this is exact.
+    A command is held for one period, so with a dead time of `n + f` periods the valve sees the
+    command of `n + 1` periods ago for
+    the first part `f` of the period and that of `n` periods ago for the rest. Nothing is
+    interpolated: this is exact.
 
     Args:
         u: Command history, shape `(N, H, J)`, newest last.
         delay_periods: Dead time in control periods, shape `(N, J)`, in [0, H - 1].
 
     Returns:
-        The earlier command, the later command, and the part of the period in which the earlier one acts, each `(N, J)`.
+        The earlier command, the later command, and the part of the period in which the earlier one
+        acts, each `(N, J)`.
     """
     last = u.shape[1] - 1
     # half a millionth of a period forgives 0.55 / 0.05 = 11.000000000000002
@@ -39,7 +44,9 @@ def commands_in_force(u: torch.Tensor, delay_periods: torch.Tensor) -> tuple[tor
     return earlier, later, part
 
 
-def opened(u: torch.Tensor, dead_band_extend: torch.Tensor, dead_band_retract: torch.Tensor) -> torch.Tensor:
+def opened(
+    u: torch.Tensor, dead_band_extend: torch.Tensor, dead_band_retract: torch.Tensor
+) -> torch.Tensor:
     """Returns how far the valve is open, shape of `u`, in [-1, 1]: zero inside the dead band, one at full command each way."""
     extend = torch.relu(u - dead_band_extend) / (1.0 - dead_band_extend)
     retract = torch.relu(-u - dead_band_retract) / (1.0 - dead_band_retract)

@@ -1,7 +1,8 @@
 """Fits `actuators.valve` in seconds: positions hardly feed back into the speed, so the speed is fitted as a function of commands.
 
-The model is driven by recorded commands and, for the pose, recorded positions; increments of `WIDTH` samples are compared. For
-given dead time, play and lags the curves are a linear least-squares problem; pose and pump follow in a few turns.
+The model is driven by recorded commands and, for the pose, recorded positions; increments of
+`WIDTH` samples are compared. For given dead time, play and lags the curves are a linear
+least-squares problem; pose and pump follow in a few turns.
 Axes: `R` recordings, `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments.
 """
 
@@ -32,11 +33,13 @@ class ValveFit:
     """Fits the valve curve and all other numbers of `actuator=valve`.
 
     Attributes:
-        name: Name of the model in tables and of the file that it leaves, `<name>.yaml`, an option for `actuator=@…`.
+        name: Name of the model in tables and of the file that it leaves, `<name>.yaml`, an option
+            for `actuator=@…`.
         actuator: The model; its knots are kept.
         longest_lag_s: Upper bound of each lag.
         sweeps: Turns of curve, pose and pump.
-        iterations: Steps of each of the two searches for dead time, play and lags, joint by joint; the second knows pose and pump.
+        iterations: Steps of each of the two searches for dead time, play and lags, joint by joint;
+            the second knows pose and pump.
     """
 
     name: str
@@ -73,13 +76,22 @@ class ValveFit:
             for turn, j in progress.track(rounds, description=f"{self.name}: dead times and lags"):
                 if turn and known is None:
                     known = data.factors(data.statics(dynamics, self.sweeps), dynamics)
-                dynamics[j] = self._dynamics(data, j, known[j] if known else None, dynamics[j] if turn else None)
+                dynamics[j] = self._dynamics(
+                    data, j, known[j] if known else None, dynamics[j] if turn else None
+                )
         fitted = self._spec(data, dynamics)
         facts = {key: _plain(value) for key, value in dataclasses.asdict(fitted).items()}  # pyright: ignore[reportArgumentType]
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            text = yaml.safe_dump({"_target_": f"{Valve.__module__}.{Valve.__name__}", **facts}, sort_keys=False, width=130)
-            write_text(folder / f"{self.name}.yaml", f"# fitted to {len(data.recordings)} recordings of {machine.name}\n{text}")
+            text = yaml.safe_dump(
+                {"_target_": f"{Valve.__module__}.{Valve.__name__}", **facts},
+                sort_keys=False,
+                width=130,
+            )
+            write_text(
+                folder / f"{self.name}.yaml",
+                f"# fitted to {len(data.recordings)} recordings of {machine.name}\n{text}",
+            )
         except OSError as error:
             raise StorageError(f"cannot write into {folder}: {error.strerror or error}") from error
         return fitted
@@ -90,27 +102,43 @@ class ValveFit:
         dynamics = np.array([[column[name] for column in columns] for name in machine.joint_names])
         assert isinstance(fitted.demand, dict), "a fitted actuator has numbers by joint"
         demand = np.array([fitted.demand[name] for name in machine.joint_names])
-        return self._spec(Speeds(recordings, machine, np.array(self.actuator.knots)), dynamics, demand)
+        return self._spec(
+            Speeds(recordings, machine, np.array(self.actuator.knots)), dynamics, demand
+        )
 
-    def _dynamics(self, data: Speeds, j: int, known: Sequence[np.ndarray] | None, start: np.ndarray | None) -> np.ndarray:
+    def _dynamics(
+        self, data: Speeds, j: int, known: Sequence[np.ndarray] | None, start: np.ndarray | None
+    ) -> np.ndarray:
         """Returns dead time, play, spool lag and speed lag of joint `j` that explain its increments best.
 
         Args:
             data: The recordings.
             j: The joint.
-            known: Factor on the speed, from pose and pump, of each recording; `None` while they are not known.
+            known: Factor on the speed, from pose and pump, of each recording; `None` while they are
+                not known.
             start: Where the search begins; `None`: at the best dead time.
         """
         machine = data.machine
-        most = np.array([(machine.num_history - 2) * machine.period_s, PLAYS[-1], self.longest_lag_s, self.longest_lag_s])
+        most = np.array(
+            [
+                (machine.num_history - 2) * machine.period_s,
+                PLAYS[-1],
+                self.longest_lag_s,
+                self.longest_lag_s,
+            ]
+        )
 
         def left(x: np.ndarray) -> np.ndarray:
             features = data.features(j, x, known)
-            return (data.way[j] - features @ data.curve(features, data.way[j])) / np.sqrt(data.scale[j])
+            return (data.way[j] - features @ data.curve(features, data.way[j])) / np.sqrt(
+                data.scale[j]
+            )
 
         if start is None:
             delays = np.arange(0.0, most[0] + 1e-9, machine.period_s)
-            losses = [float(np.square(left(np.array([delay, 0.01, 0.04, 0.0]))).sum()) for delay in delays]
+            losses = [
+                float(np.square(left(np.array([delay, 0.01, 0.04, 0.0]))).sum()) for delay in delays
+            ]
             start = np.array([delays[int(np.argmin(losses))], 0.02, 0.03, 0.02])
         inside = np.clip(start, 1e-6, most - 1e-6)
         step = np.array([0.1, 0.3, 0.3, 0.3])  # of `x_scale`: above the grain of the samples
@@ -126,14 +154,19 @@ class ValveFit:
         ).x
 
     def _spec(self, data: Speeds, dynamics: np.ndarray, demand: np.ndarray | None = None) -> Valve:
-        found = data.statics(dynamics, self.sweeps if demand is None else max(1, self.sweeps // 2), demand)
+        found = data.statics(
+            dynamics, self.sweeps if demand is None else max(1, self.sweeps // 2), demand
+        )
         names, half = data.machine.joint_names, len(self.actuator.knots) - 1
 
         def table(values: np.ndarray) -> dict[str, float]:
             return {name: float(f"{value:.5g}") for name, value in zip(names, values, strict=True)}
 
         def rows(values: np.ndarray) -> dict[str, tuple[float, ...]]:
-            return {name: tuple(float(f"{v:.5g}") for v in row) for name, row in zip(names, values, strict=True)}
+            return {
+                name: tuple(float(f"{v:.5g}") for v in row)
+                for name, row in zip(names, values, strict=True)
+            }
 
         zero = np.zeros((len(names), 1))
         return dataclasses.replace(  # pyright: ignore[reportArgumentType]

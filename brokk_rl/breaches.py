@@ -1,6 +1,7 @@
 """The rules of the recording format, and every place where a file breaks one.
 
-Reading stops at the first breach; inspecting a recording lists them all. Rows count from 0; `T` is time.
+Reading stops at the first breach; inspecting a recording lists them all. Rows count from 0; `T` is
+time.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,11 +44,15 @@ def of_metadata(metadata: Mapping[str, str], machine: str) -> Iterator[Breach]:
     """Yields what is wrong with the metadata (without the prefix `brokk.`) of a recording made on the machine of that name."""
     for key in ("schema", "machine", "rate_hz"):
         if key not in metadata:
-            yield Breach(f"metadata 'brokk.{key}' is missing; not a recording, or one made by another program")
+            yield Breach(
+                f"metadata 'brokk.{key}' is missing; not a recording, or one made by another program"
+            )
     if metadata.get("schema", SCHEMA) != SCHEMA:
         yield Breach(f"brokk.schema is '{metadata['schema']}', this version reads '{SCHEMA}'")
     if metadata.get("machine", machine) != machine:
-        yield Breach(f"unknown machine '{metadata['machine']}', expected '{machine}'; choose it with machine=…")
+        yield Breach(
+            f"unknown machine '{metadata['machine']}', expected '{machine}'; choose it with machine=…"
+        )
     if "rate_hz" in metadata and rate_hz(metadata) is None:
         yield Breach(f"brokk.rate_hz is '{metadata['rate_hz']}', expected a positive number")
 
@@ -68,7 +73,9 @@ def of_names(required: Sequence[str], present: Sequence[str]) -> Iterator[Breach
             yield Breach(f"column '{name}' is missing; {choices(name, present)}", name)
 
 
-def of_columns(columns: Mapping[str, np.ndarray], required: Sequence[str], stated_hz: float) -> Iterator[Breach]:
+def of_columns(
+    columns: Mapping[str, np.ndarray], required: Sequence[str], stated_hz: float
+) -> Iterator[Breach]:
     """Yields what is wrong with the numbers.
 
     In an optional column NaN means "not measured"; everywhere else it is a breach.
@@ -98,7 +105,12 @@ def of_columns(columns: Mapping[str, np.ndarray], required: Sequence[str], state
 def _of_time(t_s: np.ndarray, stated_hz: float) -> Iterator[Breach]:
     period_s = np.diff(t_s)
     for row, count in runs(period_s <= 0):
-        yield Breach(f"time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)", "t_s", row + 1, count)
+        yield Breach(
+            f"time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)",
+            "t_s",
+            row + 1,
+            count,
+        )
     for row, count in runs((np.abs(period_s * stated_hz - 1.0) > RATE_TOLERANCE) & (period_s > 0)):
         text = (
             f"{period_s[row]:g} s after the row before, but brokk.rate_hz = {stated_hz:g} means {1.0 / stated_hz:g} s "

@@ -1,6 +1,7 @@
 """Where the tool is: forward kinematics of a serial machine over a whole recording, in numpy and double precision.
 
-For computers without torch, and where there is no hurry; `brokk_rl.kinematics` is for every step of a thousand machines.
+For computers without torch, and where there is no hurry; `brokk_rl.kinematics` is for every step of
+a thousand machines.
 
 Axes: `T` time, `J` joints; anything may stand before `J`.
 """

@@ -1,12 +1,15 @@
 """The classical controller: resolved-rate control of the tool with dead-time compensation, under the masks of the machine.
 
-It is what a user would pick instead of a learned policy, and it is the base on which the default policy learns a residual. It
-sees only what the policy sees: the measured history and the estimated target. Torch, batched, without a host synchronisation, and
-made of operations that ONNX knows, so that an exported policy carries it inside.
+It is what a user would pick instead of a learned policy, and it is the base on which the default
+policy learns a residual. It
+sees only what the policy sees: the measured history and the estimated target. Torch, batched,
+without a host synchronisation, and made of operations that ONNX knows, so that an exported policy
+carries it inside.
 
-Dead-time compensation is the idea of the Smith predictor (O. J. M. Smith, 1957): commands that were sent but have not acted yet
-are added to the measured position through a static map of the valve, and the controller acts on where the machine is going to be.
-Resolved-rate control with damped least squares follows Nakamura and Hanafusa (1986).
+Dead-time compensation is the idea of the Smith predictor (O. J. M. Smith, 1957): commands that were
+sent but have not acted yet are added to the measured position through a static map of the valve,
+and the controller acts on where the machine is going to be. Resolved-rate control with damped least
+squares follows Nakamura and Hanafusa (1986).
 """
 
 from dataclasses import dataclass
@@ -23,20 +26,24 @@ class Classical:
     """Resolved-rate control of the tool with dead-time compensation.
 
     Attributes:
-        in_flight_samples: Past commands that have not yet fully acted: dead time and lag, in control periods (may be fractional).
+        in_flight_samples: Past commands that have not yet fully acted: dead time and lag, in
+            control periods (may be fractional).
         dead_band: Command below which the static valve map gives no motion.
         gain_1_s: Speed of approach per distance left.
         top_speed_m_s: Bound on the speed of the tool point.
         top_rate_rad_s: Bound on the rate of its pitch.
-        straight: Whether what one joint cannot do slows all of them alike, so that the tool goes straight; otherwise each goes as
-            fast as it can.
-        damping: Damping of the least squares, in the same unit as the Jacobian times joint speed (m/s at full command).
+        straight: Whether what one joint cannot do slows all of them alike, so that the tool goes
+            straight; otherwise each goes as fast as it can.
+        damping: Damping of the least squares, in the same unit as the Jacobian times joint speed
+            (m/s at full command).
         rest: Share of full speed below which a joint is left alone.
-        creep: Smallest share of full speed that is commanded at all, large enough to be beyond the dead band of every valve.
+        creep: Smallest share of full speed that is commanded at all, large enough to be beyond the
+            dead band of every valve.
         hover_m: Height above the target at which the tool waits until it is aligned.
         funnel_m: Lateral error at which the descent begins and at which it is free, (outer, inner).
         margin_rad: Distance to a joint limit within which the joint is no longer driven towards it.
-        brake_s: Time in which a joint at full speed would cover the distance before that margin over which it is slowed down.
+        brake_s: Time in which a joint at full speed would cover the distance before that margin
+            over which it is slowed down.
     """
 
     in_flight_samples: float
@@ -63,13 +70,15 @@ class Guidance:
     """What the controller makes of a history and a target; `N` environments.
 
     Attributes:
-        command: Valve commands before the masks, `(N, J)` in [-1, 1]: exclusive joints as for positioning, the others as for the
-            approach.
-        error_m: Target minus predicted tool point, in the frame of the arm's plane (radial, tangential, up), `(N, 3)`.
+        command: Valve commands before the masks, `(N, J)` in [-1, 1]: exclusive joints as for
+            positioning, the others as for the approach.
+        error_m: Target minus predicted tool point, in the frame of the arm's plane (radial,
+            tangential, up), `(N, 3)`.
         pitch_error_rad: Wanted minus predicted pitch, `(N,)`.
-        goal_error_m: Waypoint minus predicted tool point, up, `(N,)`: hover height while not aligned, the final depth after.
-        reach_m: Measured distance from the first joint behind the exclusive ones to the target, turned into the arm's plane,
-            `(N,)`.
+        goal_error_m: Waypoint minus predicted tool point, up, `(N,)`: hover height while not
+            aligned, the final depth after.
+        reach_m: Measured distance from the first joint behind the exclusive ones to the target,
+            turned into the arm's plane, `(N,)`.
         reach_3d_m: The same measured in space.
         tip_z_m: Measured height of the tool point, `(N,)`.
         lowest: Commands below these would drive joints into their ends, `(N, J)` in [-1, 0].
@@ -100,12 +109,15 @@ class ClassicalController:
         self._lower = constant(machine.lower) + config.margin_rad
         self._upper = constant(machine.upper) - config.margin_rad
         self._exclusive = constant(machine.is_exclusive)
-        # the joint whose distance to the target decides about reach: the first one behind the exclusive joints (the paper's q3)
+        # the joint whose distance to the target decides about reach: the first one behind the
+        # exclusive joints (the paper's q3)
         exclusive = [i for i, e in enumerate(machine.is_exclusive) if e]
         self._reach_joint = min(exclusive[-1] + 1, machine.num_joints - 1) if exclusive else 0
         age = torch.arange(machine.num_history - 1, -1, -1, dtype=torch.float32, device=device)
         self._period_s = machine.period_s
-        self._in_flight = (config.in_flight_samples - age).clamp(0.0, 1.0)[:, None] * machine.period_s
+        self._in_flight = (config.in_flight_samples - age).clamp(0.0, 1.0)[
+            :, None
+        ] * machine.period_s
         self._damping = config.damping**2 * torch.eye(4, device=device)
 
     def rate(self, u: torch.Tensor) -> torch.Tensor:
@@ -116,12 +128,16 @@ class ClassicalController:
     def valve(self, rate: torch.Tensor) -> torch.Tensor:
         """Inverts `rate`: returns the commands for joint speeds given as a share of the full speed, clipped to [-1, 1].
 
-        Speeds too small for the valve are given as pulses of `creep`: the prediction counts a pulse as soon as it is sent, so
-        that no more of them are sent than are needed.
+        Speeds too small for the valve are given as pulses of `creep`: the prediction counts a pulse
+        as soon as it is sent, so that no more of them are sent than are needed.
         """
         band = self.config.dead_band
         size = rate.abs()
-        return rate.sign() * (band + (1.0 - band) * size.clamp(min=self.config.creep)).clamp(max=1.0) * (size > self.config.rest)
+        return (
+            rate.sign()
+            * (band + (1.0 - band) * size.clamp(min=self.config.creep)).clamp(max=1.0)
+            * (size > self.config.rest)
+        )
 
     def _opening(self, share: torch.Tensor) -> torch.Tensor:
         """Returns the largest command that is no faster than this share of full speed, `(N, J)` in [0, 1]; 0 for none."""
@@ -145,7 +161,8 @@ class ClassicalController:
             target_m: Where the tool point shall end up in the base frame, `(N, 3)`.
             pitch_rad: Wanted pitch, `(N,)`.
             reach_m: Good working range (nearest, farthest); positioning aims at its middle.
-            coming: Commands that will be given whatever is asked for now, `(N, F, J)`; `None` where nobody stands between.
+            coming: Commands that will be given whatever is asked for now, `(N, F, J)`; `None` where
+                nobody stands between.
         """
         config = self.config
         now = q[:, -1]
@@ -159,7 +176,9 @@ class ClassicalController:
         error = target_m - tip
         outer, inner = config.funnel_m
         lateral = error[:, :2].norm(dim=1)
-        goal_up = error[:, 2] + ((lateral - inner) / (outer - inner)).clamp(0.0, 1.0) * config.hover_m
+        goal_up = (
+            error[:, 2] + ((lateral - inner) / (outer - inner)).clamp(0.0, 1.0) * config.hover_m
+        )
         pitch_error = pitch_rad - pitch
         share = self.approach(jacobian.tip[0], jacobian.pitch[0], error, goal_up, pitch_error)
 
@@ -167,7 +186,10 @@ class ClassicalController:
         left = (sum(reach_m) / 2 - reach[0])[:, None] * reach_slope / (reach_slope.square() + 0.05)
         share = share + (config.gain_1_s * left * self._exclusive / self.speed).clamp(-1.0, 1.0)
         # each joint slows down before the place from which it must go no further
-        down, up = ((room / (self.speed * config.brake_s)).clamp(0.0, 1.0) for room in (ahead - self._lower, self._upper - ahead))
+        down, up = (
+            (room / (self.speed * config.brake_s)).clamp(0.0, 1.0)
+            for room in (ahead - self._lower, self._upper - ahead)
+        )
         share = torch.maximum(torch.minimum(share, up), -down)
 
         bearing = tip[:, :2] / tip[:, :2].norm(dim=1, keepdim=True).clamp(min=1e-3)
@@ -191,17 +213,33 @@ class ClassicalController:
         return reach[0], slope
 
     def approach(
-        self, tip_jacobian: torch.Tensor, pitch_jacobian: torch.Tensor, error: torch.Tensor, up: torch.Tensor, turn: torch.Tensor
+        self,
+        tip_jacobian: torch.Tensor,
+        pitch_jacobian: torch.Tensor,
+        error: torch.Tensor,
+        up: torch.Tensor,
+        turn: torch.Tensor,
     ) -> torch.Tensor:
         """Returns joint speeds as a share of full speed that bring the tool closer, `(N, J)` in [-1, 1]; exclusive joints rest."""
         config = self.config
         wanted = torch.cat((error[:, :2], up[:, None]), 1) * config.gain_1_s
-        wanted = wanted * (config.top_speed_m_s / wanted.norm(dim=1, keepdim=True).clamp(min=config.top_speed_m_s))
+        wanted = wanted * (
+            config.top_speed_m_s / wanted.norm(dim=1, keepdim=True).clamp(min=config.top_speed_m_s)
+        )
         turn = (turn * config.gain_1_s).clamp(-config.top_rate_rad_s, config.top_rate_rad_s)
-        jacobian = torch.cat((tip_jacobian, pitch_jacobian[:, None]), 1) * (self.speed * (1.0 - self._exclusive))
+        jacobian = torch.cat((tip_jacobian, pitch_jacobian[:, None]), 1) * (
+            self.speed * (1.0 - self._exclusive)
+        )
         square = product(jacobian, jacobian.transpose(1, 2)) + self._damping
-        share = product(jacobian.transpose(1, 2), _solve_4(square, torch.cat((wanted, turn[:, None]), 1)[..., None]))[..., 0]
-        return share / share.abs().amax(1, keepdim=True).clamp(min=1.0) if config.straight else share.clamp(-1.0, 1.0)
+        share = product(
+            jacobian.transpose(1, 2),
+            _solve_4(square, torch.cat((wanted, turn[:, None]), 1)[..., None]),
+        )[..., 0]
+        return (
+            share / share.abs().amax(1, keepdim=True).clamp(min=1.0)
+            if config.straight
+            else share.clamp(-1.0, 1.0)
+        )
 
     def _reach(self, pose: ToolPose, target_m: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Returns reach `(M, N)`, the slope of its first row over joint positions `(N, J)`, and the distance in space `(M, N)`."""

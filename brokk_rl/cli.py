@@ -19,7 +19,12 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import ConfigCompositionException, HydraException, InstantiationException, MissingConfigException
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    InstantiationException,
+    MissingConfigException,
+)
 from hydra.types import RunMode
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -43,11 +48,17 @@ def main() -> int:
     """Runs the command and returns its exit code: 0 done, 1 our own fault, 2 something the user can mend, 130 interrupted."""
     trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
     set_up_logging()
-    # our options of submitit's launchers bear its own names, as everyone knows them; Hydra warns of it three times
-    warnings.filterwarnings("ignore", message=r"\s*'hydra/launcher/\w+' is validated against ConfigStore schema")
-    # before torch is loaded: beside other work its threads, if they wait spinning, make an update thirty times slower
+    # our options of submitit's launchers bear its own names, as everyone knows them; Hydra warns of
+    # it three times
+    warnings.filterwarnings(
+        "ignore", message=r"\s*'hydra/launcher/\w+' is validated against ConfigStore schema"
+    )
+    # before torch is loaded: beside other work its threads, if they wait spinning, make an update
+    # thirty times slower
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a run that a scheduler stops ends like one stopped by hand
+    signal.signal(
+        signal.SIGTERM, signal.default_int_handler
+    )  # a run that a scheduler stops ends like one stopped by hand
     try:
         with _hydra_raises():
             extensions.register(sys.argv[1:])
@@ -62,7 +73,9 @@ def main() -> int:
         message = explain(cause)
         if trace or message is None:
             traceback.print_exception(cause)
-        if message is not None and (_speaks() or not isinstance(cause, ConfigError)):  # the first has said what is wrong for all
+        if message is not None and (
+            _speaks() or not isinstance(cause, ConfigError)
+        ):  # the first has said what is wrong for all
             sys.stderr.write(f"error: {message}\n")
         return 1 if message is None else 2
     return 0
@@ -80,7 +93,8 @@ def job(cfg: DictConfig) -> float | None:
         message = explain(error)
         if message is None:
             raise
-        # the other jobs go on; Hydra repeats only the first error, at the end, and from another process it comes without its cause
+        # the other jobs go on; Hydra repeats only the first error, at the end, and from another
+        # process it comes without its cause
         log.error("job %s failed: %s", HydraConfig.get().job.num, message)
         raise BrokkError(message) from error
 
@@ -103,11 +117,14 @@ def _run(cfg: DictConfig) -> float | None:
         resume = bool(before or getattr(mode, "resume", None))
         with mode.session.start(resolved, _facts(cfg, mode), resume) as record:
             objective = mode.run()
-            record.fields["objective"] = objective if objective is not None and math.isfinite(objective) else None
+            record.fields["objective"] = (
+                objective if objective is not None and math.isfinite(objective) else None
+            )
             return objective
     except Exception:
         if sweep:
-            # made by Hydra, in several levels where an override holds a path; what the job or the sweep has written into stays
+            # made by Hydra, in several levels where an override holds a path; what the job or the
+            # sweep has written into stays
             remove_empty([folder, *folder.parents])
         raise
 
@@ -123,7 +140,8 @@ def _speaks() -> bool:
 def _taken_in(cfg: DictConfig) -> DictConfig:
     """Returns the configuration without groups that are only taken in by another node (`actuator: ${actuator}`), not by the mode.
 
-    So an option can bring groups of its own, such as `link=simulated` the actuator that it simulates, to be chosen like any other.
+    So an option can bring groups of its own, such as `link=simulated` the actuator that it
+    simulates, to be chosen like any other.
     """
     taken = {name for name in re.findall(r"\$\{(\w+)\}", OmegaConf.to_yaml(cfg)) if name in cfg}
     if not taken:
@@ -139,7 +157,11 @@ def _facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
     settings = HydraConfig.get()
     made = OmegaConf.to_container(settings.runtime.choices)
     assert isinstance(made, dict)
-    chosen = {str(key): value for key, value in made.items() if value and str(key).split("/")[0] != "hydra"}
+    chosen = {
+        str(key): value
+        for key, value in made.items()
+        if value and str(key).split("/")[0] != "hydra"
+    }
     overrides = list(settings.overrides.task)
     for override in overrides:
         key, _, value = override.partition("=")
@@ -167,8 +189,15 @@ def run_folder(cfg: DictConfig) -> Path:
 
 def set_up_logging() -> None:
     """Shows log records to a person, on stderr; does nothing where someone has set up logging already."""
-    handler = RichHandler(console=Console(stderr=True), show_path=False, log_time_format="%H:%M:%S", omit_repeated_times=False)
-    logging.basicConfig(level=logging.INFO if _speaks() else logging.ERROR, format="%(message)s", handlers=[handler])
+    handler = RichHandler(
+        console=Console(stderr=True),
+        show_path=False,
+        log_time_format="%H:%M:%S",
+        omit_repeated_times=False,
+    )
+    logging.basicConfig(
+        level=logging.INFO if _speaks() else logging.ERROR, format="%(message)s", handlers=[handler]
+    )
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # tells of its font cache otherwise
 
 
@@ -181,7 +210,9 @@ def explain(error: BaseException) -> str | None:
     if full:
         where = f" ({full.filename})" if full.filename else ""
         return f"the disk is full{where}. Free some space, or choose another disk with session.out=<folder>."
-    if any(type(e).__name__ == "OutOfMemoryError" for e in chain):  # torch's, without importing torch for it
+    if any(
+        type(e).__name__ == "OutOfMemoryError" for e in chain
+    ):  # torch's, without importing torch for it
         return f"the memory of the GPU is full: use fewer environments, or session.device=cpu ({error})"
     if ours:
         return f"{ours}{_node(error)}"
@@ -194,7 +225,9 @@ def explain(error: BaseException) -> str | None:
         return _bad_node(error)
     if isinstance(error, ConfigCompositionException):
         return _bad_override(error)
-    if isinstance(error, (HydraException, OmegaConfBaseException)) or str(error).startswith("Config group override must"):
+    if isinstance(error, (HydraException, OmegaConfBaseException)) or str(error).startswith(
+        "Config group override must"
+    ):
         return str(error)
     return None
 
@@ -211,7 +244,9 @@ def _no_such_option(error: MissingConfigException) -> str:
         return str(error).split("\nConfig search path")[0]
     if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
         return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
-    offered = error.options or [option.name for option in registry.options() if option.group == group]  # Hydra: none for a list
+    offered = error.options or [
+        option.name for option in registry.options() if option.group == group
+    ]  # Hydra: none for a list
     if not offered:
         return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
     return f"there is no {group}={name}; {choices(name, offered)}"
@@ -233,7 +268,11 @@ def _bad_node(error: InstantiationException) -> str:
 
 def _node(error: BaseException) -> str:
     """Returns where in the configuration an object could not be built, as the tail of a message."""
-    found = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, InstantiationException) else None
+    found = (
+        re.search(r"full_key: (\S+)", str(error))
+        if isinstance(error, InstantiationException)
+        else None
+    )
     return f" (in '{found[1]}': change {found[1]}.<field>=… or its file)" if found else ""
 
 
@@ -243,7 +282,11 @@ def _bad_override(error: ConfigCompositionException) -> str:
     found = re.search(r"(?:In '([^']+)': )?Could not override '([^']+)'", text)
     if not found:
         text = "\n".join(filter(None, (text, str(error.__cause__ or ""))))
-        if mixed := re.search(r"override ([\w.]+)=.*Cannot merge (?:Dict|List)Config with (?:Dict|List)Config", text, re.DOTALL):
+        if mixed := re.search(
+            r"override ([\w.]+)=.*Cannot merge (?:Dict|List)Config with (?:Dict|List)Config",
+            text,
+            re.DOTALL,
+        ):
             return (
                 f"{mixed[1]} holds a list and you gave a table, or the reverse; Hydra puts neither in the place of the other. Take "
                 f"the old value away, '~{mixed[1]}' '+{mixed[1]}=…', or give the option as a file, <group>=@<path>."
@@ -251,15 +294,23 @@ def _bad_override(error: ConfigCompositionException) -> str:
         return text
     where, key = found[1], found[2].split("@")[0]
     source = f"{where} changes" if where and where != "config" else "you gave"
-    with contextlib.suppress(Exception):  # the mode itself may not compose; then the short answer must do
+    with contextlib.suppress(
+        Exception
+    ):  # the mode itself may not compose; then the short answer must do
         cfg = _mode_alone()
-        if "No match in the defaults list" in text or key in {option.group for option in registry.options()}:
+        if "No match in the defaults list" in text or key in {
+            option.group for option in registry.options()
+        }:
             groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra")]
             return f"{source} '{key}', but mode={_mode_name(cfg)} does not use such a group; {choices(key, groups)}"
         parent, _, leaf = key.rpartition(".")
         while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:
             parent, _, leaf = parent.rpartition(".")
-        names = [str(k) for k in node if str(k) not in ("hydra", "_target_")] if isinstance(node, DictConfig) else []
+        names = (
+            [str(k) for k in node if str(k) not in ("hydra", "_target_")]
+            if isinstance(node, DictConfig)
+            else []
+        )
         return f"{source} '{key}', but '{parent or f'mode={_mode_name(cfg)}'}' has no '{leaf}'; {choices(leaf, names)}"
     return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --cfg job` shows what it has"
 
@@ -280,8 +331,9 @@ def _resolved(cfg: DictConfig) -> str:
     values = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
     values.session.out = "???"
     settings = {"defaults": [{"hydra": "brokk"}, "_self_"]}
-    return "# Runs again: brokk --config-dir <this folder> --config-name resolved\n" + OmegaConf.to_yaml(
-        OmegaConf.merge(settings, values)
+    return (
+        "# Runs again: brokk --config-dir <this folder> --config-name resolved\n"
+        + OmegaConf.to_yaml(OmegaConf.merge(settings, values))
     )
 
 

@@ -1,9 +1,11 @@
 """CSV logs of other machines: which column means what, and the recordings that come of it.
 
-A log is cut at its gaps and each piece is brought to the machine's rate: positions linearly between samples, commands as the value
-in force (zero-order hold). Pieces of one log share the metadata `run`, so that no split into fit and test goes through a log.
+A log is cut at its gaps and each piece is brought to the machine's rate: positions linearly between
+samples, commands as the value in force (zero-order hold). Pieces of one log share the metadata
+`run`, so that no split into fit and test goes through a log.
 
-Rows in messages are those of the log's data, from 0 as in recordings, beside the line of the file that an editor shows.
+Rows in messages are those of the log's data, from 0 as in recordings, beside the line of the file
+that an editor shows.
 """
 
 import csv
@@ -46,7 +48,8 @@ class CommandColumn:
     Attributes:
         column: Its name in the header.
         neutral: Value without motion.
-        full_plus: Value of full command towards larger positions; may lie below `neutral`, which turns the sign.
+        full_plus: Value of full command towards larger positions; may lie below `neutral`, which
+            turns the sign.
         full_minus: Value of full command towards smaller positions.
     """
 
@@ -91,7 +94,8 @@ class ColumnMap:
         decimal: Decimal sign of its numbers.
         time: Time, to s; its zero does not matter.
         joints: Columns of each joint of the machine, by joint name.
-        optional: Further columns, by their name in the recording (`ee_x_m`, `force_n`, …); interpolated like positions.
+        optional: Further columns, by their name in the recording (`ee_x_m`, `force_n`, …);
+            interpolated like positions.
         overrun: Command beyond full that is taken for rounding and cut to full; more is refused.
         longest_gap_s: A longer time between two rows splits the log.
         shortest_s: Shorter pieces are left out.
@@ -108,9 +112,13 @@ class ColumnMap:
 
     def check(self) -> None:
         if self.delimiter == self.decimal:
-            raise ConfigError(f"column map: '{self.decimal}' cannot be both delimiter and decimal sign")
+            raise ConfigError(
+                f"column map: '{self.decimal}' cannot be both delimiter and decimal sign"
+            )
         if self.overrun < 0 or self.longest_gap_s <= 0 or self.shortest_s < 0:
-            raise ConfigError("column map: expected overrun >= 0, longest_gap_s > 0 and shortest_s >= 0")
+            raise ConfigError(
+                "column map: expected overrun >= 0, longest_gap_s > 0 and shortest_s >= 0"
+            )
         if self.time.scale <= 0:
             raise ConfigError(f"column map: time.scale {self.time.scale:g} must be positive")
 
@@ -130,20 +138,39 @@ class ColumnMap:
         t_s = table.numbers(self.time)
         if (row := _first(np.diff(t_s) <= 0)) is not None:
             where = table.where(row + 1, self.time.column)
-            raise RecordingError(f"{where}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)")
-        u = np.stack([self._commands(table, self.joints[name].command) for name in machine.joint_names], 1)
+            raise RecordingError(
+                f"{where}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)"
+            )
+        u = np.stack(
+            [self._commands(table, self.joints[name].command) for name in machine.joint_names], 1
+        )
         q = np.stack([table.numbers(self.joints[name].position) for name in machine.joint_names], 1)
         extra = {name: table.numbers(column, empty=True) for name, column in self.optional.items()}
-        pieces = np.split(np.arange(len(t_s)), np.flatnonzero(np.diff(t_s) > self.longest_gap_s) + 1)
-        kept = [rows for rows in pieces if len(rows) > 1 and t_s[rows[-1]] - t_s[rows[0]] >= max(self.shortest_s, machine.period_s)]
+        pieces = np.split(
+            np.arange(len(t_s)), np.flatnonzero(np.diff(t_s) > self.longest_gap_s) + 1
+        )
+        kept = [
+            rows
+            for rows in pieces
+            if len(rows) > 1
+            and t_s[rows[-1]] - t_s[rows[0]] >= max(self.shortest_s, machine.period_s)
+        ]
         if not kept:
             raise RecordingError(
                 f"{path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s among its "
                 f"{len(t_s)} rows; is import.time.scale right?"
             )
         if len(kept) < len(pieces):
-            log.warning("%s: %d pieces shorter than %g s left out", path, len(pieces) - len(kept), self.shortest_s)
-        return [_resampled(t_s[p], u[p], q[p], {k: v[p] for k, v in extra.items()}, path, machine) for p in kept]
+            log.warning(
+                "%s: %d pieces shorter than %g s left out",
+                path,
+                len(pieces) - len(kept),
+                self.shortest_s,
+            )
+        return [
+            _resampled(t_s[p], u[p], q[p], {k: v[p] for k, v in extra.items()}, path, machine)
+            for p in kept
+        ]
 
     def _commands(self, table: "_Table", column: CommandColumn) -> np.ndarray:
         u = column.command(table.numbers(Column(column=column.column, scale=1.0, offset=0.0)))
@@ -185,9 +212,13 @@ class _Table:
         """Returns a column, shape `(T,)`; an empty cell is NaN where `empty` allows it."""
         header = self._cells.header
         if column.column not in header:
-            raise RecordingError(f"{self._path}: column '{column.column}' is missing; {choices(column.column, header)}")
+            raise RecordingError(
+                f"{self._path}: column '{column.column}' is missing; {choices(column.column, header)}"
+            )
         if header.count(column.column) > 1:
-            raise RecordingError(f"{self._path}: {header.count(column.column)} columns are named '{column.column}'; rename them")
+            raise RecordingError(
+                f"{self._path}: {header.count(column.column)} columns are named '{column.column}'; rename them"
+            )
         at = header.index(column.column)
         values = np.empty(len(self._cells.rows))
         for row, cells in enumerate(self._cells.rows):
@@ -195,7 +226,9 @@ class _Table:
             try:
                 values[row] = float(text.replace(self._decimal, ".") or ("nan" if empty else ""))
             except ValueError:
-                raise RecordingError(f"{self.where(row, column.column)}: '{text}' is not a number") from None
+                raise RecordingError(
+                    f"{self.where(row, column.column)}: '{text}' is not a number"
+                ) from None
             if not (empty or np.isfinite(values[row])):
                 raise RecordingError(f"{self.where(row, column.column)}: {text} is not a number")
         return column.scale * values + column.offset
@@ -221,22 +254,37 @@ def _cells(path: Path, delimiter: str) -> Cells:
     except csv.Error as error:
         raise RecordingError(f"{path}: line {reader.line_num}: not CSV ({error})") from error
     if len(lines) < 2:
-        raise RecordingError(f"{path}: {max(0, len(lines) - 1)} rows of data below the header; a log has at least 2")
+        raise RecordingError(
+            f"{path}: {max(0, len(lines) - 1)} rows of data below the header; a log has at least 2"
+        )
     (_, header), *body = lines
     number, last = body[-1]
-    if len(last) < len(header) or not text.endswith(("\n", "\r")):  # a number may be cut off too, and still look like one
+    if len(last) < len(header) or not text.endswith(
+        ("\n", "\r")
+    ):  # a number may be cut off too, and still look like one
         log.warning(
-            "%s: the last line, %d, is cut off or lacks its end (%d of %d cells): left out", path, number, len(last), len(header)
+            "%s: the last line, %d, is cut off or lacks its end (%d of %d cells): left out",
+            path,
+            number,
+            len(last),
+            len(header),
         )
         body.pop()
     for row, (number, cells) in enumerate(body):
         if len(cells) != len(header):
-            raise RecordingError(f"{path}: line {number} (row {row}): {len(cells)} cells, the header has {len(header)}")
+            raise RecordingError(
+                f"{path}: line {number} (row {row}): {len(cells)} cells, the header has {len(header)}"
+            )
     return Cells(header, [cells for _, cells in body], [number for number, _ in body])
 
 
 def _resampled(
-    t_s: np.ndarray, u: np.ndarray, q: np.ndarray, extra: dict[str, np.ndarray], path: Path, machine: Machine
+    t_s: np.ndarray,
+    u: np.ndarray,
+    q: np.ndarray,
+    extra: dict[str, np.ndarray],
+    path: Path,
+    machine: Machine,
 ) -> Recording:
     """Returns a piece at the machine's rate."""
     ends_s = t_s - t_s[0]
@@ -252,6 +300,14 @@ def _resampled(
         t_s=grid_s,
         u=u[newest].astype(np.float32),
         q=np.stack([np.interp(grid_s, ends_s, values) for values in q.T], 1).astype(np.float32),
-        extra={name: np.interp(grid_s, ends_s, values).astype(np.float32) for name, values in extra.items()},
-        metadata={"source": f"log: {path.name}", "run": path.stem, "fingerprint": record.stamp(machine), "resampled_from": was},
+        extra={
+            name: np.interp(grid_s, ends_s, values).astype(np.float32)
+            for name, values in extra.items()
+        },
+        metadata={
+            "source": f"log: {path.name}",
+            "run": path.stem,
+            "fingerprint": record.stamp(machine),
+            "resampled_from": was,
+        },
     )

@@ -48,7 +48,9 @@ def as_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Table:
     for name in (*RATES, *MEASURES):
         table.add_column(HEADINGS[name], justify="right", min_width=7)
     for group, setting in zip(groups, settings, strict=True):
-        figures = [_text(group[name], SCALES.get(name, 1.0), name in RATES) for name in (*RATES, *MEASURES)]
+        figures = [
+            _text(group[name], SCALES.get(name, 1.0), name in RATES) for name in (*RATES, *MEASURES)
+        ]
         table.add_row(group["policy"], *setting, str(group["runs"]), *figures)
     return table
 
@@ -56,29 +58,64 @@ def as_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Table:
 def unlike_most(groups: Sequence[dict[str, Any]]) -> list[str]:
     """Returns, for each group, the values that it does not share with most others; of values all equally frequent, each is said."""
     counts = {
-        column: Counter(repr(group["variation"][column]) for group in groups).most_common() for column in groups[0]["variation"]
+        column: Counter(repr(group["variation"][column]) for group in groups).most_common()
+        for column in groups[0]["variation"]
     }
-    usual = {column: found[0][0] for column, found in counts.items() if len(found) == 1 or found[0][1] > found[1][1]}
+    usual = {
+        column: found[0][0]
+        for column, found in counts.items()
+        if len(found) == 1 or found[0][1] > found[1][1]
+    }
     names = _shortest(list(counts))
     return [
-        ", ".join(f"{names[key]} {value}" for key, value in group["variation"].items() if repr(value) != usual.get(key))
+        ", ".join(
+            f"{names[key]} {value}"
+            for key, value in group["variation"].items()
+            if repr(value) != usual.get(key)
+        )
         for group in groups
     ]
 
 
 def draw(groups: Sequence[dict[str, Any]]) -> Figure:
     """Draws success with its interval, peak force and valve travel, one row for each policy and variation."""
-    labels = [", ".join(filter(None, (group["policy"], text))) for group, text in zip(groups, unlike_most(groups), strict=True)]
+    labels = [
+        ", ".join(filter(None, (group["policy"], text)))
+        for group, text in zip(groups, unlike_most(groups), strict=True)
+    ]
     figure = Figure(figsize=(11.0, 1.4 + 0.42 * len(groups)), layout="constrained")
     success, *others = figure.subplots(1, 3, sharey=True, width_ratios=(2, 1, 1))
     rows = np.arange(len(groups))[::-1]
-    for shift, rate, color, mark in ((0.14, "success_strict", "#1f5f8b", "o"), (-0.14, "success_paper", "#c27c2c", "s")):
-        _marks(success, rows + shift, [group[rate] for group in groups], 1.0, color, mark, HEADINGS[rate])
+    for shift, rate, color, mark in (
+        (0.14, "success_strict", "#1f5f8b", "o"),
+        (-0.14, "success_paper", "#c27c2c", "s"),
+    ):
+        _marks(
+            success,
+            rows + shift,
+            [group[rate] for group in groups],
+            1.0,
+            color,
+            mark,
+            HEADINGS[rate],
+        )
     for axes, name in zip(others, ("peak_force_n", "valve_travel"), strict=True):
-        _marks(axes, rows, [group[name] for group in groups], SCALES.get(name, 1.0), "#444444", "o", None)
+        _marks(
+            axes,
+            rows,
+            [group[name] for group in groups],
+            SCALES.get(name, 1.0),
+            "#444444",
+            "o",
+            None,
+        )
         axes.set(xlabel=HEADINGS[name])
         axes.set_xlim(left=0.0)
-    success.set(yticks=rows, yticklabels=[fill(label, LABEL_WIDTH) for label in labels], xlabel="success rate, 95 % interval")
+    success.set(
+        yticks=rows,
+        yticklabels=[fill(label, LABEL_WIDTH) for label in labels],
+        xlabel="success rate, 95 % interval",
+    )
     success.set_xlim(right=1.005)
     success.legend(loc="lower left", frameon=False)
     for axes in (success, *others):
@@ -105,7 +142,14 @@ def draw_learning(curves: Mapping[str, Sequence[Curve]]) -> Figure:
         for index, (label, members) in enumerate(curves.items()):
             for number, curve in enumerate(members):
                 x = scale * np.asarray(curve[name])
-                axes.plot(x, curve[SUCCESS], color=f"C{index % 10}", linewidth=1.0, alpha=0.8, label=None if number else label)
+                axes.plot(
+                    x,
+                    curve[SUCCESS],
+                    color=f"C{index % 10}",
+                    linewidth=1.0,
+                    alpha=0.8,
+                    label=None if number else label,
+                )
         axes.axhline(REACHED, color="#888888", linewidth=0.8, linestyle="--")
         axes.set(xlabel=heading, ylim=(0.0, 1.0))
         axes.set_xlim(left=0.0)
@@ -118,14 +162,32 @@ def draw_learning(curves: Mapping[str, Sequence[Curve]]) -> Figure:
 
 
 def _marks(
-    axes: Axes, rows: np.ndarray, figures: Sequence[dict[str, Any]], scale: float, color: str, mark: str, label: str | None
+    axes: Axes,
+    rows: np.ndarray,
+    figures: Sequence[dict[str, Any]],
+    scale: float,
+    color: str,
+    mark: str,
+    label: str | None,
 ) -> None:
     """Draws means as marks and their intervals as lines, leaving out what was not measured."""
-    known = [(row, figure) for row, figure in zip(rows, figures, strict=True) if figure["mean"] is not None]
-    axes.plot([scale * figure["mean"] for _, figure in known], [row for row, _ in known], mark, color=color, label=label)
+    known = [
+        (row, figure)
+        for row, figure in zip(rows, figures, strict=True)
+        if figure["mean"] is not None
+    ]
+    axes.plot(
+        [scale * figure["mean"] for _, figure in known],
+        [row for row, _ in known],
+        mark,
+        color=color,
+        label=label,
+    )
     for row, figure in known:
         if figure["ci95"]:
-            axes.plot(scale * np.asarray(figure["ci95"]), [row] * 2, "-", color=color, linewidth=1.5)
+            axes.plot(
+                scale * np.asarray(figure["ci95"]), [row] * 2, "-", color=color, linewidth=1.5
+            )
 
 
 def _shortest(columns: Sequence[str]) -> dict[str, str]:
@@ -139,7 +201,9 @@ def _shortest(columns: Sequence[str]) -> dict[str, str]:
     for column in columns:
         lengths = range(1, len(parts[column]) + 1)
         found[column] = next(
-            end(column, length) for length in lengths if [end(other, length) for other in columns].count(end(column, length)) == 1
+            end(column, length)
+            for length in lengths
+            if [end(other, length) for other in columns].count(end(column, length)) == 1
         )
     return found
 

@@ -1,7 +1,9 @@
 """What the parts of the framework promise each other. Rooms meet only here; the config puts them together.
 
-`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of extensions.
-Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe a target.
+`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
+extensions.
+Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe
+a target.
 """
 
 from __future__ import annotations
@@ -34,8 +36,9 @@ class Mode(Protocol):
 class ActuatorModel(Protocol):
     """From the last `H` positions and commands to the next joint position, for all environments at once.
 
-    A model with a state of its own (spool position, pressure) keeps it in tensors of fixed shape listed by `state`. `step` works
-    without a host synchronisation and without data-dependent shapes, so that it can be captured in a CUDA graph.
+    A model with a state of its own (spool position, pressure) keeps it in tensors of fixed shape
+    listed by `state`. `step` works without a host synchronisation and without data-dependent
+    shapes, so that it can be captured in a CUDA graph.
     """
 
     @property
@@ -50,7 +53,8 @@ class ActuatorModel(Protocol):
     def step(self, history: History) -> torch.Tensor:
         """Returns the joint positions one control period later, shape `(N, J)` in rad or m.
 
-        `history.u[:, -1]` is the command that has just come into force, `history.q[:, -1]` the position at this moment.
+        `history.u[:, -1]` is the command that has just come into force, `history.q[:, -1]` the
+        position at this moment.
         """
         ...
 
@@ -58,8 +62,8 @@ class ActuatorModel(Protocol):
 class SensingModel(ActuatorModel, Protocol):
     """An actuator model that also says what is seen of the motion; what effects on sensors and geometry make of a model.
 
-    A loop asks an actuator for `sides` (absent: none) and calls `measure` and `misplacement` only where they do something, once a
-    control period, after `reset`. `step` is given true positions.
+    A loop asks an actuator for `sides` (absent: none) and calls `measure` and `misplacement` only
+    where they do something, once a control period, after `reset`. `step` is given true positions.
     """
 
     @property
@@ -95,12 +99,16 @@ class Segment:
     Attributes:
         name: What it is, different from all others of its plan, e.g. `ramps_q3_02`.
         start: Joint positions from which it is played, `(J,)`, rad or m.
-        u: The program, `(T, J)` in [-1, 1]; row `k` is in force in control period `k`. Exclusive joints never together with others.
-        stops: What happens when a joint is about to come to rest closer to its stop than `stop_margin`. `home`: everything goes
-            back to `start` and waits until the program, which runs on by the clock, next passes zero. `inward`: this joint is
+        u: The program, `(T, J)` in [-1, 1]; row `k` is in force in control period `k`. Exclusive
+            joints never together with others.
+        stops: What happens when a joint is about to come to rest closer to its stop than
+            `stop_margin`. `home`: everything goes
+            back to `start` and waits until the program, which runs on by the clock, next passes
+                zero. `inward`: this joint is
             driven the other way until its program next passes zero.
         stop_margin: Distance from the stops, as a part of the joint's travel.
-        repeat_of: Name of an earlier segment of the same length, of which this one repeats what was really sent.
+        repeat_of: Name of an earlier segment of the same length, of which this one repeats what was
+            really sent.
     """
 
     name: str
@@ -119,12 +127,17 @@ class Excitation(Protocol):
         ...
 
     def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator, before: Sequence[Segment]
+        self,
+        machine: Machine,
+        duration_s: float,
+        generator: np.random.Generator,
+        before: Sequence[Segment],
     ) -> list[Segment]:
         """Returns segments whose programs last `duration_s` in all, or as much of it as whole segments fill.
 
         Args:
-            machine: Gives limits, speeds, weights, and the joints that never move together with others.
+            machine: Gives limits, speeds, weights, and the joints that never move together with
+                others.
             duration_s: Time for the programs, without the ways to their start poses.
             generator: The only source of chance.
             before: Segments that are already planned.
@@ -157,7 +170,9 @@ class ActuatorFit(Protocol):
 class Effect(Protocol):
     """A spec in `conf/effect`: something a simulator leaves out; wraps an actuator model and is again one."""
 
-    def wrap(self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
+    def wrap(
+        self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
+    ) -> ActuatorModel:
         """Returns `model` with the effect added; with the effect's neutral value nothing changes."""
         ...
 
@@ -165,7 +180,8 @@ class Effect(Protocol):
 class FollowerModel(Protocol):
     """From the command that the policy proposes to the one that is given, as a person at the levers does it, in `N` environments.
 
-    `step` works without a host synchronisation and without data-dependent shapes, so that it can be captured in a CUDA graph.
+    `step` works without a host synchronisation and without data-dependent shapes, so that it can be
+    captured in a CUDA graph.
     """
 
     @property
@@ -180,8 +196,8 @@ class FollowerModel(Protocol):
     def step(self, proposed: torch.Tensor) -> torch.Tensor:
         """Returns the command given during the coming control period, `(N, J)` in [-1, 1].
 
-        `proposed`, `(N, J)`, is what the policy shows from now on. Where no proposal moves an exclusive joint together with
-        others, what is given does not either.
+        `proposed`, `(N, J)`, is what the policy shows from now on. Where no proposal moves an
+        exclusive joint together with others, what is given does not either.
         """
         ...
 
@@ -197,7 +213,8 @@ class Follower(Protocol):
 class World(Protocol):
     """Parallel physics: the machine, pushed along by its drive, beside a block with a borehole.
 
-    All tensors are float32 on `device`, of fixed address, and refreshed in place by `step` and `reset`.
+    All tensors are float32 on `device`, of fixed address, and refreshed in place by `step` and
+    `reset`.
     """
 
     num_worlds: int
@@ -207,7 +224,8 @@ class World(Protocol):
     contact_force_n: torch.Tensor
     """Peak force between tool and surroundings over the last control period, `(N,)`."""
     faults: torch.Tensor
-    """Worlds that diverged, lost contacts to a full buffer, or became NaN since their last reset, `(N,)` bool."""
+    """Worlds that diverged, lost contacts to a full buffer, or became NaN since their last reset,
+    `(N,)` bool."""
     supports_graphs: bool
     """True when `step` and `reset` may be captured in a CUDA graph."""
 
@@ -263,7 +281,8 @@ class TaskProcess(Protocol):
     state: dict[str, torch.Tensor]
     """Everything needed to go on exactly, by name, each `(N, …)`; written in place."""
     episode: dict[str, torch.Tensor]
-    """Figures of the running episode, each `(N,)`; those that stand in `evaluation.json` have the names given there."""
+    """Figures of the running episode, each `(N,)`; those that stand in `evaluation.json` have the
+    names given there."""
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """Draws `count` valid starts: `q` `(count, J)`, `scene` `(count, S)` and whatever else `reset` needs."""
@@ -281,11 +300,14 @@ class TaskProcess(Protocol):
         """Judges the control step that has just been simulated."""
         ...
 
-    def observe(self, history: History, shift_m: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    def observe(
+        self, history: History, shift_m: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
         """Returns the observation groups, called once a control step after `step` and `reset`.
 
-        `history` is what sensors say; `shift_m`, `(N, 3)`, is how far off the target is believed (`SensingModel.misplacement`).
-        `policy` is the vector of `brokk_rl.observation`; the tensors are the task's own and are overwritten by the next call.
+        `history` is what sensors say; `shift_m`, `(N, 3)`, is how far off the target is believed
+        (`SensingModel.misplacement`). `policy` is the vector of `brokk_rl.observation`; the tensors
+        are the task's own and are overwritten by the next call.
         """
         ...
 
@@ -350,7 +372,8 @@ class OperatorView:
 
     Attributes:
         q: Joint positions, `(N, J)`.
-        rim_in_base_m: Centre of the hole's rim, `(N, 3)`; how well it is seen is the operator's matter.
+        rim_in_base_m: Centre of the hole's rim, `(N, 3)`; how well it is seen is the operator's
+            matter.
         advice: Commands that are advised, `(N, J)`; NaN where none is shown.
     """
 
@@ -378,7 +401,9 @@ class Operator(Protocol):
 class TrialGround(Protocol):
     """A spec in `conf/ground`: where simulated operators do trials."""
 
-    def run(self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel) -> list[Recording]:
+    def run(
+        self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
+    ) -> list[Recording]:
         """Does the trials; returns a recording of each, in order, with advice where it was shown."""
         ...
 
@@ -403,8 +428,9 @@ class PerceptionBackend(Protocol):
 class Link(Protocol):
     """The open connection to a machine, real or simulated; a context manager.
 
-    Arrays are `(J,)`, or `(N, J)` where a simulated link drives `N > 1` machines side by side. Leaving the context brings the
-    machine to a standstill. A link may have `extra() -> dict[str, float | array (N,)]`: more columns of the recording (`oil_c`).
+    Arrays are `(J,)`, or `(N, J)` where a simulated link drives `N > 1` machines side by side.
+    Leaving the context brings the machine to a standstill. A link may have `extra() -> dict[str,
+    float | array (N,)]`: more columns of the recording (`oil_c`).
     """
 
     def read(self) -> JointState:

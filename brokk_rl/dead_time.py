@@ -1,7 +1,7 @@
 """Dead time of each joint from recordings: the delay at which a static curve of the command explains the motion best.
 
-The lag of spool and oil counts as delay here (at 20 Hz the two can hardly be told apart), so this is the total that a controller
-has to look ahead, not the time to first motion.
+The lag of spool and oil counts as delay here (at 20 Hz the two can hardly be told apart), so this
+is the total that a controller has to look ahead, not the time to first motion.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,11 @@ KNOTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7)
 """Commands at which the static curve bends, on either side."""
 RESOLUTION_S = 0.01
 LONGEST_S = 1.0
-"""Longest delay searched for; more than the history of any model here, so that a history too short shows."""
+"""Longest delay searched for; more than the history of any model here, so that a history too short
+shows."""
 SMOOTHING = np.hanning(11)[1:-1] / np.hanning(11).sum()
-"""Applied to command curve and motion alike. Without it a delay between samples, which averages two commands, would be preferred
-because averaging looks like the valve's lag."""
+"""Applied to command curve and motion alike. Without it a delay between samples, which averages two
+commands, would be preferred because averaging looks like the valve's lag."""
 AT_STOP = 0.005
 """A joint this close to its stop, as a part of its travel, tells nothing about the delay."""
 RESAMPLED = 200
@@ -53,7 +54,9 @@ class Delay:
         return self.value_s < float(self.tried_s[-1]) - RESOLUTION_S / 2
 
 
-def delays(recordings: Sequence[Recording], machine: Machine, generator: np.random.Generator) -> dict[str, Delay | None]:
+def delays(
+    recordings: Sequence[Recording], machine: Machine, generator: np.random.Generator
+) -> dict[str, Delay | None]:
     """Returns the dead time of each joint; `None` for a joint that is hardly commanded.
 
     Raises:
@@ -63,14 +66,26 @@ def delays(recordings: Sequence[Recording], machine: Machine, generator: np.rand
     if not usable:
         raise RecordingError(f"too little data: no recording is longer than {2.0 * LONGEST_S:g} s")
     grid_s = np.arange(0.0, LONGEST_S + 1e-9, RESOLUTION_S)
-    return {name: _delay(usable, joint, grid_s, machine, generator) for joint, name in enumerate(machine.joint_names)}
+    return {
+        name: _delay(usable, joint, grid_s, machine, generator)
+        for joint, name in enumerate(machine.joint_names)
+    }
 
 
 def _delay(
-    recordings: Sequence[Recording], joint: int, grid_s: np.ndarray, machine: Machine, generator: np.random.Generator
+    recordings: Sequence[Recording],
+    joint: int,
+    grid_s: np.ndarray,
+    machine: Machine,
+    generator: np.random.Generator,
 ) -> Delay | None:
-    moving = [recording for recording in recordings if (np.abs(recording.u[:, joint]) > KNOTS[1]).any()]
-    if sum(int((np.abs(recording.u[:, joint]) > KNOTS[1]).sum()) for recording in moving) < MIN_MOVING:
+    moving = [
+        recording for recording in recordings if (np.abs(recording.u[:, joint]) > KNOTS[1]).any()
+    ]
+    if (
+        sum(int((np.abs(recording.u[:, joint]) > KNOTS[1]).sum()) for recording in moving)
+        < MIN_MOVING
+    ):
         return None
     runs = by_run(moving).values()
     moments = np.stack(
@@ -82,26 +97,41 @@ def _delay(
     low, high = np.percentile(again, (2.5, 97.5))
     total = moments.sum(0)
     left = _residual(total) / total[:, -1, -1]
-    interval = max(0.0, min(low, grid_s[value] - RESOLUTION_S / 2)), max(high, grid_s[value] + RESOLUTION_S / 2)
-    return Delay(float(grid_s[value]), (float(interval[0]), float(interval[1])), float(1.0 - left[value]), grid_s, left)
+    interval = (
+        max(0.0, min(low, grid_s[value] - RESOLUTION_S / 2)),
+        max(high, grid_s[value] + RESOLUTION_S / 2),
+    )
+    return Delay(
+        float(grid_s[value]),
+        (float(interval[0]), float(interval[1])),
+        float(1.0 - left[value]),
+        grid_s,
+        left,
+    )
 
 
 def _moments(recording: Recording, joint: int, grid_s: np.ndarray, machine: Machine) -> np.ndarray:
     """Returns, for each delay, the sums of products of the curve's features and the increment, shape `(D, F + 1, F + 1)`."""
     u, q = recording.u[:, joint].astype(np.float64), recording.q[:, joint].astype(np.float64)
     knots, reach = np.array(KNOTS), int(LONGEST_S / machine.period_s) + 1
-    curve = np.concatenate([np.maximum(u[:, None] - knots, 0.0), np.maximum(-u[:, None] - knots, 0.0)], 1)[:-1]
+    curve = np.concatenate(
+        [np.maximum(u[:, None] - knots, 0.0), np.maximum(-u[:, None] - knots, 0.0)], 1
+    )[:-1]
     curve = np.stack([np.convolve(feature, SMOOTHING, mode="valid") for feature in curve.T], 1)
     moved = np.convolve(np.diff(q), SMOOTHING, mode="valid")
     margin = AT_STOP * (machine.upper[joint] - machine.lower[joint])
     stopped = (q[:-1] < machine.lower[joint] + margin) | (q[:-1] > machine.upper[joint] - margin)
-    free = np.convolve(stopped, np.ones(len(SMOOTHING)), mode="valid") < 0.5  # a stop ends the motion before the command does
+    free = (
+        np.convolve(stopped, np.ones(len(SMOOTHING)), mode="valid") < 0.5
+    )  # a stop ends the motion before the command does
     now = np.flatnonzero(free[reach:]) + reach
     found = []
     for delay_s in grid_s:
         whole, part = divmod(delay_s / machine.period_s + 1e-9, 1.0)
         back = int(whole)
-        delayed = part * curve[now - back - 1] + (1.0 - part) * curve[now - back]  # the command changes inside the period
+        delayed = (
+            part * curve[now - back - 1] + (1.0 - part) * curve[now - back]
+        )  # the command changes inside the period
         features = np.concatenate([delayed, moved[now, None]], 1)
         found.append(features.T @ features)
     return np.stack(found)

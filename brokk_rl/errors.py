@@ -1,7 +1,7 @@
 """The errors that a person can act on.
 
-Every message says what was expected, what came, and where to change it. Anything that is not a `BrokkError` is our own bug and
-keeps its traceback.
+Every message says what was expected, what came, and where to change it. Anything that is not a
+`BrokkError` is our own bug and keeps its traceback.
 """
 
 from collections.abc import Iterable

@@ -1,7 +1,8 @@
 """Nobody between policy and machine: what is proposed is given.
 
-On the machine a person reads the proposed lever positions and moves the levers, late and imperfectly; such a follower is one of
-`conf/follower`. This is the neutral one, of which every other is a departure.
+On the machine a person reads the proposed lever positions and moves the levers, late and
+imperfectly; such a follower is one of `conf/follower`. This is the neutral one, of which every
+other is a departure.
 """
 
 from __future__ import annotations

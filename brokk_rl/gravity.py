@@ -35,7 +35,9 @@ class Gravity:
     def load(self, q: torch.Tensor) -> torch.Tensor:
         """Returns the force with which gravity pushes each joint in its positive direction, shape of `q` `(N, J)`, Nm or N."""
         angle = (q * self._hinge)[..., None, None]
-        turn = self._eye + angle.sin() * self._cross + (1.0 - angle.cos()) * self._cross_twice  # Rodrigues
+        turn = (
+            self._eye + angle.sin() * self._cross + (1.0 - angle.cos()) * self._cross_twice
+        )  # Rodrigues
         slide = (q * (1.0 - self._hinge))[..., None] * self._axis
         rotation, at_m = self._eye.expand(q.shape[0], 3, 3), q.new_zeros(q.shape[0], 3)
         origins, axes, moments = [], [], []
@@ -46,7 +48,11 @@ class Gravity:
             origins.append(at_m)
             moments.append(self._mass_kg[j] * (at_m + rotation @ self._com_m[j]))
         axis, origin_m = torch.stack(axes, 1), torch.stack(origins, 1)
-        carried = torch.stack(moments, 1).flip(1).cumsum(1).flip(1) - self._carried_kg[:, None] * origin_m
-        turning = axis[..., 0] * carried[..., 1] - axis[..., 1] * carried[..., 0]  # z of axis x lever arm, times mass
+        carried = (
+            torch.stack(moments, 1).flip(1).cumsum(1).flip(1) - self._carried_kg[:, None] * origin_m
+        )
+        turning = (
+            axis[..., 0] * carried[..., 1] - axis[..., 1] * carried[..., 0]
+        )  # z of axis x lever arm, times mass
         lifting = self._carried_kg * axis[..., 2]
         return -GRAVITY_M_S2 * (self._hinge * turning + (1.0 - self._hinge) * lifting)

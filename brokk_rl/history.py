@@ -3,8 +3,9 @@
 Worked trace (H = 3), one control step at time t:
 
     observe      q = [q(t-2), q(t-1), q(t)]     u = [u(t-3), u(t-2), u(t-1)]
-    push_u       q = [q(t-2), q(t-1), q(t)]     u = [u(t-2), u(t-1), u(t)]      <- rows pair up as in a recording; actuator input
-    push_q       q = [q(t-1), q(t), q(t+1)]     u = [u(t-2), u(t-1), u(t)]      <- next observation
+    push_u       q = [q(t-2), q(t-1), q(t)]     u = [u(t-2), u(t-1), u(t)]      <- rows pair up as
+    in a recording; actuator input push_q       q = [q(t-1), q(t), q(t+1)]     u = [u(t-2), u(t-1),
+    u(t)]      <- next observation
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,8 @@ class History:
         q: Joint positions, shape `(N, H, J)`, rad or m.
         u: Commands in force, shape `(N, H, J)`, in [-1, 1].
 
-    Works on torch tensors; every update is in place, so that a captured CUDA graph keeps its addresses.
+    Works on torch tensors; every update is in place, so that a captured CUDA graph keeps its
+    addresses.
     """
 
     q: Any

@@ -28,7 +28,8 @@ KINDS: dict[Kind, str] = {
 CODE_REPEATS = 5
 """A value measured so often is a step of the sensor and no coincidence."""
 STEP_QUANTILE = 0.05
-"""Neighbouring values of a coarse sensor lie one step apart or, where those between were not visited often, several."""
+"""Neighbouring values of a coarse sensor lie one step apart or, where those between were not
+visited often, several."""
 JUMP = 1.5
 """A sensor that has missed a sample jumps by two periods' worth of motion."""
 
@@ -43,7 +44,8 @@ class Thresholds:
         still: A smaller speed counts as rest, as a part of the joint's full speed.
         settle_s: Time beyond the dead time that a joint takes to start or to stop.
         unanswered_s: Command without motion is told from this duration on.
-        drift: Motion without command is told from this part of the travel on, within one stretch without command.
+        drift: Motion without command is told from this part of the travel on, within one stretch
+            without command.
         equal_rows: Equal samples in a row that a sensor with noise does not show.
         steps: A change of so many steps of the sensor, or of its noise, cannot hide in it.
         at_limit: A joint so close to its limit, as a part of its travel, may stand at its stop.
@@ -61,7 +63,9 @@ class Thresholds:
 
     def check(self) -> None:
         if not 0 <= self.commanded <= self.driving <= 1:
-            raise ConfigError(f"thresholds: expected 0 <= commanded <= driving <= 1, got {self.commanded} and {self.driving}")
+            raise ConfigError(
+                f"thresholds: expected 0 <= commanded <= driving <= 1, got {self.commanded} and {self.driving}"
+            )
         if self.equal_rows < 2:
             raise ConfigError(f"thresholds.equal_rows: expected 2 or more, got {self.equal_rows}")
 
@@ -109,8 +113,17 @@ def inspect(recording: Recording, machine: Machine, thresholds: Thresholds) -> I
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
         look = _Look(recording, machine, thresholds)
-        findings = [*look.no_motion(), *look.no_command(), *look.frozen(), *look.repeated(), *look.beyond(), *look.exclusive()]
-        return Inspection(look.timing(), look.joints(), sorted(findings, key=lambda finding: finding.row))
+        findings = [
+            *look.no_motion(),
+            *look.no_command(),
+            *look.frozen(),
+            *look.repeated(),
+            *look.beyond(),
+            *look.exclusive(),
+        ]
+        return Inspection(
+            look.timing(), look.joints(), sorted(findings, key=lambda finding: finding.row)
+        )
 
 
 class _Look:
@@ -118,26 +131,42 @@ class _Look:
 
     def __init__(self, recording: Recording, machine: Machine, thresholds: Thresholds) -> None:
         self._machine, self._limits = machine, thresholds
-        self._t_s, self._u, self._q = recording.t_s, recording.u.astype(np.float64), recording.q.astype(np.float64)
+        self._t_s, self._u, self._q = (
+            recording.t_s,
+            recording.u.astype(np.float64),
+            recording.q.astype(np.float64),
+        )
         self._period_s = 1.0 / recording.rate_hz
         self._travel = machine.upper - machine.lower
         self._reach = max(1, round(0.15 / self._period_s))
         self._after, self._before = self._speed(self._reach, 0), self._speed(0, self._reach)
         both = (self._after + self._before) / 2.0
-        self._v = np.where(np.isnan(self._after), self._before, np.where(np.isnan(self._before), self._after, both))
+        self._v = np.where(
+            np.isnan(self._after), self._before, np.where(np.isnan(self._before), self._after, both)
+        )
         self._is_moving = np.abs(self._v) > thresholds.still * machine.max_speed
         self._lead = round((machine.dead_time_s + thresholds.settle_s) / self._period_s)
-        self._idle = np.stack([_held(np.abs(u) < thresholds.commanded, self._lead) for u in self._u.T], 1)
+        self._idle = np.stack(
+            [_held(np.abs(u) < thresholds.commanded, self._lead) for u in self._u.T], 1
+        )
         self._noise = np.array([self._noise_of(j) for j in range(machine.num_joints)])
         self._step = np.array([_step(q) for q in self._q.T])
-        self._visible = thresholds.steps * np.fmax(np.nan_to_num(self._step), np.nan_to_num(self._noise))
+        self._visible = thresholds.steps * np.fmax(
+            np.nan_to_num(self._step), np.nan_to_num(self._noise)
+        )
 
     def timing(self) -> dict[str, float | None]:
         """Returns duration, rate and jitter."""
         period_s = np.diff(self._t_s)
         period_s = period_s[np.isfinite(period_s)]
         if not len(period_s):
-            return {"duration_s": 0.0, "rate_hz": None, "stated_rate_hz": 1.0 / self._period_s, "jitter_s": None, "longest_s": None}
+            return {
+                "duration_s": 0.0,
+                "rate_hz": None,
+                "stated_rate_hz": 1.0 / self._period_s,
+                "jitter_s": None,
+                "longest_s": None,
+            }
         median_s = float(np.median(period_s))
         return {
             "duration_s": _plain(np.nanmax(self._t_s) - np.nanmin(self._t_s)),
@@ -151,7 +180,9 @@ class _Look:
         """Returns the figures of each joint."""
         size, found = np.abs(self._u), {}
         margin = self._limits.at_limit * self._travel
-        at_limit = (self._q < self._machine.lower + margin) | (self._q > self._machine.upper - margin)
+        at_limit = (self._q < self._machine.lower + margin) | (
+            self._q > self._machine.upper - margin
+        )
         for j, name in enumerate(self._machine.joint_names):
             found[name] = {
                 "lowest": _plain(np.nanmin(self._q[:, j])),
@@ -174,10 +205,20 @@ class _Look:
                 driven = _held(sign * self._u[:, j] > self._limits.driving, self._lead)
                 stop = self._q[:, j] > self._machine.upper[j] - margin[j]
                 stop = stop if sign > 0 else self._q[:, j] < self._machine.lower[j] + margin[j]
-                for row, count in runs(driven & ~self._is_moving[:, j] & ~stop & np.isfinite(self._v[:, j])):
+                for row, count in runs(
+                    driven & ~self._is_moving[:, j] & ~stop & np.isfinite(self._v[:, j])
+                ):
                     if count * self._period_s >= self._limits.unanswered_s:
                         mean = self._u[row : row + count, j].mean()
-                        found.append(self._finding("no motion", name, row, count, f"commanded {mean:+.2f}, does not move"))
+                        found.append(
+                            self._finding(
+                                "no motion",
+                                name,
+                                row,
+                                count,
+                                f"commanded {mean:+.2f}, does not move",
+                            )
+                        )
         return found
 
     def no_command(self) -> list[Finding]:
@@ -186,7 +227,9 @@ class _Look:
         for j, (name, unit) in enumerate(self._units()):
             for row, count in runs(self._idle[:, j]):
                 ends = min(5, count)
-                moved = np.nanmedian(self._q[row + count - ends : row + count, j]) - np.nanmedian(self._q[row : row + ends, j])
+                moved = np.nanmedian(self._q[row + count - ends : row + count, j]) - np.nanmedian(
+                    self._q[row : row + ends, j]
+                )
                 if abs(moved) > max(self._limits.drift * self._travel[j], self._visible[j]):
                     speed = moved / (count * self._period_s)
                     text = f"moves {moved:+.3g} {unit} without command ({speed:+.2g} {unit}/s)"
@@ -202,9 +245,14 @@ class _Look:
             for row, count in runs(equal):
                 end = row + count  # first row with another value
                 jump = abs(self._q[end, j] - self._q[end - 1, j]) if end < len(equal) else 0.0
-                before, after = abs(self._before[row - 1, j]), abs(self._after[min(end, len(equal) - 1), j])
+                before, after = (
+                    abs(self._before[row - 1, j]),
+                    abs(self._after[min(end, len(equal) - 1), j]),
+                )
                 was_moving = before > self._limits.still * self._machine.max_speed[j]
-                if was_moving and jump > max(self._visible[j], JUMP * np.fmax(before, after) * self._period_s):
+                if was_moving and jump > max(
+                    self._visible[j], JUMP * np.fmax(before, after) * self._period_s
+                ):
                     text = f"{count + 1} equal samples, then a jump of {jump:.2g} {unit}"
                 elif is_noisy and count + 1 >= self._limits.equal_rows:
                     text = f"{count + 1} equal samples of a sensor with noise"
@@ -226,10 +274,20 @@ class _Look:
         """Finds positions outside the limits, by more than the sensor's own noise and step."""
         found = []
         for j, (name, unit) in enumerate(self._units()):
-            over = np.fmax(self._q[:, j] - self._machine.upper[j], self._machine.lower[j] - self._q[:, j])
+            over = np.fmax(
+                self._q[:, j] - self._machine.upper[j], self._machine.lower[j] - self._q[:, j]
+            )
             for row, count in runs(over > self._visible[j]):
                 most = np.nanmax(over[row : row + count])
-                found.append(self._finding("beyond limit", name, row, count, f"up to {most:.2g} {unit} beyond its limit"))
+                found.append(
+                    self._finding(
+                        "beyond limit",
+                        name,
+                        row,
+                        count,
+                        f"up to {most:.2g} {unit} beyond its limit",
+                    )
+                )
         return found
 
     def exclusive(self) -> list[Finding]:
@@ -240,7 +298,11 @@ class _Look:
             others = np.delete(commanded, j, axis=1).any(1)
             for row, count in runs(commanded[:, j] & others):
                 name = self._machine.joint_names[j]
-                found.append(self._finding("exclusive", name, row, count, "commanded together with another joint"))
+                found.append(
+                    self._finding(
+                        "exclusive", name, row, count, "commanded together with another joint"
+                    )
+                )
         return found
 
     def _finding(self, kind: Kind, joint: str | None, row: int, count: int, text: str) -> Finding:
@@ -254,7 +316,9 @@ class _Look:
         """Returns the mean speed from `behind` rows before to `ahead` rows after each row, `(T, J)`; NaN near the ends."""
         speed, span = np.full(self._q.shape, np.nan), ahead + behind
         if len(self._q) > span:
-            change = (self._q[span:] - self._q[:-span]) / (self._t_s[span:] - self._t_s[:-span])[:, None]
+            change = (self._q[span:] - self._q[:-span]) / (self._t_s[span:] - self._t_s[:-span])[
+                :, None
+            ]
             speed[behind : len(self._q) - ahead] = change
         return speed
 

@@ -16,10 +16,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # distinguishable by those who see no red or green (Okabe and Ito)
-COLOURS = dict(zip(KINDS, ("#e69f00", "#cc79a7", "#56b4e9", "#0072b2", "#d55e00", "#009e73"), strict=True))
+COLOURS = dict(
+    zip(KINDS, ("#e69f00", "#cc79a7", "#56b4e9", "#0072b2", "#d55e00", "#009e73"), strict=True)
+)
 BREACH = "#b00020"
 THINNEST = 0.002
-"""A finding is drawn at least this wide, as a part of the picture, so that a single row can be seen."""
+"""A finding is drawn at least this wide, as a part of the picture, so that a single row can be
+seen."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,13 @@ class Line:
     num_breaches: int
 
 
-def recording(path: Path, recording: Recording, machine: Machine, inspection: Inspection, breaches: Sequence[Breach]) -> None:
+def recording(
+    path: Path,
+    recording: Recording,
+    machine: Machine,
+    inspection: Inspection,
+    breaches: Sequence[Breach],
+) -> None:
     """Draws commands and positions of each joint, findings shaded, breaches of the format as vertical lines; writes a PNG."""
     from matplotlib.figure import Figure
 
@@ -63,7 +72,13 @@ def recording(path: Path, recording: Recording, machine: Machine, inspection: In
         for finding in inspection.findings:
             if finding.joint in (joint.name, None):
                 width_s = max(finding.duration_s, THINNEST * span_s)
-                commands.axvspan(finding.t_s, finding.t_s + width_s, color=COLOURS[finding.kind], alpha=0.35, linewidth=0)
+                commands.axvspan(
+                    finding.t_s,
+                    finding.t_s + width_s,
+                    color=COLOURS[finding.kind],
+                    alpha=0.35,
+                    linewidth=0,
+                )
         own = {f"u_{joint.name}", f"q_{joint.name}_{joint.unit}", "t_s"}
         for breach in breaches:
             if breach.row is not None and breach.column in own and np.isfinite(t_s[breach.row]):
@@ -72,7 +87,11 @@ def recording(path: Path, recording: Recording, machine: Machine, inspection: In
     axes[-1].set_xlim(begin_s, begin_s + span_s)
     name = recording.path.name if recording.path else "recording"
     figure.suptitle(f"{name}: measured position (black), command in [-1, 1] (grey)", fontsize=11)
-    _legend(figure, {finding.kind for finding in inspection.findings}, any(breach.row is not None for breach in breaches))
+    _legend(
+        figure,
+        {finding.kind for finding in inspection.findings},
+        any(breach.row is not None for breach in breaches),
+    )
     figure.savefig(path, dpi=100)
 
 
@@ -85,15 +104,23 @@ def overview(path: Path, lines: Mapping[str, Line]) -> None:
     longest_s = max((line.duration_s for line in lines.values()), default=0.0) or 1.0
     for place, line in enumerate(lines.values()):
         axis.barh(place, line.duration_s, height=0.7, color="0.9")
-        for finding in sorted(line.findings, key=lambda finding: -finding.duration_s):  # none hides a shorter one
+        for finding in sorted(
+            line.findings, key=lambda finding: -finding.duration_s
+        ):  # none hides a shorter one
             width_s = max(finding.duration_s, THINNEST * longest_s)
             axis.barh(place, width_s, left=finding.t_s, height=0.7, color=COLOURS[finding.kind])
         if line.num_breaches:
-            text = f" breaks the format {line.num_breaches} ×" if line.num_breaches > 1 else " breaks the format"
+            text = (
+                f" breaks the format {line.num_breaches} ×"
+                if line.num_breaches > 1
+                else " breaks the format"
+            )
             axis.text(line.duration_s, place, text, color=BREACH, va="center", fontsize=8)
     axis.set_yticks(range(len(lines)), list(lines), fontsize=8)
     axis.invert_yaxis()
-    axis.set_xlim(0.0, longest_s * (1.25 if any(line.num_breaches for line in lines.values()) else 1.0))
+    axis.set_xlim(
+        0.0, longest_s * (1.25 if any(line.num_breaches for line in lines.values()) else 1.0)
+    )
     axis.set_xlabel("time [s]")
     _legend(figure, {finding.kind for line in lines.values() for finding in line.findings}, False)
     figure.savefig(path, dpi=100)
@@ -103,8 +130,18 @@ def _legend(figure: "Figure", kinds: set[str], has_breaches: bool) -> None:
     """Explains the colours that occur."""
     from matplotlib.patches import Patch
 
-    patches = [Patch(color=colour, alpha=0.6, label=kind) for kind, colour in COLOURS.items() if kind in kinds]
+    patches = [
+        Patch(color=colour, alpha=0.6, label=kind)
+        for kind, colour in COLOURS.items()
+        if kind in kinds
+    ]
     if has_breaches:
         patches.append(Patch(color=BREACH, label="breaks the format"))
     if patches:
-        figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), fontsize=9, frameon=False)
+        figure.legend(
+            handles=patches,
+            loc="outside lower center",
+            ncols=len(patches),
+            fontsize=9,
+            frameon=False,
+        )

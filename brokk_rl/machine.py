@@ -1,7 +1,8 @@
 """The machine: joints, limits, geometry, control rate and levers, read from one YAML file.
 
-Everything that must agree between training, recordings and the machine's own computer comes from here, and `fingerprint` stamps it
-onto every file, so that a policy of one machine cannot be loaded on another unnoticed. This module needs neither torch nor MuJoCo.
+Everything that must agree between training, recordings and the machine's own computer comes from
+here, and `fingerprint` stamps it onto every file, so that a policy of one machine cannot be loaded
+on another unnoticed. This module needs neither torch nor MuJoCo.
 """
 
 import hashlib
@@ -22,7 +23,8 @@ class Dimension:
     Attributes:
         value: The number, in the unit that its key names.
         source: Data sheet, measurement, paper, or how it was estimated.
-        confidence: How far to trust it; the randomisation of a low-confidence dimension should be wide.
+        confidence: How far to trust it; the randomisation of a low-confidence dimension should be
+            wide.
     """
 
     value: float
@@ -39,7 +41,8 @@ class Body:
         origin_m: Position of the joint in the frame of the parent link.
         mass_kg: Mass of the link.
         com_m: Centre of mass of the link in its own frame.
-        yield_force: Largest force (N) or torque (Nm) beyond the weight with which the joint pushes before its relief valve opens.
+        yield_force: Largest force (N) or torque (Nm) beyond the weight with which the joint pushes
+            before its relief valve opens.
         stiffness: Stiffness of the closed cylinder seen at the joint (Nm/rad or N/m).
     """
 
@@ -66,7 +69,8 @@ class Joint:
         upper: Upper end of travel.
         home: Position to which data collection returns.
         max_speed: Speed at full command (rad/s or m/s), the slower of both directions.
-        body: The link behind it; `null` where it is not known: such a machine can be recorded and identified, but not simulated.
+        body: The link behind it; `null` where it is not known: such a machine can be recorded and
+            identified, but not simulated.
     """
 
     name: str
@@ -84,7 +88,9 @@ class Joint:
 
     def check(self) -> None:
         if not self.lower.value <= self.home <= self.upper.value:
-            raise ConfigError(f"joint {self.name}: home {self.home} lies outside [{self.lower.value}, {self.upper.value}]")
+            raise ConfigError(
+                f"joint {self.name}: home {self.home} lies outside [{self.lower.value}, {self.upper.value}]"
+            )
 
 
 @spec
@@ -111,7 +117,8 @@ class Machine:
     Attributes:
         name: Config name, written into recordings and checkpoints.
         title: What it is, for people.
-        mjcf: File name of the model under `brokk_rl/sim/assets`, or an absolute path; `null`: there is none.
+        mjcf: File name of the model under `brokk_rl/sim/assets`, or an absolute path; `null`: there
+            is none.
         period_s: Control period.
         dead_time_s: Nominal time from command to first motion.
         num_history: Samples of commands and positions that actuator models and policies see.
@@ -138,7 +145,9 @@ class Machine:
             raise ConfigError(f"machine {self.name}: joint names repeat: {', '.join(names)}")
         for other in (*self.exclusive, *(lever.joint for lever in self.levers)):
             if other not in names:
-                raise ConfigError(f"machine {self.name}: '{other}' is none of its joints ({', '.join(names)})")
+                raise ConfigError(
+                    f"machine {self.name}: '{other}' is none of its joints ({', '.join(names)})"
+                )
         if self.dead_time_s > (self.num_history - 1) * self.period_s + 1e-9:
             raise ConfigError(
                 f"machine {self.name}: {self.num_history} samples of {self.period_s} s do not span the dead time of "
@@ -208,16 +217,22 @@ class Machine:
             ConfigError: it is not known.
         """
         if self.tool_m is None:
-            raise ConfigError(f"machine '{self.name}' has no tool point; add tool_m to its file, or choose another machine=…")
+            raise ConfigError(
+                f"machine '{self.name}' has no tool point; add tool_m to its file, or choose another machine=…"
+            )
         return np.array([d.value for d in self.tool_m])
 
     def fingerprint(self) -> dict[str, str]:
         """Returns what another file must agree with to be used on this machine: a short hash of each group of fields.
 
-        Sources, confidences, titles and home positions do not matter; names, order, limits, geometry, rate and masks do.
+        Sources, confidences, titles and home positions do not matter; names, order, limits,
+        geometry, rate and masks do.
         """
         bodies = [joint.body for joint in self.joints]
-        geometry = [None if body is None else [d.value for d in body.origin_m] + [*body.axis] for body in bodies]
+        geometry = [
+            None if body is None else [d.value for d in body.origin_m] + [*body.axis]
+            for body in bodies
+        ]
         groups = {
             "name": self.name,
             "joints": [[joint.name, joint.kind] for joint in self.joints],
@@ -226,7 +241,10 @@ class Machine:
             "control": [self.period_s, self.num_history, list(self.exclusive)],
             "levers": [asdict(lever) for lever in self.levers],
         }
-        return {key: hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12] for key, value in groups.items()}
+        return {
+            key: hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
+            for key, value in groups.items()
+        }
 
     def check_fingerprint(self, other: dict[str, str], what: str) -> None:
         """Raises a `CheckpointError` that names the groups of fields in which `other`, the stamp on `what`, differs."""
@@ -242,7 +260,8 @@ class Machine:
 def exclusive_mask(is_exclusive: Any, positioning: Any) -> Any:
     """Returns which joints may be commanded: the exclusive ones while positioning, else all the others.
 
-    These are the paper's masks [0, 1, 0, 0, 0] and [1, 0, 1, 1, 1]; tasks, excitations, guard and levers all use this function.
+    These are the paper's masks [0, 1, 0, 0, 0] and [1, 0, 1, 1, 1]; tasks, excitations, guard and
+    levers all use this function.
 
     Args:
         is_exclusive: `Machine.is_exclusive`, `(J,)` bool, numpy or torch.
@@ -251,4 +270,6 @@ def exclusive_mask(is_exclusive: Any, positioning: Any) -> Any:
     Returns:
         `(J,)` for one bool, else `(…, J)`.
     """
-    return is_exclusive == (positioning[..., None] if getattr(positioning, "ndim", 0) else positioning)
+    return is_exclusive == (
+        positioning[..., None] if getattr(positioning, "ndim", 0) else positioning
+    )

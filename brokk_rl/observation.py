@@ -1,10 +1,11 @@
 """The policy's observation vector (paper, Table I), the same code in training and on the machine.
 
-Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first (H x J); 133 numbers for five
-joints and 13 samples. A task in which the wanted pitch of the tool differs from episode to episode appends it as one more number,
-and a policy that proposes to a person what it proposed before, oldest first (H x J): histories hold what the person did. Each part
-is normalised with an approximate mean and standard deviation that follow from the configuration, so that a policy carries no hidden
-statistics.
+Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first (H
+x J); 133 numbers for five joints and 13 samples. A task in which the wanted pitch of the tool
+differs from episode to episode appends it as one more number,
+and a policy that proposes to a person what it proposed before, oldest first (H x J): histories hold
+what the person did. Each part is normalised with an approximate mean and standard deviation that
+follow from the configuration, so that a policy carries no hidden statistics.
 """
 
 from collections.abc import Callable
@@ -23,8 +24,8 @@ class Scaling:
     Attributes:
         target_mean_m: Approximate mean of the target point in the base frame.
         target_std_m: Its approximate standard deviation.
-        pitch_rad: Approximate mean and standard deviation of the wanted pitch where it differs from episode to episode and so
-            belongs to the vector; `null` where the task fixes it.
+        pitch_rad: Approximate mean and standard deviation of the wanted pitch where it differs from
+            episode to episode and so belongs to the vector; `null` where the task fixes it.
     """
 
     target_mean_m: tuple[float, float, float]
@@ -41,9 +42,11 @@ class Encoder:
     """Turns a history and a target into the policy's vector, and back.
 
     Args:
-        machine: Gives the normalisation of joint positions (middle and quarter of the travel), rate and order.
+        machine: Gives the normalisation of joint positions (middle and quarter of the travel), rate
+            and order.
         scaling: Normalisation of the target point.
-        constant: Makes an array of the kind and on the device of the inputs; `numpy.asarray` on the machine.
+        constant: Makes an array of the kind and on the device of the inputs; `numpy.asarray` on the
+            machine.
         concat: `numpy.concatenate` or `torch.cat`, called as `concat(parts, 1)`.
         with_proposals: Whether the policy proposes to a person.
     """
@@ -68,15 +71,19 @@ class Encoder:
         self._q_mean = constant(((machine.lower + machine.upper) / 2).astype(np.float32))
         self._q_std = constant(((machine.upper - machine.lower) / 4).astype(np.float32))
 
-    def encode(self, target_in_base_m: Any, q: Any, u: Any, pitch_rad: Any = None, proposed: Any = None) -> Any:
+    def encode(
+        self, target_in_base_m: Any, q: Any, u: Any, pitch_rad: Any = None, proposed: Any = None
+    ) -> Any:
         """Returns the vector, shape `(N, size)`.
 
         Args:
-            target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N, 3)`.
+            target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N,
+                3)`.
             q: Measured joint positions, oldest first, shape `(N, H, J)`, rad or m.
             u: Commands in force, oldest first, shape `(N, H, J)`, in [-1, 1].
             pitch_rad: Wanted pitch of the tool, shape `(N,)`; left out where the task fixes it.
-            proposed: What was proposed before, oldest first, shape `(N, H, J)`; left out where nobody stands between.
+            proposed: What was proposed before, oldest first, shape `(N, H, J)`; left out where
+                nobody stands between.
         """
         target = (target_in_base_m - self._target_mean_m) / self._target_std_m
         joints = ((q - self._q_mean) / self._q_std).reshape(len(q), -1)
@@ -96,7 +103,10 @@ class Encoder:
 
     def decode_pitch(self, vector: Any) -> Any:
         """Returns the wanted pitch `(N,)` in rad, where `has_pitch`."""
-        return vector[:, 3 + 2 * self.shape[0] * self.shape[1]] * self._pitch_std_rad + self._pitch_mean_rad
+        return (
+            vector[:, 3 + 2 * self.shape[0] * self.shape[1]] * self._pitch_std_rad
+            + self._pitch_mean_rad
+        )
 
     def decode_proposals(self, vector: Any) -> Any:
         """Returns what was proposed, `(N, H, J)`, where `has_proposals`."""
@@ -106,12 +116,21 @@ class Encoder:
         """Returns order and scale of the vector as plain JSON data, for the contract of a policy."""
         lower, upper = self._machine.lower, self._machine.upper
         order = ["target_in_base_m (3)", "q oldest first (H x J)", "u oldest first (H x J)"]
-        pitch = {"pitch": {"mean_rad": self._pitch_mean_rad, "std_rad": self._pitch_std_rad}} if self.has_pitch else {}
-        order += ["pitch_rad (1)"] * self.has_pitch + ["proposals oldest first (H x J)"] * self.has_proposals
+        pitch = (
+            {"pitch": {"mean_rad": self._pitch_mean_rad, "std_rad": self._pitch_std_rad}}
+            if self.has_pitch
+            else {}
+        )
+        order += ["pitch_rad (1)"] * self.has_pitch + [
+            "proposals oldest first (H x J)"
+        ] * self.has_proposals
         return {
             "size": self.size,
             "order": order,
-            "target": {"mean_m": list(self._scaling.target_mean_m), "std_m": list(self._scaling.target_std_m)},
+            "target": {
+                "mean_m": list(self._scaling.target_mean_m),
+                "std_m": list(self._scaling.target_std_m),
+            },
             "q": {"mean": ((lower + upper) / 2).tolist(), "std": ((upper - lower) / 4).tolist()},
             "u": {"mean": 0.0, "std": 1.0},
         } | pitch

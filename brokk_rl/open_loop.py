@@ -1,7 +1,9 @@
 """Free runs: an actuator model is given the recorded commands and its own predictions, never the recorded positions.
 
-One-step errors hardly separate models (a machine at 20 Hz moves little in a step); what counts is where a free run ends up.
-Axes: `W` windows, `K` steps, `J` joints, `L` samples before the free run, of which `H` are the first history.
+One-step errors hardly separate models (a machine at 20 Hz moves little in a step); what counts is
+where a free run ends up.
+Axes: `W` windows, `K` steps, `J` joints, `L` samples before the free run, of which `H` are the
+first history.
 """
 
 from __future__ import annotations
@@ -20,8 +22,9 @@ from brokk_rl.record import Recording
 from brokk_rl.split import by_run
 
 WARM_UP_S = 1.0
-"""Before a free run a model sees recorded positions for so long: a model with a state of its own (spool, pressure, commands on
-their way) would else begin each window as a machine at rest, although the recorded one is moving."""
+"""Before a free run a model sees recorded positions for so long: a model with a state of its own
+(spool, pressure, commands on their way) would else begin each window as a machine at rest, although
+the recorded one is moving."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +32,8 @@ class Windows:
     """Windows of recordings for free runs; where the recording ends within a window, positions are NaN from there on.
 
     Attributes:
-        u: Commands, shape `(W, L - 1 + K, J)`: those before, then those of the `K` steps to come; step `k` sees them up to
-            `u[:, L - 1 + k]`.
+        u: Commands, shape `(W, L - 1 + K, J)`: those before, then those of the `K` steps to come;
+            step `k` sees them up to `u[:, L - 1 + k]`.
         q: Positions, shape `(W, L + K, J)`; the free run starts at `q[:, L - 1]`.
         run: Run that each window comes from, shape `(W,)`; windows of one run are not independent.
         num_history: `H`.
@@ -61,7 +64,11 @@ def num_before(machine: Machine) -> int:
 
 
 def windows(
-    recordings: Sequence[Recording], machine: Machine, horizon_s: float, stride_s: float, shortest_s: float | None = None
+    recordings: Sequence[Recording],
+    machine: Machine,
+    horizon_s: float,
+    stride_s: float,
+    shortest_s: float | None = None,
 ) -> Windows:
     """Cuts recordings into windows of `horizon_s` after what comes before, one every `stride_s`.
 
@@ -70,7 +77,8 @@ def windows(
         machine: Gives period and history.
         horizon_s: Length of the free runs.
         stride_s: Distance between two beginnings.
-        shortest_s: A window may end early with its recording, but not before this; `None`: all are whole.
+        shortest_s: A window may end early with its recording, but not before this; `None`: all are
+            whole.
 
     Raises:
         RecordingError: no recording is long enough.
@@ -102,7 +110,9 @@ def joined(cuts: Sequence[Windows]) -> Windows:
     return Windows(u, q, run, cuts[0].num_history, cuts[0].num_before)
 
 
-def free_run(actuator: Actuator, machine: Machine, cut: Windows, device: torch.device) -> np.ndarray:
+def free_run(
+    actuator: Actuator, machine: Machine, cut: Windows, device: torch.device
+) -> np.ndarray:
     """Returns the positions of free runs through all windows at once, shape `(W, K, J)`.
 
     Raises:
@@ -112,7 +122,9 @@ def free_run(actuator: Actuator, machine: Machine, cut: Windows, device: torch.d
     model = actuator.build(machine, count, device)
     u = torch.as_tensor(cut.u, dtype=torch.float32, device=device)
     q = torch.as_tensor(cut.q[:, :before], dtype=torch.float32, device=device)
-    history = History(q=q[:, :size].clone(), u=u[:, :size].roll(1, 1))  # before the first push_u the newest command is one back
+    history = History(
+        q=q[:, :size].clone(), u=u[:, :size].roll(1, 1)
+    )  # before the first push_u the newest command is one back
     path = []
     with torch.inference_mode():
         model.reset(torch.ones(count, dtype=torch.bool, device=device))

@@ -18,10 +18,18 @@ def panels(machine: Machine, shared: str) -> tuple[Figure, list[Axes]]:
     """Returns a figure with one panel a joint, in rows of three at most, with the same scale along the axes in `shared`."""
     columns = 2 if machine.num_joints in (2, 4) else min(3, machine.num_joints)
     rows = -(-machine.num_joints // columns)
-    figure = Figure(figsize=(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows + 0.6), layout="constrained")
+    figure = Figure(
+        figsize=(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows + 0.6), layout="constrained"
+    )
     first = figure.add_subplot(rows, columns, 1)
     share = {f"share{side}": first for side in shared}
-    return figure, [first, *(figure.add_subplot(rows, columns, number + 1, **share) for number in range(1, machine.num_joints))]
+    return figure, [
+        first,
+        *(
+            figure.add_subplot(rows, columns, number + 1, **share)
+            for number in range(1, machine.num_joints)
+        ),
+    ]
 
 
 def legend(figure: Figure, axis: Axes) -> None:

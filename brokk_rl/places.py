@@ -1,8 +1,10 @@
 """Places for the jobs of a sweep that run at the same time on one computer.
 
-submitit starts all jobs of a local sweep at once and shows each of them no GPU or the same ones. So the launching process says what
-places there are, a GPU each, and a job waits for a free one before it touches a GPU. A place is a locked file: the system frees it
-when its process ends, however it ends, and two sweeps on one computer share the GPUs without knowing of each other.
+submitit starts all jobs of a local sweep at once and shows each of them no GPU or the same ones. So
+the launching process says what
+places there are, a GPU each, and a job waits for a free one before it touches a GPU. A place is a
+locked file: the system frees it when its process ends, however it ends, and two sweeps on one
+computer share the GPUs without knowing of each other.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from pathlib import Path
 from typing import IO
 
 OFFERED = "BROKK_PLACES"
-"""Environment variable with the places, one job at a time in each: `0,1,2,3` are GPUs, `0,0` two jobs on one, `cpu,cpu` none."""
+"""Environment variable with the places, one job at a time in each: `0,1,2,3` are GPUs, `0,0` two
+jobs on one, `cpu,cpu` none."""
 NO_GPU = "cpu"
 POLL_S = 0.5
 
@@ -31,7 +34,9 @@ def offer() -> None:
         return
     import torch
 
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(torch.cuda.device_count())))
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(
+        map(str, range(torch.cuda.device_count()))
+    )
     os.environ[OFFERED] = visible if torch.cuda.device_count() else NO_GPU
 
 

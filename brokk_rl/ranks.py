@@ -1,6 +1,7 @@
 """Which of several processes this one is.
 
-`torchrun` starts one process a GPU and tells each by the environment; started by hand, a process is alone.
+`torchrun` starts one process a GPU and tells each by the environment; started by hand, a process is
+alone.
 """
 
 from __future__ import annotations
@@ -65,4 +66,6 @@ def check_together(mode: type, sweep: bool) -> None:
     if not getattr(mode, "together", False):
         raise ConfigError(f"{mode.__name__} is the work of one process: start it without torchrun")
     if sweep:
-        raise ConfigError("a job of a sweep is one process: start the sweep without torchrun, with hydra/launcher=submitit_local")
+        raise ConfigError(
+            "a job of a sweep is one process: start the sweep without torchrun, with hydra/launcher=submitit_local"
+        )

@@ -1,6 +1,7 @@
 """Recordings: the log of one run of a machine, its twin or the simulator, as one Parquet file.
 
-Axes: `T` time, `J` joints in machine order. Row `k` holds the measured position at `t_s[k]` and the command in force from then on.
+Axes: `T` time, `J` joints in machine order. Row `k` holds the measured position at `t_s[k]` and the
+command in force from then on.
 """
 
 import contextlib
@@ -35,7 +36,8 @@ class Recording:
         u: Commands in force, shape `(T, J)`, in [-1, 1].
         q: Measured joint positions, shape `(T, J)`, rad or m.
         extra: Optional columns by name, each `(T,)`.
-        metadata: Further `brokk.*` metadata without the prefix: `source`, `fingerprint`, `created`, `seed`, `run`.
+        metadata: Further `brokk.*` metadata without the prefix: `source`, `fingerprint`, `created`,
+            `seed`, `run`.
         path: Where it was read from.
     """
 
@@ -89,9 +91,18 @@ def write(recording: Recording, path: Path) -> None:
         columns[command_column(joint)] = recording.u[:, j].astype(np.float32)
     for j, (joint, unit) in enumerate(zip(recording.joints, recording.units, strict=True)):
         columns[position_column(joint, unit)] = recording.q[:, j].astype(np.float32)
-    columns.update({name: np.asarray(values, dtype=np.float32) for name, values in recording.extra.items()})
-    metadata = {"schema": SCHEMA, "machine": recording.machine, "rate_hz": f"{recording.rate_hz:g}", **recording.metadata}
-    table = pa.table(columns).replace_schema_metadata({f"brokk.{key}": value for key, value in metadata.items()})
+    columns.update(
+        {name: np.asarray(values, dtype=np.float32) for name, values in recording.extra.items()}
+    )
+    metadata = {
+        "schema": SCHEMA,
+        "machine": recording.machine,
+        "rate_hz": f"{recording.rate_hz:g}",
+        **recording.metadata,
+    }
+    table = pa.table(columns).replace_schema_metadata(
+        {f"brokk.{key}": value for key, value in metadata.items()}
+    )
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,15 +111,17 @@ def write(recording: Recording, path: Path) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
-        raise StorageError(f"cannot write recording {path}: {error.strerror or error}; nothing was left behind") from error
+        raise StorageError(
+            f"cannot write recording {path}: {error.strerror or error}; nothing was left behind"
+        ) from error
 
 
 def read(path: Path, machine: Machine) -> Recording:
     """Reads the recording at `path`, made on `machine`.
 
     Raises:
-        RecordingError: the file is missing or truncated, was made on another machine, lacks a column, or breaks a rule of the
-            format; the message names file, row and column.
+        RecordingError: the file is missing or truncated, was made on another machine, lacks a
+            column, or breaks a rule of the format; the message names file, row and column.
     """
     recording, found = examine(path, machine)
     if recording is None or found:
@@ -120,8 +133,9 @@ def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach
     """Reads what can be read of the recording at `path`.
 
     Returns:
-        The recording, with NaN in place of what is missing and the machine's rate where none is stated, `None` where nothing can
-        be read; and every place where it breaks a rule of the format.
+        The recording, with NaN in place of what is missing and the machine's rate where none is
+        stated, `None` where nothing can be read; and every place where it breaks a rule of the
+        format.
     """
     try:
         table = pq.read_table(path)
@@ -129,13 +143,24 @@ def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach
         return None, [Breach("no such recording")]
     except (pa.ArrowException, OSError) as error:
         return None, [Breach(f"truncated or not a Parquet file ({error})")]
-    metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
-    metadata = {key.removeprefix("brokk."): value for key, value in metadata.items() if key.startswith("brokk.")}
+    metadata = {
+        key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()
+    }
+    metadata = {
+        key.removeprefix("brokk."): value
+        for key, value in metadata.items()
+        if key.startswith("brokk.")
+    }
     units = tuple(joint.unit for joint in machine.joints)
     commands = [command_column(name) for name in machine.joint_names]
-    positions = [position_column(name, unit) for name, unit in zip(machine.joint_names, units, strict=True)]
+    positions = [
+        position_column(name, unit) for name, unit in zip(machine.joint_names, units, strict=True)
+    ]
     required = ["t_s", *commands, *positions]
-    found = [*breaches.of_metadata(metadata, machine.name), *breaches.of_names(required, table.column_names)]
+    found = [
+        *breaches.of_metadata(metadata, machine.name),
+        *breaches.of_names(required, table.column_names),
+    ]
     columns: dict[str, np.ndarray] = {}
     for name in [*required, *(name for name in table.column_names if name not in required)]:
         if name not in table.column_names:
@@ -156,8 +181,16 @@ def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach
         t_s=columns["t_s"] if "t_s" in columns else np.arange(table.num_rows) / rate_hz,
         u=np.stack([columns.get(name, missing) for name in commands], 1).astype(np.float32),
         q=np.stack([columns.get(name, missing) for name in positions], 1).astype(np.float32),
-        extra={name: values.astype(np.float32) for name, values in columns.items() if name not in required},
-        metadata={key: value for key, value in metadata.items() if key not in ("schema", "machine", "rate_hz")},
+        extra={
+            name: values.astype(np.float32)
+            for name, values in columns.items()
+            if name not in required
+        },
+        metadata={
+            key: value
+            for key, value in metadata.items()
+            if key not in ("schema", "machine", "rate_hz")
+        },
         path=Path(path),
     )
     return recording, found
@@ -193,7 +226,9 @@ def check(recording: Recording, where: str) -> None:
     shape = (recording.num_samples, len(recording.joints))
     for name, values in (("u", recording.u), ("q", recording.q)):
         if values.shape != shape:
-            raise RecordingError(f"{where}: {name} has shape {values.shape}, expected {shape} (samples, joints)")
+            raise RecordingError(
+                f"{where}: {name} has shape {values.shape}, expected {shape} (samples, joints)"
+            )
     columns = {"t_s": recording.t_s}
     for j, (joint, unit) in enumerate(zip(recording.joints, recording.units, strict=True)):
         columns[command_column(joint)] = recording.u[:, j]
@@ -210,7 +245,9 @@ def now() -> str:
 
 def later(created: str, elapsed_s: float) -> str:
     """Returns the time `elapsed_s` after `created`, both as `brokk.created` wants them."""
-    return (datetime.fromisoformat(created) + timedelta(seconds=elapsed_s)).isoformat(timespec="milliseconds")
+    return (datetime.fromisoformat(created) + timedelta(seconds=elapsed_s)).isoformat(
+        timespec="milliseconds"
+    )
 
 
 def stamp(machine: Machine) -> str:

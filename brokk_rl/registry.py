@@ -1,7 +1,8 @@
 """The registries: which options each config group has, ours and those of installed extensions.
 
-A registry is a folder of YAML files. Nothing here imports what an option stands for: the line that describes an option is read from
-the source of its spec, so that listing costs nothing and a broken option can be listed too.
+A registry is a folder of YAML files. Nothing here imports what an option stands for: the line that
+describes an option is read from the source of its spec, so that listing costs nothing and a broken
+option can be listed too.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ CORE = "conf"
 SETTINGS = ("hydra",)
 """Groups of Hydra's own settings: no registry of ours."""
 SAME_SPEC = ("machine", "rig", "scene", "session")
-"""Groups whose options differ in their numbers only, so that the spec says nothing about one of them."""
+"""Groups whose options differ in their numbers only, so that the spec says nothing about one of
+them."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,9 @@ def _folder(package: str, who: str) -> Path:
     except ModuleNotFoundError:
         place = None
     if place is None or not place.submodule_search_locations:
-        raise ConfigError(f"{who}: no package '{package}' with config folders; install it again or uninstall it")
+        raise ConfigError(
+            f"{who}: no package '{package}' with config folders; install it again or uninstall it"
+        )
     return Path(next(iter(place.submodule_search_locations)))
 
 

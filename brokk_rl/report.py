@@ -1,12 +1,13 @@
 """One self-contained HTML page: text, tables and pictures in a single file that opens without a network, on a phone or printed.
 
-    page = Page("Identification of brokk170", "The network is better than the linear model on every joint.")
-    page.heading("Errors")
+    page = Page("Identification of brokk170", "The network is better than the linear model on every
+    joint.") page.heading("Errors")
     page.table(["joint", "mlp", "arx"], [["q1", Cell(0.012, best=True), 0.034]], "RMSE at 5 s, rad")
     page.picture(figure, "Measured and predicted position")
     page.write(folder / "identification.html")
 
-Everything that is given is escaped; nothing is taken as markup. The page forbids itself scripts and any request.
+Everything that is given is escaped; nothing is taken as markup. The page forbids itself scripts and
+any request.
 """
 
 from __future__ import annotations
@@ -31,7 +32,12 @@ if TYPE_CHECKING:
 Tone = Literal["good", "bad", "warn", "plain"]
 MISSING = "–"
 """Stands for a figure that there is none of."""
-PICTURE_TYPES = {".png": "image/png", ".svg": "image/svg+xml", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
+PICTURE_TYPES = {
+    ".png": "image/png",
+    ".svg": "image/svg+xml",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+}
 FIGURE = re.compile(r"\s*[<>±≈]?\s*[-+−]?\d")
 """How text begins that is read as a figure."""
 MARK = "▸ "
@@ -79,7 +85,8 @@ class Cell:
     Attributes:
         value: Text, number, or `None` for a figure that there is none of.
         note: Said small below it: an interval, a reason.
-        best: Marked as the best of its kind, by weight, colour and a sign (also for those who see no colour).
+        best: Marked as the best of its kind, by weight, colour and a sign (also for those who see
+            no colour).
     """
 
     value: str | float | None
@@ -110,7 +117,11 @@ class Page:
         """Adds paragraphs; an empty line separates them. `tone` sets one apart as good news, bad news or a warning."""
         classes = " ".join(filter(None, (style, tone if tone != "plain" else "")))
         for paragraph in filter(None, (part.strip() for part in text.split("\n\n"))):
-            self._parts.append(f'<p class="{classes}">{escape(paragraph)}</p>' if classes else f"<p>{escape(paragraph)}</p>")
+            self._parts.append(
+                f'<p class="{classes}">{escape(paragraph)}</p>'
+                if classes
+                else f"<p>{escape(paragraph)}</p>"
+            )
 
     def items(self, texts: Sequence[str]) -> None:
         """Adds a list of short texts."""
@@ -121,15 +132,21 @@ class Page:
         self._parts.append(f"<pre>{escape(text)}</pre>")
 
     def table(
-        self, columns: Sequence[str], rows: Sequence[Sequence[str | float | Cell | None]], caption: str = "", digits: int = 3
+        self,
+        columns: Sequence[str],
+        rows: Sequence[Sequence[str | float | Cell | None]],
+        caption: str = "",
+        digits: int = 3,
     ) -> None:
         """Adds a table.
 
         Args:
             columns: Headings.
-            rows: One cell a column; the first cell of a row names it. Columns of numbers are aligned at the right.
+            rows: One cell a column; the first cell of a row names it. Columns of numbers are
+                aligned at the right.
             caption: What it shows, with the unit.
-            digits: Significant digits of numbers; text is left as it is, so give text where a column wants fixed decimals.
+            digits: Significant digits of numbers; text is left as it is, so give text where a
+                column wants fixed decimals.
         """
         cells = [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in rows]
         for row in cells:
@@ -137,13 +154,23 @@ class Page:
                 raise ValueError(f"expected {len(columns)} cells a row, got {len(row)}: {row}")
         numeric = [_is_numeric([row[i].value for row in cells]) for i in range(len(columns))]
         kinds = [' class="number"' if number else "" for number in numeric]
-        head = "".join(f'<th scope="col"{kind}>{escape(name)}</th>' for name, kind in zip(columns, kinds, strict=True))
+        head = "".join(
+            f'<th scope="col"{kind}>{escape(name)}</th>'
+            for name, kind in zip(columns, kinds, strict=True)
+        )
         body = "".join(
-            "<tr>" + "".join(_cell(row[i], numeric[i], i == 0, digits) for i in range(len(row))) + "</tr>" for row in cells
+            "<tr>"
+            + "".join(_cell(row[i], numeric[i], i == 0, digits) for i in range(len(row)))
+            + "</tr>"
+            for row in cells
         )
         top = f"<thead><tr>{head}</tr></thead>" if any(columns) else ""
-        title = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""  # outside of what scrolls sideways on a phone
-        self._parts.append(f'<figure>{title}<div class="scroll"><table>{top}<tbody>{body}</tbody></table></div></figure>')
+        title = (
+            f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+        )  # outside of what scrolls sideways on a phone
+        self._parts.append(
+            f'<figure>{title}<div class="scroll"><table>{top}<tbody>{body}</tbody></table></div></figure>'
+        )
 
     def facts(self, facts: dict[str, str | float | None]) -> None:
         """Adds names and what is known of them, one a line."""
@@ -155,7 +182,8 @@ class Page:
         Args:
             source: A matplotlib figure, drawn as PNG, or a PNG, SVG or JPEG file.
             caption: Said below it.
-            description: What it shows, for those who cannot see it; the caption where there is none.
+            description: What it shows, for those who cannot see it; the caption where there is
+                none.
 
         Raises:
             StorageError: the file cannot be read.
@@ -167,19 +195,25 @@ class Page:
             try:
                 data = source.read_bytes()
             except OSError as error:
-                raise StorageError(f"cannot read picture {source}: {error.strerror or error}") from error
+                raise StorageError(
+                    f"cannot read picture {source}: {error.strerror or error}"
+                ) from error
         else:
             kind, buffer = PICTURE_TYPES[".png"], io.BytesIO()
             source.savefig(buffer, format="png", dpi=DPI)
             data = buffer.getvalue()
         text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
         address = f"data:{kind};base64,{base64.b64encode(data).decode()}"
-        self._parts.append(f'<figure><img src="{address}" alt="{escape(description or caption)}">{text}</figure>')
+        self._parts.append(
+            f'<figure><img src="{address}" alt="{escape(description or caption)}">{text}</figure>'
+        )
 
     @contextmanager
     def details(self, summary: str, is_open: bool = False) -> Iterator[None]:
         """Puts what is added within the block behind a line to click on; printed in full."""
-        self._parts.append(f"<details{' open' if is_open else ''}><summary>{escape(summary)}</summary>")
+        self._parts.append(
+            f"<details{' open' if is_open else ''}><summary>{escape(summary)}</summary>"
+        )
         try:
             yield
         finally:
@@ -205,7 +239,9 @@ class Page:
         try:
             write_text(path, self.html())
         except OSError as error:
-            raise StorageError(f"cannot write {path}: {error.strerror or error}; nothing was left behind") from error
+            raise StorageError(
+                f"cannot write {path}: {error.strerror or error}; nothing was left behind"
+            ) from error
 
 
 def _is_numeric(values: Sequence[str | float | None]) -> bool:
@@ -224,7 +260,9 @@ def _cell(cell: Cell, is_numeric: bool, is_name: bool, digits: int) -> str:
         text = str(value)
     else:
         text = f"{value:.{digits}g}"
-    classes = " ".join(name for name, given in (("number", is_numeric), ("best", cell.best)) if given)
+    classes = " ".join(
+        name for name, given in (("number", is_numeric), ("best", cell.best)) if given
+    )
     attribute = f' class="{classes}"' if classes else ""
     note = f'<span class="note">{escape(cell.note)}</span>' if cell.note else ""
     tag = 'th scope="row"' if is_name else "td"

@@ -27,7 +27,17 @@ if TYPE_CHECKING:
 
 RECORD = "session.json"
 RESOLVED = "resolved.yaml"
-STAMPED = ("brokk-rl", "hydra-core", "torch", "numpy", "rsl-rl-lib", "mujoco", "mujoco-warp", "warp-lang", "onnxruntime")
+STAMPED = (
+    "brokk-rl",
+    "hydra-core",
+    "torch",
+    "numpy",
+    "rsl-rl-lib",
+    "mujoco",
+    "mujoco-warp",
+    "warp-lang",
+    "onnxruntime",
+)
 """Packages whose versions stand in `session.json`."""
 
 
@@ -49,8 +59,12 @@ class Session:
         if self.seed < 0:
             raise ConfigError(f"session.seed: expected 0 or more, got {self.seed}")
         kind, _, index = self.device.partition(":")
-        if kind not in ("auto", "cpu", "cuda") or (index and (kind != "cuda" or not index.isdigit())):
-            raise ConfigError(f"session.device: expected auto, cpu, cuda or cuda:<index>, got '{self.device}'")
+        if kind not in ("auto", "cpu", "cuda") or (
+            index and (kind != "cuda" or not index.isdigit())
+        ):
+            raise ConfigError(
+                f"session.device: expected auto, cpu, cuda or cuda:<index>, got '{self.device}'"
+            )
 
     @property
     def folder(self) -> Path:
@@ -61,7 +75,8 @@ class Session:
         """Returns the device to compute on; of several processes each has the GPU of its local rank.
 
         Raises:
-            DeviceError: A GPU was asked for and is not there. `auto` never raises in a process that is alone.
+            DeviceError: A GPU was asked for and is not there. `auto` never raises in a process that
+                is alone.
         """
         import torch
 
@@ -69,7 +84,9 @@ class Session:
         rank = ranks.own()
         if rank.count > 1:
             if index:
-                raise DeviceError(f"session.device={self.device}: torchrun gives each process its own GPU; use cuda, cpu or auto")
+                raise DeviceError(
+                    f"session.device={self.device}: torchrun gives each process its own GPU; use cuda, cpu or auto"
+                )
             index = str(rank.local)
         if kind == "cpu" or (kind == "auto" and not torch.cuda.is_available()):
             return torch.device("cpu")
@@ -82,14 +99,19 @@ class Session:
         if number >= torch.cuda.device_count():
             raise DeviceError(
                 f"session.device={self.device}: there are {torch.cuda.device_count()} GPUs, numbered from 0"
-                + (f"; torchrun started a process for number {number}, start no more than there are GPUs" if rank.count > 1 else "")
+                + (
+                    f"; torchrun started a process for number {number}, start no more than there are GPUs"
+                    if rank.count > 1
+                    else ""
+                )
             )
         return torch.device("cuda", number)
 
     def stream(self, name: str) -> int:
         """Returns the seed of the stream `name`, below 2**32: the same for the same session seed and name, unrelated otherwise.
 
-        Of several processes the first has the streams of a process that is alone, each other one streams of its own.
+        Of several processes the first has the streams of a process that is alone, each other one
+        streams of its own.
         """
         rank = ranks.own().index
         key = f"{self.seed}/{name}" + (f"/rank{rank}" if rank else "")
@@ -127,7 +149,8 @@ class Session:
         Of several processes only the first writes; the record of the others stays in memory.
 
         Raises:
-            StorageError: The folder holds a run already and `resume` is false, or cannot be written.
+            StorageError: The folder holds a run already and `resume` is false, or cannot be
+                written.
         """
         if not ranks.own().first:
             yield Record(self.folder)
@@ -153,7 +176,9 @@ class Session:
             write_text(self.folder / RESOLVED, resolved)
             record.write()
         except OSError as error:
-            raise StorageError(f"cannot write into {self.folder}: {error.strerror}. Choose session.out=<folder>.") from error
+            raise StorageError(
+                f"cannot write into {self.folder}: {error.strerror}. Choose session.out=<folder>."
+            ) from error
         outcome = "failed"
         try:
             yield record
@@ -211,7 +236,8 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 def earlier(folder: Path, resolved: str) -> dict[str, Any] | None:
     """Returns what `session.json` says of the same job of the same sweep, run earlier; `None` where there is none.
 
-    So a sweep that is run again, into the same `session.out`, skips what is finished and goes on with the rest.
+    So a sweep that is run again, into the same `session.out`, skips what is finished and goes on
+    with the rest.
 
     Args:
         folder: The job's folder.
@@ -273,8 +299,19 @@ def commit() -> str | None:
     if not (root / ".git").exists():  # an installed wheel may lie inside someone else's checkout
         return None
     try:
-        git = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
-        return subprocess.run(git, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+        git = [
+            "git",
+            "-C",
+            str(root),
+            "describe",
+            "--always",
+            "--abbrev=40",
+            "--dirty",
+            "--exclude=*",
+        ]
+        return subprocess.run(
+            git, capture_output=True, text=True, check=True, timeout=10
+        ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
 

@@ -1,9 +1,11 @@
 """What the parts of perception promise each other: sources, segmenters, ellipses, poses, targets.
 
-Every part is an option of a config group (`conf/perception/{source,segmenter,ellipse,pose,filter}`): a spec with `build()`, which
-returns what the Protocols here describe. Pictures are `(h, w)` or `(h, w, 3)`, RGB, uint8; pixel centres lie at whole numbers.
-Camera coordinates follow the optical convention (x right, y down, z forward); depth is z, in m, `NaN` where it is unknown and never
-0 or infinite. Times `t_s` are of one clock, in s.
+Every part is an option of a config group
+(`conf/perception/{source,segmenter,ellipse,pose,filter}`): a spec with `build()`, which returns
+what the Protocols here describe. Pictures are `(h, w)` or `(h, w, 3)`, RGB, uint8; pixel centres
+lie at whole numbers. Camera coordinates follow the optical convention (x right, y down, z forward);
+depth is z, in m, `NaN` where it is unknown and never 0 or infinite. Times `t_s` are of one clock,
+in s.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ class Masks:
 
     Attributes:
         block: Probability that a pixel shows the block, `(h, w)` float32 in [0, 1].
-        mouth: Probability that a pixel shows the inside of a hole, `(h, w)` float32 in [0, 1]; `None` where nobody has looked.
+        mouth: Probability that a pixel shows the inside of a hole, `(h, w)` float32 in [0, 1];
+            `None` where nobody has looked.
     """
 
     block: np.ndarray
@@ -79,8 +82,8 @@ class HolePose:
         frame: In which coordinates all of it stands: `camera` (optical) or `base`.
         score: How sure it is a hole, in [0, 1].
         t_s: When it was seen.
-        shared_m2: Part of `cov_m2` that no further frame takes away, since the camera's pose is off by the same in all of them;
-            `None` for none.
+        shared_m2: Part of `cov_m2` that no further frame takes away, since the camera's pose is off
+            by the same in all of them; `None` for none.
         shared_rad2: The same part of `axis_cov_rad2`.
     """
 
@@ -112,7 +115,8 @@ class HolePose:
             axis=rotation @ self.axis,
             radius_m=self.radius_m,
             cov_m2=rotation @ self.cov_m2 @ rotation.T + (0.0 if shared[0] is None else shared[0]),
-            axis_cov_rad2=rotation @ self.axis_cov_rad2 @ rotation.T + (0.0 if shared[1] is None else shared[1]),
+            axis_cov_rad2=rotation @ self.axis_cov_rad2 @ rotation.T
+            + (0.0 if shared[1] is None else shared[1]),
             frame="base",
             score=self.score,
             t_s=self.t_s,
@@ -174,7 +178,8 @@ class Sighting:
     Attributes:
         holes: Holes, the surest first.
         rejected: All that was refused, in the order of the stages.
-        ellipses: Ellipses that were judged, one for each hole and then those refused by the pose stage.
+        ellipses: Ellipses that were judged, one for each hole and then those refused by the pose
+            stage.
         masks: What the segmenter said, `None` where it was not asked.
         ms: Time of each stage in ms.
     """
@@ -198,7 +203,8 @@ class FrameSource(Protocol):
         """Returns the newest frame that has not been returned yet, from disk the next one; `None` when there is none left.
 
         Raises:
-            FrameError: this frame cannot be used, its message says which and why; the next call goes on with the next frame.
+            FrameError: this frame cannot be used, its message says which and why; the next call
+                goes on with the next frame.
         """
         ...
 
@@ -218,7 +224,9 @@ class Segmenter(Protocol):
 class EllipseDetector(Protocol):
     """Finds ellipses in a grey picture."""
 
-    def detect(self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None) -> list[Ellipse]:
+    def detect(
+        self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None
+    ) -> list[Ellipse]:
         """Returns ellipses, the best first.
 
         Args:

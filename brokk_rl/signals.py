@@ -1,6 +1,7 @@
 """The words that simulation, policy and machine share.
 
-Shapes: `N` environments (absent on the machine), `J` joints. Arrays are numpy on the machine and torch in the simulator.
+Shapes: `N` environments (absent on the machine), `J` joints. Arrays are numpy on the machine and
+torch in the simulator.
 """
 
 from dataclasses import dataclass
@@ -50,14 +51,16 @@ class Frame:
         color: RGB, `(h, w, 3)` uint8.
         depth_m: Depth along z, `(h, w)` float32 in m, NaN where unknown; never 0, never infinite.
         camera_matrix: `(3, 3)`, px; pixel centres at whole numbers.
-        base_from_camera: Pose of the camera in the base frame when the picture was taken, `(4, 4)`; `None` where nobody knows it.
+        base_from_camera: Pose of the camera in the base frame when the picture was taken, `(4, 4)`;
+            `None` where nobody knows it.
         t_s: When the picture was taken.
         distortion: Coefficients of the lens in OpenCV's order; `None` for a rectified picture.
         right: Right picture of a rectified stereo pair, as `color`; `None` where there is none.
         baseline_m: Distance between the two cameras of the pair.
         name: Path of a frame on disk without its endings, else ''.
-        camera_cov: How uncertain the camera's pose is, the same way in all frames: covariance of a small motion of it in its own
-            coordinates, `(6, 6)`, m and then rad; `None` where nobody has told.
+        camera_cov: How uncertain the camera's pose is, the same way in all frames: covariance of a
+            small motion of it in its own coordinates, `(6, 6)`, m and then rad; `None` where nobody
+            has told.
     """
 
     color: np.ndarray

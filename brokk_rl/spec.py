@@ -14,10 +14,10 @@ T = TypeVar("T")
 def spec(cls: type[T]) -> type[T]:
     """Makes `cls` a spec: a frozen, keyword-only dataclass whose fields are checked against their annotations.
 
-    A YAML list becomes a tuple, an integer given for a float becomes a float, and a whole number such as 48e6 given for an
-    integer an integer; any other mismatch is a `ConfigError` that names the field, what was expected and what came. A spec may
-    define `check(self)` for rules between fields. Specs are pure data: a number lives in one YAML file, so fields have no
-    defaults here.
+    A YAML list becomes a tuple, an integer given for a float becomes a float, and a whole number
+    such as 48e6 given for an integer an integer; any other mismatch is a `ConfigError` that names
+    the field, what was expected and what came. A spec may define `check(self)` for rules between
+    fields. Specs are pure data: a number lives in one YAML file, so fields have no defaults here.
     """
     cls.__post_init__ = _post_init  # type: ignore[attr-defined]
     return dataclass(frozen=True, kw_only=True)(cls)
@@ -27,7 +27,9 @@ def _post_init(self: Any) -> None:
     hints = typing.get_type_hints(type(self))
     for field in fields(self):
         where = f"{type(self).__name__}.{field.name}"
-        object.__setattr__(self, field.name, _fitted(getattr(self, field.name), hints[field.name], where))
+        object.__setattr__(
+            self, field.name, _fitted(getattr(self, field.name), hints[field.name], where)
+        )
     if check := getattr(self, "check", None):
         check()
 
@@ -41,15 +43,25 @@ def _fitted(value: Any, hint: Any, where: str) -> Any:
         return _first_fit(value, args, where, hint)
     if origin is typing.Literal:
         if value not in args:
-            raise ConfigError(f"{where}: expected one of {', '.join(map(repr, args))}, got {value!r}")
+            raise ConfigError(
+                f"{where}: expected one of {', '.join(map(repr, args))}, got {value!r}"
+            )
         return value
     if origin is tuple and isinstance(value, (list, tuple)):
         inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
         if len(inner) != len(value):
-            raise ConfigError(f"{where}: expected {len(inner)} values, got {len(value)}: {list(value)}")
-        return tuple(_fitted(v, h, f"{where}[{i}]") for i, (v, h) in enumerate(zip(value, inner, strict=True)))
+            raise ConfigError(
+                f"{where}: expected {len(inner)} values, got {len(value)}: {list(value)}"
+            )
+        return tuple(
+            _fitted(v, h, f"{where}[{i}]")
+            for i, (v, h) in enumerate(zip(value, inner, strict=True))
+        )
     if origin is dict and isinstance(value, dict):
-        return {_fitted(k, args[0], where): _fitted(v, args[1], f"{where}.{k}") for k, v in value.items()}
+        return {
+            _fitted(k, args[0], where): _fitted(v, args[1], f"{where}.{k}")
+            for k, v in value.items()
+        }
     plain = origin or hint
     if plain is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)

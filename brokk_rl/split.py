@@ -1,6 +1,7 @@
 """Splits of recordings into sets to fit to, to stop by and to judge by: whole runs only, and each joint commanded in every set.
 
-Windows of one run are not independent (same oil, same operator, same load), so a run that is split makes any model look good.
+Windows of one run are not independent (same oil, same operator, same load), so a run that is split
+makes any model look good.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ COMMANDED = 0.02
 def by_run(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
     """Returns the recordings of each run, by a name that is the run's alone.
 
-    Two collections may give their runs the same names; the seed tells them apart. A recording that does not say which run it is a
-    part of is one by itself.
+    Two collections may give their runs the same names; the seed tells them apart. A recording that
+    does not say which run it is a part of is one by itself.
     """
     runs: dict[str, list[Recording]] = {}
     for number, recording in enumerate(recordings):
@@ -37,15 +38,22 @@ def by_run(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
 
 def commanded_s(recordings: Sequence[Recording]) -> np.ndarray:
     """Returns for how long each joint is commanded in all recordings together, s, shape `(J,)`."""
-    return np.sum([(np.abs(recording.u) > COMMANDED).sum(0) / recording.rate_hz for recording in recordings], 0)
+    return np.sum(
+        [(np.abs(recording.u) > COMMANDED).sum(0) / recording.rate_hz for recording in recordings],
+        0,
+    )
 
 
-def split(runs: Mapping[str, Sequence[Recording]], shares: Mapping[str, float]) -> dict[str, list[str]]:
+def split(
+    runs: Mapping[str, Sequence[Recording]], shares: Mapping[str, float]
+) -> dict[str, list[str]]:
     """Distributes runs over sets such that each joint is commanded in each set for about its share of the time.
 
-    The joint that is commanded in the fewest runs comes first; its longest run goes to the set that lacks it, or else to the one
-    that, over all joints of the run, is furthest from its share. Where names alone could decide, a hash of them does: the last runs
-    of a collection are often the warmest, and must not all be in the same set. The same names always give the same split.
+    The joint that is commanded in the fewest runs comes first; its longest run goes to the set that
+    lacks it, or else to the one
+    that, over all joints of the run, is furthest from its share. Where names alone could decide, a
+    hash of them does: the last runs of a collection are often the warmest, and must not all be in
+    the same set. The same names always give the same split.
 
     Source: iterative stratification, Sechidis et al. 2011, with seconds in place of labels.
 
@@ -58,7 +66,12 @@ def split(runs: Mapping[str, Sequence[Recording]], shares: Mapping[str, float]) 
     """
     names = sorted(runs, key=lambda name: hashlib.sha256(name.encode()).hexdigest())
     # the last column, the length of the runs, distributes those in which nothing is commanded
-    seconds = np.stack([np.append(commanded_s(runs[name]), sum(r.duration_s for r in runs[name])) for name in names])
+    seconds = np.stack(
+        [
+            np.append(commanded_s(runs[name]), sum(r.duration_s for r in runs[name]))
+            for name in names
+        ]
+    )
     left = np.ones(len(names), dtype=bool)
     scale = np.maximum(seconds.sum(0), 1.0) ** 2
     need = np.array(list(shares.values()))[:, None] * seconds.sum(0)
@@ -78,10 +91,14 @@ def split(runs: Mapping[str, Sequence[Recording]], shares: Mapping[str, float]) 
     return {part: [name for name in runs if name in members] for part, members in chosen.items()}
 
 
-def check_commanded(runs: Mapping[str, Sequence[Recording]], machine: Machine, needed: int, why: str) -> None:
+def check_commanded(
+    runs: Mapping[str, Sequence[Recording]], machine: Machine, needed: int, why: str
+) -> None:
     """Raises a `RecordingError` that names a joint commanded in fewer than `needed` runs, and what to record; `why`: for what."""
     moving = {name: commanded_s(recordings) > 0 for name, recordings in runs.items()}
-    minutes = sum(recording.duration_s for recordings in runs.values() for recording in recordings) / 60.0
+    minutes = (
+        sum(recording.duration_s for recordings in runs.values() for recording in recordings) / 60.0
+    )
     for joint, name in enumerate(machine.joint_names):
         where = [run for run, commanded in moving.items() if commanded[joint]]
         if len(where) >= needed:

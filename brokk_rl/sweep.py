@@ -26,7 +26,11 @@ class SweepFolder(Callback):
     @classmethod
     def drop_if_unused(cls) -> None:
         """Removes what Hydra made when no job has written into it."""
-        if cls.new and cls.new[0].is_dir() and {path.name for path in cls.new[0].iterdir()} <= {"multirun.yaml"}:
+        if (
+            cls.new
+            and cls.new[0].is_dir()
+            and {path.name for path in cls.new[0].iterdir()} <= {"multirun.yaml"}
+        ):
             (cls.new[0] / "multirun.yaml").unlink(missing_ok=True)
             remove_empty(cls.new)
         cls.new = ()

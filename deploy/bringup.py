@@ -71,7 +71,9 @@ class Bringup(Listener):
     def check(self) -> None:
         for name in ("listen_s", "patience_s", "shadow_s", "quiet", "rate"):
             if getattr(self, name) <= 0:
-                raise ConfigError(f"bringup.{name}: expected more than 0, got {getattr(self, name)}")
+                raise ConfigError(
+                    f"bringup.{name}: expected more than 0, got {getattr(self, name)}"
+                )
 
     def run(self, machine: Machine, session: Session, say: Callable[[str], None]) -> list[Finding]:
         """Runs the checks in order, writes `bringup.json` and the capture, and returns what was found.
@@ -90,14 +92,19 @@ class Bringup(Listener):
         children = Children(exchange, self.realtime)
         try:
             self.listen(children, machine, target_s=math.inf, pitch_rad=None)
-            capture = Capture(session.folder, self.dbc, machine, {"source": "bring-up"}, pictures_hz=0.0)
+            capture = Capture(
+                session.folder, self.dbc, machine, {"source": "bring-up"}, pictures_hz=0.0
+            )
             children.start("log", "deploy.recorder.capture:run", (capture,))
             findings = _Checks(self, machine, children, say).all()
         finally:
             children.end()
             exchange.close()
         findings.insert(0, self._rates(machine, session))
-        write_json(session.folder / REPORT, {"machine": machine.name, "findings": [asdict(one) for one in findings]})
+        write_json(
+            session.folder / REPORT,
+            {"machine": machine.name, "findings": [asdict(one) for one in findings]},
+        )
         for one in findings:
             say(f"{'passed' if one.passed else 'FAILED':7} {one.check:10} {one.text}")
         return findings
@@ -107,20 +114,37 @@ class Bringup(Listener):
         description, contents = Description(self.dbc, machine), reading.read(session.folder / MCAP)
         values, poor = {}, []
         for layout in (*description.sent_by(GATEWAY), *description.sent_by(REMOTE)):
-            times = contents.messages[layout.name].series("t_s") if layout.name in contents.messages else ()
+            times = (
+                contents.messages[layout.name].series("t_s")
+                if layout.name in contents.messages
+                else ()
+            )
             rate_hz = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
-            values[layout.name] = {"rate_hz": rate_hz, "nominal_hz": 1 / layout.period_s if layout.period_s else None}
+            values[layout.name] = {
+                "rate_hz": rate_hz,
+                "nominal_hz": 1 / layout.period_s if layout.period_s else None,
+            }
             if layout.period_s and rate_hz * layout.period_s < self.rate:
                 poor.append(f"{layout.name} {rate_hz:.0f} of {1 / layout.period_s:.0f} Hz")
-        refused = len(contents.messages.get("refused", [])) + len(contents.messages.get("fault", []))
-        text = "; ".join([*poor, f"{refused} messages refused"]) if poor or refused else "every message at its rate, none refused"
-        return Finding("bus", not poor and not refused, text, {"messages": values, "refused": refused})
+        refused = len(contents.messages.get("refused", [])) + len(
+            contents.messages.get("fault", [])
+        )
+        text = (
+            "; ".join([*poor, f"{refused} messages refused"])
+            if poor or refused
+            else "every message at its rate, none refused"
+        )
+        return Finding(
+            "bus", not poor and not refused, text, {"messages": values, "refused": refused}
+        )
 
 
 class _Checks:
     """The checks that go by the machine's state."""
 
-    def __init__(self, bringup: Bringup, machine: Machine, children: Children, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, bringup: Bringup, machine: Machine, children: Children, say: Callable[[str], None]
+    ) -> None:
         self._bringup, self._machine, self._children, self._say = bringup, machine, children, say
         self._exchange = children.exchange
         self._samples: list[tuple[float, np.ndarray, np.ndarray]] = []
@@ -129,7 +153,9 @@ class _Checks:
         """Runs them."""
         self._say("listening for the machine")
         if self._until(lambda state: float(state["q_t_s"]) > 0) is None:
-            raise LinkError(f"no joint positions within {self._bringup.patience_s:g} s; is the machine on, and the bus connected?")
+            raise LinkError(
+                f"no joint positions within {self._bringup.patience_s:g} s; is the machine on, and the bus connected?"
+            )
         return [
             self._positions(),
             self._seen("dead-man", "deadman", "press the dead-man, then release it"),
@@ -143,13 +169,23 @@ class _Checks:
         self._watch(self._bringup.listen_s)
         q = np.array([q for _, q, _ in self._samples])
         scatter, machine, last = q.std(0), self._machine, self._exchange.state.read()
-        outside = [name for j, name in enumerate(machine.joint_names) if not machine.lower[j] <= q[-1, j] <= machine.upper[j]]
-        noisy = [name for j, name in enumerate(machine.joint_names) if scatter[j] > self._bringup.quiet]
-        wrong = [f"{', '.join(outside)} outside the limits"] * bool(outside) + [f"{', '.join(noisy)} not quiet"] * bool(noisy)
+        outside = [
+            name
+            for j, name in enumerate(machine.joint_names)
+            if not machine.lower[j] <= q[-1, j] <= machine.upper[j]
+        ]
+        noisy = [
+            name for j, name in enumerate(machine.joint_names) if scatter[j] > self._bringup.quiet
+        ]
+        wrong = [f"{', '.join(outside)} outside the limits"] * bool(outside) + [
+            f"{', '.join(noisy)} not quiet"
+        ] * bool(noisy)
         if last is None or not last["q_plausible"]:
             wrong.append("not plausible")
         values = {"q": q[-1].tolist(), "standard_deviation": scatter.tolist()}
-        return Finding("positions", not wrong, "; ".join(wrong) or "valid, inside the limits, quiet", values)
+        return Finding(
+            "positions", not wrong, "; ".join(wrong) or "valid, inside the limits, quiet", values
+        )
 
     def _seen(self, check: str, field: str, request: str) -> Finding:
         self._say(request)
@@ -157,12 +193,16 @@ class _Checks:
         released_s = None if pressed_s is None else self._until(lambda state: not state[field])
         if pressed_s is None or released_s is None:
             what = "pressed" if pressed_s is None else "released"
-            return Finding(check, False, f"not seen to be {what} within {self._bringup.patience_s:g} s", {})
+            return Finding(
+                check, False, f"not seen to be {what} within {self._bringup.patience_s:g} s", {}
+            )
         return Finding(check, True, "pressed and released", {"held_s": released_s - pressed_s})
 
     def _joints(self) -> Finding:
         machine, found = self._machine, dict[str, Motion]()
-        self._say(f"move one joint after the other, both ways, a second or more each: {', '.join(machine.joint_names)}")
+        self._say(
+            f"move one joint after the other, both ways, a second or more each: {', '.join(machine.joint_names)}"
+        )
         self._samples.clear()
         end_s = time.monotonic() + self._bringup.patience_s
         while time.monotonic() < end_s:
@@ -181,9 +221,15 @@ class _Checks:
         wrong += [f"sign turned: {', '.join(turned)}"] * bool(turned)
         dead_s = [motion.dead_time_s for motion in found.values()]
         if dead_s and max(dead_s) > (machine.num_history - 1) * machine.period_s:
-            wrong.append(f"dead time of up to {max(dead_s):.2f} s is longer than the policy's history")
-        text = "; ".join(wrong) or f"signs agree; dead times {min(dead_s):.2f} to {max(dead_s):.2f} s"
-        return Finding("joints", not wrong, text, {name: asdict(motion) for name, motion in found.items()})
+            wrong.append(
+                f"dead time of up to {max(dead_s):.2f} s is longer than the policy's history"
+            )
+        text = (
+            "; ".join(wrong) or f"signs agree; dead times {min(dead_s):.2f} to {max(dead_s):.2f} s"
+        )
+        return Finding(
+            "joints", not wrong, text, {name: asdict(motion) for name, motion in found.items()}
+        )
 
     def _shadow(self) -> Finding:
         self._say("shadow run: the policy runs along, nothing is shown")
@@ -198,16 +244,24 @@ class _Checks:
             time.sleep(POLL_S)
         share = reasons.count(Advised.VALID.value) / max(1, len(reasons))
         others = sorted(set(reasons) - {Advised.VALID.value})
-        text = f"{share:.0%} of {len(reasons)} advices valid" + (f" ({', '.join(others)})" if others else "")
-        return Finding("shadow", share >= self._bringup.rate, text, {"advices": len(reasons), "valid": share})
+        text = f"{share:.0%} of {len(reasons)} advices valid" + (
+            f" ({', '.join(others)})" if others else ""
+        )
+        return Finding(
+            "shadow", share >= self._bringup.rate, text, {"advices": len(reasons), "valid": share}
+        )
 
     def _watch(self, seconds: float) -> None:
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             self._children.check()
             state = self._exchange.state.read()
-            if state is not None and (not self._samples or float(state["t_s"]) > self._samples[-1][0]):
-                self._samples.append((float(state["t_s"]), np.array(state["q"]), np.array(state["flow"])))
+            if state is not None and (
+                not self._samples or float(state["t_s"]) > self._samples[-1][0]
+            ):
+                self._samples.append(
+                    (float(state["t_s"]), np.array(state["q"]), np.array(state["flow"]))
+                )
             time.sleep(POLL_S)
 
     def _until(self, holds: Callable[[Any], bool]) -> float | None:

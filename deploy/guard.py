@@ -7,11 +7,12 @@ Pure: no clock, no bus, no file, no tensor; the caller hands in everything.
     READY    zero is sent, until the dead-man is pressed, levers in neutral.
     ACTIVE   what is asked for is sent, within the limits.
 
-    SILENT --armed on purpose--> LATCHED --released, neutral, healthy--> READY --pressed, neutral, healthy--> ACTIVE
-    ACTIVE --released--> READY; ACTIVE or READY --anything wrong--> LATCHED; any --no longer armed--> SILENT
+    SILENT --armed on purpose--> LATCHED --released, neutral, healthy--> READY --pressed, neutral,
+    healthy--> ACTIVE ACTIVE --released--> READY; ACTIVE or READY --anything wrong--> LATCHED; any
+    --no longer armed--> SILENT
 
-Away from zero a command grows by no more than `max_rate_1_s`; towards zero it may fall at once. Nothing is ever sent that the guard
-has not seen in the same cycle.
+Away from zero a command grows by no more than `max_rate_1_s`; towards zero it may fall at once.
+Nothing is ever sent that the guard has not seen in the same cycle.
 """
 
 from __future__ import annotations
@@ -134,7 +135,11 @@ class Guard:
         self._limits, self._body = limits, body
         self._still = (0.0,) * len(body.lower)
         self._state, self._cause = State.SILENT, Trip.NONE
-        self._sent, self._before_s, self._followed_s = self._still, math.nan, math.nan  # never: no comparison with nan holds
+        self._sent, self._before_s, self._followed_s = (
+            self._still,
+            math.nan,
+            math.nan,
+        )  # never: no comparison with nan holds
 
     def decide(self, now_s: float, armed: bool, seen: Seen, request: Request | None) -> Decision:
         """Returns what to send in this cycle.
@@ -175,7 +180,9 @@ class Guard:
 
     def stops(self, seen: Seen) -> bool:
         """Says whether what is seen now ends a motion: then the caller decides at once, not in its next cycle."""
-        return self._state is State.ACTIVE and (not seen.deadman or self._health(seen, 0.0) is not Trip.NONE)
+        return self._state is State.ACTIVE and (
+            not seen.deadman or self._health(seen, 0.0) is not Trip.NONE
+        )
 
     def _health(self, seen: Seen, elapsed_s: float) -> Trip:
         """Returns the first thing that is wrong, whatever is asked for."""
@@ -199,9 +206,15 @@ class Guard:
         if request is None or not request.age_s <= self._limits.request_s:
             return Trip.REQUEST_STALE
         full = 1.0 + self._limits.overrun
-        if len(request.u) != len(self._still) or not all(-full <= value <= full for value in request.u):
+        if len(request.u) != len(self._still) or not all(
+            -full <= value <= full for value in request.u
+        ):
             return Trip.REQUEST_INVALID
-        moved = {exclusive for exclusive, value in zip(self._body.exclusive, request.u, strict=True) if value != 0}
+        moved = {
+            exclusive
+            for exclusive, value in zip(self._body.exclusive, request.u, strict=True)
+            if value != 0
+        }
         alone = sum(value != 0 for value in request.u) == 1
         if True in moved and not alone:
             return Trip.REQUEST_EXCLUSIVE
@@ -212,11 +225,15 @@ class Guard:
         limits, body = self._limits, self._body
         most = limits.max_rate_1_s * elapsed_s
         values = []
-        for wanted, sent, at, lower, upper in zip(u, self._sent, q, body.lower, body.upper, strict=True):
+        for wanted, sent, at, lower, upper in zip(
+            u, self._sent, q, body.lower, body.upper, strict=True
+        ):
             value = max(-limits.max_command, min(limits.max_command, wanted))
             start = abs(sent) if value * sent > 0 else 0.0
             value = math.copysign(min(abs(value), start + most), value)
-            outward = (value > 0 and at >= upper - limits.stop_margin) or (value < 0 and at <= lower + limits.stop_margin)
+            outward = (value > 0 and at >= upper - limits.stop_margin) or (
+                value < 0 and at <= lower + limits.stop_margin
+            )
             values.append(0.0 if outward else value)
         return tuple(values)
 

@@ -1,8 +1,9 @@
 """From commands to lever positions that a person can follow, and back (paper, equations 2 and 3).
 
-A lever angle is the joint's command times the angle at full command. Which joint hangs on which axis is the machine's business
-(`machine.levers`) or that of a pattern here; a joint that is never moved together with others shares an axis and needs the button
-of that lever held. What is shown changes no faster than a hand can, and an axis passes through neutral before the button changes.
+A lever angle is the joint's command times the angle at full command. Which joint hangs on which
+axis is the machine's business (`machine.levers`) or that of a pattern here; a joint that is never
+moved together with others shares an axis and needs the button of that lever held. What is shown
+changes no faster than a hand can, and an axis passes through neutral before the button changes.
 """
 
 from __future__ import annotations
@@ -68,12 +69,17 @@ class Guidance:
 
     def check(self) -> None:
         if not 0 <= self.dead_zone < 1 or self.max_rate_rad_s <= 0:
-            raise ConfigError("guidance: expected dead_zone in [0, 1) and max_rate_rad_s of more than 0")
+            raise ConfigError(
+                "guidance: expected dead_zone in [0, 1) and max_rate_rad_s of more than 0"
+            )
 
 
 def full_angles_rad(levers: Sequence[Lever]) -> tuple[float, ...]:
     """Returns the angle at full deflection of each of the four `AXES`; 1 where no joint hangs on it."""
-    return tuple(max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0) for axis in AXES)
+    return tuple(
+        max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0)
+        for axis in AXES
+    )
 
 
 class LeverMap:
@@ -91,11 +97,17 @@ class LeverMap:
         names = machine.joint_names
         for lever in levers:
             if lever.joint not in names:
-                raise ConfigError(f"guidance: machine '{machine.name}' has no joint '{lever.joint}'; {choices(lever.joint, names)}")
+                raise ConfigError(
+                    f"guidance: machine '{machine.name}' has no joint '{lever.joint}'; {choices(lever.joint, names)}"
+                )
         by_joint = {lever.joint: lever for lever in levers}
         if missing := [name for name in names if name not in by_joint]:
-            raise ConfigError(f"guidance: no lever for {', '.join(missing)}; add it to guidance.levers or to the machine's file")
-        self._axis = np.array([AXES.index((by_joint[name].side, by_joint[name].axis)) for name in names])
+            raise ConfigError(
+                f"guidance: no lever for {', '.join(missing)}; add it to guidance.levers or to the machine's file"
+            )
+        self._axis = np.array(
+            [AXES.index((by_joint[name].side, by_joint[name].axis)) for name in names]
+        )
         self.full_rad = np.array([by_joint[name].max_angle_rad for name in names])
         """Lever angle at full command, `(J,)`."""
         self._exclusive = machine.is_exclusive

@@ -20,17 +20,22 @@ class Limits:
         max_command: Largest command, of full.
         max_rate_1_s: Largest growth of a command per second.
         overrun: Command beyond full that counts as rounding; more is refused.
-        neutral: Deflection of the operator's own levers, of full, below which they count as released.
-        stop_margin: Distance to the joint limits (rad or m) within which commands further outward are zero.
+        neutral: Deflection of the operator's own levers, of full, below which they count as
+            released.
+        stop_margin: Distance to the joint limits (rad or m) within which commands further outward
+            are zero.
         joints_s: Age of joint positions from which they are stale.
         levers_s: Age of the remote's message from which it is stale.
         status_s: Age of the machine's status from which it is stale.
         request_s: Age of a command from which it is stale.
-        ignored_s: Time for which the gateway may give the valves to somebody else, or nobody, while commands are sent.
-        gap_s: Time between two cycles from which time is said to have stood still (a stopped process, a sleeping computer).
+        ignored_s: Time for which the gateway may give the valves to somebody else, or nobody, while
+            commands are sent.
+        gap_s: Time between two cycles from which time is said to have stood still (a stopped
+            process, a sleeping computer).
         jump_margin: Speed over the machine's fastest, beyond which a joint has jumped.
         jump_slack: Jump (rad or m) that noise alone may make.
-        range_slack: Distance beyond the joint limits (rad or m) at which a position is still believed.
+        range_slack: Distance beyond the joint limits (rad or m) at which a position is still
+            believed.
         num_jumps: Jumps in a row after which positions are not plausible.
     """
 
@@ -67,7 +72,13 @@ class Limits:
         for name in positive:
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"guard.{name}: expected more than 0, got {getattr(self, name)}")
-        if self.overrun < 0 or self.stop_margin < 0 or not 0 < self.neutral < 1 or self.jump_margin < 1 or self.num_jumps < 1:
+        if (
+            self.overrun < 0
+            or self.stop_margin < 0
+            or not 0 < self.neutral < 1
+            or self.jump_margin < 1
+            or self.num_jumps < 1
+        ):
             raise ConfigError(
                 "guard: expected overrun and stop_margin of 0 or more, neutral in (0, 1), jump_margin and num_jumps of 1 or more"
             )
@@ -90,6 +101,16 @@ class Body:
     exclusive: tuple[bool, ...]
 
 
-def body_of(lower: Sequence[float], upper: Sequence[float], max_speed: Sequence[float], exclusive: Sequence[bool]) -> Body:
+def body_of(
+    lower: Sequence[float],
+    upper: Sequence[float],
+    max_speed: Sequence[float],
+    exclusive: Sequence[bool],
+) -> Body:
     """Returns the machine as the guard knows it, from arrays of length `J`."""
-    return Body(tuple(map(float, lower)), tuple(map(float, upper)), tuple(map(float, max_speed)), tuple(map(bool, exclusive)))
+    return Body(
+        tuple(map(float, lower)),
+        tuple(map(float, upper)),
+        tuple(map(float, max_speed)),
+        tuple(map(bool, exclusive)),
+    )

@@ -1,7 +1,8 @@
 """The link to a real machine, or its twin, for whoever commands it directly: `mode=collect link=can`.
 
-The bus process is the loop's own, guard included. Before the first command the operator has to release the dead-man and press it;
-letting go of it stops the machine for as long, anything else that the guard objects to ends the run.
+The bus process is the loop's own, guard included. Before the first command the operator has to
+release the dead-man and press it; letting go of it stops the machine for as long, anything else
+that the guard objects to ends the run.
 """
 
 from __future__ import annotations
@@ -105,11 +106,17 @@ class CanLink:
             time.sleep(0.002)
         if int(state["guard"]) == State.LATCHED.value:
             safety = view(exchange).safety
-            raise LinkError(f"link: the guard has stopped the machine: {safety.cause if safety else 'unknown'}")
+            raise LinkError(
+                f"link: the guard has stopped the machine: {safety.cause if safety else 'unknown'}"
+            )
         if int(state["guard"]) != State.ACTIVE.value:
             self._reached = np.zeros_like(u)
             return Command(np.zeros_like(u))
-        passed = np.where(np.array(state["sent"]) != 0, u.clip(-self._can.limits.max_command, self._can.limits.max_command), 0.0)
+        passed = np.where(
+            np.array(state["sent"]) != 0,
+            u.clip(-self._can.limits.max_command, self._can.limits.max_command),
+            0.0,
+        )
         return Command(self._mean(passed))
 
     def extra(self) -> dict[str, float]:
@@ -122,14 +129,24 @@ class CanLink:
         self._exchange = Exchange.new(machine.num_joints, commands=True)
         setting = Setting(can.wire, can.dbc, machine, can.limits)
         priority = BUS_PRIORITY if can.realtime else None
-        self._child = Child("bus", "deploy.loop.station:run", (setting, self._exchange), self._exchange.files, priority)
+        self._child = Child(
+            "bus",
+            "deploy.loop.station:run",
+            (setting, self._exchange),
+            self._exchange.files,
+            priority,
+        )
         until_s = time.monotonic() + can.patience_s
         try:
             while (state := self._exchange.state.read()) is None or float(state["q_t_s"]) == 0.0:
                 if self._child.code is not None:
-                    raise LinkError(f"link: the bus process has died (exit code {self._child.code})")
+                    raise LinkError(
+                        f"link: the bus process has died (exit code {self._child.code})"
+                    )
                 if time.monotonic() > until_s:
-                    raise LinkError(f"link: no joint positions on {can.source} within {can.patience_s:g} s; is the machine on?")
+                    raise LinkError(
+                        f"link: no joint positions on {can.source} within {can.patience_s:g} s; is the machine on?"
+                    )
                 time.sleep(0.02)
         except BaseException:
             self.__exit__()
@@ -165,7 +182,9 @@ class CanLink:
         while int(self._state()["guard"]) != State.ACTIVE.value:
             if time.monotonic() > until_s:
                 safety = view(self._opened()).safety
-                raise LinkError(f"link: the machine was not released for motion: {safety.trip if safety else 'no state'}")
+                raise LinkError(
+                    f"link: the machine was not released for motion: {safety.trip if safety else 'no state'}"
+                )
             self._ask(np.zeros(self._machine.num_joints))
             time.sleep(0.02)
         self._was_active = True
@@ -178,7 +197,9 @@ class CanLink:
     def _mean(self, wanted: np.ndarray) -> np.ndarray:
         """Returns the mean over a period of commands that grow towards `wanted`, `(J,)`, no faster than the guard allows."""
         rate, period_s = self._can.limits.max_rate_1_s, self._machine.period_s
-        start = np.where(wanted * self._reached > 0, np.minimum(np.abs(self._reached), np.abs(wanted)), 0.0)
+        start = np.where(
+            wanted * self._reached > 0, np.minimum(np.abs(self._reached), np.abs(wanted)), 0.0
+        )
         grow_s = np.minimum((np.abs(wanted) - start) / rate, period_s)
         end = start + rate * grow_s
         self._reached = np.sign(wanted) * end

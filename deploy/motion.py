@@ -44,7 +44,10 @@ def judge(t_s: np.ndarray, q: np.ndarray, flow: np.ndarray, travel: float) -> Mo
         flow: What its valve gets, `(T,)`, of full.
         travel: Length of its travel.
     """
-    began = np.flatnonzero((np.abs(flow[1:]) >= SMALLEST_FLOW) & (np.abs(flow[:-1]) < SMALLEST_FLOW)) + 1
+    began = (
+        np.flatnonzero((np.abs(flow[1:]) >= SMALLEST_FLOW) & (np.abs(flow[:-1]) < SMALLEST_FLOW))
+        + 1
+    )
     found: dict[int, list[tuple[bool, float]]] = {1: [], -1: []}
     for row in began:
         # at rest before, or what moves is the answer to something else
@@ -56,13 +59,19 @@ def judge(t_s: np.ndarray, q: np.ndarray, flow: np.ndarray, travel: float) -> Mo
         if len(away):
             sign = int(np.sign(flow[row]))
             agrees = bool(np.sign(q[window][away[0]] - q[row]) == sign)
-            found[sign].append((agrees, _began_s(t_s[window], q[window] - q[row], away[0]) - float(t_s[row])))
+            found[sign].append(
+                (agrees, _began_s(t_s[window], q[window] - q[row], away[0]) - float(t_s[row]))
+            )
     if not found[1] or not found[-1]:
         return None
     both = [*found[1], *found[-1]]
     step = max(1, round(0.2 / max(1e-3, float(np.median(np.diff(t_s))))))
     speed = np.abs(q[step:] - q[:-step]) / np.maximum(t_s[step:] - t_s[:-step], 1e-6)
-    return Motion(all(agrees for agrees, _ in both), float(np.median([dead_s for _, dead_s in both])), float(speed.max()))
+    return Motion(
+        all(agrees for agrees, _ in both),
+        float(np.median([dead_s for _, dead_s in both])),
+        float(speed.max()),
+    )
 
 
 def _began_s(t_s: np.ndarray, moved: np.ndarray, row: int) -> float:

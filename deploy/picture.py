@@ -8,7 +8,9 @@ import numpy as np
 
 def jpeg(color: np.ndarray, quality: int) -> bytes:
     """Returns an RGB picture, `(h, w, 3)` uint8, as JPEG of `quality`, 1 to 100."""
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    done, data = cv2.imencode(
+        ".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )
     assert done, "OpenCV codes any RGB picture"
     return data.tobytes()
 

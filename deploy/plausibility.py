@@ -26,13 +26,18 @@ class Plausibility:
     def accept(self, joint: int, now_s: float, position: float) -> bool:
         """Says whether to use a new position of `joint`; a rejected one is judged against the last that was used.
 
-        Where the joint stays at its new place, it is believed again as soon as the machine could have got there.
+        Where the joint stays at its new place, it is believed again as soon as the machine could
+        have got there.
         """
         limits, body, last = self._limits, self._body, self._last[joint]
         reach = limits.jump_slack
         if last is not None:
             reach += body.max_speed[joint] * limits.jump_margin * max(0.0, now_s - last[0])
-        inside = body.lower[joint] - limits.range_slack <= position <= body.upper[joint] + limits.range_slack
+        inside = (
+            body.lower[joint] - limits.range_slack
+            <= position
+            <= body.upper[joint] + limits.range_slack
+        )
         if inside and (last is None or abs(position - last[1]) <= reach):
             self._last[joint], self._jumps[joint] = (now_s, position), 0
             return True

@@ -1,8 +1,9 @@
 """The face's plane from both pictures at once: the one by which the right picture, brought onto the left, agrees with it best.
 
-A matcher answers for each pixel, by its neighbourhood, with whatever its sub-pixel step gets wrong; where all of a face is known to
-be one plane, three numbers are left to be found from all of its pixels, each of which counts as much as the picture is steep there
-(Lucas and Kanade 1981, with the plane's homography as the warp). What does not agree by that warp, inside a rim, lies deeper.
+A matcher answers for each pixel, by its neighbourhood, with whatever its sub-pixel step gets wrong;
+where all of a face is known to be one plane, three numbers are left to be found from all of its
+pixels, each of which counts as much as the picture is steep there (Lucas and Kanade 1981, with the
+plane's homography as the warp). What does not agree by that warp, inside a rim, lies deeper.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ ROUNDS, SETTLED_PX = 3, 0.004
 """Steps at most, and the last one's length, px: each is a fifth of the one before."""
 TUKEY = 4.685
 MARGIN_PX, BORDER_PX, SATURATED = 6, 4, 248.0
-"""Around what stands before the face, where a matcher bleeds; within its border, where blur mixes it with what lies behind; and
-the grey level from which a picture shows nothing."""
+"""Around what stands before the face, where a matcher bleeds; within its border, where blur mixes
+it with what lies behind; and the grey level from which a picture shows nothing."""
 LEAST, LEAST_INSIDE = 200, 24
 """Pixels in which a plane is aligned, and in which an inside is compared."""
 ALIKE = 0.7
-"""Correlation of left and right below which they do not show the same; in haze and in the dark it is still 0.96."""
+"""Correlation of left and right below which they do not show the same; in haze and in the dark it
+is still 0.96."""
 LARGEST_PX = 1.0
 """Shift of the whole face beyond which the pictures agree on something else."""
 
@@ -62,14 +64,21 @@ class Pair:
 
     def places(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns columns `(1, w)` and rows `(h, 1)` in the picture of those of `left`, `(w,)` and `(h,)`."""
-        u, v = ((some + 0.5) * self.shrink - 0.5 + corner for some, corner in zip((columns, rows), self.corner, strict=True))
+        u, v = (
+            (some + 0.5) * self.shrink - 0.5 + corner
+            for some, corner in zip((columns, rows), self.corner, strict=True)
+        )
         return u[None, :], v[:, None]
 
     def on_plane(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
         """Returns where `right` shows the points of a plane that the left one has at such places, columns `(h, w)`."""
-        return (u - self.pull_px * inverse_depth(m, self.camera_matrix, u, v) - self.right_column + 0.5) / self.shrink - 0.5
+        return (
+            u - self.pull_px * inverse_depth(m, self.camera_matrix, u, v) - self.right_column + 0.5
+        ) / self.shrink - 0.5
 
-    def seen(self, u: np.ndarray, v: np.ndarray, row: np.ndarray, m: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    def seen(
+        self, u: np.ndarray, v: np.ndarray, row: np.ndarray, m: np.ndarray, picture: np.ndarray
+    ) -> np.ndarray:
         """Returns what a picture like `right`, of one channel or more, shows of the points of a plane; `row` as `remap` has it."""
         return cv2.remap(picture, self.on_plane(u, v, m).astype(np.float32), row, cv2.INTER_CUBIC)
 
@@ -87,7 +96,9 @@ class Pair:
         return (x > 3) & (x < self.right.shape[1] - 4)
 
 
-def pair(frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, outer: float) -> Pair | None:
+def pair(
+    frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, outer: float
+) -> Pair | None:
     """Returns the surroundings of an ellipse `(5,)`, up to `outer` of its radii, in both pictures; `None` without a right one."""
     if frame.right is None or frame.baseline_m is None or frame.right.shape != frame.color.shape:
         return None
@@ -99,7 +110,9 @@ def pair(frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, out
         return None
     shrink = max(1, -(-(right - left) // WIDE_PX))
     pull_px = float(frame.camera_matrix[0, 0]) * frame.baseline_m
-    shift = pull_px * inverse_depth(m, frame.camera_matrix, np.array([[left, right]]), np.array([[top], [bottom]]))
+    shift = pull_px * inverse_depth(
+        m, frame.camera_matrix, np.array([[left, right]]), np.array([[top], [bottom]])
+    )
     first = max(0, int(left - shift.max()) - 8 * shrink)
     last = min(width, int(right - shift.min()) + 8 * shrink)
     rows, columns = (bottom - top) // shrink, (right - left) // shrink
@@ -107,25 +120,39 @@ def pair(frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, out
     if others < 16:
         return None
     partner = cv2.cvtColor(
-        np.ascontiguousarray(frame.right[top : top + rows * shrink, first : first + others * shrink]), cv2.COLOR_RGB2GRAY
+        np.ascontiguousarray(
+            frame.right[top : top + rows * shrink, first : first + others * shrink]
+        ),
+        cv2.COLOR_RGB2GRAY,
     )
     mine = gray[top : top + rows * shrink, left : left + columns * shrink]
     small = [cv2.resize(picture, (size, rows), interpolation=cv2.INTER_AREA) if shrink > 1 else picture
              for picture, size in ((mine, columns), (partner, others))]  # fmt: skip
-    one, other = (cv2.GaussianBlur(picture.astype(np.float32), (0, 0), SMOOTH_PX) for picture in small)
+    one, other = (
+        cv2.GaussianBlur(picture.astype(np.float32), (0, 0), SMOOTH_PX) for picture in small
+    )
     return Pair(one, other, shrink, (left, top), first, frame.camera_matrix, pull_px)
 
 
 def aligned(
-    both: Pair, face: Plane, frame: Frame, allowed: np.ndarray, ellipse: np.ndarray, inner: float, cell_px: int, bias_per_m: float
+    both: Pair,
+    face: Plane,
+    frame: Frame,
+    allowed: np.ndarray,
+    ellipse: np.ndarray,
+    inner: float,
+    cell_px: int,
+    bias_per_m: float,
 ) -> Plane | None:
     """Returns the plane by which the two pictures agree best on the face; `face` itself where too little of it is in sight.
 
     `None` where they do not agree: the right picture is another's, or shifted.
 
-    What dust, exposure and vignetting add to one of them varies slowly, so only what departs from the mean of a window counts.
-    The slopes of a noisy picture are larger than those of what it shows: steps by them are too short, and the plane would seem too
-    sure. So differences are held against the slopes of the left picture, whose noise is another (instrumental variables).
+    What dust, exposure and vignetting add to one of them varies slowly, so only what departs from
+    the mean of a window counts.
+    The slopes of a noisy picture are larger than those of what it shows: steps by them are too
+    short, and the plane would seem too sure. So differences are held against the slopes of the left
+    picture, whose noise is another (instrumental variables).
 
     Args:
         both: The face in both pictures.
@@ -141,7 +168,8 @@ def aligned(
     lines = np.arange(0, height, stride)
     u, v = both.places(np.arange(width), lines)
     pixel = np.ix_(
-        np.rint(v[:, 0]).astype(int).clip(0, allowed.shape[0] - 1), np.rint(u[0]).astype(int).clip(0, allowed.shape[1] - 1)
+        np.rint(v[:, 0]).astype(int).clip(0, allowed.shape[0] - 1),
+        np.rint(u[0]).astype(int).clip(0, allowed.shape[1] - 1),
     )
     depth = frame.depth_m[pixel]
     radii = conic.radii(ellipse, u, v)
@@ -151,9 +179,16 @@ def aligned(
         other = (off > 8.0 * face.sigma).astype(np.uint8)
     other = cv2.morphologyEx(other, cv2.MORPH_OPEN, np.ones((1 if stride > 1 else 3, 3), np.uint8))
     margin = np.ones((2 * round(MARGIN_PX / stride) + 1, 2 * MARGIN_PX + 1), np.uint8)
-    on &= (cv2.dilate(np.asarray(other), margin) == 0) & both.inside(u, v, face.m) & (both.left[::stride] < SATURATED)
+    on &= (
+        (cv2.dilate(np.asarray(other), margin) == 0)
+        & both.inside(u, v, face.m)
+        & (both.left[::stride] < SATURATED)
+    )
     whole = cv2.morphologyEx(on.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 5), np.uint8))
-    on &= cv2.erode(whole, np.ones((2 * round(BORDER_PX / stride) + 1, 2 * BORDER_PX + 1), np.uint8)) > 0
+    on &= (
+        cv2.erode(whole, np.ones((2 * round(BORDER_PX / stride) + 1, 2 * BORDER_PX + 1), np.uint8))
+        > 0
+    )
     at = np.flatnonzero(on)
     if len(at) < LEAST:
         return face
@@ -168,7 +203,8 @@ def aligned(
         return departs.reshape(-1, 2)[at].T.astype(float)
 
     left, right = (
-        cv2.merge([picture, cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)]) for picture in (both.left, both.right)
+        cv2.merge([picture, cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
+        for picture in (both.left, both.right)
     )
     mine, instrument = departing(left[::stride])
     row = np.repeat(lines.astype(np.float32)[:, None], width, 1)
@@ -178,7 +214,10 @@ def aligned(
     m, seen = face.m, mine
     for _ in range(ROUNDS):
         seen, rise = departing(both.seen(u, v, row, m, right))
-        push, heavy = (np.vstack([ray * (-both.pull_px / both.shrink * slope), -mine]) for slope in (rise, instrument))
+        push, heavy = (
+            np.vstack([ray * (-both.pull_px / both.shrink * slope), -mine])
+            for slope in (rise, instrument)
+        )
         gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
         off = seen - gain * mine
         scale = 1.4826 * middle(np.abs(off)) + 1e-6
@@ -191,7 +230,10 @@ def aligned(
     if likeness < ALIKE:
         return None
     moved_px = both.pull_px * np.abs((m - face.m) @ ray).max()
-    if not np.isfinite(m).all() or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px:
+    if (
+        not np.isfinite(m).all()
+        or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px
+    ):
         return face
     cell = (v_on // cell_px).astype(np.int64) * 10_000 + (u_on // cell_px).astype(np.int64)
     slopes = (push[:3] * yielding(off / (TUKEY * scale))).T
@@ -208,12 +250,18 @@ def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:
 
 
 def disagreement(
-    both: Pair, face: Plane, depth_m: np.ndarray, ellipse: np.ndarray, inner: float, ring: tuple[float, float]
+    both: Pair,
+    face: Plane,
+    depth_m: np.ndarray,
+    ellipse: np.ndarray,
+    inner: float,
+    ring: tuple[float, float],
 ) -> tuple[float, float]:
     """Returns how much the pictures differ inside an ellipse by the plane's warp, over how much they do on the face around it.
 
-    A flat disc looks the same from both cameras, the inside of a hole does not. NaN where too little of it can be seen. With it,
-    the part of the inside that something hides from the right camera alone.
+    A flat disc looks the same from both cameras, the inside of a hole does not. NaN where too
+    little of it can be seen. With it, the part of the inside that something hides from the right
+    camera alone.
 
     Args:
         both: The ellipse's surroundings in both pictures.
@@ -226,17 +274,24 @@ def disagreement(
     reach = ring[1] * ellipse[2] / both.shrink
     across, down = (
         (max(0, int(middle - reach)), min(size, int(middle + reach) + 2))
-        for middle, size in zip((both.column(ellipse[0]), both.row(ellipse[1])), both.left.shape[::-1], strict=True)
+        for middle, size in zip(
+            (both.column(ellipse[0]), both.row(ellipse[1])), both.left.shape[::-1], strict=True
+        )
     )
     part = np.s_[down[0] : down[1], across[0] : across[1]]
     if down[1] <= down[0] or across[1] <= across[0]:
         return float("nan"), 0.0
     u, v = both.places(np.arange(*across), np.arange(*down))
     radii = conic.radii(ellipse, u, v)
-    rows, columns = (np.rint(some).astype(int).clip(0, most - 1) for some, most in zip((v[:, 0], u[0]), depth_m.shape, strict=True))
+    rows, columns = (
+        np.rint(some).astype(int).clip(0, most - 1)
+        for some, most in zip((v[:, 0], u[0]), depth_m.shape, strict=True)
+    )
     depth = depth_m[np.ix_(rows, columns)]
     with np.errstate(invalid="ignore"):
-        before = (1.0 / depth - face.inverse_depth(both.camera_matrix, u, v) > 4 * face.sigma).astype(np.uint8)
+        before = (
+            1.0 / depth - face.inverse_depth(both.camera_matrix, u, v) > 4 * face.sigma
+        ).astype(np.uint8)
     shown = both.inside(u, v, face.m) & (cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0)
     hidden = shown & (radii < inner) & _hidden(both, face, depth_m, u, v)
     covered = float(hidden.sum() / max(np.count_nonzero(shown & (radii < inner)), 1))
@@ -246,7 +301,9 @@ def disagreement(
         return float("nan"), covered
     row = np.repeat(np.arange(*down, dtype=np.float32)[:, None], across[1] - across[0], 1)
     mine, seen = both.left[part], both.seen(u, v, row, face.m, both.right)
-    within &= seen < np.median(seen[around])  # the right camera may see there what stands before a disc
+    within &= seen < np.median(
+        seen[around]
+    )  # the right camera may see there what stands before a disc
     if within.sum() < LEAST_INSIDE:
         return float("nan"), covered
     off = mine - seen * (np.median(mine[around]) / max(float(np.median(seen[around])), 1.0))
@@ -254,12 +311,18 @@ def disagreement(
     return float(np.std(off[within])) / max(usual, 0.1), covered
 
 
-def _hidden(both: Pair, face: Plane, depth_m: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _hidden(
+    both: Pair, face: Plane, depth_m: np.ndarray, u: np.ndarray, v: np.ndarray
+) -> np.ndarray:
     """Says which points of a face, `(h, w)`, seen by the left camera, something nearer hides from the right one."""
     rows = np.rint(v[:, 0]).astype(int).clip(0, len(depth_m) - 1)
-    columns = np.arange(max(0, int(u[0, 0])), depth_m.shape[1])  # what hides them from the right camera lies to their right
+    columns = np.arange(
+        max(0, int(u[0, 0])), depth_m.shape[1]
+    )  # what hides them from the right camera lies to their right
     depth = depth_m[rows, columns[0] :]
-    here = face.inverse_depth(both.camera_matrix, columns[None, :], rows[:, None]).astype(np.float32)
+    here = face.inverse_depth(both.camera_matrix, columns[None, :], rows[:, None]).astype(
+        np.float32
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
         row, column = np.nonzero(1.0 / depth - here > 4 * face.sigma)
     shadow = np.zeros((len(rows), depth_m.shape[1]), np.uint8)
@@ -268,4 +331,7 @@ def _hidden(both: Pair, face: Plane, depth_m: np.ndarray, u: np.ndarray, v: np.n
     shadow[row[on], place[on]] = 1
     shadow = cv2.dilate(shadow, np.ones((3, 2 * MARGIN_PX + 1), np.uint8))
     away = both.pull_px * face.inverse_depth(both.camera_matrix, u, v)
-    return np.take_along_axis(shadow, np.rint(u - away).astype(int).clip(0, shadow.shape[1] - 1), 1) > 0
+    return (
+        np.take_along_axis(shadow, np.rint(u - away).astype(int).clip(0, shadow.shape[1] - 1), 1)
+        > 0
+    )

@@ -11,11 +11,13 @@ from perception import conic
 from perception.plane import Plane
 
 INSIDE, RING = 0.8, (1.15, 1.8)
-"""Radii: the inside without the rim's blur, and the ring around that shows how bright the face is."""
+"""Radii: the inside without the rim's blur, and the ring around that shows how bright the face
+is."""
 WIDE = 8.0
 """Radii: its surroundings, in which something else is dark too, unless there is dust."""
 CLEARLY_M = 0.03
-"""How far behind the face depth must be to be taken for the inside of a hole, whatever the noise."""
+"""How far behind the face depth must be to be taken for the inside of a hole, whatever the
+noise."""
 
 
 @dataclass(frozen=True)
@@ -24,14 +26,17 @@ class Interior:
 
     Attributes:
         darkness: Brightness of its darkest quarter over that of the face around it.
-        slope: Change of brightness over one radius in the direction in which the hole goes on behind the face, over the contrast
-            between face and darkest quarter. Of the wall the camera sees the sunlit or sky-lit end near the rim on the far side of
-            the hole and the dark depth on the near side: clearly negative in a hole, about zero on a disc.
+        slope: Change of brightness over one radius in the direction in which the hole goes on
+            behind the face, over the contrast between face and darkest quarter. Of the wall the
+            camera sees the sunlit or sky-lit end near the rim on the far side of
+            the hole and the dark depth on the near side: clearly negative in a hole, about zero on
+                a disc.
         deeper: Part of the known depth inside that lies clearly behind the face.
         unknown: Part of the inside without depth.
-        around: Brightness of the darkest hundredth of what surrounds it, over that of the face; before the face there is less dust,
-            and what stands there does not count.
-        contrast: By how much its darkest quarter is darker than the darker part of the face, in standard deviations of the grain.
+        around: Brightness of the darkest hundredth of what surrounds it, over that of the face;
+            before the face there is less dust, and what stands there does not count.
+        contrast: By how much its darkest quarter is darker than the darker part of the face, in
+            standard deviations of the grain.
     """
 
     darkness: float
@@ -43,7 +48,11 @@ class Interior:
 
 
 def interior(
-    gray: np.ndarray, depth_m: np.ndarray, ellipse: np.ndarray, camera_matrix: np.ndarray, plane: Plane | None
+    gray: np.ndarray,
+    depth_m: np.ndarray,
+    ellipse: np.ndarray,
+    camera_matrix: np.ndarray,
+    plane: Plane | None,
 ) -> Interior:
     """Returns what is seen inside an ellipse `(5,)`; slope and depth need the plane of the face."""
     x, y, a = ellipse[:3]
@@ -57,13 +66,19 @@ def interior(
     if inside.sum() < 8 or ring.sum() < 8:
         return Interior(*[np.nan] * 6)
     face = max(float(np.median(part[ring])), 1.0)
-    smooth = cv2.GaussianBlur(part, (0, 0), max(0.15 * float(np.sqrt(ellipse[2] * ellipse[3])), 0.6))
+    smooth = cv2.GaussianBlur(
+        part, (0, 0), max(0.15 * float(np.sqrt(ellipse[2] * ellipse[3])), 0.6)
+    )
     inside &= smooth < face  # what is brighter is the lit arm before it, where it has no depth
     depth = depth_m[top:bottom, left:right]
     known = np.isfinite(depth)
     if plane is not None:
-        behind = plane.inverse_depth(camera_matrix, columns, rows) - 1.0 / np.where(known, depth, np.inf)
-        before = (known & (behind < -4 * plane.sigma)).astype(np.uint8)  # an arm that hides a part of it
+        behind = plane.inverse_depth(camera_matrix, columns, rows) - 1.0 / np.where(
+            known, depth, np.inf
+        )
+        before = (known & (behind < -4 * plane.sigma)).astype(
+            np.uint8
+        )  # an arm that hides a part of it
         inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
     if inside.sum() < 8:
         return Interior(*[np.nan] * 6)
@@ -78,22 +93,32 @@ def interior(
         into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
         away = _places(inside, left, top) - (x, y)
         along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
-        drift = _gradient(part[ring], _places(ring, left, top) - (x, y)) * min(darkness, 1.0)  # of dust, over hole and face alike
+        drift = _gradient(part[ring], _places(ring, left, top) - (x, y)) * min(
+            darkness, 1.0
+        )  # of dust, over hole and face alike
         values = values - away @ drift
         apart = along - along.mean()
-        slope = float(apart @ values / max(float(apart @ apart), 1e-9)) / max(face * (1.0 - darkness), 1.0)
+        slope = float(apart @ values / max(float(apart @ apart), 1e-9)) / max(
+            face * (1.0 - darkness), 1.0
+        )
     around = _darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
-    return Interior(darkness, slope, deeper, unknown, around, _contrast(smooth[ring], face * darkness))
+    return Interior(
+        darkness, slope, deeper, unknown, around, _contrast(smooth[ring], face * darkness)
+    )
 
 
 def _contrast(ring: np.ndarray, dark: float) -> float:
     """Returns by how much `dark` is darker than a ring, in standard deviations of its grain.
 
-    The edge of a shadow across the ring is no grain: the darker of its two parts (Otsu 1979) counts, by what varies within it.
+    The edge of a shadow across the ring is no grain: the darker of its two parts (Otsu 1979)
+    counts, by what varies within it.
     """
-    limit = cv2.threshold(np.rint(ring).clip(0, 255).astype(np.uint8).reshape(-1, 1), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[
-        0
-    ]
+    limit = cv2.threshold(
+        np.rint(ring).clip(0, 255).astype(np.uint8).reshape(-1, 1),
+        0,
+        255,
+        cv2.THRESH_BINARY + cv2.THRESH_OTSU,
+    )[0]
     part = ring[ring <= limit + 0.5]
     part = part if len(part) > 0.2 * len(ring) else ring
     level = float(np.median(part))
@@ -102,7 +127,11 @@ def _contrast(ring: np.ndarray, dark: float) -> float:
 
 
 def _darkest_around(
-    gray: np.ndarray, depth_m: np.ndarray, ellipse: np.ndarray, camera_matrix: np.ndarray, plane: Plane | None
+    gray: np.ndarray,
+    depth_m: np.ndarray,
+    ellipse: np.ndarray,
+    camera_matrix: np.ndarray,
+    plane: Plane | None,
 ) -> float:
     """Returns the grey level of the darkest hundredth of what is on or behind the face around an ellipse; 0 where nothing is."""
     x, y, wide = ellipse[0], ellipse[1], WIDE * ellipse[2]
@@ -114,7 +143,9 @@ def _darkest_around(
     near = gray[np.ix_(rows, columns)]
     if plane is not None:
         here = plane.inverse_depth(camera_matrix, columns[None, :], rows[:, None])
-        behind = here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma  # false where depth is unknown
+        behind = (
+            here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma
+        )  # false where depth is unknown
         near = near[cv2.erode(behind.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0]
     return float(np.percentile(near, 1.0)) if near.size else 0.0
 

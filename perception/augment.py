@@ -1,8 +1,9 @@
 """Augmentations: what light, dust, lens, sensor and file do to pictures, without moving anything in them.
 
-The paper's five are blur, crop, contrast, gamma and noise; crop changes the geometry and is `training_data.Crop`. All take and
-return a batch of RGB pictures in [0, 1], `(B, 3, h, w)` float32 on any device, each picture changed by a draw of its own from the
-generator that they are given, which is of the same device, and from nothing else.
+The paper's five are blur, crop, contrast, gamma and noise; crop changes the geometry and is
+`training_data.Crop`. All take and return a batch of RGB pictures in [0, 1], `(B, 3, h, w)` float32
+on any device, each picture changed by a draw of its own from the generator that they are given,
+which is of the same device, and from nothing else.
 """
 
 from __future__ import annotations
@@ -35,11 +36,15 @@ class Augmentation(Protocol):
 
 
 def augmented(
-    pictures: torch.Tensor, steps: Mapping[str, Augmentation], chance: torch.Generator, generator: torch.Generator
+    pictures: torch.Tensor,
+    steps: Mapping[str, Augmentation],
+    chance: torch.Generator,
+    generator: torch.Generator,
 ) -> torch.Tensor:
     """Returns the pictures after all augmentations in their order, each with its probability, clipped to [0, 1].
 
-    `chance`, on the CPU, says which pictures each one changes (whoever asks a graphics card for that waits); `generator` says how.
+    `chance`, on the CPU, says which pictures each one changes (whoever asks a graphics card for
+    that waits); `generator` says how.
     """
     for step in steps.values():
         chosen = torch.nonzero(torch.rand(len(pictures), generator=chance) < step.probability)[:, 0]
@@ -139,8 +144,13 @@ class Shadow:
         x, y = (_drawn((0.2, 0.8), pictures, generator) for _ in range(2))
         across = torch.arange(width, device=pictures.device) / width - x
         down = torch.arange(height, device=pictures.device)[:, None] / width - y * height / width
-        half, soft = _drawn(self.width, pictures, generator) / 2.0, _drawn(self.softness, pictures, generator)
-        inside = ((half - (across * angle_rad.cos() + down * angle_rad.sin()).abs()) / soft + 0.5).clamp(0.0, 1.0)
+        half, soft = (
+            _drawn(self.width, pictures, generator) / 2.0,
+            _drawn(self.softness, pictures, generator),
+        )
+        inside = (
+            (half - (across * angle_rad.cos() + down * angle_rad.sin()).abs()) / soft + 0.5
+        ).clamp(0.0, 1.0)
         return pictures * (1.0 - inside * (1.0 - _drawn(self.depth, pictures, generator)))
 
 
@@ -165,11 +175,17 @@ class Haze:
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Returns the pictures through dust."""
-        coarse = _drawn((-self.unevenness, self.unevenness), pictures, generator, 20).reshape(-1, 1, 4, 5)
-        drift = functional.interpolate(coarse, pictures.shape[2:], mode="bicubic", align_corners=False)
+        coarse = _drawn((-self.unevenness, self.unevenness), pictures, generator, 20).reshape(
+            -1, 1, 4, 5
+        )
+        drift = functional.interpolate(
+            coarse, pictures.shape[2:], mode="bicubic", align_corners=False
+        )
         through = (_drawn(self.transmission, pictures, generator) + drift).clamp(0.05, 1.0)
         tint = torch.cat([_drawn((low, 1.0), pictures, generator) for low in (0.95, 0.9, 0.85)], 1)
-        return pictures * through + _drawn(self.brightness, pictures, generator) * tint * (1.0 - through)
+        return pictures * through + _drawn(self.brightness, pictures, generator) * tint * (
+            1.0 - through
+        )
 
 
 @spec
@@ -211,8 +227,12 @@ class MotionBlur:
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Returns the pictures smeared along a line; what is shown stays where it was, in the middle of the way."""
         half = math.ceil(self.length_px[1] / 2.0) + 1
-        length, angle_rad = (_drawn(one, pictures, generator) for one in (self.length_px, (0.0, math.pi)))
-        way = length * torch.linspace(-0.5, 0.5, 8 * half + 1, device=pictures.device)[:, None, None]
+        length, angle_rad = (
+            _drawn(one, pictures, generator) for one in (self.length_px, (0.0, math.pi))
+        )
+        way = (
+            length * torch.linspace(-0.5, 0.5, 8 * half + 1, device=pictures.device)[:, None, None]
+        )
         place = torch.arange(-half, half + 1, device=pictures.device).float()
         # each step along the way falls on the four pixels around it
         near = (1.0 - (place - way * angle_rad.cos()).abs()).clamp_min(0.0)
@@ -243,9 +263,16 @@ class Noise:
         """Returns the pictures with noise."""
         noise = torch.randn(pictures.shape, device=pictures.device, generator=generator)
         kernel = _gaussian(_drawn(self.grain_px, pictures, generator), self.grain_px[1])
-        noise = _filtered(_filtered(noise, kernel), kernel.transpose(2, 3)) / kernel.square().sum((2, 3), keepdim=True)
-        constant, photon = (_drawn(one, pictures, generator) for one in (self.constant, self.photon))
-        return pictures + noise * (constant.square() + photon.square() * pictures.clamp(0.0, 1.0)).sqrt()
+        noise = _filtered(_filtered(noise, kernel), kernel.transpose(2, 3)) / kernel.square().sum(
+            (2, 3), keepdim=True
+        )
+        constant, photon = (
+            _drawn(one, pictures, generator) for one in (self.constant, self.photon)
+        )
+        return (
+            pictures
+            + noise * (constant.square() + photon.square() * pictures.clamp(0.0, 1.0)).sqrt()
+        )
 
 
 @spec
@@ -268,7 +295,9 @@ class Jpeg:
         return jpeg.recompressed(pictures, _drawn(self.quality, pictures, generator))
 
 
-def _drawn(limits: Range, pictures: torch.Tensor, generator: torch.Generator, count: int = 1) -> torch.Tensor:
+def _drawn(
+    limits: Range, pictures: torch.Tensor, generator: torch.Generator, count: int = 1
+) -> torch.Tensor:
     """Returns evenly drawn numbers, `(B, count, 1, 1)`, for a batch of pictures."""
     low, high = limits
     drawn = torch.rand((len(pictures), count, 1, 1), device=pictures.device, generator=generator)
@@ -286,7 +315,9 @@ def _gaussian(sigma_px: torch.Tensor, largest_px: float) -> torch.Tensor:
 def _filtered(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
     """Returns each picture filtered by its own kernel, `(B, 1, k, l)`; what lies beyond a border is like the border."""
     down, across = kernels.shape[2] // 2, kernels.shape[3] // 2
-    wide = functional.pad(pictures, (across, across, down, down), mode="replicate").flatten(0, 1)[None]
+    wide = functional.pad(pictures, (across, across, down, down), mode="replicate").flatten(0, 1)[
+        None
+    ]
     each = kernels.repeat_interleave(pictures.shape[1], 0)
     return functional.conv2d(wide, each, groups=len(each))[0].unflatten(0, pictures.shape[:2])
 
@@ -294,7 +325,11 @@ def _filtered(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
 def _check(step: Augmentation, **ranges: Range) -> None:
     """Raises a `ConfigError` for a probability outside [0, 1] and for ranges that are empty or reach below 0."""
     if not 0.0 <= step.probability <= 1.0:
-        raise ConfigError(f"{type(step).__name__}.probability: expected 0 to 1, got {step.probability}")
+        raise ConfigError(
+            f"{type(step).__name__}.probability: expected 0 to 1, got {step.probability}"
+        )
     for name, (low, high) in ranges.items():
         if not 0.0 <= low <= high:
-            raise ConfigError(f"{type(step).__name__}.{name}: expected 0 <= lowest <= highest, got [{low}, {high}]")
+            raise ConfigError(
+                f"{type(step).__name__}.{name}: expected 0 <= lowest <= highest, got [{low}, {high}]"
+            )

@@ -15,7 +15,8 @@ from brokk_rl.signals import Frame
 from perception import dataset
 
 NEAR_M = 0.05
-"""A found hole belongs to a true one whose line of sight it lies this near to: its radius. How deep it lies is its error."""
+"""A found hole belongs to a true one whose line of sight it lies this near to: its radius. How deep
+it lies is its error."""
 ONE_SIGMA_2D = 1.515
 """Radius that holds 68.3 % of a round Gaussian in two dimensions, in standard deviations of one."""
 
@@ -81,13 +82,18 @@ class Tally:
     def noise(self) -> dict[str, float | None]:
         """Returns the error model for training: what stays the same over an episode, and what one more frame would change.
 
-        A camera that stands still sees the same face with the same matcher: nearly all of the error is the episode's. The policy's
-        task draws it as a shift of at most `target_bias_m`, here the 95th percentile.
+        A camera that stands still sees the same face with the same matcher: nearly all of the error
+        is the episode's. The policy's task draws it as a shift of at most `target_bias_m`, here the
+        95th percentile.
         """
         return {
             "target_bias_m": _quantile(np.array(self.position_m), 95),
-            "along_std_m": float(np.sqrt(np.mean(np.square(self.along_m)))) if self.along_m else None,
-            "across_std_m": float(np.sqrt(np.mean(np.square(self.across_m)))) if self.across_m else None,
+            "along_std_m": float(np.sqrt(np.mean(np.square(self.along_m))))
+            if self.along_m
+            else None,
+            "across_std_m": float(np.sqrt(np.mean(np.square(self.across_m))))
+            if self.across_m
+            else None,
         }
 
     @property
@@ -97,9 +103,13 @@ class Tally:
 
     def __add__(self, other: Tally) -> Tally:
         """Returns what was counted by both."""
-        both: dict[str, Any] = {name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "ms"}
+        both: dict[str, Any] = {
+            name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "ms"
+        }
         stages = dict.fromkeys((*self.ms, *other.ms))
-        return Tally(**both, ms={stage: self.ms.get(stage, []) + other.ms.get(stage, []) for stage in stages})
+        return Tally(
+            **both, ms={stage: self.ms.get(stage, []) + other.ms.get(stage, []) for stage in stages}
+        )
 
 
 def judge(observer: Observer, frame: Frame, truth: dataset.Truth) -> tuple[Tally, Sighting]:
@@ -120,7 +130,8 @@ def judge(observer: Observer, frame: Frame, truth: dataset.Truth) -> tuple[Tally
 def compare(holes: Sequence[HolePose], truth: dataset.Truth, frame: Frame, tally: Tally) -> None:
     """Adds one frame: each true hole is found by the target nearest to its line of sight, each target finds one at most.
 
-    Holes of which more than half of the rim is hidden, or that leave the picture, need not be found; found, they are no mistake.
+    Holes of which more than half of the rim is hidden, or that leave the picture, need not be
+    found; found, they are no mistake.
     """
     left = list(holes)
     eye = np.zeros(3)
@@ -146,7 +157,9 @@ def compare(holes: Sequence[HolePose], truth: dataset.Truth, frame: Frame, tally
         tally.false += not fooled
 
 
-def _measure(pose: HolePose, center: np.ndarray, axis: np.ndarray, eye: np.ndarray, tally: Tally) -> None:
+def _measure(
+    pose: HolePose, center: np.ndarray, axis: np.ndarray, eye: np.ndarray, tally: Tally
+) -> None:
     ray = (center - eye) / np.linalg.norm(center - eye)
     error = pose.center_m - center
     side = np.linalg.svd(ray[None])[2][1:]
@@ -155,7 +168,9 @@ def _measure(pose: HolePose, center: np.ndarray, axis: np.ndarray, eye: np.ndarr
     tally.along_m.append(along)
     tally.across_m.append(across.tolist())
     tally.along_sigmas.append(abs(along) / float(np.sqrt(ray @ pose.cov_m2 @ ray)))
-    tally.across_sigmas.append(float(np.sqrt(across @ np.linalg.solve(side @ pose.cov_m2 @ side.T, across))))
+    tally.across_sigmas.append(
+        float(np.sqrt(across @ np.linalg.solve(side @ pose.cov_m2 @ side.T, across)))
+    )
     tilt = np.linalg.svd(axis[None])[2][1:]
     turn = tilt @ (pose.axis - axis)
     tally.normal_rad.append(float(np.arccos(np.clip(pose.axis @ axis, -1, 1))))
@@ -171,7 +186,11 @@ def _beside(pose: HolePose, center: np.ndarray, eye: np.ndarray) -> float:
 
 
 def _in(circle: dataset.Circle, in_base: bool) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return (circle.center_in_base_m, circle.axis_in_base) if in_base else (circle.center_m, circle.axis)
+    return (
+        (circle.center_in_base_m, circle.axis_in_base)
+        if in_base
+        else (circle.center_m, circle.axis)
+    )
 
 
 def _quantile(values: np.ndarray, percent: float) -> float | None:

@@ -1,7 +1,8 @@
 """Conics, many at a time: ellipses by centre, semi-axes and direction, and as quadratic forms.
 
-Axes: `C` conics, `P` points. An ellipse is a row `(x, y, a, b, theta_rad)` with `a >= b`; rows of NaN are no ellipses. A quadratic
-form `Q`, `(3, 3)`, holds the points with `(x, y, 1) Q (x, y, 1)^T = 0`.
+Axes: `C` conics, `P` points. An ellipse is a row `(x, y, a, b, theta_rad)` with `a >= b`; rows of
+NaN are no ellipses. A quadratic form `Q`, `(3, 3)`, holds the points with `(x, y, 1) Q (x, y, 1)^T
+= 0`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import numpy as np
 def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Returns the ellipses that fit weighted points best, `(C, 5)`, rows of NaN where they determine none.
 
-    Halir and Flusser (1998), the numerically stable form of Fitzgibbon's direct fit, on points moved and scaled to unit size.
+    Halir and Flusser (1998), the numerically stable form of Fitzgibbon's direct fit, on points
+    moved and scaled to unit size.
 
     Args:
         points: `(C, P, 2)`.
@@ -48,18 +50,29 @@ def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def _largest(m: np.ndarray) -> np.ndarray:
     """Returns the eigenvectors to the largest eigenvalues of matrices `(C, 3, 3)` whose eigenvalues are real, `(3, C)`.
 
-    Of a direct fit it is the only positive one, which belongs to the ellipse. By the cubic's roots: a thousand at once.
+    Of a direct fit it is the only positive one, which belongs to the ellipse. By the cubic's roots:
+    a thousand at once.
     """
-    m = np.ascontiguousarray((m / np.maximum(np.abs(m).max((1, 2), keepdims=True), 1e-300)).transpose(1, 2, 0))
+    m = np.ascontiguousarray(
+        (m / np.maximum(np.abs(m).max((1, 2), keepdims=True), 1e-300)).transpose(1, 2, 0)
+    )
     trace = m[0, 0] + m[1, 1] + m[2, 2]
     minors = sum(m[i, i] * m[j, j] - m[i, j] * m[j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
-    det = m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]) - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+    det = m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]) - m[0, 1] * (
+        m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
+    )
     det += m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
     spread = np.sqrt(np.maximum(trace**2 - 3 * minors, 0.0)) / 3
     with np.errstate(divide="ignore", invalid="ignore"):
-        cosine = np.clip(np.nan_to_num((2 * trace**3 - 9 * trace * minors + 27 * det) / (54 * spread**3)), -1.0, 1.0)
+        cosine = np.clip(
+            np.nan_to_num((2 * trace**3 - 9 * trace * minors + 27 * det) / (54 * spread**3)),
+            -1.0,
+            1.0,
+        )
         value = trace / 3 + 2 * spread * np.cos(np.arccos(cosine) / 3)
-        step = (((value - trace) * value + minors) * value - det) / (3 * value**2 - 2 * trace * value + minors)
+        step = (((value - trace) * value + minors) * value - det) / (
+            3 * value**2 - 2 * trace * value + minors
+        )
         value = value - np.where(np.abs(step) < 1e-6, step, 0.0)
     m[[0, 1, 2], [0, 1, 2]] -= value
     normals = np.empty_like(m)
@@ -85,10 +98,19 @@ def form(ellipses: np.ndarray) -> np.ndarray:
 
 def ellipse_of(forms: np.ndarray) -> np.ndarray:
     """Returns the ellipses `(C, 5)` of forms `(C, 3, 3)`, rows of NaN where a form is no ellipse."""
-    return _ellipse(forms[:, 0, 0], forms[:, 0, 1], forms[:, 1, 1], forms[:, 0, 2], forms[:, 1, 2], forms[:, 2, 2])
+    return _ellipse(
+        forms[:, 0, 0],
+        forms[:, 0, 1],
+        forms[:, 1, 1],
+        forms[:, 0, 2],
+        forms[:, 1, 2],
+        forms[:, 2, 2],
+    )
 
 
-def _ellipse(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, e: np.ndarray, last: np.ndarray) -> np.ndarray:
+def _ellipse(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, e: np.ndarray, last: np.ndarray
+) -> np.ndarray:
     """Returns the ellipses `(C, 5)` of `a x² + 2 b xy + c y² + 2 d x + 2 e y + last`, rows of NaN where that is none."""
     result = np.empty((len(a), 5))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -98,8 +120,15 @@ def _ellipse(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, e: np.n
         mean, half, skew = (a + c) / 2 / level, (a - c) / 2 / level, b / level
         apart = np.hypot(half, skew)
         flat = mean - apart
-        flat = np.where(flat < 0.5 * mean, det / level**2 / (mean + apart), flat)  # their product, where they cancel
-        result[:, 0], result[:, 1], result[:, 2], result[:, 3] = x, y, 1.0 / np.sqrt(flat), 1.0 / np.sqrt(mean + apart)
+        flat = np.where(
+            flat < 0.5 * mean, det / level**2 / (mean + apart), flat
+        )  # their product, where they cancel
+        result[:, 0], result[:, 1], result[:, 2], result[:, 3] = (
+            x,
+            y,
+            1.0 / np.sqrt(flat),
+            1.0 / np.sqrt(mean + apart),
+        )
         result[:, 4] = np.arctan2(-skew, -half) / 2 % np.pi
         largest = np.maximum(np.maximum(np.abs(a), np.abs(c)), np.abs(b))
         known = (det > 1e-15 * np.maximum(largest, 1e-300) ** 2) & np.isfinite(result).all(1)
@@ -128,7 +157,9 @@ def dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1]
 
 
-def sample(ellipses: np.ndarray, angles_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sample(
+    ellipses: np.ndarray, angles_rad: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns points, outward unit normals, `(C, P, 2)` each, and the arc length per radian `(C, P)` at eccentric angles `(P,)`."""
     x, y, a, b, theta = (column[:, None] for column in ellipses.T)
     cos, sin, c, s = np.cos(angles_rad), np.sin(angles_rad), np.cos(theta), np.sin(theta)
@@ -165,7 +196,9 @@ def _value(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
     return u * u + v * v - 1.0, slope
 
 
-def on_plane(ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def on_plane(
+    ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns the curve on the plane `m · P = 1` that a camera sees as an ellipse, exactly.
 
     Args:
@@ -174,7 +207,8 @@ def on_plane(ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray) -> t
         m: The plane, `(3,)`.
 
     Returns:
-        The centre of the curve in camera coordinates, `(3,)` m, and its semi-axes `(2,)`, NaN where it is no ellipse.
+        The centre of the curve in camera coordinates, `(3,)` m, and its semi-axes `(2,)`, NaN where
+        it is no ellipse.
     """
     ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
     origin = ray / (m @ ray)
@@ -187,7 +221,9 @@ def on_plane(ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray) -> t
     return origin + curve[0] * first + curve[1] * second, curve[2:4]
 
 
-def circles(ellipse: np.ndarray, camera_matrix: np.ndarray, radius_m: float) -> list[tuple[np.ndarray, np.ndarray]]:
+def circles(
+    ellipse: np.ndarray, camera_matrix: np.ndarray, radius_m: float
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns the circles of a known radius that a camera sees as an ellipse: two of them, told apart by something else.
 
     From the eigenvectors of the cone through the circle (Forsyth et al. 1991).
@@ -201,7 +237,9 @@ def circles(ellipse: np.ndarray, camera_matrix: np.ndarray, radius_m: float) -> 
         Centre `(3,)` m and unit normal towards the camera `(3,)` of each.
     """
     cone = camera_matrix.T @ form(ellipse) @ camera_matrix
-    values, vectors = np.linalg.eigh(cone if np.linalg.det(cone) < 0 else -cone)  # one negative value: the cone's axis
+    values, vectors = np.linalg.eigh(
+        cone if np.linalg.det(cone) < 0 else -cone
+    )  # one negative value: the cone's axis
     order = [2, 1, 0]
     (l1, l2, l3), v = values[order], vectors[:, order]
     along = np.sqrt(max((l1 - l2) / (l1 - l3), 0.0))

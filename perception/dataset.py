@@ -1,12 +1,15 @@
 """Frames on disk, and beside each rendered one its truth.
 
-A folder holds `camera.yaml` and for each frame `<stem>.color.png`, `<stem>.depth.npy` (float32, m, NaN unknown) or
-`<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is a pair `<stem>.right.png`. Truth of a rendered frame:
+A folder holds `camera.yaml` and for each frame `<stem>.color.png`, `<stem>.depth.npy` (float32, m,
+NaN unknown) or `<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is a pair
+`<stem>.right.png`. Truth of a rendered frame:
 
-* `<stem>.truth.json`: `scene`, `conditions`, `holes` (`center_m`, `axis` and `center_in_base_m`, `axis_in_base`, `radius_m`,
-  `depth_m`, `hidden`: the part of the rim that cannot be seen, `in_view`), `decoys` (likewise), `block` (`center_m`, `rotation`,
-  `half_m`). Axes point out of the hole; coordinates without a frame in their name are the left camera's.
-* `<stem>.mask.png`: bits of `BLOCK` (its mouths too), `MOUTH` (what is seen through the rim of a hole), `ARM`.
+* `<stem>.truth.json`: `scene`, `conditions`, `holes` (`center_m`, `axis` and `center_in_base_m`,
+  `axis_in_base`, `radius_m`, `depth_m`, `hidden`: the part of the rim that cannot be seen,
+  `in_view`), `decoys` (likewise), `block` (`center_m`, `rotation`, `half_m`). Axes point out of the
+  hole; coordinates without a frame in their name are the left camera's.
+* `<stem>.mask.png`: bits of `BLOCK` (its mouths too), `MOUTH` (what is seen through the rim of a
+  hole), `ARM`.
 """
 
 from __future__ import annotations
@@ -89,9 +92,17 @@ def stems(folder: Path) -> list[Path]:
     Raises:
         FrameError: there is no such folder, or no frame in it.
     """
-    found = sorted(path.with_name(path.name.removesuffix(COLOR)) for path in folder.glob(f"*{COLOR}") if path.name[0] != ".")
+    found = sorted(
+        path.with_name(path.name.removesuffix(COLOR))
+        for path in folder.glob(f"*{COLOR}")
+        if path.name[0] != "."
+    )
     if not found:
-        raise FrameError(f"{folder}: no frames; expected files <stem>{COLOR}" if folder.is_dir() else f"{folder}: no such folder")
+        raise FrameError(
+            f"{folder}: no frames; expected files <stem>{COLOR}"
+            if folder.is_dir()
+            else f"{folder}: no such folder"
+        )
     return found
 
 
@@ -104,8 +115,12 @@ def read_truth(stem: Path) -> Truth:
     path = _beside(stem, TRUTH)
     try:
         told = json.loads(path.read_text())
-        circles = {name: tuple(Circle(**entry) for entry in told[name]) for name in ("holes", "decoys")}
-        return Truth(told["scene"], told["conditions"], circles["holes"], circles["decoys"], told["block"])
+        circles = {
+            name: tuple(Circle(**entry) for entry in told[name]) for name in ("holes", "decoys")
+        }
+        return Truth(
+            told["scene"], told["conditions"], circles["holes"], circles["decoys"], told["block"]
+        )
     except FileNotFoundError as error:
         raise FrameError(f"{path}: no truth; only rendered frames have it") from error
     except (ValueError, KeyError, TypeError) as error:
@@ -121,7 +136,9 @@ def read_label(stem: Path) -> Label:
     path = _beside(stem, MASK)
     bits = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if bits is None or bits.ndim != 2:
-        raise FrameError(f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames have one")
+        raise FrameError(
+            f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames have one"
+        )
     bits = np.asarray(bits, np.uint8)
     return Label((bits & BLOCK) > 0, (bits & MOUTH) > 0, (bits & ARM) > 0)
 
@@ -132,14 +149,21 @@ def mask_bits(label: Label) -> np.ndarray:
 
 
 def write_camera(
-    folder: Path, matrix: np.ndarray, base_from_camera: np.ndarray | None, baseline_m: float | None, dist: Sequence[float] = ()
+    folder: Path,
+    matrix: np.ndarray,
+    base_from_camera: np.ndarray | None,
+    baseline_m: float | None,
+    dist: Sequence[float] = (),
 ) -> None:
     """Writes `camera.yaml`.
 
     Raises:
         StorageError: it could not be written.
     """
-    told: dict[str, Any] = {"K": np.asarray(matrix).tolist(), "dist": [float(value) for value in dist]}
+    told: dict[str, Any] = {
+        "K": np.asarray(matrix).tolist(),
+        "dist": [float(value) for value in dist],
+    }
     if baseline_m is not None:
         told["baseline_m"] = float(baseline_m)
     if base_from_camera is not None:
@@ -160,7 +184,10 @@ def write_frame(
     Raises:
         StorageError: a file could not be written.
     """
-    for ending, picture in ((COLOR, color[..., ::-1]), (RIGHT, None if right is None else right[..., ::-1])):
+    for ending, picture in (
+        (COLOR, color[..., ::-1]),
+        (RIGHT, None if right is None else right[..., ::-1]),
+    ):
         if picture is not None:
             write_picture(_beside(stem, ending), picture)
     if depth_m is not None:
@@ -168,7 +195,10 @@ def write_frame(
     if label is not None:
         write_picture(_beside(stem, MASK), mask_bits(label))
     if truth is not None:
-        _write(_beside(stem, TRUTH), (json.dumps(asdict(truth), indent=1, allow_nan=False) + "\n").encode())
+        _write(
+            _beside(stem, TRUTH),
+            (json.dumps(asdict(truth), indent=1, allow_nan=False) + "\n").encode(),
+        )
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
@@ -202,4 +232,6 @@ def _write(path: Path, value: bytes | np.ndarray) -> None:
         part.replace(path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise StorageError(f"{path} could not be written: {error.strerror or error}; nothing was left behind") from error
+        raise StorageError(
+            f"{path} could not be written: {error.strerror or error}; nothing was left behind"
+        ) from error

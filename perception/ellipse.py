@@ -19,32 +19,38 @@ class ContourArcs:
         arc_tolerance_px: Polygon that finds where arcs bend back.
         corner_rad: Turn of that polygon at which an arc ends.
         arc_points: Least number of points of an arc.
-        reach_px: How far from an ellipse its edge points may lie, per px of the geometric mean of the semi-axes `reach_relative`,
-            at least this.
+        reach_px: How far from an ellipse its edge points may lie, per px of the geometric mean of
+            the semi-axes `reach_relative`, at least this.
         reach_relative: See `reach_px`.
-        angle_rad: Largest angle between the gradient at a supporting point and the ellipse's normal.
+        angle_rad: Largest angle between the gradient at a supporting point and the ellipse's
+            normal.
         coverage: Least part of the circumference with support.
         gap: Largest part of the circumference without any.
-        rms_px: Largest standard deviation of the support's distances, plus `rms_relative` per px of the geometric mean semi-axis;
-            for an ellipse seen in part, as large a part of that.
+        rms_px: Largest standard deviation of the support's distances, plus `rms_relative` per px of
+            the geometric mean semi-axis; for an ellipse seen in part, as large a part of that.
         rms_relative: See `rms_px`.
-        wave_px: Deviation of the support's distances in the mean over an eighth of a turn, which noise leaves no trace in; together
-            with that of its angles, over this and `wave_rad`, at most 1 where half is seen, 2 where all is.
+        wave_px: Deviation of the support's distances in the mean over an eighth of a turn, which
+            noise leaves no trace in; together with that of its angles, over this and `wave_rad`, at
+            most 1 where half is seen, 2 where all is.
         wave_rad: See `wave_px`; plus `wave_small` over the geometric mean semi-axis in px.
         wave_small: See `wave_rad`.
-        angle_rms_rad: Largest standard deviation of the support's angles, plus `angle_rms_small` over the geometric mean semi-axis
-            in px; for an ellipse seen in part, as large a part of that.
+        angle_rms_rad: Largest standard deviation of the support's angles, plus `angle_rms_small`
+            over the geometric mean semi-axis in px; for an ellipse seen in part, as large a part of
+            that.
         angle_rms_small: See `angle_rms_rad`.
         purity: Least part of the supporting edges, from corner to corner, that lies on the ellipse.
-        departure: Largest part of the circumference where the supporting edges run on beside the ellipse, up to their corners
-            (spirals, hearts).
+        departure: Largest part of the circumference where the supporting edges run on beside the
+            ellipse, up to their corners (spirals, hearts).
         evidence: Least decimal exponent by which the support is no accident.
-        score: Least score of an ellipse that is seen nearly all around; of half of one less than half of it will do.
-        prior_slack: By how much wider the limits of residual, angle and departure are, and the one of purity lower, where a size is
+        score: Least score of an ellipse that is seen nearly all around; of half of one less than
+            half of it will do.
+        prior_slack: By how much wider the limits of residual, angle and departure are, and the one
+            of purity lower, where a size is
             given: it shuts out most of what else they do, and rims are chipped.
         smallest_px: Least minor semi-axis.
         flattest: Least ratio of the semi-axes.
-        prior_flattest: The same where a size is given: what has a known size lies on a face that is seen.
+        prior_flattest: The same where a size is given: what has a known size lies on a face that is
+            seen.
     """
 
     sigma_px: float

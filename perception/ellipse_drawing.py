@@ -15,13 +15,15 @@ from perception.ellipse_arcs import ArcDetector
 class EdgeDrawing:
     """Arcs, and what OpenCV's Edge Drawing (EDCircles, Akinlar and Topal 2013) proposes as well; needs OpenCV with contrib modules.
 
-    Edge Drawing snaps small ellipses to circles, so what it proposes is fitted again and judged like everything else.
+    Edge Drawing snaps small ellipses to circles, so what it proposes is fitted again and judged
+    like everything else.
 
     Attributes:
         arcs: How arcs are found, and how all ellipses are judged.
         gradient: Gradient from which a pixel is an edge.
         anchor: By how much an anchor stands out from its neighbours.
-        sigma_px: Blur; below 1 the released library writes into the picture that it was given (opencv_contrib issue 4203).
+        sigma_px: Blur; below 1 the released library writes into the picture that it was given
+            (opencv_contrib issue 4203).
     """
 
     arcs: ContourArcs
@@ -49,7 +51,10 @@ class EdgeDrawing:
                 "opencv-contrib-python-headless in place of opencv-python-headless, or take perception/ellipse=contour_arcs"
             )
         drawing, parameters = extra.createEdgeDrawing(), extra.EdgeDrawing.Params()
-        parameters.GradientThresholdValue, parameters.AnchorThresholdValue = self.gradient, self.anchor
+        parameters.GradientThresholdValue, parameters.AnchorThresholdValue = (
+            self.gradient,
+            self.anchor,
+        )
         parameters.Sigma = self.sigma_px
         drawing.setParams(parameters)
 
@@ -67,4 +72,6 @@ def rows_of(found: np.ndarray | None) -> np.ndarray:
     x, y, radius, one, two, degrees = np.asarray(found, float).reshape(-1, 6).T
     swapped = two > one
     major, minor = np.where(swapped, two, one) + radius, np.where(swapped, one, two) + radius
-    return np.column_stack([x, y, major, minor, (np.radians(degrees) + np.where(swapped, np.pi / 2, 0.0)) % np.pi])
+    return np.column_stack(
+        [x, y, major, minor, (np.radians(degrees) + np.where(swapped, np.pi / 2, 0.0)) % np.pi]
+    )

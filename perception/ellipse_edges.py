@@ -9,18 +9,21 @@ import cv2
 import numpy as np
 
 SCALE = 16.0
-"""Gradients are given to Canny as whole numbers; in a dark picture they are a few grey levels a pixel."""
+"""Gradients are given to Canny as whole numbers; in a dark picture they are a few grey levels a
+pixel."""
 
 END_PX = 3.0
 """Of each arc: where it ends the edges of two things meet and are bent by the blur."""
 BLUNT_PX = 5.0
 """A side of a polygon shorter than this may be a corner that the blur has cut off."""
 MANY = 200_000
-"""Pixels of which a sixteenth tells the distribution of gradients well enough; of fewer a quarter does."""
+"""Pixels of which a sixteenth tells the distribution of gradients well enough; of fewer a quarter
+does."""
 WEAK = 2.5
 """Standard deviations of noise below which an edge does not go on: chains of noise alone would."""
 LONG_PX, LONG = 25.0, 6.0
-"""A side longer than this, and so many times longer than the next, is a straight line that goes over into something else."""
+"""A side longer than this, and so many times longer than the next, is a straight line that goes
+over into something else."""
 CLOSE = 4
 """Points from the ends of a closed line at which its directions are compared."""
 NO_SPANS = np.empty((0, 2), int)
@@ -54,13 +57,18 @@ class Edges:
         """Returns the same edges with their convex arcs and their runs from corner to corner; see `_pieces`."""
         arcs, runs = _pieces(self, tolerance_px, corner_rad, least)
         step = np.zeros(len(self.points))
-        step[2:-2] = np.linalg.norm(self.points[4:] - self.points[:-4], axis=1) / 4  # over four points: they scatter
+        step[2:-2] = (
+            np.linalg.norm(self.points[4:] - self.points[:-4], axis=1) / 4
+        )  # over four points: they scatter
         way = np.cumsum(np.minimum(step, 1.5))
         run = np.full(len(self.points), -1)
         for number, (start, stop) in enumerate(runs.tolist()):
             run[start:stop] = number
         length = way[runs[:, 1] - 1] - way[runs[:, 0]] - END_PX
-        for start, stop in self._closed().tolist():  # a closed line begins somewhere; that is no corner
+        for (
+            start,
+            stop,
+        ) in self._closed().tolist():  # a closed line begins somewhere; that is no corner
             first, last = run[start], run[stop - 1]
             if first != last and min(first, last) >= 0:
                 run[run == last] = first
@@ -72,7 +80,9 @@ class Edges:
         height, width = self.nearest.shape
         x, y = np.rint(points[..., 0]), np.rint(points[..., 1])
         place = (y * width + x).astype(np.intp)
-        place[(x < 0) | (y < 0) | (x >= width) | (y >= height)] = 0  # the picture's border has no edges
+        place[(x < 0) | (y < 0) | (x >= width) | (y >= height)] = (
+            0  # the picture's border has no edges
+        )
         return self.nearest.ravel().take(place)
 
     def _closed(self) -> np.ndarray:
@@ -84,19 +94,28 @@ class Edges:
 
 
 def find(
-    gray: np.ndarray, roi: np.ndarray | None, sigma_px: float, percentile: float, noise: float, low: float, least: int, near_px: int
+    gray: np.ndarray,
+    roi: np.ndarray | None,
+    sigma_px: float,
+    percentile: float,
+    noise: float,
+    low: float,
+    least: int,
+    near_px: int,
 ) -> Edges:
     """Returns the edges of a picture.
 
-    Thresholds follow the picture, so that dark and hazy ones have edges too: the upper one is the given percentile of the gradient,
-    at least `noise` times what the gradient of noise alone would be, and at least a grey level a pixel.
+    Thresholds follow the picture, so that dark and hazy ones have edges too: the upper one is the
+    given percentile of the gradient, at least `noise` times what the gradient of noise alone would
+    be, and at least a grey level a pixel.
 
     Args:
         gray: `(h, w)` uint8.
         roi: `(h, w)` bool, `None` for everywhere.
         sigma_px: Gaussian blur before the gradient.
         percentile: Of the gradient's magnitude, 0 to 100.
-        noise: Upper threshold in standard deviations of the gradient of noise, as the median magnitude tells it.
+        noise: Upper threshold in standard deviations of the gradient of noise, as the median
+            magnitude tells it.
         low: Lower threshold as a part of the upper one.
         least: Contours with fewer points are left out.
         near_px: How far from its edge points a picture knows the nearest one.
@@ -118,7 +137,11 @@ def find(
     if roi is not None:
         canny = cv2.bitwise_and(canny, canny, mask=roi.view(np.uint8))
     canny[[0, -1]] = canny[:, [0, -1]] = 0
-    contours = [c for c in cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0] if len(c) >= least]
+    contours = [
+        c
+        for c in cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
+        if len(c) >= least
+    ]
     if not contours:
         return _none(gray.shape)
     pixels, spans = _chains(contours, gray.shape, least)
@@ -132,11 +155,14 @@ def find(
     )  # fmt: skip
 
 
-def _pieces(edges: Edges, tolerance_px: float, corner_rad: float, least: int) -> tuple[np.ndarray, np.ndarray]:
+def _pieces(
+    edges: Edges, tolerance_px: float, corner_rad: float, least: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns convex arcs and runs as spans of edge points, `(A, 2)`: chains cut at corners, arcs also where they bend back.
 
-    A polygon that follows a circle within the tolerance turns by eight times it over the length of its sides at each vertex; one
-    that turns by more than that and `corner_rad` together has a corner there.
+    A polygon that follows a circle within the tolerance turns by eight times it over the length of
+    its sides at each vertex; one that turns by more than that and `corner_rad` together has a
+    corner there.
 
     Args:
         edges: Edges.
@@ -148,14 +174,21 @@ def _pieces(edges: Edges, tolerance_px: float, corner_rad: float, least: int) ->
     if not len(spans):
         return NO_SPANS, NO_SPANS
     fine = np.round(edges.points * 16).astype(np.int32)
-    polygons = [cv2.approxPolyDP(fine[start:stop, None], tolerance_px * 16, False)[:, 0] for start, stop in spans.tolist()]
+    polygons = [
+        cv2.approxPolyDP(fine[start:stop, None], tolerance_px * 16, False)[:, 0]
+        for start, stop in spans.tolist()
+    ]
     owner = np.repeat(np.arange(len(spans)), [len(polygon) for polygon in polygons])
     corners = np.concatenate(polygons)
     steps = np.diff(corners / 16.0, axis=0)
-    turn = np.arctan2(steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0], (steps[:-1] * steps[1:]).sum(1))
+    turn = np.arctan2(
+        steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0], (steps[:-1] * steps[1:]).sum(1)
+    )
     size = np.linalg.norm(steps, axis=1)
     inner = owner[2:] == owner[:-2]
-    half = 4 * tolerance_px / np.maximum(size, 1.0)  # of the turn of a circle's chord of this length
+    half = (
+        4 * tolerance_px / np.maximum(size, 1.0)
+    )  # of the turn of a circle's chord of this length
     sharp = np.abs(turn) > corner_rad + half[1:] + half[:-1]
     cut_off = (size[1:-1] < BLUNT_PX) & inner[1:] & inner[:-1]  # a corner that the blur has cut off
     cut_off &= np.abs(turn[1:] + turn[:-1]) > corner_rad + half[2:] + half[:-2]
@@ -171,17 +204,26 @@ def _pieces(edges: Edges, tolerance_px: float, corner_rad: float, least: int) ->
         bounds = np.unique(np.concatenate([spans.ravel(), place[np.flatnonzero(cuts) + 1]]))
         pieces = np.column_stack([bounds[:-1], bounds[1:]])
         within = np.searchsorted(spans[:, 0], pieces[:, 0], side="right") - 1
-        found.append(pieces[(pieces[:, 1] <= spans[within, 1]) & (pieces[:, 1] - pieces[:, 0] >= least)])
+        found.append(
+            pieces[(pieces[:, 1] <= spans[within, 1]) & (pieces[:, 1] - pieces[:, 0] >= least)]
+        )
     return found[0], found[1]
 
 
-def _places(fine: np.ndarray, spans: np.ndarray, corners: np.ndarray, owner: np.ndarray) -> np.ndarray:
+def _places(
+    fine: np.ndarray, spans: np.ndarray, corners: np.ndarray, owner: np.ndarray
+) -> np.ndarray:
     """Returns the number of the edge point at which each corner of the polygon of a span stands."""
     member = np.concatenate([np.arange(start, stop) for start, stop in spans.tolist()])
     span = np.repeat(np.arange(len(spans)), spans[:, 1] - spans[:, 0])
 
     def key(number: np.ndarray, points: np.ndarray) -> np.ndarray:
-        return (number.astype(np.int64) << 40) + (points[:, 1].astype(np.int64) + 64 << 20) + points[:, 0] + 64
+        return (
+            (number.astype(np.int64) << 40)
+            + (points[:, 1].astype(np.int64) + 64 << 20)
+            + points[:, 0]
+            + 64
+        )
 
     keys = key(span, fine[member])
     order = np.argsort(keys, kind="stable")
@@ -191,15 +233,17 @@ def _places(fine: np.ndarray, spans: np.ndarray, corners: np.ndarray, owner: np.
 def _chains(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns edge pixels `(E, 2)` in order, each once, and unbranched spans.
 
-    A contour runs around a line of edge pixels: along both sides of an open one, inside and outside of a closed one. Taking each
-    pixel where it comes first leaves the line, cut at its ends and branches. An open line whose topmost pixel lies within it comes
-    in two halves, which are joined.
+    A contour runs around a line of edge pixels: along both sides of an open one, inside and outside
+    of a closed one. Taking each pixel where it comes first leaves the line, cut at its ends and
+    branches. An open line whose topmost pixel lies within it comes in two halves, which are joined.
     """
     lengths = np.array([len(c) for c in contours])
     order = np.argsort(-lengths, kind="stable")
     pixels = np.concatenate([contours[i][:, 0] for i in order])
     contour = np.repeat(np.arange(len(contours)), lengths[order])
-    first = np.sort(np.unique(pixels[:, 1].astype(np.int64) * shape[1] + pixels[:, 0], return_index=True)[1])
+    first = np.sort(
+        np.unique(pixels[:, 1].astype(np.int64) * shape[1] + pixels[:, 0], return_index=True)[1]
+    )
     pixels, contour = pixels[first], contour[first]
     step = np.abs(np.diff(pixels.astype(int), axis=0)).max(1)
     cut = np.flatnonzero((step > 1) | (np.diff(contour) != 0)) + 1
@@ -207,7 +251,9 @@ def _chains(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndarray, n
     pieces = np.column_stack([bounds[:-1], bounds[1:]])
     pieces = pieces[pieces[:, 1] > pieces[:, 0]]
     start, following = pieces[:-1, 0], pieces[1:, 0]
-    halves = (contour[start] == contour[following]) & (np.abs(pixels[start].astype(int) - pixels[following]).max(1) <= 1)
+    halves = (contour[start] == contour[following]) & (
+        np.abs(pixels[start].astype(int) - pixels[following]).max(1) <= 1
+    )
     halves &= pieces[:-1, 1] - start > 1
     halves[1:] &= ~halves[:-1]
     place = np.arange(len(pixels))
@@ -224,7 +270,9 @@ def _chains(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndarray, n
     return pixels, joined
 
 
-def _refined(pixels: np.ndarray, gx: np.ndarray, gy: np.ndarray, magnitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _refined(
+    pixels: np.ndarray, gx: np.ndarray, gy: np.ndarray, magnitude: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns where along its gradient each edge pixel's gradient is strongest, by a parabola through three samples."""
     x, y = pixels[:, 0], pixels[:, 1]
     here = np.maximum(magnitude[y, x], 1e-6)
@@ -239,8 +287,8 @@ def _refined(pixels: np.ndarray, gx: np.ndarray, gy: np.ndarray, magnitude: np.n
 def _nearest(pixels: np.ndarray, shape: tuple, near_px: int) -> np.ndarray:
     """Returns the number of the edge pixel nearest to each pixel not farther from one than that, `(h, w)`, -1 elsewhere.
 
-    Each edge pixel writes its number around itself, the farthest place first: a distance transform costs by the picture, not by
-    its edges.
+    Each edge pixel writes its number around itself, the farthest place first: a distance transform
+    costs by the picture, not by its edges.
     """
     height, width = shape[0] + 2 * near_px, shape[1] + 2 * near_px
     number = np.full(height * width, -1, np.int32)
@@ -256,7 +304,10 @@ def _nearest(pixels: np.ndarray, shape: tuple, near_px: int) -> np.ndarray:
 def _bilinear(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Returns the picture between its pixels, at `(E, 2)` points away from its border."""
     height, width = picture.shape
-    x0, y0 = (np.floor(points[:, k]).astype(np.intp).clip(0, size - 2) for k, size in ((0, width), (1, height)))
+    x0, y0 = (
+        np.floor(points[:, k]).astype(np.intp).clip(0, size - 2)
+        for k, size in ((0, width), (1, height))
+    )
     fx, fy = points[:, 0] - x0, points[:, 1] - y0
     flat, here = picture.ravel(), y0 * width + x0
     top = flat.take(here) * (1 - fx) + flat.take(here + 1) * fx
@@ -267,4 +318,13 @@ def _bilinear(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _none(shape: tuple) -> Edges:
     empty = np.empty((0, 2))
     run = np.empty(0, int)
-    return Edges(empty, empty, np.empty(0), np.full(shape, -1, np.int32), NO_SPANS, NO_SPANS, run, np.empty(0))
+    return Edges(
+        empty,
+        empty,
+        np.empty(0),
+        np.full(shape, -1, np.int32),
+        NO_SPANS,
+        NO_SPANS,
+        run,
+        np.empty(0),
+    )

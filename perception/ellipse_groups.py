@@ -20,8 +20,9 @@ STRAIGHT_PX = 0.35
 def find(arcs: np.ndarray, edges: Edges, numbers: Sequence[int]) -> list[np.ndarray]:
     """Returns groups of so many arcs each, `(M, number)`, numbers into `arcs`, each the likeliest next one of the one before.
 
-    Where a circle's arc ends and its next one begins, the chord between them halves the angle between their tangents; of an ellipse
-    nearly so. Both bend to the same side, with the bright on the same side, about as strongly.
+    Where a circle's arc ends and its next one begins, the chord between them halves the angle
+    between their tangents; of an ellipse nearly so. Both bend to the same side, with the bright on
+    the same side, about as strongly.
     """
     following = _next(arcs, edges) if len(arcs) > 1 else np.full(len(arcs), -1)
     found = []
@@ -64,10 +65,19 @@ def _next(arcs: np.ndarray, edges: Edges) -> np.ndarray:
     arriving = _turn(gap, head[other])
     total = leaving + arriving
     mean_bend = (bend[usable][:, None] + bend[other]) / 2
-    ratio = np.maximum(bend[usable][:, None], bend[other]) / np.maximum(np.minimum(bend[usable][:, None], bend[other]), 1e-9)
+    ratio = np.maximum(bend[usable][:, None], bend[other]) / np.maximum(
+        np.minimum(bend[usable][:, None], bend[other]), 1e-9
+    )
     uneven = np.abs(leaving - arriving)
-    strength = np.abs(np.log(np.maximum(2 * np.sin(np.clip(total, 0.02, np.pi) / 2) / length, 1e-6) / mean_bend))
-    good = (other != usable[:, None]) & (polarity[other] == polarity[usable][:, None]) & (uneven < 0.6) & (ratio < 5)
+    strength = np.abs(
+        np.log(np.maximum(2 * np.sin(np.clip(total, 0.02, np.pi) / 2) / length, 1e-6) / mean_bend)
+    )
+    good = (
+        (other != usable[:, None])
+        & (polarity[other] == polarity[usable][:, None])
+        & (uneven < 0.6)
+        & (ratio < 5)
+    )
     good &= (leaving > -0.1) & (arriving > -0.1) & (total < 2.6) & (strength < 1.1)
     cost = np.where(good, uneven + 0.5 * strength + 0.2 * np.log(ratio), np.inf)
     best = np.argmin(cost, 1)
@@ -85,4 +95,6 @@ def _tangent(edges: Edges, place: np.ndarray, polarity: np.ndarray) -> np.ndarra
 
 def _turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Returns the signed angle from one direction to another, rad."""
-    return np.arctan2(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0], (first * second).sum(-1))
+    return np.arctan2(
+        first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0], (first * second).sum(-1)
+    )

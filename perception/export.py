@@ -45,7 +45,9 @@ def write(path: Path, network: UNet, header: Mapping[str, Any]) -> None:
     Raises:
         StorageError: it could not be written.
     """
-    tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
+    tensors = {
+        name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
+    }
     write_bytes(path, save(tensors, metadata={"brokk": json.dumps(header)}))
 
 
@@ -79,7 +81,9 @@ def inference(network: UNet, device: torch.device) -> Infer:
     return infer
 
 
-def write_onnx(path: Path, network: UNet, header: Mapping[str, Any], pictures: torch.Tensor) -> float:
+def write_onnx(
+    path: Path, network: UNet, header: Mapping[str, Any], pictures: torch.Tensor
+) -> float:
     """Writes an ONNX file with the header as metadata, and compares it with the network.
 
     Args:
@@ -111,9 +115,15 @@ def write_onnx(path: Path, network: UNet, header: Mapping[str, Any], pictures: t
         expected = module(pictures).numpy()
     model = onnx.load(part)
     part.unlink()
-    onnx.helper.set_model_props(model, {f"{PREFIX}{key}": json.dumps(value) for key, value in header.items()})
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    largest = float(np.abs(np.asarray(session.run(None, {"picture": pictures.numpy()})[0]) - expected).max())
+    onnx.helper.set_model_props(
+        model, {f"{PREFIX}{key}": json.dumps(value) for key, value in header.items()}
+    )
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    largest = float(
+        np.abs(np.asarray(session.run(None, {"picture": pictures.numpy()})[0]) - expected).max()
+    )
     if not largest <= TOLERANCE:
         raise CheckpointError(
             f"the exported network differs from the one in torch by {largest:.3g} of probability, over {TOLERANCE}; {path} was not "

@@ -20,7 +20,8 @@ class Fusion:
     """Weighs what frames say by their covariance, leaves outliers out, says when the target is stale.
 
     Attributes:
-        gate: Squared Mahalanobis distance beyond which a hole is another one, in units of the 99 % quantile.
+        gate: Squared Mahalanobis distance beyond which a hole is another one, in units of the 99 %
+            quantile.
         floor_m: Standard deviation that frames of one place share and that no averaging takes away.
         drift_m: Standard deviation by which the target may move, per square root of a second.
         confirm: Frames that must agree before there is a target.
@@ -96,7 +97,9 @@ class FusionFilter:
         return Target(pose, track.num_frames, age_s, age_s > s.stale_s)
 
     def _drifted(self, track: _Track, t_s: float) -> _Track:
-        grown = track.pose.cov_m2 + np.eye(3) * self.settings.drift_m**2 * max(t_s - track.updated_s, 0.0)
+        grown = track.pose.cov_m2 + np.eye(3) * self.settings.drift_m**2 * max(
+            t_s - track.updated_s, 0.0
+        )
         return replace(track, pose=replace(track.pose, cov_m2=grown), updated_s=t_s)
 
     def _distance(self, first: HolePose, second: HolePose) -> float:
@@ -109,7 +112,9 @@ class FusionFilter:
 def _own(pose: HolePose) -> HolePose:
     """Returns a pose with what is its own of its covariances: further frames take that away, and not what all of them share."""
     return replace(
-        pose, cov_m2=pose.cov_m2 - _or_zero(pose.shared_m2), axis_cov_rad2=pose.axis_cov_rad2 - _or_zero(pose.shared_rad2)
+        pose,
+        cov_m2=pose.cov_m2 - _or_zero(pose.shared_m2),
+        axis_cov_rad2=pose.axis_cov_rad2 - _or_zero(pose.shared_rad2),
     )
 
 
@@ -123,7 +128,10 @@ def _fused(track: _Track, pose: HolePose, t_s: float) -> _Track:
     gain = before.cov_m2 @ np.linalg.inv(before.cov_m2 + pose.cov_m2 + tiny)
     center = before.center_m + gain @ (pose.center_m - before.center_m)
     cov = (np.eye(3) - gain) @ before.cov_m2 @ (np.eye(3) - gain).T + gain @ pose.cov_m2 @ gain.T
-    w = 1.0 / max(float(np.trace(before.axis_cov_rad2)), 1e-12), 1.0 / max(float(np.trace(pose.axis_cov_rad2)), 1e-12)
+    w = (
+        1.0 / max(float(np.trace(before.axis_cov_rad2)), 1e-12),
+        1.0 / max(float(np.trace(pose.axis_cov_rad2)), 1e-12),
+    )
     part = w[1] / (w[0] + w[1])
     axis = (1 - part) * before.axis + part * pose.axis
     axis_cov = (1 - part) ** 2 * before.axis_cov_rad2 + part**2 * pose.axis_cov_rad2

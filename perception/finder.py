@@ -65,7 +65,9 @@ class Perception:
         if self.roi not in ("mask", "box"):
             raise ConfigError(f"perception.roi: expected mask or box, got '{self.roi}'")
         if self.radius_m <= 0 or self.size_slack < 0:
-            raise ConfigError(f"perception: expected radius_m > 0 and size_slack >= 0, got {self.radius_m} and {self.size_slack}")
+            raise ConfigError(
+                f"perception: expected radius_m > 0 and size_slack >= 0, got {self.radius_m} and {self.size_slack}"
+            )
 
     def build(self) -> Finder:
         """Returns a finder."""
@@ -84,7 +86,9 @@ class Finder:
     def find(self, frame: Frame) -> Borehole | None:
         """Returns the borehole in the base frame, or `None` when there is none to be sure of in this frame."""
         if frame.base_from_camera is None:
-            raise FrameError(f"{frame.name or 'frame'}: nobody knows where the camera is (T_base_cam); run mode=calibrate first")
+            raise FrameError(
+                f"{frame.name or 'frame'}: nobody knows where the camera is (T_base_cam); run mode=calibrate first"
+            )
         try:
             sighting = self.look(frame)
         except FrameError:
@@ -110,12 +114,24 @@ class Finder:
         roi = masks.block > s.block_probability
         share = cv2.countNonZero(roi.view(np.uint8)) / roi.size
         if share < s.smallest_block:
-            return Sighting([], [Rejection("segment", "part of the picture that is block", share, s.smallest_block)], [], masks, ms)
+            return Sighting(
+                [],
+                [
+                    Rejection(
+                        "segment", "part of the picture that is block", share, s.smallest_block
+                    )
+                ],
+                [],
+                masks,
+                ms,
+            )
         with _timed(ms, "ellipse"):
             gray = gray_of(frame)
             levels = search.levels(frame, roi, s.radius_m, s.size_slack, s.comfortable_px)
             levels = search.box(roi, levels) if s.roi == "box" else levels
-            ellipses = _distinct([one for level in levels for one in level.detect(self._detector, gray)])
+            ellipses = _distinct(
+                [one for level in levels for one in level.detect(self._detector, gray)]
+            )
         with _timed(ms, "pose"):
             judged = [(ellipse, self._pose.estimate(frame, masks, ellipse)) for ellipse in ellipses]
             found = [(e, pose) for e, pose in judged if isinstance(pose, HolePose)]
@@ -124,7 +140,10 @@ class Finder:
         if not ellipses:
             refused = [Rejection("ellipse", "ellipses of a possible size on the block", 0.0, 1.0)]
         if frame.base_from_camera is not None:
-            holes = [(ellipse, pose.moved(frame.base_from_camera, frame.camera_cov)) for ellipse, pose in holes]
+            holes = [
+                (ellipse, pose.moved(frame.base_from_camera, frame.camera_cov))
+                for ellipse, pose in holes
+            ]
         rejected = [*refused, *doubles]
         shown = [e for e, _ in holes] + [r.ellipse for r in rejected if r.ellipse is not None]
         ms["total"] = sum(ms.values())
@@ -138,7 +157,9 @@ class Finder:
         """Returns in words what was refused, why, and what could be done."""
         return explain.words(rejection)
 
-    def _single(self, found: Sequence[tuple[Ellipse, HolePose]]) -> tuple[list[tuple[Ellipse, HolePose]], list[Rejection]]:
+    def _single(
+        self, found: Sequence[tuple[Ellipse, HolePose]]
+    ) -> tuple[list[tuple[Ellipse, HolePose]], list[Rejection]]:
         """Returns each hole once, the best first: of rims within each other the outer one, which is the near one."""
         kept: list[tuple[Ellipse, HolePose]] = []
         doubles = []
@@ -147,9 +168,14 @@ class Finder:
         strong = [(e.score >= 0.5 * best, pose.radius_m) for e, pose in found]
         for k in sorted(range(len(found)), key=lambda k: strong[k], reverse=True):
             ellipse, pose = found[k]
-            distance = min((float(np.linalg.norm(pose.center_m - other.center_m)) for _, other in kept), default=np.inf)
+            distance = min(
+                (float(np.linalg.norm(pose.center_m - other.center_m)) for _, other in kept),
+                default=np.inf,
+            )
             if distance < limit:
-                doubles.append(Rejection("pose", "distance to a larger rim, m", distance, limit, ellipse))
+                doubles.append(
+                    Rejection("pose", "distance to a larger rim, m", distance, limit, ellipse)
+                )
             else:
                 kept.append((ellipse, pose))
         return sorted(kept, key=lambda one: -one[1].score), doubles
@@ -161,11 +187,28 @@ def rectified(frame: Frame) -> Frame:
         return frame
     height, width = frame.depth_m.shape
     maps = cv2.initUndistortRectifyMap(
-        frame.camera_matrix, frame.distortion, np.eye(3), frame.camera_matrix, (width, height), cv2.CV_32FC1
+        frame.camera_matrix,
+        frame.distortion,
+        np.eye(3),
+        frame.camera_matrix,
+        (width, height),
+        cv2.CV_32FC1,
     )
     color = cv2.remap(frame.color, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    depth = cv2.remap(frame.depth_m, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
-    return replace(frame, color=np.asarray(color, np.uint8), depth_m=np.asarray(depth, np.float32), distortion=None, right=None)
+    depth = cv2.remap(
+        frame.depth_m,
+        *maps,
+        cv2.INTER_NEAREST,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=float("nan"),
+    )
+    return replace(
+        frame,
+        color=np.asarray(color, np.uint8),
+        depth_m=np.asarray(depth, np.float32),
+        distortion=None,
+        right=None,
+    )
 
 
 def _distinct(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
@@ -174,7 +217,8 @@ def _distinct(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
     for one in sorted(ellipses, key=lambda one: -one.score):
         size = (one.a * one.b) ** 0.5
         if not any(
-            np.hypot(one.x - other.x, one.y - other.y) < ALIKE * size and abs((other.a * other.b) ** 0.5 / size - 1) < ALIKE
+            np.hypot(one.x - other.x, one.y - other.y) < ALIKE * size
+            and abs((other.a * other.b) ** 0.5 / size - 1) < ALIKE
             for other in kept
         ):
             kept.append(one)

@@ -1,6 +1,7 @@
 """Masks for real footage: the block is placed once, refined over all frames, and projected into each of them.
 
-What LabelFusion (Marion et al., 2018) does by reconstruction and alignment of meshes; a cuboid needs neither.
+What LabelFusion (Marion et al., 2018) does by reconstruction and alignment of meshes; a cuboid
+needs neither.
 """
 
 from __future__ import annotations
@@ -48,12 +49,14 @@ class Labelling:
     Attributes:
         source: The frames.
         camera: How to know where the camera was.
-        placing: YAML file: corners of the drilled face, thickness, mouths; see `perception.label_placing`.
+        placing: YAML file: corners of the drilled face, thickness, mouths; see
+            `perception.label_placing`.
         noise_per_m: Standard deviation of inverse depth, 1/m.
         num_sigma: Depth this many standard deviations off says that something else is there.
         num_refined: Frames, evenly spread, by which the block is refined; 0 takes it as placed.
         reach_px: How far from the placed outline the picture's edges are looked for.
-        max_outline_px: Largest mean distance between the projected outline and the picture's edges; a frame with more is left out.
+        max_outline_px: Largest mean distance between the projected outline and the picture's edges;
+            a frame with more is left out.
         min_depth_share: Least part of the block's known depth that must agree with it.
     """
 
@@ -68,7 +71,10 @@ class Labelling:
     min_depth_share: float
 
     def check(self) -> None:
-        if min(self.noise_per_m, self.num_sigma, self.reach_px, self.max_outline_px) <= 0 or self.num_refined < 0:
+        if (
+            min(self.noise_per_m, self.num_sigma, self.reach_px, self.max_outline_px) <= 0
+            or self.num_refined < 0
+        ):
             raise ConfigError(
                 "label: expected noise_per_m, num_sigma, reach_px and max_outline_px above 0, num_refined of 0 or more"
             )
@@ -82,7 +88,8 @@ class Labelling:
         """Labels; writes frames with masks, and overlays, into `folder`.
 
         Returns:
-            What `labels.json` says: the block, figures of each frame, and which were left out and why.
+            What `labels.json` says: the block, figures of each frame, and which were left out and
+                why.
 
         Raises:
             ConfigError: the placing cannot be read, or names a frame that is not there.
@@ -94,19 +101,45 @@ class Labelling:
         before, views = cuboid.world(np.array([cuboid.low_m, cuboid.high_m])), []
         if self.num_refined:
             names = sorted(poses)
-            chosen = {names[k] for k in np.linspace(0, len(names) - 1, min(self.num_refined, len(names))).round().astype(int)}
-            views = [label_refine.seen(frame, poses[frame.name].world_from_camera) for frame in self._frames(chosen)]
+            chosen = {
+                names[k]
+                for k in np.linspace(0, len(names) - 1, min(self.num_refined, len(names)))
+                .round()
+                .astype(int)
+            }
+            views = [
+                label_refine.seen(frame, poses[frame.name].world_from_camera)
+                for frame in self._frames(chosen)
+            ]
             cuboid = label_refine.refined(cuboid, views, self.noise_per_m, self.reach_px)
-        shift_m = float(np.linalg.norm(cuboid.world(np.array([cuboid.low_m, cuboid.high_m])) - before, axis=1).max())
+        shift_m = float(
+            np.linalg.norm(
+                cuboid.world(np.array([cuboid.low_m, cuboid.high_m])) - before, axis=1
+            ).max()
+        )
         cuboid = label_placing.with_mouths(cuboid, placing, *clicked)
-        cuboid = label_refine.refined_mouths(cuboid, views, self.noise_per_m, self.reach_px) if views else cuboid
+        cuboid = (
+            label_refine.refined_mouths(cuboid, views, self.noise_per_m, self.reach_px)
+            if views
+            else cuboid
+        )
         self._write(cuboid, poses, told, folder)
         good = [entry for entry in told.values() if entry["left_out"] is None]
         if not good:
             reasons = sorted({str(entry["left_out"]) for entry in told.values()})
             raise FrameError(f"no frame could be labelled: {'; '.join(reasons[:3])}")
-        block = {"rotation": cuboid.rotation.tolist(), "origin_m": cuboid.origin_m.tolist(), "size_m": cuboid.size_m.tolist()}
-        return {"schema": 1, "block": block, "refined_by_m": shift_m, "num_labelled": len(good), "frames": told}
+        block = {
+            "rotation": cuboid.rotation.tolist(),
+            "origin_m": cuboid.origin_m.tolist(),
+            "size_m": cuboid.size_m.tolist(),
+        }
+        return {
+            "schema": 1,
+            "block": block,
+            "refined_by_m": shift_m,
+            "num_labelled": len(good),
+            "frames": told,
+        }
 
     def _frames(self, names: set[str] | None = None) -> Any:
         with self.source.build() as source:
@@ -129,7 +162,12 @@ class Labelling:
         told: dict[str, dict[str, Any]] = {}
         clicked = None
         for frame in self._frames():
-            entry: dict[str, Any] = {"left_out": None, "board_px": None, "outline_px": None, "depth_share": None}
+            entry: dict[str, Any] = {
+                "left_out": None,
+                "board_px": None,
+                "outline_px": None,
+                "depth_share": None,
+            }
             told[Path(frame.name).name] = entry
             try:
                 pose = tracker.locate(frame)
@@ -142,10 +180,18 @@ class Labelling:
         if clicked is None:
             why = told.get(str(clicked_in), {}).get("left_out")
             known = ", ".join(list(told)[:5]) or "none"
-            raise ConfigError(f"label.placing: frame '{clicked_in}' cannot be used: {why or f'there is none; frames: {known}, …'}")
+            raise ConfigError(
+                f"label.placing: frame '{clicked_in}' cannot be used: {why or f'there is none; frames: {known}, …'}"
+            )
         return poses, told, clicked
 
-    def _write(self, cuboid: Cuboid, poses: dict[str, CameraPose], told: dict[str, dict[str, Any]], folder: Path) -> None:
+    def _write(
+        self,
+        cuboid: Cuboid,
+        poses: dict[str, CameraPose],
+        told: dict[str, dict[str, Any]],
+        folder: Path,
+    ) -> None:
         (folder / OVERLAYS).mkdir(parents=True, exist_ok=True)
         with Progress(transient=True) as progress:
             task = progress.add_task("masks", total=len(poses))
@@ -154,12 +200,18 @@ class Labelling:
                 found, share = self._masks(cuboid, frame, pose)
                 outline_px = self._outline_px(cuboid, frame, pose)
                 entry = told[name]
-                entry |= {"outline_px": outline_px, "depth_share": share, "left_out": self._left_out(outline_px, share)}
+                entry |= {
+                    "outline_px": outline_px,
+                    "depth_share": share,
+                    "left_out": self._left_out(outline_px, share),
+                }
                 picture = _overlay(cuboid, frame, pose, found, entry["left_out"] is None)
                 dataset.write_picture(folder / OVERLAYS / f"{name}.png", picture[..., ::-1])
                 if entry["left_out"] is None:
                     truth = _truth(cuboid, frame, pose, outline_px or 0.0, self.noise_per_m)
-                    dataset.write_frame(folder / FRAMES / name, frame.color, None, label=found, truth=truth)
+                    dataset.write_frame(
+                        folder / FRAMES / name, frame.color, None, label=found, truth=truth
+                    )
                 progress.advance(task)
 
     def _left_out(self, outline_px: float | None, share: float | None) -> str | None:
@@ -185,20 +237,28 @@ class Labelling:
         block = there.face >= 0
         with np.errstate(invalid="ignore"):
             away = frame.depth_m - np.where(block, there.depth_m, np.nan)
-            step = np.maximum(self.num_sigma * self.noise_per_m * np.where(block, there.depth_m, 0.0) ** 2, LEAST_STEP_M)
+            step = np.maximum(
+                self.num_sigma * self.noise_per_m * np.where(block, there.depth_m, 0.0) ** 2,
+                LEAST_STEP_M,
+            )
             near, far = away < -step, (away > step) & ~there.mouth
         known = block & ~there.mouth & np.isfinite(frame.depth_m)
         share = float((known & ~near & ~far).sum() / known.sum()) if known.any() else None
-        # single wild matches, and the rim where a matcher smears depth across an edge, are no things
+        # single wild matches, and the rim where a matcher smears depth across an edge, are no
+        # things
         size = max(3, 2 * round(frame.color.shape[1] / 400) + 1)
         near, far = (
-            cv2.morphologyEx(one.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) > 0 for one in (near, far)
+            cv2.morphologyEx(one.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
+            > 0
+            for one in (near, far)
         )
         shown = block & ~near & ~far
         return Label(shown, shown & there.mouth, block & near), share
 
 
-def _truth(cuboid: Cuboid, frame: Frame, pose: np.ndarray, outline_px: float, noise_per_m: float) -> Truth:
+def _truth(
+    cuboid: Cuboid, frame: Frame, pose: np.ndarray, outline_px: float, noise_per_m: float
+) -> Truth:
     """Returns the block and its holes as a truth file has them; without a known base the world stands in for it."""
     camera_from_world = np.linalg.inv(pose)
     base = pose if frame.base_from_camera is None else frame.base_from_camera
@@ -206,7 +266,10 @@ def _truth(cuboid: Cuboid, frame: Frame, pose: np.ndarray, outline_px: float, no
     middle = cuboid.world((cuboid.low_m + cuboid.high_m) / 2.0)
     circles = []
     for number, mouth in enumerate(cuboid.mouths):
-        center = camera_from_world[:3, :3] @ cuboid.world(np.array([mouth.x_m, mouth.y_m, 0.0])) + camera_from_world[:3, 3]
+        center = (
+            camera_from_world[:3, :3] @ cuboid.world(np.array([mouth.x_m, mouth.y_m, 0.0]))
+            + camera_from_world[:3, 3]
+        )
         seen = len(mouth_outline(cuboid, number, frame, pose, noise_per_m, 0.0).points_m)
         circles.append(
             Circle(
@@ -222,7 +285,9 @@ def _truth(cuboid: Cuboid, frame: Frame, pose: np.ndarray, outline_px: float, no
     return Truth("real", {"outline_px": outline_px}, tuple(circles), (), place)
 
 
-def _overlay(cuboid: Cuboid, frame: Frame, pose: np.ndarray, found: Label, good: bool) -> np.ndarray:
+def _overlay(
+    cuboid: Cuboid, frame: Frame, pose: np.ndarray, found: Label, good: bool
+) -> np.ndarray:
     """Returns the frame with block, mouths and what hides them in colour, and the block's edges."""
     picture = frame.color.astype(np.float32)
     for mask, colour in ((found.block, GREEN), (found.arm, ORANGE), (found.mouth, RED)):

@@ -65,21 +65,32 @@ class Cuboid:
         rotation = turn @ self.rotation
         # the face grows on both sides of its middle, and the mouths stay where they are on it
         origin_m = middle + change[3:6] - rotation @ (size_m * [0.5, 0.5, 0.0])
-        mouths = tuple(replace(one, x_m=one.x_m + change[6] / 2, y_m=one.y_m + change[7] / 2) for one in self.mouths)
+        mouths = tuple(
+            replace(one, x_m=one.x_m + change[6] / 2, y_m=one.y_m + change[7] / 2)
+            for one in self.mouths
+        )
         return Cuboid(rotation, origin_m, size_m, mouths)
 
     def edges(self, eye_m: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns the edges of faces that can be seen from `eye_m` (world), as end points in its own coordinates."""
         eye = self.own(eye_m)
         low, high = self.low_m, self.high_m
-        visible = {face for face in FACES if (eye[face[0]] > high[face[0]] if face[1] > 0 else eye[face[0]] < low[face[0]])}
+        visible = {
+            face
+            for face in FACES
+            if (eye[face[0]] > high[face[0]] if face[1] > 0 else eye[face[0]] < low[face[0]])
+        }
         found = []
         for axis in range(3):
             one, two = (axis + 1) % 3, (axis + 2) % 3
             for first in (-1, 1):
                 for second in (-1, 1):
                     if (one, first) in visible or (two, second) in visible:
-                        begin = np.where(np.arange(3) == one, high if first > 0 else low, high if second > 0 else low)
+                        begin = np.where(
+                            np.arange(3) == one,
+                            high if first > 0 else low,
+                            high if second > 0 else low,
+                        )
                         begin, end = begin.copy(), begin.copy()
                         begin[axis], end[axis] = low[axis], high[axis]
                         found.append((begin, end))
@@ -117,21 +128,27 @@ def look(cuboid: Cuboid, rays: np.ndarray, world_from_camera: np.ndarray) -> Loo
     axis = first.argmax(-1)
     enters, leaves = first.max(-1), np.maximum(low, high).min(-1)
     hit = (enters > 0) & (enters < leaves)
-    positive = np.take_along_axis(along, axis[..., None], -1)[..., 0] < 0  # it comes from the positive side
+    positive = (
+        np.take_along_axis(along, axis[..., None], -1)[..., 0] < 0
+    )  # it comes from the positive side
     face = np.full(axis.shape, -1)
     for number, (of, side) in enumerate(FACES):
         face[hit & (axis == of) & (positive == (side > 0))] = number
     point = eye + along * np.where(hit, enters, 0.0)[..., None]
     mouth = np.zeros(hit.shape, bool)
     for one in cuboid.mouths:
-        mouth |= (face == 0) & (np.hypot(point[..., 0] - one.x_m, point[..., 1] - one.y_m) < one.radius_m)
+        mouth |= (face == 0) & (
+            np.hypot(point[..., 0] - one.x_m, point[..., 1] - one.y_m) < one.radius_m
+        )
     return Look(np.where(hit, enters, np.inf), face, mouth)
 
 
 def sight_lines(frame: Frame, step: int = 1) -> np.ndarray:
     """Returns the line of sight of every `step`-th pixel at depth 1, `(h, w, 3)`, lens distortion taken out."""
     height, width = frame.color.shape[:2]
-    columns, rows = np.meshgrid(np.arange(0, width, step, dtype=float), np.arange(0, height, step, dtype=float))
+    columns, rows = np.meshgrid(
+        np.arange(0, width, step, dtype=float), np.arange(0, height, step, dtype=float)
+    )
     return sight(frame, np.stack([columns, rows], axis=-1))
 
 
@@ -141,7 +158,9 @@ def sight(frame: Frame, pixels: np.ndarray) -> np.ndarray:
     if frame.distortion is None or not np.any(frame.distortion):
         flat = (pixels - matrix[:2, 2]) / [matrix[0, 0], matrix[1, 1]]
     else:
-        flat = np.asarray(cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, frame.distortion)).reshape(pixels.shape)
+        flat = np.asarray(
+            cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, frame.distortion)
+        ).reshape(pixels.shape)
     return np.concatenate([flat, np.ones((*pixels.shape[:-1], 1))], axis=-1)
 
 
@@ -153,7 +172,9 @@ def project(points_m: np.ndarray, frame: Frame, world_from_camera: np.ndarray) -
     if ahead.any():
         zero = np.zeros(3)
         there = np.ascontiguousarray(local[ahead])
-        seen, _ = cv2.projectPoints(there, zero, zero, np.asarray(frame.camera_matrix, float), frame.distortion)
+        seen, _ = cv2.projectPoints(
+            there, zero, zero, np.asarray(frame.camera_matrix, float), frame.distortion
+        )
         pixels[ahead] = np.asarray(seen).reshape(-1, 2)
     return pixels
 
@@ -172,4 +193,8 @@ def cuboid_of(corners_m: np.ndarray, thickness_m: float, eye_m: np.ndarray) -> C
     x = one / np.linalg.norm(one)
     z = np.cross(one, two) / np.linalg.norm(np.cross(one, two))
     y = np.cross(z, x)
-    return Cuboid(np.stack([x, y, z], axis=1), corners_m[0], np.array([np.linalg.norm(one), two @ y, thickness_m]))
+    return Cuboid(
+        np.stack([x, y, z], axis=1),
+        corners_m[0],
+        np.array([np.linalg.norm(one), two @ y, thickness_m]),
+    )

@@ -28,7 +28,8 @@ class Placing:
 
     Attributes:
         frame: Stem of the frame that was clicked in; `None` where everything was touched.
-        corners: A corner of the face and its two neighbours, `(3, 2)` px or `(3, 3)` m in the world.
+        corners: A corner of the face and its two neighbours, `(3, 2)` px or `(3, 3)` m in the
+            world.
         thickness_m: Of the block behind the face.
         mouths: Centre, `(2,)` px or `(3,)` m, and radius in m of each mouth.
     """
@@ -47,16 +48,30 @@ def read(path: Path) -> Placing:
     """
     try:
         told = yaml.safe_load(path.read_text())
-        corners = np.asarray(told["corners_px"] if "corners_px" in told else told["corners_m"], float)
+        corners = np.asarray(
+            told["corners_px"] if "corners_px" in told else told["corners_m"], float
+        )
         mouths = tuple((_center(one), float(one["radius_m"])) for one in told.get("mouths", ()))
         frame = None if told.get("frame") is None else str(told["frame"])
         placing = Placing(frame, corners, float(told["thickness_m"]), mouths)
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(f"label.placing={path}: {type(error).__name__} {error}; {EXAMPLE}") from error
-    if corners.shape not in ((3, 2), (3, 3)) or placing.thickness_m <= 0 or any(radius_m <= 0 for _, radius_m in mouths):
-        raise ConfigError(f"label.placing={path}: corners of shape {corners.shape}, sizes above 0 are needed; {EXAMPLE}")
-    if frame is None and any(len(points) == 2 for points in (*corners, *(center for center, _ in mouths))):
-        raise ConfigError(f"label.placing={path}: pixels are given, but not the frame they were clicked in; {EXAMPLE}")
+        raise ConfigError(
+            f"label.placing={path}: {type(error).__name__} {error}; {EXAMPLE}"
+        ) from error
+    if (
+        corners.shape not in ((3, 2), (3, 3))
+        or placing.thickness_m <= 0
+        or any(radius_m <= 0 for _, radius_m in mouths)
+    ):
+        raise ConfigError(
+            f"label.placing={path}: corners of shape {corners.shape}, sizes above 0 are needed; {EXAMPLE}"
+        )
+    if frame is None and any(
+        len(points) == 2 for points in (*corners, *(center for center, _ in mouths))
+    ):
+        raise ConfigError(
+            f"label.placing={path}: pixels are given, but not the frame they were clicked in; {EXAMPLE}"
+        )
     return placing
 
 
@@ -65,7 +80,8 @@ def placed(placing: Placing, frame: Frame, world_from_camera: np.ndarray) -> Cub
 
     Args:
         placing: What a person has said.
-        frame: The frame that was clicked in, any frame that shows the face where everything was touched.
+        frame: The frame that was clicked in, any frame that shows the face where everything was
+            touched.
         world_from_camera: Its camera, `(4, 4)`.
 
     Raises:
@@ -79,7 +95,9 @@ def placed(placing: Placing, frame: Frame, world_from_camera: np.ndarray) -> Cub
     return cuboid_of(corners, placing.thickness_m, world_from_camera[:3, 3])
 
 
-def with_mouths(cuboid: Cuboid, placing: Placing, frame: Frame, world_from_camera: np.ndarray) -> Cuboid:
+def with_mouths(
+    cuboid: Cuboid, placing: Placing, frame: Frame, world_from_camera: np.ndarray
+) -> Cuboid:
     """Returns the block with its mouths: where the clicked sight meets the face, or the touched point lies."""
     eye = cuboid.own(world_from_camera[:3, 3])
     mouths = []
@@ -109,7 +127,9 @@ def _face_plane(frame: Frame, corners_px: np.ndarray) -> np.ndarray:
     cv2.fillConvexPoly(inside, np.rint(shrunk).astype(np.int32), 1)
     rows, columns = np.nonzero((inside > 0) & np.isfinite(frame.depth_m))
     if len(rows) < 50:
-        raise FrameError(f"{frame.name}: depth is known at {len(rows)} pixels between the clicked corners, 50 are needed")
+        raise FrameError(
+            f"{frame.name}: depth is known at {len(rows)} pixels between the clicked corners, 50 are needed"
+        )
     lines = sight(frame, np.stack([columns, rows], axis=1).astype(float))
     inverse = 1.0 / frame.depth_m[rows, columns].astype(float)
     generator = np.random.default_rng(0)
@@ -117,7 +137,8 @@ def _face_plane(frame: Frame, corners_px: np.ndarray) -> np.ndarray:
     triples = triples[np.abs(np.linalg.det(lines[triples])) > 1e-7]
     trials = np.linalg.solve(lines[triples], inverse[triples][..., None])[..., 0]
     judge = generator.integers(len(rows), size=JUDGES)
-    # least median of squares (Rousseeuw, 1984): up to half of what lies between the corners may be an arm, a mouth, a wild match
+    # least median of squares (Rousseeuw, 1984): up to half of what lies between the corners may be
+    # an arm, a mouth, a wild match
     plane = trials[np.median(np.abs(trials @ lines[judge].T - inverse[judge]), axis=1).argmin()]
     for _ in range(TRIMS):
         away = np.abs(lines @ plane - inverse)

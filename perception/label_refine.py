@@ -64,50 +64,78 @@ def refined(cuboid: Cuboid, views: Sequence[Seen], noise_per_m: float, reach_px:
     """
     for number in range(ROUNDS):
         reach = reach_px * REACH_END ** (number / (ROUNDS - 1))
-        edges = [_edges(block_outline(cuboid, view.frame, view.pose, noise_per_m, reach), view, reach) for view in views]
+        edges = [
+            _edges(block_outline(cuboid, view.frame, view.pose, noise_per_m, reach), view, reach)
+            for view in views
+        ]
         depths = [_depths(cuboid, view, noise_per_m, reach) for view in views]
 
         def misfit(
-            change: np.ndarray, now: Cuboid = cuboid, edges: list[_Edges] = edges, depths: list[_Depths] = depths
+            change: np.ndarray,
+            now: Cuboid = cuboid,
+            edges: list[_Edges] = edges,
+            depths: list[_Depths] = depths,
         ) -> np.ndarray:
             block = now.moved(change)
             parts = []
             for view, edge, depth in zip(views, edges, depths, strict=True):
                 # a point of an edge stays on it when the face grows
-                parts.append(_across(block, edge.points_m * (block.size_m / now.size_m), edge, view))
+                parts.append(
+                    _across(block, edge.points_m * (block.size_m / now.size_m), edge, view)
+                )
                 parts.append(_out_of_face(block, depth, view) / noise_per_m)
             return np.concatenate(parts)
 
-        found = least_squares(misfit, np.zeros(8), loss="soft_l1", x_scale=[0.01] * 3 + [0.01] * 5, max_nfev=20)
+        found = least_squares(
+            misfit, np.zeros(8), loss="soft_l1", x_scale=[0.01] * 3 + [0.01] * 5, max_nfev=20
+        )
         cuboid = cuboid.moved(found.x)
     return cuboid
 
 
-def refined_mouths(cuboid: Cuboid, views: Sequence[Seen], noise_per_m: float, reach_px: float) -> Cuboid:
+def refined_mouths(
+    cuboid: Cuboid, views: Sequence[Seen], noise_per_m: float, reach_px: float
+) -> Cuboid:
     """Returns the block with its mouths moved to where the pictures have their rims; arguments as `refined`."""
     for number in range(len(cuboid.mouths)):
         cuboid = _with_mouth(cuboid, number, views, noise_per_m, reach_px)
     return cuboid
 
 
-def _with_mouth(cuboid: Cuboid, number: int, views: Sequence[Seen], noise_per_m: float, reach_px: float) -> Cuboid:
+def _with_mouth(
+    cuboid: Cuboid, number: int, views: Sequence[Seen], noise_per_m: float, reach_px: float
+) -> Cuboid:
     """Returns the block with the centre of one mouth moved to where the rim's edges are."""
     for turn in range(ROUNDS):
         reach = reach_px * REACH_END ** (turn / (ROUNDS - 1))
-        edges = [_edges(mouth_outline(cuboid, number, view.frame, view.pose, noise_per_m, reach), view, reach) for view in views]
+        edges = [
+            _edges(
+                mouth_outline(cuboid, number, view.frame, view.pose, noise_per_m, reach),
+                view,
+                reach,
+            )
+            for view in views
+        ]
         if not sum(len(edge.points_m) for edge in edges):
             return cuboid
 
-        def misfit(change: np.ndarray, now: Cuboid = cuboid, edges: list[_Edges] = edges) -> np.ndarray:
+        def misfit(
+            change: np.ndarray, now: Cuboid = cuboid, edges: list[_Edges] = edges
+        ) -> np.ndarray:
             shift = np.array([change[0], change[1], 0.0])
             return np.concatenate(
-                [_across(now, edge.points_m + shift, edge, view) for view, edge in zip(views, edges, strict=True)]
+                [
+                    _across(now, edge.points_m + shift, edge, view)
+                    for view, edge in zip(views, edges, strict=True)
+                ]
             )
 
         found = least_squares(misfit, np.zeros(2), loss="soft_l1", x_scale=0.01, max_nfev=20)
         mouths = list(cuboid.mouths)
         mouths[number] = replace(
-            mouths[number], x_m=mouths[number].x_m + float(found.x[0]), y_m=mouths[number].y_m + float(found.x[1])
+            mouths[number],
+            x_m=mouths[number].x_m + float(found.x[0]),
+            y_m=mouths[number].y_m + float(found.x[1]),
         )
         cuboid = replace(cuboid, mouths=tuple(mouths))
     return cuboid
@@ -123,7 +151,9 @@ def _edges(outline: Outline, view: Seen, reach_px: float) -> _Edges:
 def _across(block: Cuboid, points_m: np.ndarray, edge: _Edges, view: Seen) -> np.ndarray:
     """Returns how far points of the outline are from their edges, across the outline, in standard deviations."""
     pixels = project(block.world(points_m), view.frame, view.pose)
-    return np.nan_to_num(((pixels - edge.target_px) * edge.normal).sum(1) / EDGE_SIGMA_PX, nan=100.0)
+    return np.nan_to_num(
+        ((pixels - edge.target_px) * edge.normal).sum(1) / EDGE_SIGMA_PX, nan=100.0
+    )
 
 
 def _depths(cuboid: Cuboid, view: Seen, noise_per_m: float, reach_px: float) -> _Depths:
@@ -134,7 +164,9 @@ def _depths(cuboid: Cuboid, view: Seen, noise_per_m: float, reach_px: float) -> 
     rays, measured = rays[known], measured[known].astype(float)
     along = rays @ view.pose[:3, :3].T
     points = cuboid.own(view.pose[:3, 3] + along * measured[:, None])
-    slack = np.maximum(reach_px / view.frame.camera_matrix[0, 0] * measured, 3.0 * noise_per_m * measured**2)
+    slack = np.maximum(
+        reach_px / view.frame.camera_matrix[0, 0] * measured, 3.0 * noise_per_m * measured**2
+    )
     face, nearest = np.full(len(points), -1), slack.copy()
     eye = cuboid.own(view.pose[:3, 3])
     for number, (axis, side) in enumerate(FACES):
@@ -145,7 +177,9 @@ def _depths(cuboid: Cuboid, view: Seen, noise_per_m: float, reach_px: float) -> 
         here = (away < nearest) & (room > slack) & (side * (eye[axis] - bound) > 0)
         face[here], nearest[here] = number, away[here]
     for mouth in cuboid.mouths:
-        within = np.hypot(points[:, 0] - mouth.x_m, points[:, 1] - mouth.y_m) < mouth.radius_m + slack
+        within = (
+            np.hypot(points[:, 0] - mouth.x_m, points[:, 1] - mouth.y_m) < mouth.radius_m + slack
+        )
         face[within & (face == 0)] = -1
     on = face >= 0
     return _Depths(1.0 / measured[on], along[on], face[on])

@@ -13,7 +13,13 @@ from brokk_rl.sight import Ellipse, HolePose, Sighting
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 
-BLOCK, FOUND, REFUSED, AXIS, DOUBT = (255, 180, 60), (60, 220, 60), (60, 60, 235), (255, 220, 40), (220, 120, 255)
+BLOCK, FOUND, REFUSED, AXIS, DOUBT = (
+    (255, 180, 60),
+    (60, 220, 60),
+    (60, 60, 235),
+    (255, 220, 40),
+    (220, 120, 255),
+)
 """Colours, blue first."""
 
 
@@ -33,7 +39,9 @@ class Drawing:
 
     def check(self) -> None:
         if self.width_px < 64 or self.axis_m <= 0:
-            raise ConfigError(f"overlay: expected width_px >= 64 and axis_m > 0, got {self.width_px} and {self.axis_m}")
+            raise ConfigError(
+                f"overlay: expected width_px >= 64 and axis_m > 0, got {self.width_px} and {self.axis_m}"
+            )
 
     def write(self, path: Path, frame: Frame, sighting: Sighting) -> None:
         """Writes the picture in one step; see `brokk_rl.sight.Overlay`."""
@@ -43,7 +51,9 @@ class Drawing:
             part.write_bytes(data.tobytes() if done else b"")
             part.replace(path)
         except OSError as error:
-            raise StorageError(f"cannot write {path}: {error.strerror or error}; nothing was left behind") from error
+            raise StorageError(
+                f"cannot write {path}: {error.strerror or error}; nothing was left behind"
+            ) from error
         finally:
             part.unlink(missing_ok=True)
 
@@ -52,16 +62,29 @@ class Drawing:
         height, width = frame.color.shape[:2]
         scale = min(1.0, self.width_px / width)
         size = (round(width * scale), round(height * scale))
-        picture = cv2.cvtColor(cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+        picture = cv2.cvtColor(
+            cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR
+        )
         if sighting.masks is not None:
-            mask = cv2.resize((sighting.masks.block > 0.5).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-            cv2.drawContours(picture, cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0], -1, BLOCK, 1, cv2.LINE_AA)
+            mask = cv2.resize(
+                (sighting.masks.block > 0.5).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST
+            )
+            cv2.drawContours(
+                picture,
+                cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0],
+                -1,
+                BLOCK,
+                1,
+                cv2.LINE_AA,
+            )
         refused = [one.ellipse for one in sighting.rejected if one.ellipse is not None]
         for ellipse in sighting.ellipses:
             _ellipse(picture, ellipse, scale, REFUSED if ellipse in refused else FOUND)
         for one in sighting.rejected:
             if one.ellipse is not None:
-                below = np.array([one.ellipse.x - one.ellipse.a, one.ellipse.y + one.ellipse.a]) * scale
+                below = (
+                    np.array([one.ellipse.x - one.ellipse.a, one.ellipse.y + one.ellipse.a]) * scale
+                )
                 _words(picture, one.reason.split(",")[0], below + np.array([0, 14]), REFUSED)
         for hole in sighting.holes:
             self._hole(picture, hole, frame, scale)
@@ -75,29 +98,42 @@ class Drawing:
             shift = -turn @ frame.base_from_camera[:3, 3]
         center, axis = turn @ hole.center_m + shift, turn @ hole.axis
         cov = turn @ hole.cov_m2 @ turn.T
-        start, end = (_pixel(frame.camera_matrix, point) * scale for point in (center, center + self.axis_m * axis))
+        start, end = (
+            _pixel(frame.camera_matrix, point) * scale
+            for point in (center, center + self.axis_m * axis)
+        )
         cv2.arrowedLine(picture, _whole(start), _whole(end), AXIS, 2, cv2.LINE_AA, tipLength=0.2)
         x, y, z = center
-        slope = frame.camera_matrix[:2, :2] @ np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]])
+        slope = frame.camera_matrix[:2, :2] @ np.array(
+            [[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]]
+        )
         values, vectors = np.linalg.eigh(slope @ cov @ slope.T)
         axes = np.maximum(self.num_sigma * np.sqrt(np.maximum(values, 0.0)) * scale, 1.0)
         angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
-        cv2.ellipse(picture, _whole(start), _whole(axes[::-1]), angle, 0, 360, DOUBT, 1, cv2.LINE_AA)
+        cv2.ellipse(
+            picture, _whole(start), _whole(axes[::-1]), angle, 0, 360, DOUBT, 1, cv2.LINE_AA
+        )
         std = 1000 * np.sqrt(np.trace(hole.cov_m2))
         text = f"{np.linalg.norm(center):.2f} m, +-{std:.1f} mm, r {1000 * hole.radius_m:.1f} mm"
         _words(picture, text, np.minimum(start, end) + np.array([8, -12]), FOUND)
 
 
-def _ellipse(picture: np.ndarray, ellipse: Ellipse, scale: float, color: tuple[int, int, int]) -> None:
+def _ellipse(
+    picture: np.ndarray, ellipse: Ellipse, scale: float, color: tuple[int, int, int]
+) -> None:
     place = _whole(np.array([ellipse.x, ellipse.y]) * scale * 16)
     axes = _whole(np.array([ellipse.a, ellipse.b]) * scale * 16)
-    cv2.ellipse(picture, place, axes, float(np.degrees(ellipse.theta_rad)), 0, 360, color, 1, cv2.LINE_AA, 4)
+    cv2.ellipse(
+        picture, place, axes, float(np.degrees(ellipse.theta_rad)), 0, 360, color, 1, cv2.LINE_AA, 4
+    )
 
 
 def _words(picture: np.ndarray, text: str, place: np.ndarray, color: tuple[int, int, int]) -> None:
     """Writes words that can be read on any ground."""
     for ink, width in (((0, 0, 0), 3), (color, 1)):
-        cv2.putText(picture, text, _whole(place), cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, width, cv2.LINE_AA)
+        cv2.putText(
+            picture, text, _whole(place), cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, width, cv2.LINE_AA
+        )
 
 
 def _pixel(camera_matrix: np.ndarray, point: np.ndarray) -> np.ndarray:

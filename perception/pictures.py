@@ -52,11 +52,15 @@ class PictureSource:
             self._paths = sorted(
                 path
                 for path in (self._place.iterdir() if self._place.is_dir() else ())
-                if path.suffix.lower() in ENDINGS and not path.name.endswith(BESIDE) and path.name[0] != "."
+                if path.suffix.lower() in ENDINGS
+                and not path.name.endswith(BESIDE)
+                and path.name[0] != "."
             )
         if not self._paths:
             what = "no pictures" if self._place.is_dir() else "no such folder"
-            raise FrameError(f"{self._place}: {what}; expected files that end in {', '.join(sorted(ENDINGS))}")
+            raise FrameError(
+                f"{self._place}: {what}; expected files that end in {', '.join(sorted(ENDINGS))}"
+            )
         self._next = 0
         return self
 
@@ -82,6 +86,15 @@ class PictureSource:
             raise FrameError(f"{path}: {'truncated or no picture' if len(data) else 'empty'}")
         color = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
         height, width = color.shape[:2]
-        matrix = np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]])
+        matrix = np.array(
+            [[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]]
+        )
         name = str(path.with_name(path.name.removesuffix(".color.png").removesuffix(path.suffix)))
-        return Frame(color, np.full((height, width), np.nan, np.float32), matrix, None, float(self._next - 1), name=name)
+        return Frame(
+            color,
+            np.full((height, width), np.nan, np.float32),
+            matrix,
+            None,
+            float(self._next - 1),
+            name=name,
+        )

@@ -17,12 +17,13 @@ from perception.plane import Plane
 from perception.rim import Circle
 
 UNTOLD, UNTOLD_SCORE = 0.8, 0.5
-"""Part of an inside without depth, hidden from the right camera, from which on nobody can tell it from a flat disc; the score of
-what nobody can, for dust or for this."""
+"""Part of an inside without depth, hidden from the right camera, from which on nobody can tell it
+from a flat disc; the score of what nobody can, for dust or for this."""
 
 FORGIVEN, AT_FIRST = 0.55, 1.4
-"""Part of the circle that must show where its ellipse alone was too small or too long for one; and how many times as far off as the
-circle an ellipse may be, which follows the shade within a rim where that is the steeper edge."""
+"""Part of the circle that must show where its ellipse alone was too small or too long for one; and
+how many times as far off as the circle an ellipse may be, which follows the shade within a rim
+where that is the steeper edge."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which what stands before the rest of a rim is seen."""
 
@@ -33,15 +34,21 @@ class Looks:
 
     Attributes:
         darkness: Largest brightness of the darkest quarter inside over that of the face.
-        veiled: From which on something lies over both: dust, behind which nobody sees how deep a hole is; or it is a stain.
-        darker: If something near it is darker by more than this, over the brightness of the face, it is no dust.
-        contrast: Least contrast, in standard deviations of the face's grain, of what is veiled: a stain has less; unless both
-            cameras see that it is deep.
-        mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives one.
-        sure_mouth: From which the mouth channel decides where nobody sees how deep it is; where that is seen, it overrules nothing.
-        slope: Slope of brightness inside, see `Interior`, that alone would show a hole; less is as much less evidence, and adds up.
+        veiled: From which on something lies over both: dust, behind which nobody sees how deep a
+            hole is; or it is a stain.
+        darker: If something near it is darker by more than this, over the brightness of the face,
+            it is no dust.
+        contrast: Least contrast, in standard deviations of the face's grain, of what is veiled: a
+            stain has less; unless both cameras see that it is deep.
+        mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives
+            one.
+        sure_mouth: From which the mouth channel decides where nobody sees how deep it is; where
+            that is seen, it overrules nothing.
+        slope: Slope of brightness inside, see `Interior`, that alone would show a hole; less is as
+            much less evidence, and adds up.
         deeper: Part of the depth inside that lies behind the face, likewise.
-        parallax: Difference of left and right picture inside over that on the face, likewise; 1 is none.
+        parallax: Difference of left and right picture inside over that on the face, likewise; 1 is
+            none.
         parts: Radii of an ellipse: its inside for the parallax, and the ring of face around it.
     """
 
@@ -63,25 +70,28 @@ class PlaneConic:
 
     Attributes:
         radius_m: Radius of the holes that are looked for.
-        radius_tolerance: How far the measured radius may be off, as a part of it; in proportion more at first, where something
-            hides a part of the rim.
+        radius_tolerance: How far the measured radius may be off, as a part of it; in proportion
+            more at first, where something hides a part of the rim.
         axis_ratio: Least ratio of the semi-axes on the plane; 1 is a circle; likewise.
         coverage: Least part of the circle on the face whose rim is seen.
         tilt_rad: Largest angle between the face's normal and the line of sight.
-        inner: Inner limit of the face's support in radii of the ellipse; keeps the rim's bleeding out.
-        rings: Outer limits in radii: the ring in which the plane is found, and those across which it is grown.
+        inner: Inner limit of the face's support in radii of the ellipse; keeps the rim's bleeding
+            out.
+        rings: Outer limits in radii: the ring in which the plane is found, and those across which
+            it is grown.
         max_pixels: Pixels of the face that are used.
         cell_px: Side of the squares within which depth noise is taken to be alike.
         noise_floor_per_m: Least standard deviation of inverse depth, 1/m.
         noise_limit_per_m: Largest standard deviation of inverse depth on the face, 1/m.
-        matcher_alike: By how much the covariance of the plane from depth alone is larger than its residuals say: what a matcher
-            gets wrong is alike over wide stretches.
-        matcher_bias_per_m: Standard deviation of inverse depth by which a matcher is off all over a face, 1/m; with a right picture
-            the face is aligned anew.
-        bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual shows, 1/m.
+        matcher_alike: By how much the covariance of the plane from depth alone is larger than its
+            residuals say: what a matcher gets wrong is alike over wide stretches.
+        matcher_bias_per_m: Standard deviation of inverse depth by which a matcher is off all over a
+            face, 1/m; with a right picture the face is aligned anew.
+        bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual
+            shows, 1/m.
         center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
-        shape_px: Standard deviation by which a rim departs from a circle at each of its first waves, px: it moves the centre of
-            what is left of one.
+        shape_px: Standard deviation by which a rim departs from a circle at each of its first
+            waves, px: it moves the centre of what is left of one.
         looks: What it must look like.
         without_depth: What is tried where the face has no depth; `null` for nothing.
         blind: Part of the face around a hole with known depth below which it has none.
@@ -114,7 +124,9 @@ class PlaneConic:
                 f"{self.radius_m} and {self.radius_tolerance}"
             )
         if not self.rings or list(self.rings) != sorted(self.rings) or self.rings[0] <= self.inner:
-            raise ConfigError(f"perception.pose.rings: expected increasing limits above inner={self.inner}, got {list(self.rings)}")
+            raise ConfigError(
+                f"perception.pose.rings: expected increasing limits above inner={self.inner}, got {list(self.rings)}"
+            )
 
     def build(self) -> PlaneConicEstimator:
         """Returns an estimator."""
@@ -126,7 +138,9 @@ class PlaneConicEstimator:
 
     def __init__(self, settings: PlaneConic) -> None:
         self.settings = settings
-        self._without_depth: PoseEstimator | None = settings.without_depth.build() if settings.without_depth else None
+        self._without_depth: PoseEstimator | None = (
+            settings.without_depth.build() if settings.without_depth else None
+        )
         self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
@@ -135,35 +149,70 @@ class PlaneConicEstimator:
         row = vector(ellipse)
         gray, allowed = self._pictures(frame, masks)
         reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
-        points = plane.support(frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px)
+        points = plane.support(
+            frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px
+        )
         face = plane.fit(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
         if face is None:
-            if self._without_depth is not None and frame.base_from_camera is not None and points.known < s.blind:
+            if (
+                self._without_depth is not None
+                and frame.base_from_camera is not None
+                and points.known < s.blind
+            ):
                 return self._without_depth.estimate(frame, masks, ellipse)
-            return Rejection("pose", "pixels of the face with depth", float(len(points.inverse)), float(plane.LEAST), ellipse)
+            return Rejection(
+                "pose",
+                "pixels of the face with depth",
+                float(len(points.inverse)),
+                float(plane.LEAST),
+                ellipse,
+            )
         if face.sigma > s.noise_limit_per_m:
-            return Rejection("pose", "depth noise on the face, 1/m", face.sigma, s.noise_limit_per_m, ellipse)
+            return Rejection(
+                "pose", "depth noise on the face, 1/m", face.sigma, s.noise_limit_per_m, ellipse
+            )
         face = replace(face, cov=face.cov * s.matcher_alike)
         shape = self._shape(face, row, frame, ellipse)
         if isinstance(shape, Rejection):
             return shape
         both = alignment.pair(frame, gray, face.m, row, face.extent)
         if both is not None:
-            agreed = alignment.aligned(both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m)
+            agreed = alignment.aligned(
+                both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m
+            )
             both, face = (None, face) if agreed is None else (both, agreed)
             shape = self._shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
-        circle = rim.circle(gray, row, frame.camera_matrix, face.m, s.radius_m, s.radius_tolerance, s.center_px, s.shape_px)
+        circle = rim.circle(
+            gray,
+            row,
+            frame.camera_matrix,
+            face.m,
+            s.radius_m,
+            s.radius_tolerance,
+            s.center_px,
+            s.shape_px,
+        )
         least = s.coverage if shape else max(s.coverage, FORGIVEN)
         if circle is None or circle.coverage < least:
-            return Rejection("pose", "part of a circle on the face with a rim", circle.coverage if circle else 0.0, least, ellipse)
+            return Rejection(
+                "pose",
+                "part of a circle on the face with a rim",
+                circle.coverage if circle else 0.0,
+                least,
+                ellipse,
+            )
         if abs(circle.radius_m - s.radius_m) > s.radius_tolerance * s.radius_m:
             limit = s.radius_m * (1.0 + np.sign(circle.radius_m - s.radius_m) * s.radius_tolerance)
             return Rejection("pose", "radius, m", circle.radius_m, float(limit), ellipse)
         row = circle.ellipse
         inside = appearance.interior(gray, frame.depth_m, row, frame.camera_matrix, face)
-        parallax, covered = alignment.disagreement(both, face, frame.depth_m, row, *s.looks.parts) if both else (float("nan"), 0.0)
+        parallax, covered = (
+            alignment.disagreement(both, face, frame.depth_m, row, *s.looks.parts)
+            if both
+            else (float("nan"), 0.0)
+        )
         # behind something that stands before it, or in dust, nobody can tell
         untold = inside.darkness > s.looks.veiled or (covered > UNTOLD and inside.unknown > UNTOLD)
         refused = self._looks(inside, parallax, masks, row, ellipse, untold)
@@ -189,7 +238,9 @@ class PlaneConicEstimator:
             self._seen = frame, masks, gray_of(frame), allowed
         return self._seen[2:]
 
-    def _shape(self, face: Plane, row: np.ndarray, frame: Frame, ellipse: Ellipse) -> bool | Rejection:
+    def _shape(
+        self, face: Plane, row: np.ndarray, frame: Frame, ellipse: Ellipse
+    ) -> bool | Rejection:
         """Returns whether an ellipse has size and shape of a rim with nothing forgiven, or which gate it does not pass."""
         s = self.settings
         ray = np.linalg.solve(frame.camera_matrix, np.array([row[0], row[1], 1.0]))
@@ -201,7 +252,9 @@ class PlaneConicEstimator:
         if not np.isfinite(axes).all():
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
-        seen = max(1.0 - hidden_part(face, row, frame), s.coverage)  # the less of a rim there is, the less it tells
+        seen = max(
+            1.0 - hidden_part(face, row, frame), s.coverage
+        )  # the less of a rim there is, the less it tells
         tolerance = AT_FIRST * s.radius_tolerance / seen * s.radius_m
         if abs(radius - s.radius_m) > tolerance:
             limit = s.radius_m + np.sign(radius - s.radius_m) * tolerance
@@ -212,16 +265,28 @@ class PlaneConicEstimator:
         return abs(radius / s.radius_m - 1.0) <= s.radius_tolerance and ratio >= s.axis_ratio
 
     def _looks(
-        self, inside: Interior, parallax: float, masks: Masks, row: np.ndarray, ellipse: Ellipse, untold: bool
+        self,
+        inside: Interior,
+        parallax: float,
+        masks: Masks,
+        row: np.ndarray,
+        ellipse: Ellipse,
+        untold: bool,
     ) -> Rejection | None:
         looks = self.settings.looks
         if not inside.darkness <= looks.darkness:
-            return Rejection("pose", "brightness inside over outside", inside.darkness, looks.darkness, ellipse)
+            return Rejection(
+                "pose", "brightness inside over outside", inside.darkness, looks.darkness, ellipse
+            )
         mouth = 0.0 if masks.mouth is None else inner_mean(masks.mouth, row)
         if masks.mouth is not None and mouth < looks.mouth:
             return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
         sure = mouth >= looks.sure_mouth
-        shown = [max(one, 0.0) for one in (inside.slope / looks.slope, inside.deeper / looks.deeper) if np.isfinite(one)]
+        shown = [
+            max(one, 0.0)
+            for one in (inside.slope / looks.slope, inside.deeper / looks.deeper)
+            if np.isfinite(one)
+        ]
         # a dark disc is noisier nowhere than the face: below 1 it speaks against
         against = (parallax - 1.0) / (looks.parallax - 1.0)
         evidence = sum(shown) + (against if np.isfinite(against) else 0.0)
@@ -229,13 +294,25 @@ class PlaneConicEstimator:
             if sure:
                 return None
             if inside.around < inside.darkness - looks.darker:
-                return Rejection("pose", "brightness inside over outside", inside.darkness, looks.veiled, ellipse)
+                return Rejection(
+                    "pose", "brightness inside over outside", inside.darkness, looks.veiled, ellipse
+                )
             if inside.contrast >= looks.contrast or (np.isfinite(against) and evidence >= 1.0):
                 return None
-            return Rejection("pose", "contrast to the grain of the face", inside.contrast, looks.contrast, ellipse)
+            return Rejection(
+                "pose",
+                "contrast to the grain of the face",
+                inside.contrast,
+                looks.contrast,
+                ellipse,
+            )
         if untold and not np.isfinite(against) and (sure or masks.mouth is None):
             return None
-        return None if evidence >= 1.0 else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
+        return (
+            None
+            if evidence >= 1.0
+            else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
+        )
 
 
 def covariance(face: Plane, circle: Circle, bias_per_m: float) -> np.ndarray:
@@ -254,12 +331,19 @@ def hidden_part(face: Plane, row: np.ndarray, frame: Frame) -> float:
     height, width = frame.depth_m.shape
     nearer = np.zeros(72, bool)
     for scale in BESIDE:
-        points = conic.sample((row * [1.0, 1.0, scale, scale, 1.0])[None], np.linspace(0.0, 2 * np.pi, 72, endpoint=False))[0][0]
+        points = conic.sample(
+            (row * [1.0, 1.0, scale, scale, 1.0])[None],
+            np.linspace(0.0, 2 * np.pi, 72, endpoint=False),
+        )[0][0]
         column, line = np.rint(points).astype(int).T
         on = (column >= 0) & (column < width) & (line >= 0) & (line < height)
         depth = frame.depth_m[line.clip(0, height - 1), column.clip(0, width - 1)]
-        rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
-        nearer |= on & (1.0 / depth - rays @ face.m > 4 * face.sigma)  # false where depth is unknown
+        rays = (
+            np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
+        )
+        nearer |= on & (
+            1.0 / depth - rays @ face.m > 4 * face.sigma
+        )  # false where depth is unknown
     return float(nearer.mean())
 
 

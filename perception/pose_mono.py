@@ -20,7 +20,8 @@ class MonoCircle:
         normal_in_base: Where the face looks in the base frame; also tells the two solutions apart.
         normal_rad: Largest angle to it.
         ellipse_px: Least standard deviation of the ellipse's axes, px; decides the covariance.
-        darkness: Largest brightness of the darkest quarter inside over that of the face; nothing else speaks for a hole here.
+        darkness: Largest brightness of the darkest quarter inside over that of the face; nothing
+            else speaks for a hole here.
     """
 
     radius_m: float
@@ -47,21 +48,35 @@ class MonoCircleEstimator:
             return Rejection("pose", "known pose of the camera", 0.0, 1.0, ellipse)
         expected = frame.base_from_camera[:3, :3].T @ np.array(s.normal_in_base)
         row = vector(ellipse)
-        center, normal = max(conic.circles(row, frame.camera_matrix, s.radius_m), key=lambda one: float(one[1] @ expected))
+        center, normal = max(
+            conic.circles(row, frame.camera_matrix, s.radius_m),
+            key=lambda one: float(one[1] @ expected),
+        )
         angle = float(np.arccos(np.clip(normal @ expected, -1, 1)))
         if angle > s.normal_rad:
-            return Rejection("pose", "angle to the expected normal, rad", angle, s.normal_rad, ellipse)
-        dark = appearance.interior(gray_of(frame), frame.depth_m, row, frame.camera_matrix, None).darkness
+            return Rejection(
+                "pose", "angle to the expected normal, rad", angle, s.normal_rad, ellipse
+            )
+        dark = appearance.interior(
+            gray_of(frame), frame.depth_m, row, frame.camera_matrix, None
+        ).darkness
         if not dark <= s.darkness:
             return Rejection("pose", "brightness inside over outside", dark, s.darkness, ellipse)
-        std = np.array([1, 1, 1, 1, 0]) * max(ellipse.rms_px, s.ellipse_px) / np.sqrt(max(ellipse.coverage, 0.1))
+        std = (
+            np.array([1, 1, 1, 1, 0])
+            * max(ellipse.rms_px, s.ellipse_px)
+            / np.sqrt(max(ellipse.coverage, 0.1))
+        )
         std[4] = std[2] / max(ellipse.a - ellipse.b, std[2])
         moves, turns = [], []
         for k in range(5):
             changed = row + np.eye(5)[k] * std[k]
             if changed[3] > changed[2]:
                 changed = row - np.eye(5)[k] * std[k]
-            other = min(conic.circles(changed, frame.camera_matrix, s.radius_m), key=lambda one: -float(one[1] @ normal))
+            other = min(
+                conic.circles(changed, frame.camera_matrix, s.radius_m),
+                key=lambda one: -float(one[1] @ normal),
+            )
             moves.append(other[0] - center)
             turns.append(other[1] - normal)
         return HolePose(

@@ -17,7 +17,8 @@ class CentreDepth:
 
     Attributes:
         radius_m: Radius that is reported; nothing is measured.
-        window_px: Side of the window around the centre whose median depth is taken; 1 for the pixel itself.
+        window_px: Side of the window around the centre whose median depth is taken; 1 for the pixel
+            itself.
         ring_px: Distance from the rim at which local normals are taken.
         normal_rad: Largest angle between a local normal and their mean.
         std_m: Standard deviation that is claimed for each coordinate.
@@ -53,11 +54,15 @@ class CentreDepthEstimator:
         ray = np.linalg.solve(frame.camera_matrix, np.array([ellipse.x, ellipse.y, 1.0]))
         normals = self._normals(frame, vector(ellipse))
         if len(normals) < 3:
-            return Rejection("pose", "local normals around the rim", float(len(normals)), 3.0, ellipse)
+            return Rejection(
+                "pose", "local normals around the rim", float(len(normals)), 3.0, ellipse
+            )
         mean = normals.mean(0) / max(float(np.linalg.norm(normals.mean(0))), 1e-9)
         worst = float(np.median(np.arccos(np.clip(normals @ mean, -1, 1))))
         if worst > s.normal_rad:
-            return Rejection("pose", "angle between local normals, rad", worst, s.normal_rad, ellipse)
+            return Rejection(
+                "pose", "angle between local normals, rad", worst, s.normal_rad, ellipse
+            )
         across = np.eye(3) - np.outer(mean, mean)
         return HolePose(
             center_m=ray * float(np.nanmedian(window)),
@@ -73,7 +78,9 @@ class CentreDepthEstimator:
     def _normals(self, frame: Frame, row: np.ndarray) -> np.ndarray:
         """Returns unit normals of the depth beside the rim, `(K, 3)`, from differences over a few pixels."""
         wide = row + np.array([0, 0, self.settings.ring_px, self.settings.ring_px, 0])
-        places = conic.sample(wide[None], np.arange(self.NUM_NORMALS) * 2 * np.pi / self.NUM_NORMALS)[0][0]
+        places = conic.sample(
+            wide[None], np.arange(self.NUM_NORMALS) * 2 * np.pi / self.NUM_NORMALS
+        )[0][0]
         step = max(2, round(self.settings.ring_px / 2))
         height, width = frame.depth_m.shape
         inverse = np.linalg.inv(frame.camera_matrix)

@@ -27,7 +27,9 @@ class Grid:
     def of(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> Grid:
         """Returns that of the middles of cells of `step` x `step` px."""
         y, x = (
-            ((np.arange(count) * step + step // 2 - camera_matrix[k, 2]) / camera_matrix[k, k]).astype(np.float32)
+            (
+                (np.arange(count) * step + step // 2 - camera_matrix[k, 2]) / camera_matrix[k, k]
+            ).astype(np.float32)
             for count, k in zip(shape, (1, 0), strict=True)
         )
         return Grid(x, y)
@@ -44,7 +46,9 @@ class Grid:
     @cached_property
     def powers(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns 1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: what sums over pixels are made of, by rows and columns."""
-        across, down = (np.stack([np.ones_like(some), some, some * some]) for some in (self.x, self.y))
+        across, down = (
+            np.stack([np.ones_like(some), some, some * some]) for some in (self.x, self.y)
+        )
         return across, down
 
     def inverse(self, plane: np.ndarray) -> np.ndarray:
@@ -55,4 +59,6 @@ class Grid:
 
 def squares(sums: np.ndarray) -> np.ndarray:
     """Returns the sums of the products of x, y and 1 with each other, `(3, 3)`, among those of `x^i y^j`, `[j, i]`."""
-    return np.array([[sums[j, i] for j, i in row] for row in ((XX, XY, X), (XY, YY, Y), (X, Y, ONE))])
+    return np.array(
+        [[sums[j, i] for j, i in row] for row in ((XX, XY, X), (XY, YY, Y), (X, Y, ONE))]
+    )

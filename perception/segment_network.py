@@ -1,7 +1,8 @@
 """The block and the mouths of its holes by a network: in onnxruntime as shipped, or in torch as trained.
 
-The network looks twice: at the whole picture for the block, then at the block alone, where a mouth has several times the pixels;
-once more if more of the block came to light then, and at parts of the picture where it saw none in the whole.
+The network looks twice: at the whole picture for the block, then at the block alone, where a mouth
+has several times the pixels; once more if more of the block came to light then, and at parts of the
+picture where it saw none in the whole.
 """
 
 from __future__ import annotations
@@ -26,12 +27,15 @@ PREFIX = "brokk."
 """Of our entries among the metadata of an ONNX file; each is JSON."""
 THRESHOLD = 0.5
 SMALLEST_PIECE = 0.2
-"""Of the pieces of a block that something hides in part, those below this share of the largest do not move the second look."""
+"""Of the pieces of a block that something hides in part, those below this share of the largest do
+not move the second look."""
 CLOSER_LOOKS, STAYS = 2, 0.1
-"""Looks at the block alone, at most; and by how much of its size its box changes if there is to be another one."""
+"""Looks at the block alone, at most; and by how much of its size its box changes if there is to be
+another one."""
 
 Infer = Callable[[np.ndarray], np.ndarray]
-"""From a picture `(3, h, w)` float32 in [0, 1] to the probabilities of block and mouth, `(2, h, w)`."""
+"""From a picture `(3, h, w)` float32 in [0, 1] to the probabilities of block and mouth, `(2, h,
+w)`."""
 
 
 @spec
@@ -39,8 +43,10 @@ class Onnx:
     """Runs an exported network in onnxruntime; needs no torch.
 
     Attributes:
-        weights: An ONNX file of `mode=train_perception`: a path, or the name of one that ships with the package.
-        margin: Room around the block at the second look, as a part of its box; `null`: no second look.
+        weights: An ONNX file of `mode=train_perception`: a path, or the name of one that ships with
+            the package.
+        margin: Room around the block at the second look, as a part of its box; `null`: no second
+            look.
         threads: CPU threads.
     """
 
@@ -60,17 +66,30 @@ class Onnx:
             CheckpointError: there is no such network, or it is none of ours.
         """
         import onnxruntime
-        from onnxruntime.capi.onnxruntime_pybind11_state import Fail, InvalidArgument, InvalidProtobuf, NoSuchFile
+        from onnxruntime.capi.onnxruntime_pybind11_state import (
+            Fail,
+            InvalidArgument,
+            InvalidProtobuf,
+            NoSuchFile,
+        )
 
         path = found(self.weights)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads
         try:
-            session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+            session = onnxruntime.InferenceSession(
+                path.read_bytes(), options, providers=["CPUExecutionProvider"]
+            )
         except (Fail, InvalidArgument, InvalidProtobuf, NoSuchFile) as error:
-            raise CheckpointError(f"{path}: corrupt or no ONNX file ({error}); copy it again or train a new one") from error
+            raise CheckpointError(
+                f"{path}: corrupt or no ONNX file ({error}); copy it again or train a new one"
+            ) from error
         meta = session.get_modelmeta().custom_metadata_map
-        header = {key.removeprefix(PREFIX): json.loads(value) for key, value in meta.items() if key.startswith(PREFIX)}
+        header = {
+            key.removeprefix(PREFIX): json.loads(value)
+            for key, value in meta.items()
+            if key.startswith(PREFIX)
+        }
         size_px = checked_size(path, header)
 
         def infer(picture: np.ndarray) -> np.ndarray:
@@ -84,8 +103,10 @@ class Unet:
     """Runs the network of a checkpoint in torch, on a GPU where there is one.
 
     Attributes:
-        weights: A safetensors file of `mode=train_perception`: a path, or the name of one that ships with the package.
-        margin: Room around the block at the second look, as a part of its box; `null`: no second look.
+        weights: A safetensors file of `mode=train_perception`: a path, or the name of one that
+            ships with the package.
+        margin: Room around the block at the second look, as a part of its box; `null`: no second
+            look.
         device: `cpu`, `cuda` or `cuda:<index>`.
     """
 
@@ -107,7 +128,11 @@ class Unet:
 
         device = Session(out=".", seed=0, device=self.device).torch_device()
         network, header = export.read(found(self.weights))
-        return NetworkSegmenter(export.inference(network.to(device), device), checked_size(Path(self.weights), header), self.margin)
+        return NetworkSegmenter(
+            export.inference(network.to(device), device),
+            checked_size(Path(self.weights), header),
+            self.margin,
+        )
 
 
 class NetworkSegmenter:
@@ -181,7 +206,11 @@ def checked_size(path: Path, header: dict) -> tuple[int, int]:
     Raises:
         CheckpointError: the header is not that of a segmenter that we can run.
     """
-    if header.get("schema") != SCHEMA or header.get("channels") != ["block", "mouth"] or len(header.get("size_px", ())) != 2:
+    if (
+        header.get("schema") != SCHEMA
+        or header.get("channels") != ["block", "mouth"]
+        or len(header.get("size_px", ())) != 2
+    ):
         raise CheckpointError(
             f"{path}: no segmenter of ours: expected schema {SCHEMA} and channels block, mouth, got schema "
             f"{header.get('schema')} and {header.get('channels')}; train one with `brokk mode=train_perception`"
@@ -192,4 +221,6 @@ def checked_size(path: Path, header: dict) -> tuple[int, int]:
 
 def _check_margin(margin: float | None) -> None:
     if margin is not None and margin < 0:
-        raise ConfigError(f"segmenter.margin: expected 0 or more, or null for one look, got {margin}")
+        raise ConfigError(
+            f"segmenter.margin: expected 0 or more, or null for one look, got {margin}"
+        )

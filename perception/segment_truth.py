@@ -32,8 +32,12 @@ class TruthSegmenter:
             FrameError: there are none, or they are of another size.
         """
         if not frame.name:
-            raise FrameError("segmenter=truth reads the mask beside a frame on disk; this frame comes from a live source")
+            raise FrameError(
+                "segmenter=truth reads the mask beside a frame on disk; this frame comes from a live source"
+            )
         label = dataset.read_label(Path(frame.name))
         if label.block.shape != frame.color.shape[:2]:
-            raise FrameError(f"{frame.name}{dataset.MASK}: {label.block.shape[::-1]} px, the frame has {frame.color.shape[1::-1]}")
+            raise FrameError(
+                f"{frame.name}{dataset.MASK}: {label.block.shape[::-1]} px, the frame has {frame.color.shape[1::-1]}"
+            )
         return Masks(label.block.astype(np.float32), label.mouth.astype(np.float32))

@@ -36,7 +36,9 @@ class Window:
         if target is not None:
             piece, place = picture[source], out[target]
             how = cv2.INTER_AREA if piece.shape[1] >= place.shape[1] else cv2.INTER_LINEAR
-            out[target] = cv2.resize(piece, (place.shape[1], place.shape[0]), interpolation=how).reshape(place.shape)
+            out[target] = cv2.resize(
+                piece, (place.shape[1], place.shape[0]), interpolation=how
+            ).reshape(place.shape)
         return out
 
     def put(self, values: np.ndarray, into: np.ndarray) -> None:
@@ -44,9 +46,13 @@ class Window:
         source, target = self._shared(into.shape, (values.shape[1], values.shape[0]))
         if target is not None:
             place = into[source]
-            into[source] = cv2.resize(values[target], (place.shape[1], place.shape[0]), interpolation=cv2.INTER_LINEAR)
+            into[source] = cv2.resize(
+                values[target], (place.shape[1], place.shape[0]), interpolation=cv2.INTER_LINEAR
+            )
 
-    def _shared(self, shape: tuple[int, ...], size_px: tuple[int, int]) -> tuple[tuple[slice, slice], tuple[slice, slice] | None]:
+    def _shared(
+        self, shape: tuple[int, ...], size_px: tuple[int, int]
+    ) -> tuple[tuple[slice, slice], tuple[slice, slice] | None]:
         """Returns rows and columns of the picture that lie in the window, and where in `size_px` they go; `None`: nowhere."""
         source, target = [], []
         for begin, length, limit, size in (
@@ -71,11 +77,15 @@ def whole(shape: tuple[int, ...], size_px: tuple[int, int]) -> Window:
 def halves(shape: tuple[int, ...], size_px: tuple[int, int]) -> list[Window]:
     """Returns six windows of half the size of a picture `(H, W)` that overlap and together hold nearly all of it."""
     height, width = shape[:2]
-    corners = [(across * width, down * height) for down in (0.05, 0.45) for across in (0.0, 0.25, 0.5)]
+    corners = [
+        (across * width, down * height) for down in (0.05, 0.45) for across in (0.0, 0.25, 0.5)
+    ]
     return [around((*corner, 0.5 * width, 0.5 * height), size_px, 0.0) for corner in corners]
 
 
-def around(box: tuple[float, float, float, float], size_px: tuple[int, int], margin: float) -> Window:
+def around(
+    box: tuple[float, float, float, float], size_px: tuple[int, int], margin: float
+) -> Window:
     """Returns the window of the shape of `size_px` in whose middle a box lies.
 
     Args:
@@ -86,10 +96,17 @@ def around(box: tuple[float, float, float, float], size_px: tuple[int, int], mar
     left, top, width, height = box
     scale = (1.0 + 2.0 * margin) * max(width / size_px[0], height / size_px[1])
     across, down = max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
-    return Window(round(left + width / 2.0 - across / 2.0), round(top + height / 2.0 - down / 2.0), across, down)
+    return Window(
+        round(left + width / 2.0 - across / 2.0),
+        round(top + height / 2.0 - down / 2.0),
+        across,
+        down,
+    )
 
 
-def block_box(block: np.ndarray, threshold: float, smallest: float) -> tuple[int, int, int, int] | None:
+def block_box(
+    block: np.ndarray, threshold: float, smallest: float
+) -> tuple[int, int, int, int] | None:
     """Returns the box (left, top, width, height) around the block, px; `None` where there is none.
 
     Args:

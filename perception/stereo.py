@@ -1,8 +1,8 @@
 """Depth from a rectified pair of pictures: semi-global matching, then least squares on the pictures themselves.
 
-Semi-global matching answers in sixteenths of a pixel and leans towards whole ones: rendered pairs show a mean error of 0.05 px,
-which is 6 mm at 4 m and does not average out over a face. A few steps of Lucas and Kanade's registration (1981), with brightness
-and contrast free, remove it.
+Semi-global matching answers in sixteenths of a pixel and leans towards whole ones: rendered pairs
+show a mean error of 0.05 px, which is 6 mm at 4 m and does not average out over a face. A few steps
+of Lucas and Kanade's registration (1981), with brightness and contrast free, remove it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 
 _SMOOTH_PX = 0.8
-"""Both pictures are smoothed this much before their difference is read, or noise would shrink the slope."""
+"""Both pictures are smoothed this much before their difference is read, or noise would shrink the
+slope."""
 _LARGEST_STEP_PX = 0.5
 _LARGEST_CHANGE_PX = 1.0
 """Where refinement wants to move further than this the match was wrong."""
@@ -27,7 +28,8 @@ class Stereo:
     """Makes depth of a pair by semi-global matching (Hirschmüller 2008) with sub-pixel refinement.
 
     Attributes:
-        nearest_m: Nothing nearer is looked for; decides the range of disparities and the time it takes.
+        nearest_m: Nothing nearer is looked for; decides the range of disparities and the time it
+            takes.
         window_px: Side of the compared windows; odd.
         smoothness: Factor on the usual penalties for steps and jumps between neighbours.
         uniqueness: Percent by which the best match must beat the second.
@@ -52,11 +54,21 @@ class Stereo:
 
     def check(self) -> None:
         if not 0 < self.nearest_m < self.farthest_m:
-            raise ConfigError(f"stereo: expected 0 < nearest_m < farthest_m, got {self.nearest_m} and {self.farthest_m}")
-        if min(self.window_px, self.refinement_px) < 1 or self.window_px % 2 == 0 or self.refinement_px % 2 == 0:
-            raise ConfigError(f"stereo: windows are odd and positive, got {self.window_px} and {self.refinement_px}")
+            raise ConfigError(
+                f"stereo: expected 0 < nearest_m < farthest_m, got {self.nearest_m} and {self.farthest_m}"
+            )
+        if (
+            min(self.window_px, self.refinement_px) < 1
+            or self.window_px % 2 == 0
+            or self.refinement_px % 2 == 0
+        ):
+            raise ConfigError(
+                f"stereo: windows are odd and positive, got {self.window_px} and {self.refinement_px}"
+            )
 
-    def depth_m(self, left: np.ndarray, right: np.ndarray, focal_px: float, baseline_m: float) -> np.ndarray:
+    def depth_m(
+        self, left: np.ndarray, right: np.ndarray, focal_px: float, baseline_m: float
+    ) -> np.ndarray:
         """Returns depth along z for each pixel of the left picture, `(h, w)` float32, NaN where unknown.
 
         Args:
@@ -65,13 +77,17 @@ class Stereo:
             focal_px: Focal length.
             baseline_m: Distance between the cameras.
         """
-        one, other = (np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)) for picture in (left, right))
+        one, other = (
+            np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)) for picture in (left, right)
+        )
         found = self._matched(one, other, focal_px * baseline_m / self.nearest_m)
         if self.refinements:
             found = self._refined(one, other, found)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = focal_px * baseline_m / found
-        return np.where((found > 0) & (depth >= self.nearest_m) & (depth <= self.farthest_m), depth, np.nan).astype(np.float32)
+        return np.where(
+            (found > 0) & (depth >= self.nearest_m) & (depth <= self.farthest_m), depth, np.nan
+        ).astype(np.float32)
 
     def _matched(self, left: np.ndarray, right: np.ndarray, largest_px: float) -> np.ndarray:
         """Returns disparities, NaN where there is none."""
@@ -82,15 +98,24 @@ class Stereo:
             disp12MaxDiff=self.consistency_px, preFilterCap=31, uniquenessRatio=self.uniqueness,
             speckleWindowSize=self.speckle_px, speckleRange=self.speckle_range_px, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )  # fmt: skip
-        # the matcher leaves out a border as wide as the largest disparity; what the padding itself matches is thrown away
-        wide = [cv2.copyMakeBorder(picture, 0, 0, count, 0, cv2.BORDER_REPLICATE) for picture in (left, right)]
+        # the matcher leaves out a border as wide as the largest disparity; what the padding itself
+        # matches is thrown away
+        wide = [
+            cv2.copyMakeBorder(picture, 0, 0, count, 0, cv2.BORDER_REPLICATE)
+            for picture in (left, right)
+        ]
         found = matcher.compute(*wide)[:, count:].astype(np.float32) / 16.0
         columns = np.arange(left.shape[1], dtype=np.float32)
-        return np.where((found > 0) & (columns[None] - found >= 0), found, np.nan).astype(np.float32)
+        return np.where((found > 0) & (columns[None] - found >= 0), found, np.nan).astype(
+            np.float32
+        )
 
     def _refined(self, left: np.ndarray, right: np.ndarray, start: np.ndarray) -> np.ndarray:
         """Returns disparities that make the windows of both pictures agree best, whatever their brightness and contrast."""
-        one, other = (cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _SMOOTH_PX) for picture in (left, right))
+        one, other = (
+            cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _SMOOTH_PX)
+            for picture in (left, right)
+        )
         slope = cv2.Sobel(other, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
         x, y = np.meshgrid(*[np.arange(size, dtype=np.float32) for size in left.shape[::-1]])
         known = np.isfinite(start).astype(np.float32)
@@ -103,15 +128,21 @@ class Stereo:
         mine = mean(one)
         mine_spread = mean(one * one) - mine * mine
         for _ in range(self.refinements):
-            seen, rise = (cv2.remap(picture, x - found, y, cv2.INTER_CUBIC) for picture in (other, slope))
+            seen, rise = (
+                cv2.remap(picture, x - found, y, cv2.INTER_CUBIC) for picture in (other, slope)
+            )
             theirs, mean_rise = mean(seen), mean(rise)
             spread = mean(seen * seen) - theirs * theirs
             gain = np.sqrt(np.clip(spread / np.maximum(mine_spread, 1e-3), 0.25, 4.0))
             off = gain * (one - mine) - (seen - theirs)
             steep = mean(rise * rise) - mean_rise * mean_rise
             step = -(mean(off * rise) - mean(off) * mean_rise) / np.maximum(steep, 1e-6)
-            found = found + np.where(steep > _LEAST_SLOPE, np.clip(step, -_LARGEST_STEP_PX, _LARGEST_STEP_PX), 0.0)
-        return np.where(np.abs(found - start) < _LARGEST_CHANGE_PX, found, np.nan).astype(np.float32)
+            found = found + np.where(
+                steep > _LEAST_SLOPE, np.clip(step, -_LARGEST_STEP_PX, _LARGEST_STEP_PX), 0.0
+            )
+        return np.where(np.abs(found - start) < _LARGEST_CHANGE_PX, found, np.nan).astype(
+            np.float32
+        )
 
     def _mean(self, values: np.ndarray) -> np.ndarray:
         return cv2.boxFilter(values, -1, (self.refinement_px, self.refinement_px))

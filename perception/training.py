@@ -23,7 +23,8 @@ from perception.unet import UNet, loss
 STATE = "training.pt"
 """What an interrupted training goes on from."""
 FREE = ("frames", "validation", "hold_out", "max_seconds", "validate_every")
-"""Settings that may be others when it does; frames and validation are compared by what they hold."""
+"""Settings that may be others when it does; frames and validation are compared by what they
+hold."""
 
 log = logging.getLogger(__name__)
 
@@ -35,23 +36,27 @@ class SegmenterTraining:
     Attributes:
         frames: Folder, or list of folders, of frames with masks, those below them too.
         validation: Folders to judge by; `null` sets a part of `frames` aside.
-        hold_out: Without `validation`, one part in so many is kept from the training: a run of frames at the end.
+        hold_out: Without `validation`, one part in so many is kept from the training: a run of
+            frames at the end.
         size_px: Width and height of the network's picture.
         widths: Channels of the network at each size, the full picture first.
-        start: Checkpoint whose weights it begins with, to go on with other frames: a path, or the name of one that ships with the
-            package; `null` begins with chance.
+        start: Checkpoint whose weights it begins with, to go on with other frames: a path, or the
+            name of one that ships with the package; `null` begins with chance.
         updates: Steps of the optimiser.
-        max_seconds: It ends after as many seconds too, those before a resume included; `null` for no such end. What was learned
-            until then depends on the speed of the machine.
+        max_seconds: It ends after as many seconds too, those before a resume included; `null` for
+            no such end. What was learned until then depends on the speed of the machine.
         batch: Samples a step.
-        rate: Learning rate at its highest; it rises for a twentieth of the updates, then falls as a cosine to nothing.
+        rate: Learning rate at its highest; it rises for a twentieth of the updates, then falls as a
+            cosine to nothing.
         decay: Weight decay.
-        average: The network is the mean of what it was lately, over about this part of the training: the steps of the last batches
-            are as much chance as gain.
-        bfloat16: Whether the network is trained in sixteen bits: in half the time on a graphics card or a processor that can.
+        average: The network is the mean of what it was lately, over about this part of the
+            training: the steps of the last batches are as much chance as gain.
+        bfloat16: Whether the network is trained in sixteen bits: in half the time on a graphics
+            card or a processor that can.
         closer: How often a sample is cut from the closer view of the block.
         margin: Room around the block in that view, as a part of its box; that of the segmenter.
-        validate_every: Updates between two judgements, after each of which the training can go on if it is stopped.
+        validate_every: Updates between two judgements, after each of which the training can go on
+            if it is stopped.
         crop: What a sample shows, beside what the segmenter would see.
         augment: What happens to its picture, by name, in this order.
     """
@@ -83,19 +88,26 @@ class SegmenterTraining:
                 f"{multiple}, got {list(self.size_px)}"
             )
         if min(self.updates, self.batch, self.validate_every) < 1 or self.hold_out < 2:
-            raise ConfigError("training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or more")
-        if min(self.average, self.rate, math.inf if self.max_seconds is None else self.max_seconds) <= 0:
+            raise ConfigError(
+                "training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or more"
+            )
+        if (
+            min(self.average, self.rate, math.inf if self.max_seconds is None else self.max_seconds)
+            <= 0
+        ):
             raise ConfigError("training: expected average, rate and max_seconds above 0")
 
     def fit(self, session: Session, resume: bool) -> dict[str, Any]:
         """Trains; leaves the network as safetensors and ONNX, curve and samples as PNG in the session's folder.
 
         Returns:
-            What `training.json` says: `conditions` (see `training_report.judged`), `best_update`, `parameters`, `parity`, …
+            What `training.json` says: `conditions` (see `training_report.judged`), `best_update`,
+                `parameters`, `parity`, …
 
         Raises:
             FrameError: frames or masks cannot be used.
-            CheckpointError: there is nothing to go on from, it is another training, or the export says something else.
+            CheckpointError: there is nothing to go on from, it is another training, or the export
+                says something else.
         """
         return _Training(self, session, resume).run()
 
@@ -109,7 +121,9 @@ class _Training:
         session.seed_all()
         self._train, self._unseen = self._views()
         self._network = self._begun().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._optimizer = torch.optim.AdamW(self._network.parameters(), lr=settings.rate, weight_decay=settings.decay, fused=True)
+        self._optimizer = torch.optim.AdamW(
+            self._network.parameters(), lr=settings.rate, weight_decay=settings.decay, fused=True
+        )
         self._mean = {name: value.clone() for name, value in self._network.state_dict().items()}
         self._update, self._best, self._curve = 0, {"score": -1.0, "update": 0}, []
         self._seconds = 0.0
@@ -122,7 +136,12 @@ class _Training:
         settings = self._settings
         pictures, known = training_report.looked_at(self._unseen, settings.size_px)
         total = torch.zeros((), device=self._device)
-        log.info("%d frames to train on, %d to judge by, %s", len(self._train), len(self._unseen), self._device)
+        log.info(
+            "%d frames to train on, %d to judge by, %s",
+            len(self._train),
+            len(self._unseen),
+            self._device,
+        )
         begun = time.monotonic() - self._seconds
         samples = Samples(
             self._train, settings.crop, settings.augment, settings.size_px, settings.closer, self._session.stream("samples"),
@@ -168,7 +187,9 @@ class _Training:
         else:
             unseen = training_data.frames(settings.validation)
             if shared := {path.resolve() for path in stems} & {path.resolve() for path in unseen}:
-                raise ConfigError(f"training.validation: {min(shared)} is also among training.frames; judge by other frames")
+                raise ConfigError(
+                    f"training.validation: {min(shared)} is also among training.frames; judge by other frames"
+                )
         if not stems:
             raise ConfigError("training.frames: one frame is too few to train on and to judge by")
         both = training_data.read([*stems, *unseen], settings.size_px, settings.margin, seed)
@@ -192,8 +213,11 @@ class _Training:
         """Moves the mean network by a part of the way to the one under training."""
         now = self._network.state_dict()
         moving = [name for name, value in now.items() if value.is_floating_point()]
-        # all at once: a graphics card takes longer to be told of each of a hundred small tensors than to move them
-        torch._foreach_lerp_([self._mean[name] for name in moving], [now[name] for name in moving], part)
+        # all at once: a graphics card takes longer to be told of each of a hundred small tensors
+        # than to move them
+        torch._foreach_lerp_(
+            [self._mean[name] for name in moving], [now[name] for name in moving], part
+        )
 
     def _spent(self) -> float:
         """Returns which part of the training is over, by updates or by seconds, in [0, 1]."""
@@ -205,20 +229,32 @@ class _Training:
         rise = 20.0 * (self._spent() + 1.0 / self._settings.updates)
         return self._settings.rate * min(1.0, rise) * fall
 
-    def _validate(self, pictures: torch.Tensor, known: torch.Tensor, mean_loss: float | None) -> None:
+    def _validate(
+        self, pictures: torch.Tensor, known: torch.Tensor, mean_loss: float | None
+    ) -> None:
         network = UNet(self._settings.widths).to(self._device)
         network.load_state_dict(self._mean)
         probabilities = training_report.predicted(network, pictures, self._device)
         figures = training_report.judged(probabilities, known, self._unseen.conditions)["all"]
         block, mouth = figures["block"] or 0.0, figures["mouth"] or 0.0
-        self._curve.append({"update": self._update, "loss": mean_loss, "block": block, "mouth": mouth})
+        self._curve.append(
+            {"update": self._update, "loss": mean_loss, "block": block, "mouth": mouth}
+        )
         if mean_loss is not None and not math.isfinite(mean_loss):
-            raise CheckpointError(f"the training diverged before update {self._update}; try a smaller training.rate")
+            raise CheckpointError(
+                f"the training diverged before update {self._update}; try a smaller training.rate"
+            )
         if block + mouth > self._best["score"]:
             self._best = {"score": block + mouth, "update": self._update}
             self._best_tensors = {name: value.cpu().clone() for name, value in self._mean.items()}
         passed = "" if mean_loss is None else f"loss {mean_loss:.4f}, "
-        log.info("update %d: %soverlap of blocks %.3f, of mouths %.3f", self._update, passed, block, mouth)
+        log.info(
+            "update %d: %soverlap of blocks %.3f, of mouths %.3f",
+            self._update,
+            passed,
+            block,
+            mouth,
+        )
 
     def _finish(self, pictures: torch.Tensor, known: torch.Tensor) -> dict[str, Any]:
         network = UNet(self._settings.widths)
@@ -285,9 +321,13 @@ class _Training:
         try:
             state = torch.load(path, map_location=self._device, weights_only=True)
         except Exception as error:  # torch raises whatever its unpickler meets
-            raise CheckpointError(f"{path}: corrupt ({error}); delete it to begin the training again") from error
+            raise CheckpointError(
+                f"{path}: corrupt ({error}); delete it to begin the training again"
+            ) from error
         if state["stamp"] != self._stamp:
-            differing = [name for name, value in self._stamp.items() if state["stamp"].get(name) != value]
+            differing = [
+                name for name, value in self._stamp.items() if state["stamp"].get(name) != value
+            ]
             raise CheckpointError(
                 f"{path}: an interrupted training that cannot go on: its {' and '.join(differing)} differ. Train with what it "
                 "began with, or choose another folder (session.out=…)."
@@ -295,5 +335,7 @@ class _Training:
         self._network.load_state_dict(state["network"])
         self._mean = state["mean"]
         self._optimizer.load_state_dict(state["optimizer"])
-        self._update, self._best, self._curve, self._seconds = (state[key] for key in ("update", "best", "curve", "seconds"))
+        self._update, self._best, self._curve, self._seconds = (
+            state[key] for key in ("update", "best", "curve", "seconds")
+        )
         self._best_tensors = {name: value.cpu() for name, value in state["best_tensors"].items()}

@@ -17,7 +17,8 @@ class Truth:
         center_in_base_m: Centre of the rim.
         axis_in_base: Unit axis, pointing out of the hole.
         radius_m: Radius of the hole.
-        std_m: Standard deviation that is claimed for each coordinate of the centre; 0 for a hole known exactly.
+        std_m: Standard deviation that is claimed for each coordinate of the centre; 0 for a hole
+            known exactly.
     """
 
     center_in_base_m: tuple[float, float, float]
@@ -29,19 +30,29 @@ class Truth:
         if abs(float(np.linalg.norm(self.axis_in_base)) - 1.0) > 1e-6:
             raise ConfigError(f"perception.axis_in_base: {self.axis_in_base} is not a unit vector")
         if self.radius_m <= 0 or self.std_m < 0:
-            raise ConfigError(f"perception: expected radius_m > 0 and std_m >= 0, got {self.radius_m} and {self.std_m}")
+            raise ConfigError(
+                f"perception: expected radius_m > 0 and std_m >= 0, got {self.radius_m} and {self.std_m}"
+            )
 
     def build(self) -> TruthFinder:
         """Returns a finder that always finds this borehole."""
         covariance = np.eye(3) * self.std_m**2
-        return TruthFinder(Borehole(np.array(self.center_in_base_m), np.array(self.axis_in_base), self.radius_m, covariance))
+        return TruthFinder(
+            Borehole(
+                np.array(self.center_in_base_m),
+                np.array(self.axis_in_base),
+                self.radius_m,
+                covariance,
+            )
+        )
 
 
 class TruthFinder:
     """A finder that has the answer.
 
     Args:
-        borehole: The borehole; whoever moves the hole sets it anew, or to `None` when there is none.
+        borehole: The borehole; whoever moves the hole sets it anew, or to `None` when there is
+            none.
     """
 
     def __init__(self, borehole: Borehole | None) -> None:

@@ -13,7 +13,8 @@ CHANNELS = ("block", "mouth")
 DARKEST = 0.01
 """Contrast below which a picture is not stretched any more: a few grey levels of 255."""
 BRIGHTEST = 2.0
-"""Standard deviations from the mean beyond which nothing is any brighter or darker: a lit block on black ground is one of many."""
+"""Standard deviations from the mean beyond which nothing is any brighter or darker: a lit block on
+black ground is one of many."""
 
 
 class UNet(nn.Module):
@@ -26,9 +27,12 @@ class UNet(nn.Module):
     def __init__(self, widths: Sequence[int]) -> None:
         super().__init__()
         self.widths = tuple(widths)
-        self.down = nn.ModuleList(_Pair(before, after) for before, after in zip((3, *widths[:-1]), widths, strict=True))
+        self.down = nn.ModuleList(
+            _Pair(before, after) for before, after in zip((3, *widths[:-1]), widths, strict=True)
+        )
         back = list(widths[::-1])
-        # each step up takes what came from below beside the bridge and leaves half as many, as the size above has
+        # each step up takes what came from below beside the bridge and leaves half as many, as the
+        # size above has
         below, steps = back[0], []
         for here, above in zip(back[1:], [*back[2:], back[-1]], strict=True):
             steps.append(_Pair(below + here, above))
@@ -44,8 +48,10 @@ class UNet(nn.Module):
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
         """Returns logits, `(B, 2, h, w)`, of RGB pictures `(B, 3, h, w)` in [0, 1]."""
-        # of the root, in which the noise of light is alike at every brightness, and what is in the shade is not all black; each
-        # picture by its own brightness and contrast: dusk and dust are the same picture then, but for the noise
+        # of the root, in which the noise of light is alike at every brightness, and what is in the
+        # shade is not all black; each picture by its own brightness and contrast: dusk and dust are
+        # the same picture then, but
+        # for the noise
         picture = picture.sqrt()
         mean = over_picture(picture)
         spread = over_picture((picture - mean).square()).sqrt()
@@ -54,7 +60,9 @@ class UNet(nn.Module):
             x = pair(x if number == 0 else functional.max_pool2d(x, 2))
             bridges.append(x)
         for pair, bridge in zip(self.up, bridges[-2::-1], strict=True):
-            x = pair(torch.cat([functional.interpolate(x, scale_factor=2.0, mode="nearest"), bridge], 1))
+            x = pair(
+                torch.cat([functional.interpolate(x, scale_factor=2.0, mode="nearest"), bridge], 1)
+            )
         return self.head(x)
 
 
@@ -96,5 +104,9 @@ class _Pair(nn.Sequential):
     def __init__(self, before: int, after: int) -> None:
         layers: list[nn.Module] = []
         for channels in (before, after):
-            layers += [nn.Conv2d(channels, after, 3, padding=1, bias=False), nn.BatchNorm2d(after), nn.ReLU(inplace=True)]
+            layers += [
+                nn.Conv2d(channels, after, 3, padding=1, bias=False),
+                nn.BatchNorm2d(after),
+                nn.ReLU(inplace=True),
+            ]
         super().__init__(*layers)

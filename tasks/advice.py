@@ -1,8 +1,8 @@
 """Proposing to a person: what their hands have yet to do of what was proposed, and proposals that hands can follow.
 
-A person follows late and sluggishly, so the machine's history lacks what the policy has lately asked for: without its own
-proposals it would ask for the same motion again and again until the first of it arrives. With them the dead times of machine and
-person are one.
+A person follows late and sluggishly, so the machine's history lacks what the policy has lately
+asked for: without its own proposals it would ask for the same motion again and again until the
+first of it arrives. With them the dead times of machine and person are one.
 """
 
 import torch
@@ -23,10 +23,14 @@ class Advice:
     Attributes:
         delay_s: Reaction delay, from the display to the hand.
         lag_s: Time constant of the hand.
-        dead_zone: Deflection below which a lever commands nothing: what is to have an effect is proposed larger.
-        joints_at_once: Levers that the person can move at the same time, of a range the fewest: no more are proposed. `null`: all.
-        hold_s: Time for which a lever once proposed is proposed again before a larger request takes its place.
-        settle_s: Time for which the hand is followed after its last proposal; several times the lag.
+        dead_zone: Deflection below which a lever commands nothing: what is to have an effect is
+            proposed larger.
+        joints_at_once: Levers that the person can move at the same time, of a range the fewest: no
+            more are proposed. `null`: all.
+        hold_s: Time for which a lever once proposed is proposed again before a larger request takes
+            its place.
+        settle_s: Time for which the hand is followed after its last proposal; several times the
+            lag.
     """
 
     delay_s: Expected
@@ -39,7 +43,9 @@ class Advice:
     def check(self) -> None:
         for name in ("delay_s", "lag_s", "dead_zone"):
             if _middle(getattr(self, name)) < 0:
-                raise ConfigError(f"task.advice.{name}: expected 0 or more, got {getattr(self, name)}")
+                raise ConfigError(
+                    f"task.advice.{name}: expected 0 or more, got {getattr(self, name)}"
+                )
 
     def build(self, machine: Machine, device: torch.device) -> "Adviser":
         """Returns the adviser for `machine` on `device`."""
@@ -53,7 +59,9 @@ class Adviser:
         self._dead_zone = _middle(advice.dead_zone)
         self._exclusive = torch.as_tensor(machine.is_exclusive, device=device)
         most = advice.joints_at_once
-        self._most = machine.num_joints if most is None else most[0] if isinstance(most, tuple) else most
+        self._most = (
+            machine.num_joints if most is None else most[0] if isinstance(most, tuple) else most
+        )
         self._hold = round(advice.hold_s / machine.period_s)
         self._future = _future(advice, machine).to(device)
 
@@ -66,7 +74,11 @@ class Adviser:
         """
         hand = self._shown(given)
         levers = torch.einsum("fh,nhj->nfj", self._future, torch.cat((proposed, hand[:, None]), 1))
-        return levers.sign() * (levers.abs() - self._dead_zone).clamp(min=0.0) / (1.0 - self._dead_zone)
+        return (
+            levers.sign()
+            * (levers.abs() - self._dead_zone).clamp(min=0.0)
+            / (1.0 - self._dead_zone)
+        )
 
     def proposal(self, wanted: torch.Tensor, proposed: torch.Tensor) -> torch.Tensor:
         """Returns what to propose, `(N, J)`, where the commands `wanted`, `(N, J)`, are to be given.
@@ -78,14 +90,19 @@ class Adviser:
         shown = self._shown(wanted)
         if self._most >= wanted.shape[1]:
             return shown
-        # a lever that was taken lately: the newest proposals have it without a gap, but not yet for `hold_s`
+        # a lever that was taken lately: the newest proposals have it without a gap, but not yet for
+        # `hold_s`
         lately = ((proposed == 0).float().flip(1).cumsum(1) < 0.5).sum(1)
         kept = (lately > 0) & (lately < self._hold) & (shown != 0)
         return torch.where(moved_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
 
     def _shown(self, command: torch.Tensor) -> torch.Tensor:
         """Returns the deflection that commands `command`."""
-        return torch.where(command == 0, 0.0, command.sign() * (self._dead_zone + (1.0 - self._dead_zone) * command.abs()))
+        return torch.where(
+            command == 0,
+            0.0,
+            command.sign() * (self._dead_zone + (1.0 - self._dead_zone) * command.abs()),
+        )
 
 
 def _future(advice: Advice, machine: Machine) -> torch.Tensor:
@@ -100,7 +117,10 @@ def _future(advice: Advice, machine: Machine) -> torch.Tensor:
     hand[num] = 1.0
     for step in range(steps):
         target = torch.zeros(num + 1)
-        for back, weight in ((whole, 1.0 - part), (whole + 1, part)):  # the proposal of so many periods ago
+        for back, weight in (
+            (whole, 1.0 - part),
+            (whole + 1, part),
+        ):  # the proposal of so many periods ago
             place = num + step - back
             if 0 <= place < num:
                 target[place] += weight

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 class Deployable(torch.nn.Module):
     """The whole policy as it runs on the machine: from the observation vector `(B, O)` to masked commands `(B, J)`.
 
-    Everything that training computes beside the paper's observation (guidance, phase, residual, masks) is inside, so that nothing
-    of it has to be written again, in another order or scale, where the policy is deployed.
+    Everything that training computes beside the paper's observation (guidance, phase, residual,
+    masks) is inside, so that nothing of it has to be written again, in another order or scale,
+    where the policy is deployed.
     """
 
     def __init__(self, process: ToolPoseProcess, network: torch.nn.Module) -> None:
@@ -31,20 +32,33 @@ class Deployable(torch.nn.Module):
         target_m, q, u = process._encoder.decode(observation)
         q, u = process.remembered(q, u)
         varies = process._encoder.has_pitch
-        pitch = process._encoder.decode_pitch(observation) if varies else torch.full_like(target_m[:, 0], self._pitch_rad)
+        pitch = (
+            process._encoder.decode_pitch(observation)
+            if varies
+            else torch.full_like(target_m[:, 0], self._pitch_rad)
+        )
         adviser, proposed, coming = process.adviser, None, None
         if adviser is not None:
             proposed = process.recalled(process._encoder.decode_proposals(observation))
             coming = adviser.coming(proposed, u[:, -1])
-        guidance = process._controller.guide(q, u, target_m - process._down, pitch, options.switch.reach_m, coming)
+        guidance = process._controller.guide(
+            q, u, target_m - process._down, pitch, options.switch.reach_m, coming
+        )
         positioning = options.switch.positioning(guidance)
         if options.memory < q.shape[1]:
             observation = process._encoder.encode(target_m, q, u, pitch, proposed)
         groups = {"policy": observation, "guide": features(guidance, positioning, u[:, -1])}
         command = options.action.command(
-            self.network(groups), guidance.command, guidance.lowest, guidance.highest, positioning, process._exclusive
+            self.network(groups),
+            guidance.command,
+            guidance.lowest,
+            guidance.highest,
+            positioning,
+            process._exclusive,
         )
-        return command if adviser is None or proposed is None else adviser.proposal(command, proposed)
+        return (
+            command if adviser is None or proposed is None else adviser.proposal(command, proposed)
+        )
 
 
 def features(guidance: Guidance, positioning: torch.Tensor, u_last: torch.Tensor) -> torch.Tensor:
@@ -53,4 +67,15 @@ def features(guidance: Guidance, positioning: torch.Tensor, u_last: torch.Tensor
     scales = (errors, (errors / 0.1).tanh(), (errors / 0.02).tanh())
     turn = guidance.pitch_error_rad[:, None]
     reach = (guidance.reach_m - 2.0)[:, None]
-    return torch.cat((guidance.command, u_last, *scales, turn, (turn / 0.1).tanh(), reach, positioning[:, None].float()), 1)
+    return torch.cat(
+        (
+            guidance.command,
+            u_last,
+            *scales,
+            turn,
+            (turn / 0.1).tanh(),
+            reach,
+            positioning[:, None].float(),
+        ),
+        1,
+    )

@@ -1,8 +1,9 @@
 """A tool-pose task at work: episodes, observations, masks and judgement for `N` environments at once.
 
-What differs between tasks (which target, what success means) is in the `Goal` that a task hands in; everything here is the same
-for all of them. No method synchronises with the host, and every tensor of `state` and `episode` keeps its address, so that the
-whole control step can be captured in one CUDA graph.
+What differs between tasks (which target, what success means) is in the `Goal` that a task hands in;
+everything here is the same for all of them. No method synchronises with the host, and every tensor
+of `state` and `episode` keeps its address, so that the whole control step can be captured in one
+CUDA graph.
 """
 
 import math
@@ -36,7 +37,9 @@ class Goal(Protocol):
         """Draws valid starts; `q`, `scene`, `target_m` `(count, 3)` and `target_pitch_rad` `(count,)` at least."""
         ...
 
-    def judge(self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def judge(
+        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
+    ) -> dict[str, torch.Tensor]:
         """Returns `success`, `paper_success` (bool) and `closeness`, each `(N,)`."""
         ...
 
@@ -64,7 +67,12 @@ class Options:
     @classmethod
     def of(cls, task: object, **fixed: Any) -> Self:
         """Returns the options of a task's spec, whose fields have the same names; the task does not leave `fixed` open."""
-        return cls(**{field.name: fixed[field.name] if field.name in fixed else getattr(task, field.name) for field in fields(cls)})
+        return cls(
+            **{
+                field.name: fixed[field.name] if field.name in fixed else getattr(task, field.name)
+                for field in fields(cls)
+            }
+        )
 
 
 class ToolPoseProcess:
@@ -72,7 +80,9 @@ class ToolPoseProcess:
 
     reasons: tuple[str, ...] = REASONS
 
-    def __init__(self, goal: Goal, options: Options, machine: Machine, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self, goal: Goal, options: Options, machine: Machine, num_envs: int, device: torch.device
+    ) -> None:
         def constant(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
@@ -83,7 +93,9 @@ class ToolPoseProcess:
         self._kinematics = Kinematics(machine, device)
         self._controller: ClassicalController = options.classical.build(machine, device)
         self.adviser = options.advice.build(machine, device) if options.advice else None
-        self._encoder = Encoder(machine, options.scaling, constant, torch.cat, with_proposals=self.adviser is not None)
+        self._encoder = Encoder(
+            machine, options.scaling, constant, torch.cat, with_proposals=self.adviser is not None
+        )
         self._exclusive = constant(machine.is_exclusive).bool()
         self._lower = constant(machine.lower) + options.limit_margin
         self._upper = constant(machine.upper) - options.limit_margin
@@ -94,15 +106,49 @@ class ToolPoseProcess:
         num_joints = machine.num_joints
         start = self.starts(1, 0)
         shapes = {f"start.{key}": tuple(value.shape[1:]) for key, value in start.items()}
-        shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "estimate_m": (3,), "q_scale": (), "u_scale": (), "steps": (), "age": ()}
-        shapes |= {"u": (num_joints,), "u_before": (num_joints,), "closeness": (), "contact_force_n": ()}
-        shapes |= {"command": (num_joints,), "features": (self.num_features,), "policy": (self._encoder.size,), "privileged": (10,)}
-        shapes |= {"positioning": (), "rule_reach_m": (), "lowest": (num_joints,), "highest": (num_joints,)}
+        shapes |= {
+            "bias_m": (3,),
+            "estimate_sum_m": (3,),
+            "estimate_m": (3,),
+            "q_scale": (),
+            "u_scale": (),
+            "steps": (),
+            "age": (),
+        }
+        shapes |= {
+            "u": (num_joints,),
+            "u_before": (num_joints,),
+            "closeness": (),
+            "contact_force_n": (),
+        }
+        shapes |= {
+            "command": (num_joints,),
+            "features": (self.num_features,),
+            "policy": (self._encoder.size,),
+            "privileged": (10,),
+        }
+        shapes |= {
+            "positioning": (),
+            "rule_reach_m": (),
+            "lowest": (num_joints,),
+            "highest": (num_joints,),
+        }
         if self.adviser:
             shapes["proposed"] = (machine.num_history, num_joints)
-        self.state = {name: torch.zeros((num_envs, *shape), device=device) for name, shape in shapes.items()}
-        figures = ("success_strict", "success_paper", "time_to_insert_s", "lateral_error_m", "peak_force_n", "valve_travel")
-        self.episode = {name: torch.zeros(num_envs, device=device) for name in (*figures, "return", "length")}
+        self.state = {
+            name: torch.zeros((num_envs, *shape), device=device) for name, shape in shapes.items()
+        }
+        figures = (
+            "success_strict",
+            "success_paper",
+            "time_to_insert_s",
+            "lateral_error_m",
+            "peak_force_n",
+            "valve_travel",
+        )
+        self.episode = {
+            name: torch.zeros(num_envs, device=device) for name in (*figures, "return", "length")
+        }
 
     @property
     def num_features(self) -> int:
@@ -113,7 +159,9 @@ class ToolPoseProcess:
         """See `TaskProcess.starts`."""
         start = self.goal.starts(count, seed)
         pose = Kinematics(self._machine, "cpu").pose(start["q"])
-        return start | {"closeness": self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)["closeness"]}
+        return start | {
+            "closeness": self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)["closeness"]
+        }
 
     def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor]) -> None:
         """See `TaskProcess.reset`."""
@@ -140,7 +188,9 @@ class ToolPoseProcess:
     def command(self, action: torch.Tensor) -> torch.Tensor:
         """See `TaskProcess.command`."""
         base, lowest, highest = (self.state[name] for name in ("command", "lowest", "highest"))
-        u = self.options.action.command(action, base, lowest, highest, self.state["positioning"].bool(), self._exclusive)
+        u = self.options.action.command(
+            action, base, lowest, highest, self.state["positioning"].bool(), self._exclusive
+        )
         if self.adviser:
             proposed = self.state["proposed"]
             u = self.adviser.proposal(u, self.recalled(proposed))
@@ -156,14 +206,16 @@ class ToolPoseProcess:
         pose = self._kinematics.pose(q)
         start = self._start()
         verdict = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)
-        # `steps` decides about the time limit and may be set from outside (episodes out of step); `age` counts since the reset
+        # `steps` decides about the time limit and may be set from outside (episodes out of step);
+        # `age` counts since the reset
         state["steps"] += 1
         state["age"] += 1
         first = state["age"] == 1
         failed = ((q < self._lower) | (q > self._upper)).any(1)
         touching = first & (world.contact_force_n > 0)
         fault = world.faults
-        # what a diverged world says about forces may be NaN, and one NaN would poison the sums over all worlds
+        # what a diverged world says about forces may be NaN, and one NaN would poison the sums over
+        # all worlds
         force_n = torch.where(fault, 0.0, world.contact_force_n)
         success = verdict["success"] & ~fault & ~touching
         seen = ToolState(
@@ -193,18 +245,32 @@ class ToolPoseProcess:
             ended = ended | success
         # the order of REASONS decides when several hold; -1 while the episode goes on
         reason = torch.full_like(state["steps"], -1.0)
-        endings = (success if options.end_on_success else torch.zeros_like(success), failed, touching, fault, timed_out)
+        endings = (
+            success if options.end_on_success else torch.zeros_like(success),
+            failed,
+            touching,
+            fault,
+            timed_out,
+        )
         for index in reversed(range(len(REASONS))):
             reason = torch.where(endings[index], float(index), reason)
         self._count(seen, history.u, reward, success)
         state["closeness"].copy_(verdict["closeness"])
         state["contact_force_n"].copy_(force_n)
-        return Transition(reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason)
+        return Transition(
+            reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason
+        )
 
-    def observe(self, history: History, shift_m: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    def observe(
+        self, history: History, shift_m: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
         """See `TaskProcess.observe`: `policy`, `guide` (what the classical controller makes of it), `privileged` (critic only)."""
         self._perceive(history, shift_m)
-        return {"policy": self.state["policy"], "guide": self.state["features"], "privileged": self.state["privileged"]}
+        return {
+            "policy": self.state["policy"],
+            "guide": self.state["features"],
+            "privileged": self.state["privileged"],
+        }
 
     def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
         """See `TaskProcess.classical_action`."""
@@ -215,7 +281,11 @@ class ToolPoseProcess:
         """See `TaskProcess.describe`."""
         options = self.options
         advice = {"advice": asdict(options.advice)} if options.advice else {}
-        return self._encoder.describe() | {"target_filter": options.noise.filter, "switch": asdict(options.switch)} | advice
+        return (
+            self._encoder.describe()
+            | {"target_filter": options.noise.filter, "switch": asdict(options.switch)}
+            | advice
+        )
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
         """See `TaskProcess.deployable`."""
@@ -232,24 +302,42 @@ class ToolPoseProcess:
     def recalled(self, u: torch.Tensor) -> torch.Tensor:
         """Returns commands, `(N, H, J)`, with none before the last `memory` samples."""
         forgotten = u.shape[1] - self.options.memory
-        return u if forgotten <= 0 else torch.cat((torch.zeros_like(u[:, :forgotten]), u[:, forgotten:]), 1)
+        return (
+            u
+            if forgotten <= 0
+            else torch.cat((torch.zeros_like(u[:, :forgotten]), u[:, forgotten:]), 1)
+        )
 
     def _start(self) -> dict[str, torch.Tensor]:
-        return {name.removeprefix("start."): value for name, value in self.state.items() if name.startswith("start.")}
+        return {
+            name.removeprefix("start."): value
+            for name, value in self.state.items()
+            if name.startswith("start.")
+        }
 
-    def _count(self, seen: ToolState, given: torch.Tensor, reward: torch.Tensor, success: torch.Tensor) -> None:
+    def _count(
+        self, seen: ToolState, given: torch.Tensor, reward: torch.Tensor, success: torch.Tensor
+    ) -> None:
         """Updates the figures of the running episode; `given` are the commands in force, `(N, H, J)`."""
         episode, period_s = self.episode, self._machine.period_s
         new = success & (episode["success_strict"] == 0)
         episode["length"] += 1
         episode["return"] += reward
-        episode["time_to_insert_s"].copy_(torch.where(new, episode["length"] * period_s, episode["time_to_insert_s"]))
+        episode["time_to_insert_s"].copy_(
+            torch.where(new, episode["length"] * period_s, episode["time_to_insert_s"])
+        )
         open_ = episode["success_strict"] == 0
-        episode["lateral_error_m"].copy_(torch.where(open_, seen.lateral_m, episode["lateral_error_m"]))
+        episode["lateral_error_m"].copy_(
+            torch.where(open_, seen.lateral_m, episode["lateral_error_m"])
+        )
         episode["success_strict"].copy_(torch.where(success, 1.0, episode["success_strict"]))
-        episode["success_paper"].copy_(torch.where(seen.paper_success, 1.0, episode["success_paper"]))
+        episode["success_paper"].copy_(
+            torch.where(seen.paper_success, 1.0, episode["success_paper"])
+        )
         episode["peak_force_n"].copy_(torch.maximum(episode["peak_force_n"], seen.contact_force_n))
-        travel = (given[:, -1] - given[:, -2]).abs().sum(1) / period_s  # what was given, not what was proposed
+        travel = (given[:, -1] - given[:, -2]).abs().sum(
+            1
+        ) / period_s  # what was given, not what was proposed
         episode["valve_travel"] += (travel - episode["valve_travel"]) / episode["length"]
 
     def _perceive(self, history: History, shift_m: torch.Tensor | None) -> None:
@@ -267,16 +355,22 @@ class ToolPoseProcess:
             # the observation after the reset is the first sample
             sample = state["estimate_sum_m"] / (state["age"] + 1)[:, None]
         state["estimate_m"].copy_(sample)
-        q, u = self.remembered(history.q * state["q_scale"][:, None, None], history.u * state["u_scale"][:, None, None])
+        q, u = self.remembered(
+            history.q * state["q_scale"][:, None, None], history.u * state["u_scale"][:, None, None]
+        )
         pitch_rad = state["start.target_pitch_rad"]
         proposed = coming = None
         if self.adviser:
             proposed = self.recalled(state["proposed"])
             coming = self.adviser.coming(proposed, u[:, -1])
-        guidance = self._controller.guide(q, u, sample - self._down, pitch_rad, self.options.switch.reach_m, coming)
+        guidance = self._controller.guide(
+            q, u, sample - self._down, pitch_rad, self.options.switch.reach_m, coming
+        )
         positioning = self.options.switch.positioning(guidance)
         state["positioning"].copy_(positioning)
-        state["rule_reach_m"].copy_(guidance.reach_m if self.options.switch.rule == "planar" else guidance.reach_3d_m)
+        state["rule_reach_m"].copy_(
+            guidance.reach_m if self.options.switch.rule == "planar" else guidance.reach_3d_m
+        )
         state["command"].copy_(guidance.command)
         state["lowest"].copy_(guidance.lowest)
         state["highest"].copy_(guidance.highest)

@@ -1,7 +1,8 @@
 """Reward terms: free functions from the state after a control step to one number per environment, shape `(N,)`.
 
-A task lists the terms it uses with their weights in its YAML (`task.reward.<name>.weight=…`); an extension names its own functions
-there by `package.module:function`. The six terms of the paper's equation 1 carry the symbol of their term in the docstring.
+A task lists the terms it uses with their weights in its YAML (`task.reward.<name>.weight=…`); an
+extension names its own functions there by `package.module:function`. The six terms of the paper's
+equation 1 carry the symbol of their term in the docstring.
 """
 
 from pkgutil import resolve_name
@@ -33,7 +34,9 @@ class Term:
                 f"reward term '{self.function}' cannot be found ({error}); expected package.module:function"
             ) from error
         if not callable(found):
-            raise ConfigError(f"reward term '{self.function}' is no function; expected package.module:function")
+            raise ConfigError(
+                f"reward term '{self.function}' is no function; expected package.module:function"
+            )
 
     def __call__(self, state: ToolState) -> torch.Tensor:
         """Returns the weighted term, `(N,)`."""
@@ -62,7 +65,9 @@ def pitch(state: ToolState) -> torch.Tensor:
 
 def insertion(state: ToolState) -> torch.Tensor:
     """r^i: r^d + r^o (weighted five times in the paper) while the paper's criterion of success holds."""
-    return (state.paper_success & ~state.positioning) * (1.0 / (1.0 + state.distance_m) + 1.0 / (1.0 + state.pitch_error_rad))
+    return (state.paper_success & ~state.positioning) * (
+        1.0 / (1.0 + state.distance_m) + 1.0 / (1.0 + state.pitch_error_rad)
+    )
 
 
 def far_contact(state: ToolState) -> torch.Tensor:
@@ -107,8 +112,8 @@ def contact(state: ToolState) -> torch.Tensor:
 def peak_contact(state: ToolState) -> torch.Tensor:
     """Growth of the episode's peak contact force in kN, up to 10 kN.
 
-    What an episode pays for is its hardest blow, not how long it leans on the rim: a penalty of every step in contact teaches a
-    beginner to stay away from the hole.
+    What an episode pays for is its hardest blow, not how long it leans on the rim: a penalty of
+    every step in contact teaches a beginner to stay away from the hole.
     """
     peak_n = torch.maximum(state.peak_force_n, state.contact_force_n)
     return (peak_n.clamp(max=10_000.0) - state.peak_force_n.clamp(max=10_000.0)) / 1000.0

@@ -1,8 +1,8 @@
 """Random starts from which a tool-pose task can be done.
 
-A start is kept only if the tool begins in the open and if, after the exclusive joints have brought the target into reach, the
-other joints reach the wanted pose within their limits. Checked once with the kinematics when a task is built, so that resets only
-pick rows.
+A start is kept only if the tool begins in the open and if, after the exclusive joints have brought
+the target into reach, the other joints reach the wanted pose within their limits. Checked once with
+the kinematics when a task is built, so that resets only pick rows.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,8 @@ class Arms:
 
     Attributes:
         margin_rad: Distance from joint limits.
-        floor_m: Height above the ground that no joint behind the second and no tool point starts below.
+        floor_m: Height above the ground that no joint behind the second and no tool point starts
+            below.
         clearance_m: Height above the object that the tool point does not start below.
         nearest_m: Horizontal distance from the slew axis that the tool point does not start within.
     """
@@ -88,10 +89,17 @@ def random_starts(
     for _ in range(64):
         targets = draw(uniform)
         q, free = random_arms(arms, machine, controller, targets.object_z_m, generator)
-        rows = {"q": q, "scene": targets.scene, "target_m": targets.target_m, "target_pitch_rad": targets.pitch_rad}
+        rows = {
+            "q": q,
+            "scene": targets.scene,
+            "target_m": targets.target_m,
+            "target_pitch_rad": targets.pitch_rad,
+        }
         rows = {name: value[free] for name, value in rows.items()}
         deep = rows["target_m"] - torch.tensor([0.0, 0.0, depth_m])
-        done = reachable(controller, machine, rows["q"], deep, rows["target_pitch_rad"], reach_m, arms.margin_rad)
+        done = reachable(
+            controller, machine, rows["q"], deep, rows["target_pitch_rad"], reach_m, arms.margin_rad
+        )
         drawn.append({name: value[done] for name, value in rows.items()})
         if sum(len(found["q"]) for found in drawn) >= count:
             break
@@ -99,12 +107,18 @@ def random_starts(
 
 
 def random_arms(
-    arms: Arms, machine: Machine, controller: ClassicalController, object_z_m: torch.Tensor, generator: torch.Generator
+    arms: Arms,
+    machine: Machine,
+    controller: ClassicalController,
+    object_z_m: torch.Tensor,
+    generator: torch.Generator,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Draws one arm configuration per row of `object_z_m`: returns `q` `(M, J)` and whether it is in the open `(M,)` bool."""
     lower = torch.as_tensor(machine.lower, dtype=torch.float32) + arms.margin_rad
     upper = torch.as_tensor(machine.upper, dtype=torch.float32) - arms.margin_rad
-    q = lower + (upper - lower) * torch.rand(len(object_z_m), machine.num_joints, generator=generator)
+    q = lower + (upper - lower) * torch.rand(
+        len(object_z_m), machine.num_joints, generator=generator
+    )
     pose = controller.kinematics.pose(q)
     tip = pose.tip_in_base_m
     free = (tip[:, 2] > object_z_m + arms.clearance_m) & (tip[:, 2] > arms.floor_m)
@@ -124,8 +138,8 @@ def reachable(
 ) -> torch.Tensor:
     """Returns from which `q`, `(M, J)`, the target pose can be reached under the masks, `(M,)` bool.
 
-    First the exclusive joints move until the reach lies well inside the good working range, then the others by damped least
-    squares.
+    First the exclusive joints move until the reach lies well inside the good working range, then
+    the others by damped least squares.
     """
     exclusive = torch.as_tensor(machine.is_exclusive)
     lower = torch.as_tensor(machine.lower, dtype=torch.float32) + margin_rad
@@ -143,7 +157,9 @@ def reachable(
     for _ in range(120):
         pose, jacobian = controller.kinematics.pose_and_jacobian(q)
         error = target_m - pose.tip_in_base_m
-        share = controller.approach(jacobian.tip, jacobian.pitch, error, error[:, 2], pitch_rad - pose.pitch_rad)
+        share = controller.approach(
+            jacobian.tip, jacobian.pitch, error, error[:, 2], pitch_rad - pose.pitch_rad
+        )
         q = (q + 0.2 * share * controller.speed).clamp(lower, upper)
     pose = controller.kinematics.pose(q)
     near = (target_m - pose.tip_in_base_m).norm(dim=1) < 0.01

@@ -1,8 +1,9 @@
 """Bringing the tool to a pose: what the tasks of this package share.
 
-A task of this family has a target point and a wanted pitch. The policy sees an estimate of the target that is wrong in the way a
-camera is wrong, positions and commands through a scale that is slightly off, and acts under the masks of the machine: the
-exclusive joints alone while positioning, all others afterwards.
+A task of this family has a target point and a wanted pitch. The policy sees an estimate of the
+target that is wrong in the way a
+camera is wrong, positions and commands through a scale that is slightly off, and acts under the
+masks of the machine: the exclusive joints alone while positioning, all others afterwards.
 """
 
 from typing import Literal
@@ -20,10 +21,12 @@ class Noise:
 
     Attributes:
         target_sample_m: Uniform error of the target in each sample and axis (±).
-        target_bias_m: Length of the constant error of the target, uniform from 0, in a random direction.
-        target_relative: Uniform error of each sample as a share of each coordinate (±); the paper's 5 %.
-        filter: `mean` gives the policy the mean of all estimates of the episode, as a tracker of a fixed hole does; `none` each
-            sample.
+        target_bias_m: Length of the constant error of the target, uniform from 0, in a random
+            direction.
+        target_relative: Uniform error of each sample as a share of each coordinate (±); the paper's
+            5 %.
+        filter: `mean` gives the policy the mean of all estimates of the episode, as a tracker of a
+            fixed hole does; `none` each sample.
         q_scale: Scale error of all measured positions (±).
         u_scale: Scale error of all recorded commands (±).
     """
@@ -49,12 +52,15 @@ class Switch:
     """When only the exclusive joints move (paper, section III-B).
 
     Attributes:
-        rule: `planar`: while the reach, with the target turned into the arm's plane, is out of range and the tool is not low; it
-            does not depend on where q1 points and always lets the episode proceed. `text`: the same with the distance in space, as
-            the paper's text says. `equation`: while that distance is out of range or the tool is above the height, as the paper's
-            equation 1 says.
+        rule: `planar`: while the reach, with the target turned into the arm's plane, is out of
+            range and the tool is not low; it
+            does not depend on where q1 points and always lets the episode proceed. `text`: the same
+                with the distance in space, as
+            the paper's text says. `equation`: while that distance is out of range or the tool is
+            above the height, as the paper's equation 1 says.
         reach_m: The good working range (nearest, farthest).
-        height_m: Height of the tool below which the exclusive joints rest, to keep it off the ground.
+        height_m: Height of the tool below which the exclusive joints rest, to keep it off the
+            ground.
     """
 
     rule: Literal["planar", "text", "equation"]
@@ -76,10 +82,13 @@ class Action:
     """How the policy's output becomes valve commands.
 
     Attributes:
-        kind: `direct`: the output is the command. `residual`: it is added to the classical controller's command.
+        kind: `direct`: the output is the command. `residual`: it is added to the classical
+            controller's command.
         scale: Factor on the output.
-        mask: Keep exclusive and other joints apart, as the machine does; only an ablation switches it off.
-        limits: Slow joints down before their ends, as far as the commands in flight let them be foreseen.
+        mask: Keep exclusive and other joints apart, as the machine does; only an ablation switches
+            it off.
+        limits: Slow joints down before their ends, as far as the commands in flight let them be
+            foreseen.
     """
 
     kind: Literal["direct", "residual"]
@@ -101,7 +110,8 @@ class Action:
         Args:
             output: What the network says, `(N, J)`.
             base: Command of the classical controller, `(N, J)`.
-            lowest: Least commands that do not drive joints into their ends, `(N, J)` (`Guidance.lowest`).
+            lowest: Least commands that do not drive joints into their ends, `(N, J)`
+                (`Guidance.lowest`).
             highest: Largest such commands, `(N, J)`.
             positioning: Whether only the exclusive joints move, `(N,)` bool.
             exclusive: Which joints are exclusive, `(J,)` bool.

@@ -18,7 +18,8 @@ from perception.calibration.views import Views
 SIZE_PX = (1280, 720)
 MATRIX = np.array([[700.0, 0.0, 639.5], [0.0, 700.0, 359.5], [0.0, 0.0, 1.0]])
 CAMERA = rigid.pose(
-    np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]) @ Rotation.from_euler("xyz", [-0.5, 0.15, 0.05]).as_matrix(),
+    np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    @ Rotation.from_euler("xyz", [-0.5, 0.15, 0.05]).as_matrix(),
     np.array([0.3, 0.45, 1.9]),
 )
 """Where the camera truly is: on the machine's left, looking ahead and down."""
@@ -34,25 +35,37 @@ class Posed:
     link_from_board: np.ndarray
 
 
-def posed(machine: Machine, count: int, seed: int, zero_rad: float = 0.0, own_rad: float = 0.0, wobble_m: float = 0.0) -> Posed:
+def posed(
+    machine: Machine,
+    count: int,
+    seed: int,
+    zero_rad: float = 0.0,
+    own_rad: float = 0.0,
+    wobble_m: float = 0.0,
+) -> Posed:
     """Draws poses in which the board, whose z points away from who looks at it, faces the camera, in view.
 
     Args:
         machine: The arm.
         count: How many.
         seed: Of all draws.
-        zero_rad: Standard deviation of the joints' zeros, but for the first and the last, which no camera can tell.
+        zero_rad: Standard deviation of the joints' zeros, but for the first and the last, which no
+            camera can tell.
         own_rad: That of each joint in each pose.
         wobble_m: By how much, and by as many rad, the link is elsewhere.
     """
     chance = np.random.default_rng(seed)
-    facing = rigid.pose(Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix(), np.array([-0.35, -0.2, 2.1]))
+    facing = rigid.pose(
+        Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix(), np.array([-0.35, -0.2, 2.1])
+    )
     board = rigid.inverse(arm.links(machine, MIDDLE[None]).base_from_link[0]) @ CAMERA @ facing
     zeros = zero_rad * chance.standard_normal(5) * [0, 1, 1, 1, 0]
     kept, seen = [], []
     while len(kept) < count:
         q = MIDDLE + chance.uniform(-1, 1, 5) * [0.35, 0.2, 0.35, 0.4, 0.45]
-        link = arm.links(machine, (q + zeros + own_rad * chance.standard_normal(5))[None]).base_from_link[0]
+        link = arm.links(
+            machine, (q + zeros + own_rad * chance.standard_normal(5))[None]
+        ).base_from_link[0]
         link = rigid.moved(link, wobble_m * chance.standard_normal(6))
         there = rigid.inverse(CAMERA) @ link @ board
         corners = corners_m() @ there[:3, :3].T + there[:3, 3]
@@ -76,17 +89,28 @@ def corners_m() -> np.ndarray:
     return np.array([[0.0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]])
 
 
-def views(machine: Machine, poses: Posed, cov: np.ndarray, seed: int, wrong: float = 0.0) -> tuple[Views, np.ndarray]:
+def views(
+    machine: Machine, poses: Posed, cov: np.ndarray, seed: int, wrong: float = 0.0
+) -> tuple[Views, np.ndarray]:
     """Returns sights with noise of covariance `cov`, `(6, 6)`, and which of them, a share `wrong`, are of something else."""
     chance = np.random.default_rng(seed + 1000)
     count, links = len(poses.q), arm.links(machine, poses.q)
-    seen = np.array([rigid.moved(one, chance.multivariate_normal(np.zeros(6), cov)) for one in poses.camera_from_board])
+    seen = np.array(
+        [
+            rigid.moved(one, chance.multivariate_normal(np.zeros(6), cov))
+            for one in poses.camera_from_board
+        ]
+    )
     bad = np.zeros(count, bool)
     bad[chance.permutation(count)[: int(wrong * count)]] = True
     for k in np.flatnonzero(bad):
-        seen[k] = rigid.moved(seen[k], np.concatenate([chance.normal(0, 0.3, 3), chance.normal(0, 0.6, 3)]))
+        seen[k] = rigid.moved(
+            seen[k], np.concatenate([chance.normal(0, 0.3, 3), chance.normal(0, 0.6, 3)])
+        )
     shared, std = links.joints[:, 1:4], np.full(3, 0.0087)
-    slack = np.concatenate([0.0017 * links.joints, arm.wobble(links.base_from_link, 0.001, 0.001)], 1)
+    slack = np.concatenate(
+        [0.0017 * links.joints, arm.wobble(links.base_from_link, 0.001, 0.001)], 1
+    )
     found = Views(
         links.base_from_link, seen[:, None], np.broadcast_to(cov, (count, 1, 6, 6)), slack, shared, std,
         tuple(str(k) for k in range(count)), machine.joint_names[1:4],
@@ -109,7 +133,9 @@ def picture(camera_from_board: np.ndarray, chance: np.random.Generator) -> np.nd
     width, height = printed.shape[::-1]
     there = corners_m() @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
     pixel = (there @ MATRIX.T / there[:, 2:])[:, :2]
-    paper = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]])
+    paper = np.array(
+        [[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]]
+    )
     over = 2  # drawn larger and shrunk, or edges would be ragged
     scaled = (pixel * over + (over - 1) / 2).astype(np.float32)
     warp = cv2.getPerspectiveTransform(paper.astype(np.float32), scaled)

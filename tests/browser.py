@@ -21,9 +21,20 @@ from deploy.page.settings import OperatorPage
 from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Wish
 
 TOKEN = "correct horse battery staple"
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-headless-shell")
-# the page itself is painted by the processor: a card that is only simulated would be kept busy with it
-FLAGS = ["--no-sandbox", "--disable-gpu-compositing", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+CHROMIUM = (
+    os.environ.get("CHROMIUM")
+    or shutil.which("chromium")
+    or shutil.which("chromium-headless-shell")
+)
+# the page itself is painted by the processor: a card that is only simulated would be kept busy with
+# it
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu-compositing",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
 
 LEVERS = Levers(0.0, 0.0, 0.0, 0.0, False)
 SHOWN = Shown(
@@ -65,15 +76,24 @@ class Scripted:
 
     def advise(self, number: int, due_s: float | None = None, **axes: Any) -> None:
         """Advises these lever positions, of full."""
-        self.now = replace(self.now, advice=Advice(True, "valid", number, replace(LEVERS, **axes), due_s))
+        self.now = replace(
+            self.now, advice=Advice(True, "valid", number, replace(LEVERS, **axes), due_s)
+        )
 
 
 @contextmanager
-def served(feed: Any, port: int = 0, machine: Machine | None = None, annex: Any = None, **changes: Any) -> Iterator[int]:
+def served(
+    feed: Any, port: int = 0, machine: Machine | None = None, annex: Any = None, **changes: Any
+) -> Iterator[int]:
     """Serves the page of `conf/page/local.yaml` with `changes`, and what `annex` has; yields the port."""
     page: OperatorPage = replace(option("page", "local"), port=port, token=TOKEN, **changes)
     server = Server(page, machine or option("machine", "brokk170"), feed, TOKEN, annex)
-    ready, ending, found, failed = threading.Event(), threading.Event(), list[int](), list[BaseException]()
+    ready, ending, found, failed = (
+        threading.Event(),
+        threading.Event(),
+        list[int](),
+        list[BaseException](),
+    )
 
     def serve() -> None:
         try:

@@ -9,7 +9,8 @@ import numpy as np
 from brokk_rl.signals import Frame
 
 SIZE_M = np.array([1.2, 0.8, 0.6])
-"""Extents of the box along x, y, z; it stands on the ground, its front face at x = 0, looking along -x."""
+"""Extents of the box along x, y, z; it stands on the ground, its front face at x = 0, looking along
+-x."""
 HOLE_M = np.array([0.0, 0.05, 0.35])
 """Centre of the mouth of the hole, on the front face; its axis is -x."""
 RADIUS_M = 0.05
@@ -48,9 +49,18 @@ def seen(
     """Renders one view; `occluder_m` is the centre of a ball of 8 cm that floats in front of the box."""
     width, height = size_px
     focal = 0.55 * width
-    camera_matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    camera_matrix = np.array(
+        [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    )
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
-    rays = np.stack([(columns - camera_matrix[0, 2]) / focal, (rows - camera_matrix[1, 2]) / focal, np.ones(columns.shape)], -1)
+    rays = np.stack(
+        [
+            (columns - camera_matrix[0, 2]) / focal,
+            (rows - camera_matrix[1, 2]) / focal,
+            np.ones(columns.shape),
+        ],
+        -1,
+    )
     rays = rays @ pose[:3, :3].T  # in the world; one unit of the ray is one metre of depth
     eye = pose[:3, 3]
     depth, what = np.full(columns.shape, np.inf), np.zeros(columns.shape, int)
@@ -74,14 +84,24 @@ def seen(
         what, depth = np.where(ball < depth, 4, what), np.minimum(ball, depth)
     grain = np.random.default_rng(1).uniform(0.75, 1.0, (64, 64, 64))
     cell = (points * 25).astype(int) % 64
-    shade = np.select([what == 3, what == 4, what == 1, front, what == 2], [0.06, 0.9, 0.3, 0.75, 0.55], 0.95)
-    color = shade[..., None] * grain[cell[..., 0], cell[..., 1], cell[..., 2]][..., None] * np.array([1.0, 0.97, 0.9])
+    shade = np.select(
+        [what == 3, what == 4, what == 1, front, what == 2], [0.06, 0.9, 0.3, 0.75, 0.55], 0.95
+    )
+    color = (
+        shade[..., None]
+        * grain[cell[..., 0], cell[..., 1], cell[..., 2]][..., None]
+        * np.array([1.0, 0.97, 0.9])
+    )
     noise = np.random.default_rng(seed).normal(0.0, 1.0, depth.shape) * noise_per_m
     with np.errstate(divide="ignore"):
         depth = 1.0 / (1.0 / depth + noise)
-    depth = np.where(np.isfinite(depth) & (depth > 0.1) & (depth < 40), depth, np.nan).astype(np.float32)
+    depth = np.where(np.isfinite(depth) & (depth > 0.1) & (depth < 40), depth, np.nan).astype(
+        np.float32
+    )
     color = (255 * color).clip(0, 255).astype(np.uint8)
-    frame = Frame(color=color, depth_m=depth, camera_matrix=camera_matrix, base_from_camera=pose, t_s=0.0)
+    frame = Frame(
+        color=color, depth_m=depth, camera_matrix=camera_matrix, base_from_camera=pose, t_s=0.0
+    )
     return View(frame, pose, np.isin(what, (2, 3)), what == 3, what == 4)
 
 

@@ -81,13 +81,22 @@ class Desk:
         commands: Whether the bus process may send at all.
     """
 
-    def __init__(self, machine: Machine, limits: Limits, folder: Path, commands: bool = True) -> None:
+    def __init__(
+        self, machine: Machine, limits: Limits, folder: Path, commands: bool = True
+    ) -> None:
         self.machine, self.wire, self.port = machine, wire(), free_port()
         self.exchange = Exchange.new(machine.num_joints, commands)
         self._description = Description(DBC, machine)
         self._setting = Setting(self.wire, DBC, machine, limits)
         twin = Twin(
-            wire=self.wire, dbc=DBC, remote=True, deadman=True, again_s=None, fault_port=self.port, seconds=None, realtime=False
+            wire=self.wire,
+            dbc=DBC,
+            remote=True,
+            deadman=True,
+            again_s=None,
+            fault_port=self.port,
+            seconds=None,
+            realtime=False,
         )
         session = Session(out=str(folder), seed=0, device="cpu")
         self._twin_arguments = (twin, machine, NominalMachine(), session, None)
@@ -106,7 +115,9 @@ class Desk:
 
     def fault(self, fault: str, message: str = "", seconds: float = 1e9) -> float:
         """Switches a fault on; returns when (monotonic)."""
-        answer = ask(self.port, {"fault": fault, "message": message, "seconds": seconds}, timeout_s=5.0)
+        answer = ask(
+            self.port, {"fault": fault, "message": message, "seconds": seconds}, timeout_s=5.0
+        )
         assert answer.startswith("ok "), answer
         return float(answer.removeprefix("ok "))
 
@@ -140,16 +151,22 @@ class Desk:
         while time.monotonic() < end_s:
             self.fault("deadman_released", seconds=0.15)
             time.sleep(0.4)
-            if all(abs(abs(values["Flow_q1"]) - COMMAND[0]) < 0.01 for _, values in self.heard("ValveFeedback", 0.05)):
+            if all(
+                abs(abs(values["Flow_q1"]) - COMMAND[0]) < 0.01
+                for _, values in self.heard("ValveFeedback", 0.05)
+            ):
                 return
         raise AssertionError(f"the machine does not move: {view(self.exchange).plain()}")
 
     def still_after(self, since_s: float, seconds: float = 1.0) -> Stop:
         """Returns how long after `since_s` the valves got nothing any more, and zero was commanded, to the end of `seconds`.
 
-        The gateway says zero flow at once, so this is what an observer on the bus sees, and not rounded up to its cycle.
+        The gateway says zero flow at once, so this is what an observer on the bus sees, and not
+        rounded up to its cycle.
         """
-        kinds = {self._description.layouts[name].frame_id: name for name in ("ValveFeedback", "ValveCmd")}
+        kinds = {
+            self._description.layouts[name].frame_id: name for name in ("ValveFeedback", "ValveCmd")
+        }
         found: dict[str, float | None] = dict.fromkeys(kinds.values())
         end_s = since_s + seconds
         while (left_s := end_s - time.monotonic()) > 0:
@@ -159,7 +176,11 @@ class Desk:
             values = self._description.decode(self._description.layouts[name], frame.data)
             if isinstance(values, Fault):
                 continue
-            if any(value for signal, value in values.items() if signal.startswith(("Flow_", "Command_"))):
+            if any(
+                value
+                for signal, value in values.items()
+                if signal.startswith(("Flow_", "Command_"))
+            ):
                 found[name] = None
             elif found[name] is None:
                 found[name] = max(0.0, now_s - since_s)

@@ -11,10 +11,15 @@ from perception import conic
 
 K = np.array([[528.0, 0.0, 319.5], [0.0, 528.0, 239.5], [0.0, 0.0, 1.0]])
 CENTER, AXIS = np.array([0.05, 0.02, 1.2]), np.array([0.0, -0.57, -0.82]) / np.hypot(0.57, 0.82)
-RAYS = np.stack([*np.meshgrid(np.arange(640), np.arange(480)), np.ones((480, 640))], -1) @ np.linalg.inv(K).T
+RAYS = (
+    np.stack([*np.meshgrid(np.arange(640), np.arange(480)), np.ones((480, 640))], -1)
+    @ np.linalg.inv(K).T
+)
 
 
-def drawn(radius_m: float = 0.05, depth_m: float = 0.3, noise: float = 0.0) -> tuple[Frame, Masks, Ellipse]:
+def drawn(
+    radius_m: float = 0.05, depth_m: float = 0.3, noise: float = 0.0
+) -> tuple[Frame, Masks, Ellipse]:
     """Returns a frame with a hole in an endless face, ray by ray, its masks, and the ellipse of its rim."""
     m = AXIS / (AXIS @ CENTER)
     inverse = RAYS @ m
@@ -25,7 +30,9 @@ def drawn(radius_m: float = 0.05, depth_m: float = 0.3, noise: float = 0.0) -> t
     along, start = RAYS @ AXIS, hit
     across = RAYS - along[..., None] * AXIS
     a, b = (across**2).sum(-1), (across * start).sum(-1)
-    reach = (-b + np.sqrt(np.maximum(b * b - a * ((start**2).sum(-1) - radius_m**2), 0))) / a  # where the wall is hit
+    reach = (
+        -b + np.sqrt(np.maximum(b * b - a * ((start**2).sum(-1) - radius_m**2), 0))
+    ) / a  # where the wall is hit
     deep = np.minimum(-reach * along, depth_m)
     if depth_m:
         gray[inside] = (120 * np.exp(-deep / 0.04))[inside]
@@ -36,7 +43,13 @@ def drawn(radius_m: float = 0.05, depth_m: float = 0.3, noise: float = 0.0) -> t
     color = np.repeat(np.clip(gray, 0, 255).astype(np.uint8)[..., None], 3, 2)
     frame = Frame(color, depth.astype(np.float32), K, np.eye(4), 0.0)
     angle = np.linspace(0, 2 * np.pi, 90, endpoint=False)[:, None]
-    points = CENTER + radius_m * (np.cos(angle) * np.array([1.0, 0, 0]) + np.sin(angle) * np.cross(AXIS, [1.0, 0, 0]))
+    points = CENTER + radius_m * (
+        np.cos(angle) * np.array([1.0, 0, 0]) + np.sin(angle) * np.cross(AXIS, [1.0, 0, 0])
+    )
     seen = points @ K.T
     row = conic.fit((seen[:, :2] / seen[:, 2:])[None], np.ones((1, 90)))[0]
-    return frame, Masks(np.ones(inverse.shape, np.float32), None), Ellipse(*map(float, row), rms_px=0.05, coverage=1.0, score=0.9)
+    return (
+        frame,
+        Masks(np.ones(inverse.shape, np.float32), None),
+        Ellipse(*map(float, row), rms_px=0.05, coverage=1.0, score=0.9),
+    )

@@ -13,7 +13,9 @@ class Kinematic:
     def __init__(self, num_worlds: int = 8) -> None:
         self.num_worlds = num_worlds
 
-    def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> KinematicWorld:
+    def build(
+        self, machine: Machine, device: torch.device, num_worlds: int | None = None
+    ) -> KinematicWorld:
         return KinematicWorld(machine, num_worlds or self.num_worlds, device)
 
 
@@ -22,7 +24,9 @@ class KinematicWorld:
 
     supports_graphs = False
 
-    def __init__(self, machine: Machine, num_worlds: int, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, machine: Machine, num_worlds: int, device: torch.device | str = "cpu"
+    ) -> None:
         self.num_worlds, self.device = num_worlds, torch.device(device)
         self.q = torch.zeros(num_worlds, machine.num_joints)
         self.contact_force_n = torch.zeros(num_worlds)
@@ -37,7 +41,11 @@ class KinematicWorld:
         self.faults.masked_fill_(mask, False)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        return {"q": self.q.clone(), "contact_force_n": self.contact_force_n.clone(), "faults": self.faults.clone()}
+        return {
+            "q": self.q.clone(),
+            "contact_force_n": self.contact_force_n.clone(),
+            "faults": self.faults.clone(),
+        }
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         for name, value in state.items():

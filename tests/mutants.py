@@ -2,8 +2,9 @@
 
     python tests/mutants.py deploy.guard tests/unit/test_deploy_guard.py
 
-Comparisons turned, off by one boundary, negated conditions, arithmetic exchanged, constants changed, statements dropped. Each
-mutant runs in a forked process; what survives is printed. A mutant that only changes a text, a type or an error message is none.
+Comparisons turned, off by one boundary, negated conditions, arithmetic exchanged, constants
+changed, statements dropped. Each mutant runs in a forked process; what survives is printed. A
+mutant that only changes a text, a type or an error message is none.
 """
 
 from __future__ import annotations
@@ -23,7 +24,14 @@ COMPARED = {
     ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.Lt), ast.GtE: (ast.Gt, ast.Lt), ast.Eq:
     (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,),
 }  # fmt: skip
-ARITHMETIC = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Add, ast.Div: ast.Mult, ast.BitXor: ast.BitAnd, ast.Mod: ast.Add}
+ARITHMETIC = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Add,
+    ast.Div: ast.Mult,
+    ast.BitXor: ast.BitAnd,
+    ast.Mod: ast.Add,
+}
 CALLED = {"min": "max", "max": "min", "all": "any", "any": "all"}
 
 
@@ -46,7 +54,10 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.Not, ast.USub)):
         yield f"no {type(node.op).__name__}", node.operand
     elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC and not _is_type(node):
-        yield f"{type(node.op).__name__} -> {ARITHMETIC[type(node.op)].__name__}", other(op=ARITHMETIC[type(node.op)]())
+        yield (
+            f"{type(node.op).__name__} -> {ARITHMETIC[type(node.op)].__name__}",
+            other(op=ARITHMETIC[type(node.op)]()),
+        )
     elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
         yield f"{node.value} -> {not node.value}", ast.Constant(not node.value)
     elif isinstance(node, ast.Constant) and isinstance(node.value, (int, float)):
@@ -55,7 +66,10 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
         yield "condition true", other(test=ast.Constant(True))
         yield "condition false", other(test=ast.Constant(False))
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CALLED:
-        yield f"{node.func.id} -> {CALLED[node.func.id]}", other(func=ast.Name(CALLED[node.func.id], ast.Load()))
+        yield (
+            f"{node.func.id} -> {CALLED[node.func.id]}",
+            other(func=ast.Name(CALLED[node.func.id], ast.Load())),
+        )
     elif isinstance(node, (ast.Assign, ast.AugAssign)):
         yield "dropped", ast.Pass()
 
@@ -66,14 +80,20 @@ def _is_type(node: ast.BinOp) -> bool:
 
 def mutants(tree: ast.Module) -> Iterator[tuple[str, ast.Module]]:
     """Yields every mutant of a module, and where and how it differs."""
-    dead = {id(one) for node in ast.walk(tree) for decorator in getattr(node, "decorator_list", ()) for one in ast.walk(decorator)}
+    dead = {
+        id(one)
+        for node in ast.walk(tree)
+        for decorator in getattr(node, "decorator_list", ())
+        for one in ast.walk(decorator)
+    }
     places = [
         (parent, field, index)
         for parent in ast.walk(tree)
         if id(parent) not in dead
         for field, value in ast.iter_fields(parent)
         for index, child in enumerate(value if isinstance(value, list) else [value])
-        if isinstance(child, ast.AST) and field not in ("annotation", "returns", "decorator_list", "bases")
+        if isinstance(child, ast.AST)
+        and field not in ("annotation", "returns", "decorator_list", "bases")
     ]
     for parent, field, index in places:
         if isinstance(parent, ast.Module):
@@ -101,7 +121,8 @@ def survivors(module: str, tests: str) -> tuple[list[str], int]:
 
     source = Path(importlib.import_module(module).__file__ or "").read_text()
     found, count = [], 0
-    # once as it is: it must pass, and everything that the tests import is then there for all mutants
+    # once as it is: it must pass, and everything that the tests import is then there for all
+    # mutants
     if pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--no-header", tests]):
         raise SystemExit(f"{tests} fails without any mutant")
     for words, tree in mutants(ast.parse(source)):
@@ -119,7 +140,11 @@ def survivors(module: str, tests: str) -> tuple[list[str], int]:
 def _killed(module: str, tree: ast.Module, tests: str, pytest: types.ModuleType) -> int:
     """Runs the tests against a mutant; 0 where they all pass."""
     made = types.ModuleType(module)
-    for name in [name for name in sys.modules if name.startswith("deploy.") or name.split(".")[-1] == Path(tests).stem]:
+    for name in [
+        name
+        for name in sys.modules
+        if name.startswith("deploy.") or name.split(".")[-1] == Path(tests).stem
+    ]:
         del sys.modules[name]
     sys.modules[module] = made
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
@@ -134,5 +159,7 @@ def _killed(module: str, tree: ast.Module, tests: str, pytest: types.ModuleType)
 
 if __name__ == "__main__":
     left, number = survivors(sys.argv[1], sys.argv[2])
-    sys.stdout.write("\n".join([*left, f"{len(left)} of {number} mutants of {sys.argv[1]} survive"]) + "\n")
+    sys.stdout.write(
+        "\n".join([*left, f"{len(left)} of {number} mutants of {sys.argv[1]} survive"]) + "\n"
+    )
     sys.exit(bool(left))

@@ -23,10 +23,14 @@ TEXT = {"en": ("You may stop at any time.",), "de": ("Sie können jederzeit aufh
 FACTS = {"simulated": False, "twin": True}
 
 
-def plan(place: Path, machine: Machine, count: int = 2, practice: int = 0, trials: int = 2) -> list[design.Trial]:
+def plan(
+    place: Path, machine: Machine, count: int = 2, practice: int = 0, trials: int = 2
+) -> list[design.Trial]:
     """Plans a study in which the hole lies where the arm is at home, and trials begin with the first joint turned away."""
     tip = tool(machine, machine.home).tip_in_base_m
-    hole = design.Hole(center_in_base_m=(float(tip[0]), float(tip[1]), float(tip[2]) + 0.12), radius_m=0.05)
+    hole = design.Hole(
+        center_in_base_m=(float(tip[0]), float(tip[1]), float(tip[2]) + 0.12), radius_m=0.05
+    )
     names = "ABCD"[:trials]
     start = tuple(float(q) for q in machine.home + np.array([0.3, 0, 0, 0, 0]))
     what = design.Design(

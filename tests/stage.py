@@ -1,6 +1,7 @@
 """A stage for faults: twin, bus process and policy as they are, in one process, on a bus of air and a clock that is told the time.
 
-What takes seconds with real processes takes milliseconds here and comes out the same each time; times are exact to a millisecond.
+What takes seconds with real processes takes milliseconds here and comes out the same each time;
+times are exact to a millisecond.
 """
 
 from __future__ import annotations
@@ -100,7 +101,9 @@ class Stage:
         again_s: When the operator who is not followed presses the dead-man again.
     """
 
-    def __init__(self, machine: Machine, mode: Mode, folder: Path, again_s: float | None = None) -> None:
+    def __init__(
+        self, machine: Machine, mode: Mode, folder: Path, again_s: float | None = None
+    ) -> None:
         self.machine, self.mode, self.ms = machine, mode, 0
         self.exchange = Exchange.new(machine.num_joints, commands=mode != "listen")
         self.air, self.request_s, self.wanted = Air(self), 0.05, WANTED
@@ -108,14 +111,25 @@ class Stage:
         self._times = 0
         with self._time():
             twin = Twin(
-                wire=NO_WIRE, dbc=DBC, remote=True, deadman=True, again_s=again_s, fault_port=None, seconds=None, realtime=False
+                wire=NO_WIRE,
+                dbc=DBC,
+                remote=True,
+                deadman=True,
+                again_s=again_s,
+                fault_port=None,
+                seconds=None,
+                realtime=False,
             )
-            link = NominalMachine().build(machine, 1, Session(out=str(folder), seed=0, device="cpu"))
+            link = NominalMachine().build(
+                machine, 1, Session(out=str(folder), seed=0, device="cpu")
+            )
             self.twin = Running(twin, machine, link, Gateway(self), FaultPort(None))
             limits, wire = option("guard", "default"), self.air
             self.station = Station(Setting(wire, DBC, machine, limits), self.exchange)  # type: ignore[arg-type]
             policy = "tasks:policies/borehole_insertion"
-            counsel = Counsel(machine, policy, option("guidance", "machine"), limits.joints_s, 600.0, None)
+            counsel = Counsel(
+                machine, policy, option("guidance", "machine"), limits.joints_s, 600.0, None
+            )
             self.adviser = Adviser(counsel, Bundle(policy, machine), self.exchange)
             if mode == "collect":
                 self.adviser = None
@@ -169,12 +183,16 @@ class Stage:
         """Goes the operator's way until the machine moves; where nothing is sent, until there is an advice."""
         self.fault("none")
         self._times += 1
-        side = 1 - 2 * (self._times % 2)  # to and fro: no joint comes to its end, no policy to its goal
+        side = 1 - 2 * (
+            self._times % 2
+        )  # to and fro: no joint comes to its end, no policy to its goal
         self.air.broken, self.air.echo, self.request_s = False, False, 0.05
         self.wanted = tuple(side * u for u in WANTED)
         self._write("target", t_s=self.now_s, center_in_base_m=(2.5, 0.7 * side, 0.75))
         self.go(0.4)
-        self.go(1.2, lambda: bool(self.exchange.state.peek("alone")))  # a second sender is remembered for a second
+        self.go(
+            1.2, lambda: bool(self.exchange.state.peek("alone"))
+        )  # a second sender is remembered for a second
         if self.mode != "collect":
             self.go(2.0, lambda: self.advised)
             assert self.advised, self.view
@@ -219,5 +237,9 @@ class Stage:
     def _time(self) -> Iterator[None]:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(time, "monotonic", lambda: self.now_s)
-            patch.setattr(time, "sleep", lambda seconds: [self.tick() for _ in range(max(1, round(1e3 * seconds)))])
+            patch.setattr(
+                time,
+                "sleep",
+                lambda seconds: [self.tick() for _ in range(max(1, round(1e3 * seconds)))],
+            )
             yield

@@ -36,7 +36,9 @@ def plant(machine: Machine, task: Any = None, sim: Any = None, follower: Any = N
     )
 
 
-def small(max_env_steps: int | None = None, max_seconds: float | None = None, **changes: Any) -> Training:
+def small(
+    max_env_steps: int | None = None, max_seconds: float | None = None, **changes: Any
+) -> Training:
     """Returns the shipped training configuration, made small."""
     shipped = option("rl", "ppo")
     runner = copy.deepcopy(shipped.runner)
@@ -45,16 +47,27 @@ def small(max_env_steps: int | None = None, max_seconds: float | None = None, **
     for network in ("actor", "critic"):
         runner[network]["hidden_dims"] = [16]
     budget = Budget(max_env_steps=max_env_steps, max_seconds=max_seconds)
-    return replace(shipped, **{"num_envs": 16, "num_starts": 64, "save_interval": 1, "runner": runner, "budget": budget} | changes)
+    return replace(
+        shipped,
+        **{"num_envs": 16, "num_starts": 64, "save_interval": 1, "runner": runner, "budget": budget}
+        | changes,
+    )
 
 
-def make(machine: Machine, folder: Path, training: Training, loop: ControlLoop | None = None) -> tuple[Runner, Logbook]:
+def make(
+    machine: Machine, folder: Path, training: Training, loop: ControlLoop | None = None
+) -> tuple[Runner, Logbook]:
     """Returns a runner on a control loop of its own; every run of a test starts from the same seed."""
     folder.mkdir(exist_ok=True)
     torch.manual_seed(0)
     loop = loop or plant(machine).build(CPU, training.num_envs, training.num_starts, 0)
     book = Logbook(
-        folder, Off().open(folder, {}), loop.statistics, STEPS * loop.num_envs, training.max_fault_rate, training.budget.share_spent
+        folder,
+        Off().open(folder, {}),
+        loop.statistics,
+        STEPS * loop.num_envs,
+        training.max_fault_rate,
+        training.budget.share_spent,
     )
     return Runner(loop, training, folder, CPU, book), book
 
@@ -64,7 +77,9 @@ def train(machine: Machine, folder: Path, training: Training, resume: Path | Non
     runner, book = make(machine, folder, training)
     with book:
         if resume:
-            torch.manual_seed(999)  # whatever happened in this process before, the checkpoint knows better
+            torch.manual_seed(
+                999
+            )  # whatever happened in this process before, the checkpoint knows better
             runner.load(str(resume))
         runner.run()
     return runner
@@ -73,11 +88,16 @@ def train(machine: Machine, folder: Path, training: Training, resume: Path | Non
 def weights(runner: Runner) -> dict[str, torch.Tensor]:
     """Returns all learned numbers of actor and critic."""
     return {
-        f"{part}.{name}": value for part in ("actor", "critic") for name, value in getattr(runner.alg, part).state_dict().items()
+        f"{part}.{name}": value
+        for part in ("actor", "critic")
+        for name, value in getattr(runner.alg, part).state_dict().items()
     }
 
 
 def progress(folder: Path) -> list[dict[str, str]]:
     """Returns the rows of `progress.csv` without the columns that tell the time."""
     with (folder / "progress.csv").open(newline="") as file:
-        return [{name: value for name, value in row.items() if name not in TIMES} for row in csv.DictReader(file)]
+        return [
+            {name: value for name, value in row.items() if name not in TIMES}
+            for row in csv.DictReader(file)
+        ]

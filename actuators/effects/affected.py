@@ -12,8 +12,8 @@ from brokk_rl.spec import spec
 class Affected:
     """Any actuator with effects around it, as recordings show it: positions are what the sensors say.
 
-    For free runs and for collecting recordings. Not for a simulator, which keeps the true positions itself and takes the effects
-    from `effect`.
+    For free runs and for collecting recordings. Not for a simulator, which keeps the true positions
+    itself and takes the effects from `effect`.
 
     Attributes:
         actuator: The actuator.
@@ -25,34 +25,46 @@ class Affected:
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "AffectedModel":
         """Returns a model for `num_envs` environments on `device`."""
-        return AffectedModel(self.actuator.build(machine, num_envs, device), self.effects, machine, num_envs, device)
+        return AffectedModel(
+            self.actuator.build(machine, num_envs, device), self.effects, machine, num_envs, device
+        )
 
 
 class AffectedModel:
     """From measured positions to the next measured ones.
 
-    In a simulator the world keeps the true positions; here nobody else does, so they are kept in the state, beginning at what the
-    measured history lets one believe.
+    In a simulator the world keeps the true positions; here nobody else does, so they are kept in
+    the state, beginning at what the measured history lets one believe.
 
     Attributes:
-        effects: The wrapped model of each effect by name; set their `parameters` to simulate candidates side by side.
+        effects: The wrapped model of each effect by name; set their `parameters` to simulate
+            candidates side by side.
     """
 
     def __init__(
-        self, model: ActuatorModel, effects: dict[str, Effect], machine: Machine, num_envs: int, device: torch.device
+        self,
+        model: ActuatorModel,
+        effects: dict[str, Effect],
+        machine: Machine,
+        num_envs: int,
+        device: torch.device,
     ) -> None:
         self.effects: dict[str, ActuatorModel] = {}
         for name, effect in effects.items():
             model = self.effects[name] = effect.wrap(model, machine, num_envs, device)
         self._model = model
-        self._truth, self._measure = (getattr(model, name, _unchanged) for name in ("truth", "measure"))
+        self._truth, self._measure = (
+            getattr(model, name, _unchanged) for name in ("truth", "measure")
+        )
         self._q = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
         """`q`, the true history `(N, H, J)`, and the model's as `inner.…`."""
-        return {"q": self._q, "fresh": self._fresh} | {f"inner.{name}": value for name, value in self._model.state.items()}
+        return {"q": self._q, "fresh": self._fresh} | {
+            f"inner.{name}": value for name, value in self._model.state.items()
+        }
 
     def reset(self, mask: torch.Tensor) -> None:
         """Forgets the true positions in the environments of `mask`, shape `(N,)` bool; cuts all gradients."""

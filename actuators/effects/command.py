@@ -26,13 +26,17 @@ class DeadBand(EffectSpec):
     retract: Value
     side = "command"
     numbers: ClassVar = {
-        "extend": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.85)),  # servo-driven rotary valves reach 0.75
+        "extend": Number(
+            "1", none=0.0, typical=0.06, bounds=(0.0, 0.85)
+        ),  # servo-driven rotary valves reach 0.75
         "retract": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.85)),
     }
 
     def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
         """`(|u| - band) / (1 - band)` beyond the band of its side, else 0."""
-        return opened(now.history.u, now.value["extend"][:, None], now.value["retract"][:, None]), {}
+        return opened(
+            now.history.u, now.value["extend"][:, None], now.value["retract"][:, None]
+        ), {}
 
 
 @spec
@@ -75,8 +79,13 @@ class RateLimit(EffectSpec):
 
     def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
         """The command, no further than `period / stroke` from the one before."""
-        before, reach = now.memory["sent"][:, -1], now.plant.period_s / now.value["stroke_s"].clamp(min=1e-6)
-        return with_newest(now, torch.minimum(torch.maximum(now.history.u[:, -1], before - reach), before + reach))
+        before, reach = (
+            now.memory["sent"][:, -1],
+            now.plant.period_s / now.value["stroke_s"].clamp(min=1e-6),
+        )
+        return with_newest(
+            now, torch.minimum(torch.maximum(now.history.u[:, -1], before - reach), before + reach)
+        )
 
 
 @spec
@@ -102,12 +111,17 @@ class Stiction(EffectSpec):
     def begin(self, now: Moment) -> Memory:
         """A joint whose command was beyond `start` is moving."""
         before = now.history.u[:, -2]
-        return {"sent": now.history.u[:, :-1], "moving": before.sign() * (before.abs() > now.value["start"])}
+        return {
+            "sent": now.history.u[:, :-1],
+            "moving": before.sign() * (before.abs() > now.value["start"]),
+        }
 
     def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
         """The command while the joint moves, else 0; a reversal is a new start."""
         u, start = now.history.u[:, -1], now.value["start"]
-        goes_on = (now.memory["moving"] == u.sign()) & (u.abs() > torch.minimum(now.value["stop"], start))
+        goes_on = (now.memory["moving"] == u.sign()) & (
+            u.abs() > torch.minimum(now.value["stop"], start)
+        )
         moving = u.sign() * ((u.abs() > start) | goes_on)
         sent, memory = with_newest(now, u * moving.abs())
         return sent, memory | {"moving": moving}

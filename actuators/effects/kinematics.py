@@ -23,7 +23,8 @@ class LinkLength(EffectSpec):
 
     Attributes:
         joints: Joints whose links differ, or `all`.
-        extra_m: How much farther than drawn the next joint, or the tool's tip, lies from this joint.
+        extra_m: How much farther than drawn the next joint, or the tool's tip, lies from this
+            joint.
     """
 
     joints: Joints
@@ -32,7 +33,9 @@ class LinkLength(EffectSpec):
     stage = "kinematics"
     numbers: ClassVar = {"extra_m": Number("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3))}
 
-    def tool(self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant) -> torch.Tensor:
+    def tool(
+        self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant
+    ) -> torch.Tensor:
         """Moves the point along each link by what the link is too long."""
         pose = plant.kinematics.pose(q)
         ends = torch.cat((pose.joints_in_base_m, pose.tip_in_base_m[:, None]), 1)
@@ -45,7 +48,8 @@ class LinkLength(EffectSpec):
 class BaseTilt(EffectSpec):
     """The machine does not stand level, as instruments and site drawings do.
 
-    Camera and arm tilt together: the controller does not notice, outside instruments do. The weight is not turned with the machine.
+    Camera and arm tilt together: the controller does not notice, outside instruments do. The weight
+    is not turned with the machine.
 
     Attributes:
         roll_rad: Turn about x, forward; positive lifts the left side.
@@ -58,14 +62,20 @@ class BaseTilt(EffectSpec):
     stage = "kinematics"
     numbers: ClassVar = {"roll_rad": _angle(0.03), "pitch_rad": _angle(0.03)}
 
-    def tool(self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant) -> torch.Tensor:
+    def tool(
+        self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant
+    ) -> torch.Tensor:
         """Turns the point with the base."""
-        return turned(point_m, value["roll_rad"], value["pitch_rad"], torch.zeros_like(value["roll_rad"]))
+        return turned(
+            point_m, value["roll_rad"], value["pitch_rad"], torch.zeros_like(value["roll_rad"])
+        )
 
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
         """Turns it back: the camera stands on the base."""
         none = torch.zeros_like(value["roll_rad"])
-        return turned(turned(point_m, none, -value["pitch_rad"], none), -value["roll_rad"], none, none)
+        return turned(
+            turned(point_m, none, -value["pitch_rad"], none), -value["roll_rad"], none, none
+        )
 
 
 @spec
@@ -99,7 +109,9 @@ class Extrinsics(EffectSpec):
         return turned(point_m, value["roll_rad"], value["pitch_rad"], value["yaw_rad"]) + shift_m
 
 
-def turned(point_m: torch.Tensor, roll_rad: torch.Tensor, pitch_rad: torch.Tensor, yaw_rad: torch.Tensor) -> torch.Tensor:
+def turned(
+    point_m: torch.Tensor, roll_rad: torch.Tensor, pitch_rad: torch.Tensor, yaw_rad: torch.Tensor
+) -> torch.Tensor:
     """Returns points `(N, 3)` turned about the fixed axes x, then y, then z, by angles `(N, 1)`; exact for angles of zero."""
     x, y, z = point_m.split(1, 1)
     y, z = _turn(y, z, roll_rad)
@@ -108,6 +120,8 @@ def turned(point_m: torch.Tensor, roll_rad: torch.Tensor, pitch_rad: torch.Tenso
     return torch.cat((x, y, z), 1)
 
 
-def _turn(a: torch.Tensor, b: torch.Tensor, angle_rad: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _turn(
+    a: torch.Tensor, b: torch.Tensor, angle_rad: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     cos, sin = torch.cos(angle_rad), torch.sin(angle_rad)
     return cos * a - sin * b, sin * a + cos * b

@@ -16,7 +16,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
 RECENT = 4
-"""Commands that the effects on commands are shown; they look back no further, and short windows are cheap."""
+"""Commands that the effects on commands are shown; they look back no further, and short windows are
+cheap."""
 SPEED = ("speed", "joints")
 ORDER = ("command", *SPEED, "measurement")
 
@@ -25,12 +26,14 @@ ORDER = ("command", *SPEED, "measurement")
 class Library:
     """Machines that differ: each effect is there in a share of the environments, with a size of its own, drawn at each reset.
 
-    The same as its effects one around the other, the first of each side nearest to the machine, at a third of the cost: they share
-    one draw, one window of commands, and one account of what they have added to the motion.
+    The same as its effects one around the other, the first of each side nearest to the machine, at
+    a third of the cost: they share one draw, one window of commands, and one account of what they
+    have added to the motion.
 
     Attributes:
         share: Part of the environments that have an effect; or by effect, `other` for the rest.
-        effects: Effects by name; on actuation and sensing, an added dead time before the other effects on commands, jitter last.
+        effects: Effects by name; on actuation and sensing, an added dead time before the other
+            effects on commands, jitter last.
     """
 
     share: float | dict[str, float]
@@ -42,7 +45,9 @@ class Library:
                 raise ConfigError(f"effect.library.share: expected 0 to 1, got {share} for {name}")
         for name in self.share if isinstance(self.share, dict) else ():
             if name not in (*self.effects, OTHER):
-                raise ConfigError(f"effect.library.share: '{name}' is no effect of it; {choices(name, (*self.effects, OTHER))}")
+                raise ConfigError(
+                    f"effect.library.share: '{name}' is no effect of it; {choices(name, (*self.effects, OTHER))}"
+                )
         on_commands = [name for name, effect in self.effects.items() if effect.side == "command"]
         for name, effect in self.effects.items():
             if effect.side not in ORDER:
@@ -50,9 +55,13 @@ class Library:
                     f"effect.library.effects.{name}: acts on {effect.side}; put it beside the library, effect=[library,{name}]"
                 )
             if effect.delays and name != on_commands[0]:
-                raise ConfigError(f"effect.library.effects: '{name}' must come before {on_commands[0]}: nearest to the machine")
+                raise ConfigError(
+                    f"effect.library.effects: '{name}' must come before {on_commands[0]}: nearest to the machine"
+                )
             if isinstance(effect, DelayJitter) and name != on_commands[-1]:
-                raise ConfigError(f"effect.library.effects: '{name}' must come behind {on_commands[-1]}: it delays what is sent")
+                raise ConfigError(
+                    f"effect.library.effects: '{name}' must come behind {on_commands[-1]}: it delays what is sent"
+                )
 
     def _shares(self) -> dict[str, float]:
         share: PerJoint = self.share
@@ -60,7 +69,9 @@ class Library:
             return dict.fromkeys(self.effects, share)
         return {name: share.get(name, share.get(OTHER, 1.0)) for name in self.effects}
 
-    def wrap(self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device) -> "LibraryModel":
+    def wrap(
+        self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
+    ) -> "LibraryModel":
         """Returns `model` with the effects around it; see `brokk_rl.contracts.Effect`.
 
         Raises:
@@ -101,22 +112,42 @@ class LibraryModel:
         chance = any(effect.stochastic for effect in effects.values())
         salt = zlib.crc32(b"library") + len(inner.state)
         where = "effect.library.effects"
-        self._ranges = Ranges(given, numbers, joints, machine, num_envs, device, chance, salt, where, shares)
+        self._ranges = Ranges(
+            given, numbers, joints, machine, num_envs, device, chance, salt, where, shares
+        )
         self.parameters = self._ranges.value
-        self._value = {name: {key: self.parameters[f"{name}.{key}"] for key in effect.numbers} for name, effect in effects.items()}
-        self._salt = {name: zlib.crc32(name.encode()) * 2_654_435_761 for name, effect in effects.items() if effect.stochastic}
-        # a command passes from the last effect to the first, motion and measurement from the first to the last
+        self._value = {
+            name: {key: self.parameters[f"{name}.{key}"] for key in effect.numbers}
+            for name, effect in effects.items()
+        }
+        self._salt = {
+            name: zlib.crc32(name.encode()) * 2_654_435_761
+            for name, effect in effects.items()
+            if effect.stochastic
+        }
+        # a command passes from the last effect to the first, motion and measurement from the first
+        # to the last
         self._delays = {name: effect for name, effect in effects.items() if effect.delays}
-        commanded = [name for name, effect in effects.items() if effect.side == "command" and name not in self._delays]
+        commanded = [
+            name
+            for name, effect in effects.items()
+            if effect.side == "command" and name not in self._delays
+        ]
         self._commands = {name: effects[name] for name in reversed(commanded)}
         self._motions = {name: effect for name, effect in effects.items() if effect.side in SPEED}
-        self._measured = {name: effect for name, effect in effects.items() if effect.side == "measurement"}
+        self._measured = {
+            name: effect for name, effect in effects.items() if effect.side == "measurement"
+        }
         self._weighed = any(effect.weighed for effect in self._motions.values())
         self._plant = Plant(machine, device, weighed=self._weighed)
         rest = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._state = {"fresh": self._fresh, "shift": rest.clone(), "valve": rest.clone()}
-        for name, effect in (*self._commands.items(), *self._delays.items(), *self._motions.items()):
+        for name, effect in (
+            *self._commands.items(),
+            *self._delays.items(),
+            *self._motions.items(),
+        ):
             history = History(q=rest, u=rest if name in self._delays else rest[:, -RECENT:])
             begun = effect.begin(self._moment(name, {}, history, rest[:, -1], None, None))
             self._state |= {f"{name}.{key}": value.clone() for key, value in begun.items()}
@@ -125,12 +156,20 @@ class LibraryModel:
     @property
     def state(self) -> Memory:
         """What the effects remember and which are there, as `effect.…` and `drawn.effect.…`; `inner.…` for the model inside."""
-        return self._state | self._ranges.state | {f"inner.{name}": value for name, value in self.inner.state.items()}
+        return (
+            self._state
+            | self._ranges.state
+            | {f"inner.{name}": value for name, value in self.inner.state.items()}
+        )
 
     @property
     def sides(self) -> frozenset[str]:
         """Sides of all effects from here inwards."""
-        own = {name for name, those in (("measurement", self._measured), ("speed", self._motions)) if those}
+        own = {
+            name
+            for name, those in (("measurement", self._measured), ("speed", self._motions))
+            if those
+        }
         return frozenset(own) | getattr(self.inner, "sides", frozenset())
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -147,13 +186,17 @@ class LibraryModel:
         u = history.u[:, -RECENT:]
         for name, effect in self._commands.items():
             recent = History(q=history.q[:, -RECENT:], u=u)
-            u = self._after(name, effect.commands(self._now(name, effect, recent, still, counter, None)))
+            u = self._after(
+                name, effect.commands(self._now(name, effect, recent, still, counter, None))
+            )
         before = torch.where(fresh, history.u[:, :-1], state["valve"][:, 1:])
         state["valve"].copy_(torch.cat((before, u[:, -1:]), 1))
         valve = state["valve"]
         for name, effect in self._delays.items():
             delayed = History(q=history.q, u=valve)
-            valve = self._after(name, effect.commands(self._now(name, effect, delayed, still, counter, None)))
+            valve = self._after(
+                name, effect.commands(self._now(name, effect, delayed, still, counter, None))
+            )
 
         # what the inner model sees of the past is its own doing; see `Wrapped`
         shift = state["shift"].masked_fill(fresh, 0.0)
@@ -162,7 +205,10 @@ class LibraryModel:
         for name, effect in self._motions.items():
             now = self._now(name, effect, history, moved_to - history.q[:, -1], counter, weight)
             moved_to = moved_to + self._after(name, effect.extra(now))
-        lower, upper = torch.minimum(self._plant.lower, predicted), torch.maximum(self._plant.upper, predicted)
+        lower, upper = (
+            torch.minimum(self._plant.lower, predicted),
+            torch.maximum(self._plant.upper, predicted),
+        )
         moved_to = torch.minimum(torch.maximum(moved_to, lower), upper)
         added = (moved_to - predicted)[:, None]
         state["shift"].copy_(torch.cat((shift[:, 1:] + added, torch.zeros_like(added)), 1))
@@ -174,7 +220,9 @@ class LibraryModel:
         q = getattr(self.inner, "measure", _unchanged)(q)
         counter = self._ranges.advance() if self._salt else None
         for name, effect in self._measured.items():
-            q = effect.measured(q, self._value[name], None if counter is None else counter + self._salt.get(name, 0))
+            q = effect.measured(
+                q, self._value[name], None if counter is None else counter + self._salt.get(name, 0)
+            )
         return q
 
     def truth(self, q: torch.Tensor) -> torch.Tensor:
@@ -209,7 +257,8 @@ class LibraryModel:
         now = self._moment(name, {}, history, moved, counter, weight)
         begun = effect.begin(now)
         memory = {
-            key: torch.where(per_row(self._fresh, value), value, self._state[f"{name}.{key}"]) for key, value in begun.items()
+            key: torch.where(per_row(self._fresh, value), value, self._state[f"{name}.{key}"])
+            for key, value in begun.items()
         }
         return replace(now, memory=memory)
 

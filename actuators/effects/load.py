@@ -9,7 +9,8 @@ from actuators.effects.wrapped import EffectSpec, Memory, Moment
 from brokk_rl.spec import spec
 
 LEAST_HEAD, MOST_HEAD = 0.05, 2.0
-"""Pressure over the valve against that without load: a joint neither stalls nor runs away in a static formula."""
+"""Pressure over the valve against that without load: a joint neither stalls nor runs away in a
+static formula."""
 
 
 @spec
@@ -18,7 +19,8 @@ class LoadDependence(EffectSpec):
 
     Attributes:
         joints: Joints it acts on, or `all`.
-        sensitivity: Share of the weight, over the machine's `yield_force`, that is missing from the pressure over the valve.
+        sensitivity: Share of the weight, over the machine's `yield_force`, that is missing from the
+            pressure over the valve.
     """
 
     joints: Joints
@@ -39,8 +41,8 @@ class Creep(EffectSpec):
 
     Attributes:
         joints: Joints it acts on, or `all`.
-        sink_rad_s: Speed under a weight as large as the machine's `yield_force` (m/s for a sliding joint); a stretched-out boom
-            bears about half of that, a slewing joint none.
+        sink_rad_s: Speed under a weight as large as the machine's `yield_force` (m/s for a sliding
+            joint); a stretched-out boom bears about half of that, a slewing joint none.
     """
 
     joints: Joints

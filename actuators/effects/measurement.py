@@ -26,7 +26,9 @@ class Quantisation(EffectSpec):
     smooth = False
     numbers: ClassVar = {"step_rad": Number("rad", none=0.0, typical=0.003, bounds=(0.0, 0.1))}
 
-    def measured(self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None) -> torch.Tensor:
+    def measured(
+        self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
+    ) -> torch.Tensor:
         """The nearest multiple of the step."""
         step = value["step_rad"]
         return torch.where(step > 0, (q / step.clamp(min=1e-9)).round() * step, q)
@@ -48,7 +50,9 @@ class SensorNoise(EffectSpec):
     stochastic = True
     numbers: ClassVar = {"sigma_rad": Number("rad", none=0.0, typical=0.002, bounds=(0.0, 0.1))}
 
-    def measured(self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None) -> torch.Tensor:
+    def measured(
+        self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
+    ) -> torch.Tensor:
         """`q + sigma N(0, 1)`."""
         assert counter is not None, "noise is stochastic"
         return q + value["sigma_rad"] * draw.normal(counter, CHANCE, q.shape[1])
@@ -69,7 +73,9 @@ class EncoderBias(EffectSpec):
     stage = "sensing"
     numbers: ClassVar = {"bias_rad": Number("rad", none=0.0, typical=0.015, bounds=(-0.3, 0.3))}
 
-    def measured(self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None) -> torch.Tensor:
+    def measured(
+        self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
+    ) -> torch.Tensor:
         """`q + bias`."""
         return q + value["bias_rad"]
 
@@ -93,7 +99,9 @@ class EncoderScale(EffectSpec):
     stage = "sensing"
     numbers: ClassVar = {"scale": Number("1", none=1.0, typical=1.015, bounds=(0.7, 1.4))}
 
-    def measured(self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None) -> torch.Tensor:
+    def measured(
+        self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
+    ) -> torch.Tensor:
         """`scale q`."""
         return q * value["scale"]
 

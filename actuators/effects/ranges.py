@@ -14,7 +14,8 @@ from brokk_rl.errors import ConfigError, choices
 from brokk_rl.machine import Machine
 
 Value = float | tuple[float, float] | dict[str, float | tuple[float, float]]
-"""A number, a range `[low, high]` drawn per environment and joint at each reset, or either by joint name (`other` for the rest)."""
+"""A number, a range `[low, high]` drawn per environment and joint at each reset, or either by joint
+name (`other` for the rest)."""
 Joints = Literal["all"] | tuple[str, ...]
 """Joints that an effect acts on."""
 
@@ -30,8 +31,8 @@ class Number:
 
     Attributes:
         unit: SI unit, `1` for none; `rad` and `rad/s` read m and m/s for a sliding joint.
-        none: Value at which the effect changes nothing. `None` for a number that only shapes the effect (a time constant), which is
-            off when the others are.
+        none: Value at which the effect changes nothing. `None` for a number that only shapes the
+            effect (a time constant), which is off when the others are.
         typical: Size on a machine that has the effect.
         bounds: Smallest and largest value that make sense.
         per_joint: Whether each joint has its own; otherwise one number an environment, `(N, 1)`.
@@ -48,8 +49,8 @@ class Ranges:
     """Parameters of one effect or of several for all environments; what is drawn is drawn in one go.
 
     Attributes:
-        value: `(N, J)` or `(N, 1)` by name. An entry may be written in place or replaced, by one that wants gradients for example;
-            what was replaced is not drawn again.
+        value: `(N, J)` or `(N, 1)` by name. An entry may be written in place or replaced, by one
+            that wants gradients for example; what was replaced is not drawn again.
         state: Counter and drawn values; empty where nothing is random.
 
     Args:
@@ -62,8 +63,8 @@ class Ranges:
         stochastic: Whether there are draws in every step.
         salt: Keeps the draws of several effects apart.
         where: Config node named in messages.
-        shares: Part of the environments that have an effect, by effect; all have those not named. The others have its numbers at
-            their `none`. Who has what is drawn at each reset.
+        shares: Part of the environments that have an effect, by effect; all have those not named.
+            The others have its numbers at their `none`. Who has what is drawn at each reset.
 
     Raises:
         ConfigError: a number is out of bounds, a range upside down, or a joint unknown.
@@ -91,9 +92,15 @@ class Ranges:
             low, high = _sides(fields[name], number, chosen, machine, f"{where}.{name}")
             neutral = low if number.none is None else np.full_like(low, number.none)
             if (low < high).any() or (shares.get(effect, 1.0) < 1 and (low != neutral).any()):
-                drawn[name] = _Column(low, high, neutral, column * 256 + np.arange(len(low)), effect)
+                drawn[name] = _Column(
+                    low, high, neutral, column * 256 + np.arange(len(low)), effect
+                )
             else:
-                self.value[name] = torch.as_tensor(low, dtype=torch.float32, device=device).expand(num_envs, -1).clone()
+                self.value[name] = (
+                    torch.as_tensor(low, dtype=torch.float32, device=device)
+                    .expand(num_envs, -1)
+                    .clone()
+                )
         self._draw = draw.counter(num_envs, salt, device) if stochastic or drawn else None
         self.state = {} if self._draw is None else {"draw": self._draw}
         self._drawn = _Drawn(list(drawn.values()), shares, device) if drawn else None
@@ -131,7 +138,9 @@ class _Column:
 class _Drawn:
     """All numbers that are drawn, side by side in `W` columns: one draw costs as many launches as ten."""
 
-    def __init__(self, columns: Sequence[_Column], shares: Mapping[str, float], device: torch.device) -> None:
+    def __init__(
+        self, columns: Sequence[_Column], shares: Mapping[str, float], device: torch.device
+    ) -> None:
         def tensor(parts: Sequence[np.ndarray], dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.as_tensor(np.concatenate(parts), dtype=dtype, device=device)
 
@@ -142,14 +151,23 @@ class _Drawn:
         if self._some:
             effects = list(dict.fromkeys(column.effect for column in columns))
             self._none = tensor([column.none for column in columns])
-            self._share = torch.tensor([shares.get(effect, 1.0) for effect in effects], device=device)
-            self._share_key = 256 * PRESENT + torch.arange(len(effects), dtype=torch.int64, device=device)
-            self._effect = tensor([np.full(len(column.low), effects.index(column.effect)) for column in columns], torch.int64)
+            self._share = torch.tensor(
+                [shares.get(effect, 1.0) for effect in effects], device=device
+            )
+            self._share_key = 256 * PRESENT + torch.arange(
+                len(effects), dtype=torch.int64, device=device
+            )
+            self._effect = tensor(
+                [np.full(len(column.low), effects.index(column.effect)) for column in columns],
+                torch.int64,
+            )
 
     def fresh(self, counter: torch.Tensor) -> torch.Tensor:
         """Returns fresh values, `(N, W)`, for the counter `(N,)`."""
         counter = counter[:, None] * 65_536
-        value = torch.minimum(self.low + (self.high - self.low) * draw.hashed(counter + self._key), self.high)
+        value = torch.minimum(
+            self.low + (self.high - self.low) * draw.hashed(counter + self._key), self.high
+        )
         if not self._some:
             return value
         there = draw.hashed(counter + self._share_key) < self._share
@@ -162,19 +180,28 @@ def _chosen(joints: Joints, machine: Machine, where: str) -> np.ndarray:
         return np.ones(machine.num_joints, dtype=bool)
     for name in joints:
         if name not in machine.joint_names:
-            raise ConfigError(f"{where}: '{name}' is no joint of machine '{machine.name}'; {choices(name, machine.joint_names)}")
+            raise ConfigError(
+                f"{where}: '{name}' is no joint of machine '{machine.name}'; {choices(name, machine.joint_names)}"
+            )
     return np.array([name in joints for name in machine.joint_names])
 
 
-def _sides(value: Value, number: Number, chosen: np.ndarray, machine: Machine, where: str) -> tuple[np.ndarray, np.ndarray]:
+def _sides(
+    value: Value, number: Number, chosen: np.ndarray, machine: Machine, where: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns the lower and upper ends of a number, each `(J,)`, or `(1,)` for one that joints do not have."""
     if not number.per_joint:
         if isinstance(value, Mapping):
-            raise ConfigError(f"{where}: expected a number or a range [low, high], got {dict(value)}: joints do not differ in it")
+            raise ConfigError(
+                f"{where}: expected a number or a range [low, high], got {dict(value)}: joints do not differ in it"
+            )
         ends = tuple(np.array([side]) for side in _ends(value))
     else:
         tables = value if isinstance(value, Mapping) else {"other": value}
-        ends = tuple(per_joint({name: _ends(v)[side] for name, v in tables.items()}, machine, where) for side in (0, 1))
+        ends = tuple(
+            per_joint({name: _ends(v)[side] for name, v in tables.items()}, machine, where)
+            for side in (0, 1)
+        )
         if number.none is not None:
             ends = tuple(np.where(chosen, side, number.none) for side in ends)
     low, high = ends
@@ -182,7 +209,10 @@ def _sides(value: Value, number: Number, chosen: np.ndarray, machine: Machine, w
     if (low > high).any():
         raise ConfigError(f"{where}: expected a range [low, high] with low <= high, got {value}")
     if (low < least).any() or (high > most).any():
-        raise ConfigError(f"{where}: expected {least:g} to {most:g} {number.unit.replace('1', '')}".rstrip() + f", got {value}")
+        raise ConfigError(
+            f"{where}: expected {least:g} to {most:g} {number.unit.replace('1', '')}".rstrip()
+            + f", got {value}"
+        )
     return low, high
 
 

@@ -132,11 +132,17 @@ class Compliance(EffectSpec):
     def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
         """`d'' + 2 damping w d' + w^2 d = -v'`, where the inner speed `v` changes at the beginning of each period; exact."""
         period_s, damping = now.plant.period_s, now.value["damping"]
-        w = 2.0 * math.pi / now.value["ringing_s"].clamp(min=1e-5)  # beyond 100 kHz nothing is left after a period, to the last bit
+        w = (
+            2.0 * math.pi / now.value["ringing_s"].clamp(min=1e-5)
+        )  # beyond 100 kHz nothing is left after a period, to the last bit
         ringing, fade = w * torch.sqrt(1.0 - damping.square()), damping * w
         speed = now.moved / period_s
         d, rate = now.memory["deflection"], now.memory["rate"] + now.memory["speed"] - speed
-        decay, cos, sin = torch.exp(-fade * period_s), torch.cos(ringing * period_s), torch.sin(ringing * period_s)
+        decay, cos, sin = (
+            torch.exp(-fade * period_s),
+            torch.cos(ringing * period_s),
+            torch.sin(ringing * period_s),
+        )
         after = decay * (d * cos + (rate + fade * d) / ringing * sin)
         rate = decay * (rate * cos - (fade * rate + w.square() * d) / ringing * sin)
         return after - d, {"deflection": after, "rate": rate, "speed": speed}

@@ -12,8 +12,9 @@ from brokk_rl.spec import spec
 class _Delayed(EffectSpec):
     """Commands shifted in time by a constant, exact in the way a joint with constant speed goes.
 
-    A shift that is no multiple of the period gives the mean of the command over each period. The inner model sees a shifted
-    history, so that commands which have left its history must be remembered for as long again.
+    A shift that is no multiple of the period gives the mean of the command over each period. The
+    inner model sees a shifted history, so that commands which have left its history must be
+    remembered for as long again.
     """
 
     side = "command"
@@ -28,7 +29,9 @@ class _Delayed(EffectSpec):
     def _shifted(self, now: Moment, shift_s: torch.Tensor) -> tuple[torch.Tensor, Memory]:
         u = now.history.u
         known = torch.cat((now.memory["older"], u), 1)
-        return _late(known, shift_s / now.plant.period_s, u.shape[1]), {"older": known[:, 1 : u.shape[1]]}
+        return _late(known, shift_s / now.plant.period_s, u.shape[1]), {
+            "older": known[:, 1 : u.shape[1]]
+        }
 
 
 @spec
@@ -37,8 +40,8 @@ class DeadTime(_Delayed):
 
     Attributes:
         joints: Joints it acts on, or `all`.
-        dead_time_s: Transport delay beyond that of the inner model. A negative one shows the inner model commands ahead of time:
-            exact up to its own dead time.
+        dead_time_s: Transport delay beyond that of the inner model. A negative one shows the inner
+            model commands ahead of time: exact up to its own dead time.
     """
 
     joints: Joints
@@ -54,8 +57,8 @@ class DeadTime(_Delayed):
 class ClockOffset(_Delayed):
     """Positions and commands are stamped by different clocks.
 
-    In a recording a position stamped late looks like a command that acts late, and for a controller the loop is longer by as much;
-    so it is simulated as one, see `DeadTime`.
+    In a recording a position stamped late looks like a command that acts late, and for a controller
+    the loop is longer by as much; so it is simulated as one, see `DeadTime`.
 
     Attributes:
         joints: Joints it acts on, or `all`.
@@ -96,7 +99,9 @@ class DelayJitter(EffectSpec):
     def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
         """`u(t - delay)`, in which the delay grows by no more than one period a period."""
         u = now.history.u
-        delay = torch.minimum(now.value["jitter_s"] / now.plant.period_s * now.chance, now.memory["delay"] + 1.0)
+        delay = torch.minimum(
+            now.value["jitter_s"] / now.plant.period_s * now.chance, now.memory["delay"] + 1.0
+        )
         newest = _late(u, delay, 1)[:, 0]
         sent, memory = with_newest(now, newest)
         return sent, memory | {"delay": delay}
@@ -142,7 +147,10 @@ def _late(u: torch.Tensor, periods: torch.Tensor, count: int) -> torch.Tensor:
     # half a millionth of a period forgives 0.15 / 0.05 = 2.9999998
     whole = torch.floor(periods + 5e-7)
     part = (periods - whole).clamp(0.0, 1.0)[:, None]
-    place = torch.arange(last - count, last + 1, device=u.device)[:, None] - whole.to(torch.int64)[:, None]
+    place = (
+        torch.arange(last - count, last + 1, device=u.device)[:, None]
+        - whole.to(torch.int64)[:, None]
+    )
     found = u.gather(1, place.clamp(0, last))
     earlier, later = found[:, :-1], found[:, 1:]
     return later + part * (earlier - later)

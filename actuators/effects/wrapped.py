@@ -23,7 +23,8 @@ Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
 class Plant:
     """What effects need of the machine: `full_step` (way at full speed in one period) and the like, `(J,)`; weight; geometry.
 
-    Weight and geometry are made when an effect asks for them: most do not, and work on machines known by their joints only. Those
+    Weight and geometry are made when an effect asks for them: most do not, and work on machines
+    known by their joints only. Those
     that always do say so beforehand: a traced step can hold their work, but not their making.
 
     Args:
@@ -33,7 +34,9 @@ class Plant:
         placed: Whether the geometry is.
     """
 
-    def __init__(self, machine: Machine, device: torch.device, weighed: bool = False, placed: bool = False) -> None:
+    def __init__(
+        self, machine: Machine, device: torch.device, weighed: bool = False, placed: bool = False
+    ) -> None:
         def tensor(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
@@ -101,18 +104,23 @@ class EffectSpec:
 
     Attributes:
         side: What it acts on; see `actuators.effects`.
-        stage: Where on the way from command to estimate it lies (`where.stage` of `diagnosis.json`).
+        stage: Where on the way from command to estimate it lies (`where.stage` of
+            `diagnosis.json`).
         numbers: Unit, neutral value, typical size and bounds of each number.
         stochastic: Whether it draws random numbers in every step.
         smooth: Whether its numbers can be fitted by gradient.
         delays: Whether it shifts all commands that the inner model sees, not only the newest.
         weighed: Whether it asks for the weight on the joints.
-        shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever on a few of them.
-        running: Name of the number that is the time since the machine was started, which is known and not fitted.
+        shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
+            on a few of them.
+        running: Name of the number that is the time since the machine was started, which is known
+            and not fitted.
     """
 
     side: ClassVar[Side]
-    stage: ClassVar[Literal["actuation", "sensing", "kinematics", "timing", "perception"]] = "actuation"
+    stage: ClassVar[Literal["actuation", "sensing", "kinematics", "timing", "perception"]] = (
+        "actuation"
+    )
     numbers: ClassVar[dict[str, Number]]
     stochastic: ClassVar[bool] = False
     smooth: ClassVar[bool] = True
@@ -126,7 +134,9 @@ class EffectSpec:
         """Returns the name of the effect, as in `effect=[name]`."""
         return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
-    def wrap(self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device) -> "Wrapped":
+    def wrap(
+        self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
+    ) -> "Wrapped":
         """Returns `model` with the effect around it.
 
         Raises:
@@ -146,7 +156,9 @@ class EffectSpec:
         """Returns how much further than `now.moved` the joints move, `(N, J)`, and the memory; speed side."""
         return torch.zeros_like(now.moved), {}
 
-    def measured(self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None) -> torch.Tensor:
+    def measured(
+        self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
+    ) -> torch.Tensor:
         """Returns what the sensors say at the true positions `q`, `(N, J)`; measurement side."""
         return q
 
@@ -154,7 +166,9 @@ class EffectSpec:
         """Returns the likeliest true positions where the sensors say `q`, `(N, J)` or `(N, H, J)`; measurement side."""
         return q
 
-    def tool(self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant) -> torch.Tensor:
+    def tool(
+        self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant
+    ) -> torch.Tensor:
         """Returns where the tool point is that the model has at `point_m`, `(N, 3)`; kinematics."""
         return point_m
 
@@ -169,30 +183,49 @@ class Wrapped:
     Attributes:
         effect: The spec.
         inner: The model inside.
-        parameters: Numbers by name, `(N, J)` or `(N, 1)`. Write in place or replace an entry to simulate `N` candidates side by
-            side; gradients flow to an entry that wants them until the next `reset`.
+        parameters: Numbers by name, `(N, J)` or `(N, 1)`. Write in place or replace an entry to
+            simulate `N` candidates side by side; gradients flow to an entry that wants them until
+            the next `reset`.
     """
 
-    def __init__(self, effect: EffectSpec, inner: ActuatorModel, machine: Machine, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        effect: EffectSpec,
+        inner: ActuatorModel,
+        machine: Machine,
+        num_envs: int,
+        device: torch.device,
+    ) -> None:
         self.effect, self.inner = effect, inner
         name = effect.name()
         given = {field.name: getattr(effect, field.name) for field in fields(effect)}  # pyright: ignore[reportArgumentType]
         joints: Joints = given.pop("joints", "all")
         salt = zlib.crc32(name.encode()) + len(inner.state)
         where = f"effect.{name}"
-        self._ranges = Ranges(given, effect.numbers, joints, machine, num_envs, device, effect.stochastic, salt, where)
+        self._ranges = Ranges(
+            given, effect.numbers, joints, machine, num_envs, device, effect.stochastic, salt, where
+        )
         self.parameters = self._ranges.value
-        self.plant = Plant(machine, device, weighed=effect.weighed, placed=effect.side == "kinematics")
+        self.plant = Plant(
+            machine, device, weighed=effect.weighed, placed=effect.side == "kinematics"
+        )
         rest = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
-        self._memory = {key: value.clone() for key, value in self._begin(self._moment(History(q=rest, u=rest), None)).items()}
+        self._memory = {
+            key: value.clone()
+            for key, value in self._begin(self._moment(History(q=rest, u=rest), None)).items()
+        }
         self._ranges.redraw(self._fresh)
 
     @property
     def state(self) -> Memory:
         """The effect's memory and what it has drawn; `inner.…` for the model inside."""
         own = {"fresh": self._fresh, **self._memory} if self._memory else {}
-        return own | self._ranges.state | {f"inner.{name}": value for name, value in self.inner.state.items()}
+        return (
+            own
+            | self._ranges.state
+            | {f"inner.{name}": value for name, value in self.inner.state.items()}
+        )
 
     @property
     def sides(self) -> frozenset[str]:
@@ -212,11 +245,16 @@ class Wrapped:
         """Returns the joint positions one control period later, shape `(N, J)`."""
         if self.effect.side not in ("command", "speed", "joints"):
             return self.inner.step(history)
-        if torch.is_grad_enabled():  # the history is written in place, and autograd may need what it was
+        if (
+            torch.is_grad_enabled()
+        ):  # the history is written in place, and autograd may need what it was
             history = History(q=history.q.clone(), u=history.u.clone())
         now = self._moment(history, self._ranges.advance() if self.effect.stochastic else None)
         begun, fresh = self._begin(now), self._fresh.clone()
-        memory = {key: torch.where(per_row(fresh, value), begun[key], value) for key, value in self._memory.items()}
+        memory = {
+            key: torch.where(per_row(fresh, value), begun[key], value)
+            for key, value in self._memory.items()
+        }
         now = replace(now, memory=memory)
         result, memory = self._commanded(now) if self.effect.side == "command" else self._moved(now)
         for key, value in memory.items():
@@ -229,7 +267,9 @@ class Wrapped:
         q = getattr(self.inner, "measure", _unchanged)(q)
         if self.effect.side != "measurement":
             return q
-        return self.effect.measured(q, self.parameters, self._ranges.advance() if self.effect.stochastic else None)
+        return self.effect.measured(
+            q, self.parameters, self._ranges.advance() if self.effect.stochastic else None
+        )
 
     def truth(self, q: torch.Tensor) -> torch.Tensor:
         """Returns the likeliest true positions where the sensors say `q`, `(N, J)` or `(N, H, J)`."""
@@ -249,18 +289,25 @@ class Wrapped:
     def misplacement(self, q: torch.Tensor) -> torch.Tensor:
         """Returns how far from the truth the controller believes a target near the tool, `(N, 3)` in m, at the positions `q`.
 
-        A controller that works with the drawings' kinematics on a machine that differs misses by as much as one whose kinematics is
-        right and whose target is displaced; so the simulated geometry stays and the estimate moves.
+        A controller that works with the drawings' kinematics on a machine that differs misses by as
+        much as one whose kinematics is right and whose target is displaced; so the simulated
+        geometry stays and the estimate moves.
         """
         tip_m = self.plant.kinematics.pose(q).tip_in_base_m
         return self.target(self.tool(tip_m, q)) - tip_m
 
     def _moment(self, history: History, counter: torch.Tensor | None) -> Moment:
-        return Moment(self.parameters, {}, history, self.plant, torch.zeros_like(history.q[:, -1]), counter)
+        return Moment(
+            self.parameters, {}, history, self.plant, torch.zeros_like(history.q[:, -1]), counter
+        )
 
     def _begin(self, now: Moment) -> Memory:
         begun = self.effect.begin(now)
-        return begun | ({"shift": torch.zeros_like(now.history.q)} if self.effect.side in ("speed", "joints") else {})
+        return begun | (
+            {"shift": torch.zeros_like(now.history.q)}
+            if self.effect.side in ("speed", "joints")
+            else {}
+        )
 
     def _commanded(self, now: Moment) -> tuple[torch.Tensor, Memory]:
         u, memory = self.effect.commands(now)
@@ -269,16 +316,23 @@ class Wrapped:
     def _moved(self, now: Moment) -> tuple[torch.Tensor, Memory]:
         """Steps the inner model on positions from which past doings of the effect are taken out.
 
-        A learned model goes on from the increments that it sees; a gain on them would compound from step to step. So it is shown
-        increments as they would have been without the effect, ending at the true position: `shift` is added to its history.
+        A learned model goes on from the increments that it sees; a gain on them would compound from
+        step to step. So it is shown
+        increments as they would have been without the effect, ending at the true position: `shift`
+        is added to its history.
         """
         history, shift, plant = now.history, now.memory["shift"], self.plant
         predicted = self.inner.step(History(q=history.q + shift, u=history.u))
         extra, memory = self.effect.extra(replace(now, moved=predicted - history.q[:, -1]))
-        lower, upper = torch.minimum(plant.lower, predicted), torch.maximum(plant.upper, predicted)  # never through a stop
+        lower, upper = (
+            torch.minimum(plant.lower, predicted),
+            torch.maximum(plant.upper, predicted),
+        )  # never through a stop
         result = torch.minimum(torch.maximum(predicted + extra, lower), upper)
         added = (result - predicted)[:, None]
-        return result, memory | {"shift": torch.cat((shift[:, 1:] + added, torch.zeros_like(added)), 1)}
+        return result, memory | {
+            "shift": torch.cat((shift[:, 1:] + added, torch.zeros_like(added)), 1)
+        }
 
 
 def _unchanged(value: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:

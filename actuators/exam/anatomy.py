@@ -20,7 +20,10 @@ RANGES = {
     "notch": (0.15, 0.5),  # progressiveness of the metering edge: 0 linear, 1 quadratic
     "speed_scale": (0.92, 1.12),  # full speed over the machine's nominal one
     "retract_ratio": (1.0, 1.3),  # retracting over extending speed
-    "demand": (0.18, 0.25),  # flow at full speed over the pump's: four joints together just about get it
+    "demand": (
+        0.18,
+        0.25,
+    ),  # flow at full speed over the pump's: four joints together just about get it
     "sensitivity": (0.05, 0.18),  # of squared speed to weight over yield force
     "mode_hz": (5.0, 8.0),  # first mode on closed cylinders
     "friction": (0.02, 0.05),  # over the force at supply pressure
@@ -29,7 +32,8 @@ RANGES = {
     "lever": (0.0, 0.05),  # change of the cylinder's lever arm over the travel
     "noise_rad": (0.0002, 0.0005),
 }
-"""Per joint, uniform. Sizes are those of the class; see the machine's file for what is known of a real one."""
+"""Per joint, uniform. Sizes are those of the class; see the machine's file for what is known of a
+real one."""
 
 NUISANCES = {
     "hysteresis": (0.006, 0.02),  # play between command and spool, of full command
@@ -58,7 +62,9 @@ def drawn(machine: Machine, seed: int, roughness: float) -> tuple[str, Anatomy]:
         return {name: generator.uniform(low, high, count) for name, (low, high) in ranges.items()}
 
     found = each(RANGES)
-    found["transport_s"] = np.full(count, generator.uniform(0.40, 0.50)) + generator.uniform(-0.02, 0.02, count)
+    found["transport_s"] = np.full(count, generator.uniform(0.40, 0.50)) + generator.uniform(
+        -0.02, 0.02, count
+    )
     found["lever_phase"] = generator.uniform(0.0, 2.0 * np.pi, count)
     rough = each(NUISANCES)
     found["wave_phase"] = generator.uniform(0.0, 2.0 * np.pi, count)
@@ -80,4 +86,5 @@ FAULTLESS = (
 )  # fmt: skip
 """Numbers that are 0 in a machine without faults."""
 WHOLE = {"stop": 1.0, "extend": 1.0, "retract": 1.0, "scale": 1.0, "drift_s": 600.0}
-"""Numbers of a machine without faults that are not 0: travel of the spool, port areas, scale of the encoder."""
+"""Numbers of a machine without faults that are not 0: travel of the spool, port areas, scale of the
+encoder."""

@@ -1,6 +1,7 @@
 """A make with two chamber pressures a cylinder: orifices in and out, a partial compensator, compressible oil.
 
-Units: pressure over supply pressure, speed over the machine's `max_speed`, force over supply pressure times bore area.
+Units: pressure over supply pressure, speed over the machine's `max_speed`, force over supply
+pressure times bore area.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ FORCE_RATIO = 1.4
 ROD = 0.75
 """Area of the rod side over that of the bore."""
 BACK = 0.45
-"""Pressure in the emptying chamber at full speed without load: what keeps a falling load from running away."""
+"""Pressure in the emptying chamber at full speed without load: what keeps a falling load from
+running away."""
 PRIMED = 0.40
 """Pressure on the rod side of a machine that has just stopped."""
 DROP_OUT, DROP_IN = 1.0 - ROD * BACK, 1.0 - BACK
@@ -45,13 +47,17 @@ class Chambers:
         mode_hz = 1.0 / np.hypot(own_s, numbers["soft_s"])
         hose = (numbers["soft_s"] * mode_hz) ** 2  # share of the compliance
         force = FORCE_RATIO * np.array([body.yield_force.value for body in machine.bodies])
-        inertia = np.array([body.stiffness.value for body in machine.bodies]) / TAU_HZ**2 / 36.0  # first mode at 6 Hz
+        inertia = (
+            np.array([body.stiffness.value for body in machine.bodies]) / TAU_HZ**2 / 36.0
+        )  # first mode at 6 Hz
         self._push = force / (inertia * machine.max_speed)  # 1/s
         self._stiff = (TAU_HZ * mode_hz) ** 2 / self._push / (1.0 + ROD)  # 1/s
         # what is soft rings with its own damping, and what rubs less lets it
         ringing = 2.0 * numbers["soft_damping"] * TAU_HZ * mode_hz / self._push
         self._friction = numbers["friction"] * (1.0 - 0.7 * hose)
-        self._viscous = numbers["viscous"] + hose * (np.minimum(ringing, numbers["viscous"]) - numbers["viscous"])
+        self._viscous = numbers["viscous"] + hose * (
+            np.minimum(ringing, numbers["viscous"]) - numbers["viscous"]
+        )
         self._leak = numbers["leak"] / machine.max_speed
 
     def begin(self, load: np.ndarray) -> None:
@@ -81,7 +87,9 @@ class Chambers:
         rod = np.clip(rod + dt_s * self._stiff * (speed - from_rod), 0.0, 1.0)
         force = bore - ROD * rod + load / FORCE_RATIO
         drag = dt_s * self._push
-        speed = (speed + drag * force) / (1.0 + drag * rubbing(speed, self._friction, self._viscous))
+        speed = (speed + drag * force) / (
+            1.0 + drag * rubbing(speed, self._friction, self._viscous)
+        )
         self._bore, self._rod, self.speed = bore, rod, speed
         return speed
 

@@ -20,7 +20,8 @@ class Valves:
     """Hydraulic arms of three makes (chambers, compensated, throttled), each machine with numbers and nuisances of its own.
 
     Attributes:
-        roughness: By name, how much hysteresis, waviness, wandering, droop and warm-up a machine has; calibrated numbers.
+        roughness: By name, how much hysteresis, waviness, wandering, droop and warm-up a machine
+            has; calibrated numbers.
     """
 
     roughness: dict[str, float]
@@ -52,7 +53,9 @@ class Valves:
                     f"exam: no roughness '{specimen.roughness}' in exam.plants.roughness; "
                     f"{choices(specimen.roughness, self.roughness)}"
                 )
-            make, numbers = anatomy.drawn(machine, specimen.seed, self.roughness[specimen.roughness])
+            make, numbers = anatomy.drawn(
+                machine, specimen.seed, self.roughness[specimen.roughness]
+            )
             numbers = afflicted(numbers, specimen.faults)
             if specimen.ailment is not None:
                 numbers["stranger"] = specimen.ailment.severity

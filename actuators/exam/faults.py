@@ -1,7 +1,8 @@
 """Effects of the library's names, as changes of a machine's numbers. Sizes are given in the library's words, by joint.
 
-Each function takes the numbers, `(J,)` each, changes some in place, and gets what an effect's spec calls its parameters. Where a
-machine has some of an effect anyway (an overlap, a weight on its flow), the fault comes on top, as the library's does.
+Each function takes the numbers, `(J,)` each, changes some in place, and gets what an effect's spec
+calls its parameters. Where a machine has some of an effect anyway (an overlap, a weight on its
+flow), the fault comes on top, as the library's does.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from actuators.exam.valve import LAND_LEAK
 from brokk_rl.errors import ConfigError, choices
 
 Sizes = Mapping[str, np.ndarray]
-"""Parameters of an effect by name, `(J,)`, at the value that changes nothing where the fault is not."""
+"""Parameters of an effect by name, `(J,)`, at the value that changes nothing where the fault is
+not."""
 
 
 def _dead_time(n: Anatomy, size: Sizes) -> None:
@@ -37,7 +39,9 @@ def _clock_offset(n: Anatomy, size: Sizes) -> None:
 def _dead_band(n: Anatomy, size: Sizes) -> None:
     for side in ("extend", "retract"):
         overlap = n[f"overlap_{side}"]
-        n[f"overlap_{side}"] = overlap + size[side] * (1.0 - overlap)  # a command of `size` more before the land opens
+        n[f"overlap_{side}"] = overlap + size[side] * (
+            1.0 - overlap
+        )  # a command of `size` more before the land opens
 
 
 def _saturation(n: Anatomy, size: Sizes) -> None:
@@ -113,7 +117,10 @@ def _link_length(n: Anatomy, size: Sizes) -> None:
 
 
 def _base_tilt(n: Anatomy, size: Sizes) -> None:
-    n["roll_rad"], n["pitch_rad"] = n["roll_rad"] + size["roll_rad"], n["pitch_rad"] + size["pitch_rad"]
+    n["roll_rad"], n["pitch_rad"] = (
+        n["roll_rad"] + size["roll_rad"],
+        n["pitch_rad"] + size["pitch_rad"],
+    )
 
 
 FAULTS: dict[str, Callable[[Anatomy, Sizes], None]] = {
@@ -124,7 +131,8 @@ FAULTS: dict[str, Callable[[Anatomy, Sizes], None]] = {
     "quantisation": _quantisation, "sensor_noise": _sensor_noise, "encoder_bias": _encoder_bias,
     "encoder_scale": _encoder_scale, "link_length": _link_length, "base_tilt": _base_tilt,
 }  # fmt: skip
-"""By name of the effect. `extrinsics` is not among them: a case has no estimates of boreholes to see it by."""
+"""By name of the effect. `extrinsics` is not among them: a case has no estimates of boreholes to
+see it by."""
 
 
 def afflicted(numbers: Anatomy, faults: Mapping[str, Sizes]) -> Anatomy:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 STILL = 0.015
-"""Speed, of full speed, below which friction grows with speed: no chatter at the time steps used."""
+"""Speed, of full speed, below which friction grows with speed: no chatter at the time steps
+used."""
 
 
 def rubbing(speed: np.ndarray, dry: np.ndarray, viscous: np.ndarray) -> np.ndarray:

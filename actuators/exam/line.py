@@ -25,7 +25,9 @@ class Line:
         self._due_s = np.full((KEPT, *shape), -np.inf)
         self._sent, self._seen = 0, np.zeros(shape, dtype=int)
 
-    def send(self, u: np.ndarray, t_s: float, luck: np.ndarray, late: np.ndarray, later_s: np.ndarray) -> None:
+    def send(
+        self, u: np.ndarray, t_s: float, luck: np.ndarray, late: np.ndarray, later_s: np.ndarray
+    ) -> None:
         """Sends a frame.
 
         Args:

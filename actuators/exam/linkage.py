@@ -1,6 +1,7 @@
 """Behind the cylinder: an elastic boom, play in the pins, the weight of the arm, and where its tool is.
 
-All arrays begin with `N` runs. Each run has a base that may stand tilted and links that may differ from the drawing.
+All arrays begin with `N` runs. Each run has a base that may stand tilted and links that may differ
+from the drawing.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ class Boom:
         """Returns the positions of the links, `(N, J)`, whose actuators are at `q` and move with `speed`."""
         if self._soft.any():
             bend = q - self._bent
-            pull = self._omega**2 * bend * (1.0 + (bend / HARDENS_AT) ** 2) + self._fade * (speed - self._rate)
+            pull = self._omega**2 * bend * (1.0 + (bend / HARDENS_AT) ** 2) + self._fade * (
+                speed - self._rate
+            )
             self._rate = np.where(self._soft, self._rate + dt_s * pull, 0.0)
             self._bent = np.where(self._soft, self._bent + dt_s * self._rate, q)
             q = self._bent
@@ -50,7 +53,8 @@ class Arm:
 
     Args:
         machine: Axes, origins, masses.
-        numbers: `extra_m`, `roll_rad`, `pitch_rad`, `(N, J)`; the tilt of a base is that of the first column.
+        numbers: `extra_m`, `roll_rad`, `pitch_rad`, `(N, J)`; the tilt of a base is that of the
+            first column.
     """
 
     def __init__(self, machine: Machine, numbers: Anatomy) -> None:
@@ -59,11 +63,14 @@ class Arm:
         self._mass_kg = [body.mass_kg.value for body in machine.bodies]
         self._com_m = [np.array(body.com_m) for body in machine.bodies]
         self._yield = np.array([body.yield_force.value for body in machine.bodies])
-        drawn = [np.array([d.value for d in body.origin_m]) for body in machine.bodies] + [machine.tip_m]
+        drawn = [np.array([d.value for d in body.origin_m]) for body in machine.bodies] + [
+            machine.tip_m
+        ]
         extra_m = numbers["extra_m"]
         # link j reaches from joint j to the next one, or to the tip
         self._reach_m = [drawn[0][None]] + [
-            drawn[j + 1] * (1.0 + extra_m[:, j, None] / max(float(np.linalg.norm(drawn[j + 1])), 1e-9))
+            drawn[j + 1]
+            * (1.0 + extra_m[:, j, None] / max(float(np.linalg.norm(drawn[j + 1])), 1e-9))
             for j in range(len(drawn) - 1)
         ]
         self._base = _turn(np.array([0.0, 1.0, 0.0]), numbers["pitch_rad"][:, 0]) @ _turn(
@@ -95,7 +102,9 @@ class Arm:
         turned, at_m = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
         origins, axes, self._centres = [], [], []
         for j, axis in enumerate(self._axes):
-            at_m = at_m + (turned @ np.broadcast_to(self._reach_m[j], (len(q), 3))[..., None])[..., 0]
+            at_m = (
+                at_m + (turned @ np.broadcast_to(self._reach_m[j], (len(q), 3))[..., None])[..., 0]
+            )
             if not self._hinge[j]:
                 at_m = at_m + q[:, j, None] * (turned @ axis)
             origins.append(at_m)
@@ -111,4 +120,8 @@ def _turn(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Returns the rotations about a unit axis by each angle, `(N, 3, 3)`."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle)[:, None, None] * cross + (1.0 - np.cos(angle))[:, None, None] * (cross @ cross)
+    return (
+        np.eye(3)
+        + np.sin(angle)[:, None, None] * cross
+        + (1.0 - np.cos(angle))[:, None, None] * (cross @ cross)
+    )

@@ -36,7 +36,8 @@ class Plant:
         machine: Geometry, masses, limits.
         make: See `anatomy.MAKES`.
         anatomies: Numbers of each run's machine.
-        strangers: Kind of ailment outside the library of each run, or `None`; its severity is the number `stranger`.
+        strangers: Kind of ailment outside the library of each run, or `None`; its severity is the
+            number `stranger`.
         seeds: Chance of each run.
         elapsed_s: How long each machine has run before.
         tracked: Whether the tool of each run is measured.
@@ -54,9 +55,15 @@ class Plant:
         tracked: Sequence[bool],
         steps: int,
     ) -> None:
-        self._machine, self._n = machine, {name: np.stack([a[name] for a in anatomies]) for name in anatomies[0]}
+        self._machine, self._n = (
+            machine,
+            {name: np.stack([a[name] for a in anatomies]) for name in anatomies[0]},
+        )
         n, count, joints = self._n, len(anatomies), machine.num_joints
-        self._chance = [_Chance(seed, anatomy, steps, machine) for seed, anatomy in zip(seeds, anatomies, strict=True)]
+        self._chance = [
+            _Chance(seed, anatomy, steps, machine)
+            for seed, anatomy in zip(seeds, anatomies, strict=True)
+        ]
         self._wander = np.stack([chance.wander for chance in self._chance], 1)
         self._noise = np.stack([chance.noise for chance in self._chance], 1)
         self._luck = np.stack([chance.luck for chance in self._chance], 1)
@@ -68,7 +75,11 @@ class Plant:
         self._boom = Boom(n, self._q, np.full((count, 1), make != "chambers"))
         self._true, self._earlier = self._q.copy(), self._q.copy()
         self._flow, self._droop = np.zeros((count, joints)), np.zeros((count, 1))
-        self._k, self._elapsed_s, self._tracked = 0, np.asarray(elapsed_s, dtype=float), np.array(tracked)
+        self._k, self._elapsed_s, self._tracked = (
+            0,
+            np.asarray(elapsed_s, dtype=float),
+            np.array(tracked),
+        )
         self._starving = make == "compensated"
         self._power.begin(self._arm.load(self._true))
 
@@ -80,7 +91,9 @@ class Plant:
     def read(self) -> JointState:
         """Returns what the encoders show now."""
         shown = self._strangers.shown(self._true), self._strangers.shown(self._earlier)
-        return JointState(self._k * self._machine.period_s, self._encoders.read(*shown, self._noise[self._k]))
+        return JointState(
+            self._k * self._machine.period_s, self._encoders.read(*shown, self._noise[self._k])
+        )
 
     def extra(self) -> Mapping[str, np.ndarray]:
         """Returns the measured tool, NaN where nobody measures it; empty where that is so in all runs."""
@@ -89,7 +102,11 @@ class Plant:
         tip_m, pitch_rad = self._arm.tool(self._true)
         seen = np.concatenate([tip_m, pitch_rad[:, None]], 1)
         noise = np.stack([chance.tool[self._k] for chance in self._chance])
-        seen = np.where(self._tracked[:, None], seen + noise * [TRACKER_M, TRACKER_M, TRACKER_M, TRACKER_RAD], np.nan)
+        seen = np.where(
+            self._tracked[:, None],
+            seen + noise * [TRACKER_M, TRACKER_M, TRACKER_M, TRACKER_RAD],
+            np.nan,
+        )
         return dict(zip(("ee_x_m", "ee_y_m", "ee_z_m", "ee_pitch_rad"), seen.T, strict=True))
 
     def send(self, command: Command) -> Command:
@@ -104,16 +121,21 @@ class Plant:
         self._earlier = self._true
         for i in range(round(machine.period_s / dt_s)):
             moving = np.abs(power.speed) > MOVING
-            opening = self._valve.step(self._line.at(t_s + i * dt_s), dt_s, self._strangers.bend, moving, load)
+            opening = self._valve.step(
+                self._line.at(t_s + i * dt_s), dt_s, self._strangers.bend, moving, load
+            )
             self._flow = self._shared(opening, load)
             speed = power.step(self._flow * tempo, load) * machine.max_speed
             lever = 1.0 + n["lever"] * np.sin(
-                np.pi * (self._q - machine.lower) / (machine.upper - machine.lower) + n["lever_phase"]
+                np.pi * (self._q - machine.lower) / (machine.upper - machine.lower)
+                + n["lever_phase"]
             )
             moved = self._q + dt_s * speed * lever
             self._q = np.clip(moved, machine.lower, machine.upper)
             power.stopped(self._q != moved)
-            self._true = self._boom.step(self._q, np.where(self._q == moved, speed * lever, 0.0), dt_s)
+            self._true = self._boom.step(
+                self._q, np.where(self._q == moved, speed * lever, 0.0), dt_s
+            )
         self._k += 1
         return command
 
@@ -137,7 +159,11 @@ class Plant:
             return opening / np.maximum(total, 1.0)
         # oil takes the easiest way: what is missing is missing where the load is heaviest
         heavy = asked * np.exp(-2.0 * np.sign(opening) * load)
-        given = np.maximum(asked - np.maximum(total - 1.0, 0.0) * heavy / np.maximum(heavy.sum(1, keepdims=True), 1e-9), 0.0)
+        given = np.maximum(
+            asked
+            - np.maximum(total - 1.0, 0.0) * heavy / np.maximum(heavy.sum(1, keepdims=True), 1e-9),
+            0.0,
+        )
         return opening * given / np.maximum(asked, 1e-9)
 
     def __enter__(self) -> Self:
@@ -154,9 +180,13 @@ class _Chance:
         generator = np.random.default_rng(seed)
         shape = (steps + 1, machine.num_joints)
         keep = np.exp(-machine.period_s / anatomy["wander_s"])
-        white, first = generator.standard_normal(shape), generator.standard_normal(machine.num_joints)
+        white, first = (
+            generator.standard_normal(shape),
+            generator.standard_normal(machine.num_joints),
+        )
         wander = [
-            lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white[:, j], zi=[a * first[j]])[0] for j, a in enumerate(keep.tolist())
+            lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white[:, j], zi=[a * first[j]])[0]
+            for j, a in enumerate(keep.tolist())
         ]
         self.wander = (np.stack(wander, 1) * anatomy["wander"]).astype(np.float32)
         self.noise = generator.standard_normal(shape, dtype=np.float32)

@@ -8,9 +8,9 @@ Each has a severity by joint, 1 for a machine that plainly has it and 0 where it
     bouc_wen             hysteresis of the pilot stage that is no play
     joystick_curve       an exponent on the command
     intermittent_sticking   bouts of a second or two in which a joint hardly moves
-    interlock            commands are ignored for some seconds while two certain joints are both wanted fast
-    dial_error           the encoder's disc sits off its centre: an error that comes and goes with the angle
-    end_cushion          the last part of the travel is slow
+    interlock            commands are ignored for some seconds while two certain joints are both
+    wanted fast dial_error           the encoder's disc sits off its centre: an error that comes and
+    goes with the angle end_cushion          the last part of the travel is slow
     cross_talk           the commands of the others open the valve a little
     fading               the pump tires after some seconds of work and recovers in pauses
     flow_boost           above a command a second pump joins
@@ -39,13 +39,25 @@ class Strangers:
         luck: Uniform random numbers, `(T, N)`, one a control period.
     """
 
-    def __init__(self, machine: Machine, kinds: list[str | None], severity: np.ndarray, luck: np.ndarray) -> None:
-        self._period_s, self._lower, self._travel = machine.period_s, machine.lower, machine.upper - machine.lower
+    def __init__(
+        self, machine: Machine, kinds: list[str | None], severity: np.ndarray, luck: np.ndarray
+    ) -> None:
+        self._period_s, self._lower, self._travel = (
+            machine.period_s,
+            machine.lower,
+            machine.upper - machine.lower,
+        )
         self._luck = luck
         self._of = {
-            kind: severity * np.array([[other == kind] for other in kinds]) for kind in KINDS if any(k == kind for k in kinds)
+            kind: severity * np.array([[other == kind] for other in kinds])
+            for kind in KINDS
+            if any(k == kind for k in kinds)
         }
-        self._bout_s, self._blocked_s, self._tired = np.zeros(len(kinds)), np.zeros(len(kinds)), np.zeros((len(kinds), 1))
+        self._bout_s, self._blocked_s, self._tired = (
+            np.zeros(len(kinds)),
+            np.zeros(len(kinds)),
+            np.zeros((len(kinds), 1)),
+        )
         self._before = np.zeros_like(severity)
         self.bend = 0.12 * self._of.get("bouc_wen", np.zeros_like(severity))
 
@@ -59,7 +71,9 @@ class Strangers:
             has = size > 0
             wanted = (np.abs(u) > 0.25) & has
             met = wanted.any(1) & ((np.abs(u) > 0.25).sum(1) >= 2)
-            self._blocked_s = np.where(met & (self._blocked_s <= -3.0), 2.5 * size.max(1), self._blocked_s - self._period_s)
+            self._blocked_s = np.where(
+                met & (self._blocked_s <= -3.0), 2.5 * size.max(1), self._blocked_s - self._period_s
+            )
             u = np.where(has & (self._blocked_s > 0)[:, None], 0.0, u)
         return u
 
@@ -89,7 +103,9 @@ class Strangers:
             factor = factor * (1.0 - 0.9 * size * (self._bout_s > 0)[:, None])
         if (size := self._of.get("fading")) is not None:
             work = np.minimum(np.abs(flow).sum(1, keepdims=True), 1.0)
-            self._tired += (work - self._tired) * self._period_s / np.where(work > self._tired, 4.0, 8.0)
+            self._tired += (
+                (work - self._tired) * self._period_s / np.where(work > self._tired, 4.0, 8.0)
+            )
             factor = factor * (1.0 - 0.6 * size * self._tired)
         return factor
 

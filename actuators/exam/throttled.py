@@ -1,6 +1,7 @@
 """A make with open-centre throttle valves: speed settles to a static balance, loads count most at small openings.
 
-No pressures and no inertia: the answer is of first order, solved exactly over each time step. Units as in `chambers`.
+No pressures and no inertia: the answer is of first order, solved exactly over each time step. Units
+as in `chambers`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ class Throttled:
     def step(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
         """Returns the speeds after a time step, of `max_speed`; see `chambers` for the arguments."""
         grip = 0.5 * self._n["sensitivity"] / (0.4 + 0.6 * np.minimum(np.abs(opening), 1.0))
-        settled = opening * np.clip(1.0 + grip * np.sign(opening) * load, 0.2, 1.8) + self._sink * load
+        settled = (
+            opening * np.clip(1.0 + grip * np.sign(opening) * load, 0.2, 1.8) + self._sink * load
+        )
         self.speed = settled + (self.speed - settled) * self._keep
         return self.speed
 

@@ -11,7 +11,8 @@ from actuators.exam.anatomy import Anatomy
 
 TAU = 2.0 * np.pi
 LAND_LEAK = 0.08
-"""Opening at which the leak over the metering land takes half of the pressure from a joint that does not move."""
+"""Opening at which the leak over the metering land takes half of the pressure from a joint that
+does not move."""
 WEIGHT_SHARE = 0.25
 """How much a load of yield force changes the pressure that a joint needs to break away."""
 
@@ -26,13 +27,19 @@ class Valve:
     def __init__(self, numbers: Anatomy) -> None:
         self._numbers = numbers
         shape = numbers["notch"].shape
-        self._pilot, self._filtered, self._spool, self._rate, self._bent = (np.zeros(shape) for _ in range(5))
+        self._pilot, self._filtered, self._spool, self._rate, self._bent = (
+            np.zeros(shape) for _ in range(5)
+        )
         self._omega = TAU * numbers["spool_hz"]
-        self._slope = np.where(numbers["stroke_s"] > 0, 1.0 / np.maximum(numbers["stroke_s"], 1e-6), 50.0)
+        self._slope = np.where(
+            numbers["stroke_s"] > 0, 1.0 / np.maximum(numbers["stroke_s"], 1e-6), 50.0
+        )
         leaking = numbers["breakaway"] < 1.0
         self._breaks = np.where(leaking, numbers["breakaway"], 0.99)
 
-    def step(self, u: np.ndarray, dt_s: float, bend: np.ndarray, moving: np.ndarray, load: np.ndarray) -> np.ndarray:
+    def step(
+        self, u: np.ndarray, dt_s: float, bend: np.ndarray, moving: np.ndarray, load: np.ndarray
+    ) -> np.ndarray:
         """Returns signed openings after a time step, 1 for a fully open port, waviness included.
 
         Args:
@@ -48,12 +55,16 @@ class Valve:
         self._pilot = np.clip(self._pilot, u - half, u + half)
         if bend.any():
             change, reach = self._pilot - before, np.maximum(bend, 1e-9)
-            # Bouc-Wen with exponent 1: the hysteretic part follows the change and saturates at `bend`
+            # Bouc-Wen with exponent 1: the hysteretic part follows the change and saturates at
+            # `bend`
             grip = 1.0 - np.abs(self._bent) / reach * np.sign(np.maximum(self._bent * change, 0.0))
             self._bent = np.where(bend > 0, self._bent + 3.0 * change * grip, 0.0)
         wanted = self._pilot - np.clip(self._bent, -bend, bend)
         self._filtered += (wanted - self._filtered) * (dt_s / (dt_s + n["pilot_s"]))
-        pull = self._omega * self._omega * (self._filtered - self._spool) - 2.0 * n["spool_damping"] * self._omega * self._rate
+        pull = (
+            self._omega * self._omega * (self._filtered - self._spool)
+            - 2.0 * n["spool_damping"] * self._omega * self._rate
+        )
         self._rate = np.clip(self._rate + dt_s * pull, -self._slope, self._slope)
         moved = self._spool + dt_s * self._rate
         self._spool = np.clip(moved, -n["stop"], n["stop"])

@@ -18,14 +18,16 @@ class Levels:
     Attributes:
         share: Part of the time, relative to the others of the plan.
         pose_s: Time after which another start pose is taken, about.
-        turn_s: Time after which it is drawn anew whether the exclusive joints move or all the others.
+        turn_s: Time after which it is drawn anew whether the exclusive joints move or all the
+            others.
         exclusive_share: Part of the turns in which the exclusive joints move and the others rest.
         shortest_s: Shortest time a level is held; times are drawn log-uniformly.
         longest_s: Longest time.
         zero_share: Part of the levels that are zero, so that the number of moving joints varies.
         small_share: Part of the levels drawn from below `small_level`, where the dead band is.
         small_level: Largest small level.
-        stop_margin: A joint that would come to rest this close to its stop, as a part of its travel, is driven the other way.
+        stop_margin: A joint that would come to rest this close to its stop, as a part of its
+            travel, is driven the other way.
     """
 
     share: float
@@ -41,18 +43,28 @@ class Levels:
 
     def check(self) -> None:
         if not 0 < self.shortest_s <= self.longest_s:
-            raise ConfigError(f"excitation: expected 0 < shortest_s <= longest_s, got {self.shortest_s} and {self.longest_s}")
+            raise ConfigError(
+                f"excitation: expected 0 < shortest_s <= longest_s, got {self.shortest_s} and {self.longest_s}"
+            )
         if not 0 <= self.zero_share + self.small_share <= 1:
-            raise ConfigError(f"excitation: zero_share + small_share must lie in [0, 1], got {self.zero_share + self.small_share}")
+            raise ConfigError(
+                f"excitation: zero_share + small_share must lie in [0, 1], got {self.zero_share + self.small_share}"
+            )
         if not 0 < self.turn_s <= self.pose_s:
-            raise ConfigError(f"excitation: expected 0 < turn_s <= pose_s, got {self.turn_s} and {self.pose_s}")
+            raise ConfigError(
+                f"excitation: expected 0 < turn_s <= pose_s, got {self.turn_s} and {self.pose_s}"
+            )
 
     def weight(self, before: float) -> float:
         """Returns `share`."""
         return self.share
 
     def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator, before: Sequence[Segment]
+        self,
+        machine: Machine,
+        duration_s: float,
+        generator: np.random.Generator,
+        before: Sequence[Segment],
     ) -> list[Segment]:
         """Returns segments of about `pose_s` each, which fill the time."""
         total = max(1, int(duration_s / machine.period_s))
@@ -71,14 +83,19 @@ class Levels:
 
     def _program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
         """Returns the commands, `(T, J)`."""
-        u = np.stack([self._joint(steps, machine.period_s, generator) for _ in range(machine.num_joints)], 1)
+        u = np.stack(
+            [self._joint(steps, machine.period_s, generator) for _ in range(machine.num_joints)], 1
+        )
         exclusive = machine.is_exclusive
         if not exclusive.any() or exclusive.all():
             return u
         turn = max(1, round(self.turn_s / machine.period_s))
         num_turns = -(-steps // turn)
         # spread evenly from a random beginning, so that a short program has its part too
-        alone = np.diff(np.floor(self.exclusive_share * np.arange(num_turns + 1) + generator.random())) > 0
+        alone = (
+            np.diff(np.floor(self.exclusive_share * np.arange(num_turns + 1) + generator.random()))
+            > 0
+        )
         return u * exclusive_mask(exclusive, np.repeat(alone, turn)[:steps])
 
     def _joint(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
@@ -86,6 +103,8 @@ class Levels:
         most = -(-steps // max(1, int(self.shortest_s / period_s)))
         held_s = np.exp(generator.uniform(np.log(self.shortest_s), np.log(self.longest_s), most))
         kind = generator.random(most)
-        reach = np.where(kind < self.zero_share + self.small_share, self.small_level, 1.0) * (kind >= self.zero_share)
+        reach = np.where(kind < self.zero_share + self.small_share, self.small_level, 1.0) * (
+            kind >= self.zero_share
+        )
         level = reach * generator.uniform(-1.0, 1.0, most)
         return np.repeat(level, np.maximum(1, np.round(held_s / period_s).astype(int)))[:steps]

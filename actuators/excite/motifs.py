@@ -23,15 +23,23 @@ class Motif:
         """Returns `share`."""
         return self.share
 
-    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+    def programs(
+        self, machine: Machine, generator: np.random.Generator
+    ) -> list[tuple[str, np.ndarray]]:
         """Returns name and program `(T, J)` of all that is played in one pose."""
         raise NotImplementedError
 
     def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator, before: Sequence[Segment]
+        self,
+        machine: Machine,
+        duration_s: float,
+        generator: np.random.Generator,
+        before: Sequence[Segment],
     ) -> list[Segment]:
         """Returns as many segments as fit into `duration_s`."""
-        return filled(type(self).__name__.lower(), self._candidates(machine, generator), duration_s, machine)
+        return filled(
+            type(self).__name__.lower(), self._candidates(machine, generator), duration_s, machine
+        )
 
     def _candidates(self, machine: Machine, generator: np.random.Generator) -> Iterator[Segment]:
         number = count()
@@ -44,7 +52,9 @@ class Motif:
                 )  # fmt: skip
 
 
-def filled(name: str, candidates: Iterable[Segment], duration_s: float, machine: Machine) -> list[Segment]:
+def filled(
+    name: str, candidates: Iterable[Segment], duration_s: float, machine: Machine
+) -> list[Segment]:
     """Returns segments as long as they fit into `duration_s`.
 
     Raises:
@@ -64,7 +74,9 @@ def filled(name: str, candidates: Iterable[Segment], duration_s: float, machine:
     return found
 
 
-def for_each_joint(name: str, machine: Machine, program: Callable[[int], np.ndarray]) -> list[tuple[str, np.ndarray]]:
+def for_each_joint(
+    name: str, machine: Machine, program: Callable[[int], np.ndarray]
+) -> list[tuple[str, np.ndarray]]:
     """Returns name and `(T, J)` of `program(joint)`, `(T,)`, for each joint, the others at rest."""
     found = []
     for joint, joint_name in enumerate(machine.joint_names):
@@ -77,7 +89,10 @@ def for_each_joint(name: str, machine: Machine, program: Callable[[int], np.ndar
 
 def held(levels: ArrayLike, holds_s: ArrayLike, period_s: float) -> np.ndarray:
     """Returns each level held for its time, `(T,)`."""
-    return np.repeat(np.asarray(levels, dtype=float), np.maximum(1, np.round(np.asarray(holds_s) / period_s).astype(int)))
+    return np.repeat(
+        np.asarray(levels, dtype=float),
+        np.maximum(1, np.round(np.asarray(holds_s) / period_s).astype(int)),
+    )
 
 
 @spec
@@ -88,7 +103,8 @@ class Ramps(Motif):
         share: Part of the time, relative to the others of the plan.
         slopes_per_s: Change of the command per second.
         highest: Highest command.
-        reach: Largest way to either side, as a part of the joint's travel, at the machine's nominal speed; lowers the peaks.
+        reach: Largest way to either side, as a part of the joint's travel, at the machine's nominal
+            speed; lowers the peaks.
         stop_margin: As in `levels`.
     """
 
@@ -100,23 +116,35 @@ class Ramps(Motif):
 
     def check(self) -> None:
         if not self.slopes_per_s or min(self.slopes_per_s) <= 0:
-            raise ConfigError(f"excitation: slopes_per_s: expected one or more above 0, got {list(self.slopes_per_s)}")
+            raise ConfigError(
+                f"excitation: slopes_per_s: expected one or more above 0, got {list(self.slopes_per_s)}"
+            )
 
-    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+    def programs(
+        self, machine: Machine, generator: np.random.Generator
+    ) -> list[tuple[str, np.ndarray]]:
         """Returns a ramp up, through zero to the other side, and back, for each joint and slope; the first side is random."""
         way = self.reach * (machine.upper - machine.lower) / machine.max_speed
 
         def ramp(slope_per_s: float) -> Callable[[int], np.ndarray]:
             def program(joint: int) -> np.ndarray:
-                # a triangle of height h and slope s takes the joint h^2 / s of its full speed further
+                # a triangle of height h and slope s takes the joint h^2 / s of its full speed
+                # further
                 height = min(self.highest, np.sqrt(slope_per_s * way[joint]))
                 rise = max(1, round(height / slope_per_s / machine.period_s))
-                up, down = np.linspace(0.0, height, rise + 1), np.linspace(height, -height, 2 * rise + 1)
+                up, down = (
+                    np.linspace(0.0, height, rise + 1),
+                    np.linspace(height, -height, 2 * rise + 1),
+                )
                 return generator.choice([-1.0, 1.0]) * np.concatenate([up, down[1:], -up[::-1][1:]])
 
             return program
 
-        return [found for slope_per_s in self.slopes_per_s for found in for_each_joint("ramps", machine, ramp(slope_per_s))]
+        return [
+            found
+            for slope_per_s in self.slopes_per_s
+            for found in for_each_joint("ramps", machine, ramp(slope_per_s))
+        ]
 
 
 @spec
@@ -133,9 +161,13 @@ class Holds(Motif):
     hold_s: float
     stop_margin: float
 
-    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+    def programs(
+        self, machine: Machine, generator: np.random.Generator
+    ) -> list[tuple[str, np.ndarray]]:
         """Returns one hold: the way to each pose does the rest."""
-        return [("holds", np.zeros((max(1, round(self.hold_s / machine.period_s)), machine.num_joints)))]
+        return [
+            ("holds", np.zeros((max(1, round(self.hold_s / machine.period_s)), machine.num_joints)))
+        ]
 
 
 @spec
@@ -158,13 +190,18 @@ class Reversals(Motif):
     pause_s: float
     stop_margin: float
 
-    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+    def programs(
+        self, machine: Machine, generator: np.random.Generator
+    ) -> list[tuple[str, np.ndarray]]:
         """Returns all reversals of a joint in one program."""
         parts = []
         for level in self.levels:
             for hold_s in self.holds_s:
                 cycle = held([level, -level], [hold_s, hold_s], machine.period_s)
-                parts += [np.tile(cycle, self.num_cycles), held([0.0], [self.pause_s], machine.period_s)]
+                parts += [
+                    np.tile(cycle, self.num_cycles),
+                    held([0.0], [self.pause_s], machine.period_s),
+                ]
         commands = np.concatenate(parts)
         return for_each_joint("reversals", machine, lambda joint: commands)
 
@@ -175,9 +212,11 @@ class Staircase(Motif):
 
     Attributes:
         share: Part of the time, relative to the others of the plan.
-        levels: Rising commands; each is held forward, then backward, so that the joint stays where it is in the long run.
+        levels: Rising commands; each is held forward, then backward, so that the joint stays where
+            it is in the long run.
         hold_s: Time for which a level is held.
-        reach: Largest way of one level, as a part of the joint's travel, at the machine's nominal speed; shortens the holds.
+        reach: Largest way of one level, as a part of the joint's travel, at the machine's nominal
+            speed; shortens the holds.
         stop_margin: As in `levels`.
     """
 
@@ -188,16 +227,31 @@ class Staircase(Motif):
     stop_margin: float
 
     def check(self) -> None:
-        if not self.levels or list(self.levels) != sorted(self.levels) or not 0 < self.levels[0] <= self.levels[-1] <= 1:
-            raise ConfigError(f"excitation: levels: expected rising commands in (0, 1], got {list(self.levels)}")
+        if (
+            not self.levels
+            or list(self.levels) != sorted(self.levels)
+            or not 0 < self.levels[0] <= self.levels[-1] <= 1
+        ):
+            raise ConfigError(
+                f"excitation: levels: expected rising commands in (0, 1], got {list(self.levels)}"
+            )
 
-    def programs(self, machine: Machine, generator: np.random.Generator) -> list[tuple[str, np.ndarray]]:
+    def programs(
+        self, machine: Machine, generator: np.random.Generator
+    ) -> list[tuple[str, np.ndarray]]:
         """Returns the staircase of each joint."""
         stairs = np.array([*self.levels, *self.levels[::-1]])
 
         def program(joint: int) -> np.ndarray:
-            way_s = self.reach * (machine.upper[joint] - machine.lower[joint]) / machine.max_speed[joint] / stairs
+            way_s = (
+                self.reach
+                * (machine.upper[joint] - machine.lower[joint])
+                / machine.max_speed[joint]
+                / stairs
+            )
             holds_s = np.minimum(self.hold_s, way_s)
-            return held(np.stack([stairs, -stairs], 1).ravel(), np.repeat(holds_s, 2), machine.period_s)
+            return held(
+                np.stack([stairs, -stairs], 1).ravel(), np.repeat(holds_s, 2), machine.period_s
+            )
 
         return for_each_joint("staircase", machine, program)

@@ -1,6 +1,7 @@
 """Start poses of opposite load: the same command must meet weight that helps and weight that resists.
 
-Under a weight of one sign the unequal speed of the two directions, load dependence, leaks and an uneven dead band look alike.
+Under a weight of one sign the unequal speed of the two directions, load dependence, leaks and an
+uneven dead band look alike.
 """
 
 from collections.abc import Iterator
@@ -17,7 +18,8 @@ NUM_CANDIDATES = 128
 def poses(machine: Machine, margin: float, generator: np.random.Generator) -> Iterator[np.ndarray]:
     """Yields start poses `(J,)` without end, each the one of many random ones whose load best opposes the sum of those before.
 
-    So the weight on each joint takes both signs, in turn, where it can. Where masses are not known the poses are random.
+    So the weight on each joint takes both signs, in turn, where it can. Where masses are not known
+    the poses are random.
 
     Args:
         machine: Limits, masses and geometry.
@@ -28,7 +30,9 @@ def poses(machine: Machine, margin: float, generator: np.random.Generator) -> It
     total = np.zeros(machine.num_joints)
     while True:
         candidates = generator.uniform(
-            machine.lower + margin * travel, machine.upper - margin * travel, (NUM_CANDIDATES, len(travel))
+            machine.lower + margin * travel,
+            machine.upper - margin * travel,
+            (NUM_CANDIDATES, len(travel)),
         )
         if not machine.has_bodies:
             yield candidates[0]
@@ -36,7 +40,11 @@ def poses(machine: Machine, margin: float, generator: np.random.Generator) -> It
         pull = load(machine, candidates)
         pull /= np.maximum(np.abs(pull).max(0), 1e-9)
         heavy = np.abs(pull).sum(1)
-        best = int(np.argmin(((total + pull) ** 2).sum(1) - heavy)) if total.any() else int(np.argmax(heavy))
+        best = (
+            int(np.argmin(((total + pull) ** 2).sum(1) - heavy))
+            if total.any()
+            else int(np.argmax(heavy))
+        )
         total += pull[best]
         yield candidates[best]
 
@@ -51,22 +59,33 @@ def load(machine: Machine, q: np.ndarray) -> np.ndarray:
     """
     step = 1e-5
     shifts = step * np.eye(machine.num_joints)
-    down, up = (_potential_j(machine, (q[:, None] + side * shifts).reshape(-1, machine.num_joints)) for side in (-1.0, 1.0))
+    down, up = (
+        _potential_j(machine, (q[:, None] + side * shifts).reshape(-1, machine.num_joints))
+        for side in (-1.0, 1.0)
+    )
     return ((down - up) / (2.0 * step)).reshape(q.shape)
 
 
 def _potential_j(machine: Machine, q: np.ndarray) -> np.ndarray:
     """Returns the potential energy at `q`, `(N, J)`: J, `(N,)`."""
-    rotation, origin_m, energy_j = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3)), np.zeros(len(q))
+    rotation, origin_m, energy_j = (
+        np.broadcast_to(np.eye(3), (len(q), 3, 3)),
+        np.zeros((len(q), 3)),
+        np.zeros(len(q)),
+    )
     for j, (joint, body) in enumerate(zip(machine.joints, machine.bodies, strict=True)):
         axis = np.array(body.axis)
-        place = np.array([d.value for d in body.origin_m]) + (q[:, j, None] * axis if joint.kind == "slide" else 0.0)
+        place = np.array([d.value for d in body.origin_m]) + (
+            q[:, j, None] * axis if joint.kind == "slide" else 0.0
+        )
         origin_m = origin_m + (rotation @ np.broadcast_to(place, (len(q), 3))[..., None])[..., 0]
         if joint.kind == "hinge":
             x, y, z = axis
             cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
             angle = q[:, j, None, None]
-            rotation = rotation @ (np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)  # Rodrigues
+            rotation = rotation @ (
+                np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+            )  # Rodrigues
         height_m = (origin_m + rotation @ np.array(body.com_m))[:, 2]
         energy_j = energy_j + body.mass_kg.value * GRAVITY_M_S2 * height_m
     return energy_j

@@ -32,15 +32,25 @@ class Repeat:
             ConfigError: there is nothing before it.
         """
         if before <= 0:
-            raise ConfigError("excitation=repeat: nothing before it to repeat; put it last: excitation=[levels,holds,repeat]")
+            raise ConfigError(
+                "excitation=repeat: nothing before it to repeat; put it last: excitation=[levels,holds,repeat]"
+            )
         return self.times * before
 
     def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator, before: Sequence[Segment]
+        self,
+        machine: Machine,
+        duration_s: float,
+        generator: np.random.Generator,
+        before: Sequence[Segment],
     ) -> list[Segment]:
         """Returns the segments `before`, renamed; their length is what it is."""
         return [
-            replace(segment, name=f"{segment.name}_repeat_{i}", repeat_of=segment.repeat_of or segment.name)
+            replace(
+                segment,
+                name=f"{segment.name}_repeat_{i}",
+                repeat_of=segment.repeat_of or segment.name,
+            )
             for i in range(1, self.times + 1)
             for segment in before
         ]

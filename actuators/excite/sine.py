@@ -20,7 +20,8 @@ class Sine:
         highest_hz: Highest frequency.
         smallest: Smallest amplitude; amplitudes are drawn uniformly.
         largest: Largest amplitude.
-        stop_margin: A joint that would come to rest this close to its stop, as a part of its travel, is brought home.
+        stop_margin: A joint that would come to rest this close to its stop, as a part of its
+            travel, is brought home.
     """
 
     share: float
@@ -32,16 +33,24 @@ class Sine:
 
     def check(self) -> None:
         if not 0 < self.lowest_hz <= self.highest_hz:
-            raise ConfigError(f"excitation: expected 0 < lowest_hz <= highest_hz, got {self.lowest_hz} and {self.highest_hz}")
+            raise ConfigError(
+                f"excitation: expected 0 < lowest_hz <= highest_hz, got {self.lowest_hz} and {self.highest_hz}"
+            )
         if not 0 < self.smallest <= self.largest <= 1:
-            raise ConfigError(f"excitation: expected 0 < smallest <= largest <= 1, got {self.smallest} and {self.largest}")
+            raise ConfigError(
+                f"excitation: expected 0 < smallest <= largest <= 1, got {self.smallest} and {self.largest}"
+            )
 
     def weight(self, before: float) -> float:
         """Returns `share`."""
         return self.share
 
     def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator, before: Sequence[Segment]
+        self,
+        machine: Machine,
+        duration_s: float,
+        generator: np.random.Generator,
+        before: Sequence[Segment],
     ) -> list[Segment]:
         """Returns one segment a joint, from home, each of the same length, the joints in random order."""
         steps = int(duration_s / machine.num_joints / machine.period_s)
@@ -55,7 +64,11 @@ class Sine:
             u = np.zeros((steps, machine.num_joints))
             u[:, joint] = self._waves(steps, machine.period_s, generator)
             name = f"sine_{machine.joint_names[joint]}"
-            found.append(Segment(name=name, start=machine.home, u=u, stops="home", stop_margin=self.stop_margin))
+            found.append(
+                Segment(
+                    name=name, start=machine.home, u=u, stops="home", stop_margin=self.stop_margin
+                )
+            )
         return found
 
     def _waves(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
@@ -64,7 +77,9 @@ class Sine:
         shortest = max(2, round(1.0 / self.highest_hz / period_s))
         while steps - at >= shortest:
             hz = np.exp(generator.uniform(np.log(self.lowest_hz), np.log(self.highest_hz)))
-            amplitude = generator.uniform(self.smallest, self.largest) * generator.choice([-1.0, 1.0])  # may start either way
+            amplitude = generator.uniform(self.smallest, self.largest) * generator.choice(
+                [-1.0, 1.0]
+            )  # may start either way
             count = min(max(round(1.0 / hz / period_s), shortest), steps - at)
             u[at : at + count] = amplitude * np.sin(2.0 * np.pi * np.arange(count) / count)
             at += count

@@ -1,8 +1,11 @@
 """Insertion on the twin, guided and alone: python benchmarks/deploy/guided.py <folder> <trials> <at once>.
 
-Each trial is `preset=bench` with real processes, in real time. `guided`: the default mode, nothing is sent, a simulated person
-moves the levers as the policy trained behind a person shows them. `alone`: the other shipped policy commands the valves itself.
-Success is the strict one, from the captured positions. `latched`: why the guard stopped a trial until the operator pressed again.
+Each trial is `preset=bench` with real processes, in real time. `guided`: the default mode, nothing
+is sent, a simulated person
+moves the levers as the policy trained behind a person shows them. `alone`: the other shipped policy
+commands the valves itself.
+Success is the strict one, from the captured positions. `latched`: why the guard stopped a trial
+until the operator pressed again.
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ from brokk_rl.kinematics import Kinematics
 from deploy.recorder import reading
 
 SECONDS = {"guided": 55, "alone": 45}
-"""Twice what the slowest one in twenty takes in training, and half a minute until everything has started on busy cores."""
+"""Twice what the slowest one in twenty takes in training, and half a minute until everything has
+started on busy cores."""
 PORT = 43300
 BROKK = (sys.executable, "-P", "-m", "brokk_rl")
 
@@ -30,7 +34,10 @@ BROKK = (sys.executable, "-P", "-m", "brokk_rl")
 def main(folder: Path, trials: int, at_once: int) -> None:
     with hydra.initialize_config_module("conf", version_base="1.3"):
         cfg = hydra.compose("config", overrides=["mode=evaluate"])
-    machine, task = instantiate(cfg.machine, _convert_="all"), instantiate(cfg.task, _convert_="all")
+    machine, task = (
+        instantiate(cfg.machine, _convert_="all"),
+        instantiate(cfg.task, _convert_="all"),
+    )
     starts = task.build(machine, 1, torch.device("cpu")).starts(trials, 12345)
     jobs = [(kind, n) for n in range(trials) for kind in SECONDS]
 
@@ -67,7 +74,11 @@ def summary(results: list[dict[str, object]]) -> dict[str, object]:
         good = [bool(one.get("success")) for one in results if one["kind"] == kind]
         rate[kind] = sum(good) / max(1, len(good))
         found[kind] = {"trials": len(good), "success_strict": rate[kind]}
-    return {"summary": found, "ratio": rate["guided"] / rate["alone"] if rate["alone"] else None, "trials": results}
+    return {
+        "summary": found,
+        "ratio": rate["guided"] / rate["alone"] if rate["alone"] else None,
+        "trials": results,
+    }
 
 
 def judged(out: Path, machine: object, task: object, hole: np.ndarray) -> dict[str, object]:
@@ -76,7 +87,9 @@ def judged(out: Path, machine: object, task: object, hole: np.ndarray) -> dict[s
     for messages in contents.messages.values():
         for name in machine.joint_names:
             if f"Position_{name}" in messages.names:
-                positions[name] = np.stack([messages.series("t_s"), messages.series(f"Position_{name}")], 1)
+                positions[name] = np.stack(
+                    [messages.series("t_s"), messages.series(f"Position_{name}")], 1
+                )
     if len(positions) < machine.num_joints:
         return {"success": False, "error": "the twin was never heard"}
     t_s = next(iter(positions.values()))[:, 0]
@@ -84,12 +97,18 @@ def judged(out: Path, machine: object, task: object, hole: np.ndarray) -> dict[s
     tip = Kinematics(machine).pose(torch.tensor(q, dtype=torch.float32)).tip_in_base_m.numpy()
     lateral = np.linalg.norm((tip - hole)[:, :2], axis=1)
     rules = task.success
-    inside = (lateral <= task.hole.radius_m - rules.chisel_radius_m + rules.slack_m) & (hole[2] - tip[:, 2] >= rules.strict_depth_m)
+    inside = (lateral <= task.hole.radius_m - rules.chisel_radius_m + rules.slack_m) & (
+        hole[2] - tip[:, 2] >= rules.strict_depth_m
+    )
     timing = json.loads((out / "timing.json").read_text())
     late = {one["process"]: one["late_p99_s"] for one in timing["processes"]}
     moved = t_s[np.abs(q - q[0]).max(1) > 0.01]
     first_s = float(t_s[inside.argmax()] - moved[0]) if inside.any() and len(moved) else None
-    latched = [values["cause"] for _, values in contents.messages.get("guard", []) if values["state"] == "LATCHED"]
+    latched = [
+        values["cause"]
+        for _, values in contents.messages.get("guard", [])
+        if values["state"] == "LATCHED"
+    ]
     sent = any(values.get("sent") for _, values in contents.messages.get("ValveCmd", []))
     return {
         "success": bool(inside.any()),

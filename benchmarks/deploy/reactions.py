@@ -1,8 +1,9 @@
 """Reaction times with real processes: python benchmarks/deploy/reactions.py <json> [trials].
 
-Twin, bus process and a commander on a multicast bus, all with real-time priority where it is granted, the listener too. After each
-kill, stop or fault: the time until the valves get nothing any more, and until the guard commands zero, as the listener hears it. A
-fault counts from the cycle of the twin that begins with it.
+Twin, bus process and a commander on a multicast bus, all with real-time priority where it is
+granted, the listener too. After each
+kill, stop or fault: the time until the valves get nothing any more, and until the guard commands
+zero, as the listener hears it. A fault counts from the cycle of the twin that begins with it.
 """
 
 from __future__ import annotations
@@ -17,14 +18,21 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests"))
-os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT / "tests"), str(ROOT), os.environ.get("PYTHONPATH", "")])
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(ROOT / "tests"), str(ROOT), os.environ.get("PYTHONPATH", "")]
+)
 
 from composed import option  # noqa: E402
 from desk import Desk, Stop  # noqa: E402
 
 from deploy.loop.process import ask_for_priority  # noqa: E402
 
-KILLS = (("commander", signal.SIGKILL), ("commander", signal.SIGSTOP), ("bus", signal.SIGKILL), ("bus", signal.SIGSTOP))
+KILLS = (
+    ("commander", signal.SIGKILL),
+    ("commander", signal.SIGSTOP),
+    ("bus", signal.SIGKILL),
+    ("bus", signal.SIGSTOP),
+)
 FAULTS = (
     ("estop", ""), ("deadman_released", ""), ("remote_off", ""), ("drop", "JointPos1"), ("drop", "LeverState"),
     ("drop", "MachineStatus"), ("corrupt", "JointPos2"), ("freeze_counter", "JointPos1"), ("masquerade", "MachineStatus"),
@@ -58,7 +66,9 @@ def main(path: Path, trials: int) -> None:
         for fault, message in FAULTS:
             for _ in range(3):
                 desk.set_moving(60.0)
-                found.setdefault(f"{fault} {message}".strip(), []).append(desk.still_after(desk.fault(fault, message), 0.6))
+                found.setdefault(f"{fault} {message}".strip(), []).append(
+                    desk.still_after(desk.fault(fault, message), 0.6)
+                )
                 desk.fault("none")
     table = {key: row(stops) for key, stops in found.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -66,15 +76,23 @@ def main(path: Path, trials: int) -> None:
     path.write_text(json.dumps(circumstances | {"reactions": table}, indent=2) + "\n")
     for key, one in table.items():
         sys.stdout.write(
-            f"{key:28} {one['trials']:3} trials" + "".join(f"  {k} {v}" for k, v in one.items() if k.endswith("ms")) + "\n"
+            f"{key:28} {one['trials']:3} trials"
+            + "".join(f"  {k} {v}" for k, v in one.items() if k.endswith("ms"))
+            + "\n"
         )
 
 
 def row(stops: list[Stop]) -> dict[str, float]:
     """Returns what the trials of one event come to."""
     flow_ms = sorted(round(1e3 * stop.flow_s, 1) for stop in stops)
-    command_ms = sorted(round(1e3 * stop.command_s, 1) for stop in stops if stop.command_s is not None)
-    found: dict[str, float] = {"trials": len(stops), "flow_median_ms": flow_ms[len(flow_ms) // 2], "flow_worst_ms": flow_ms[-1]}
+    command_ms = sorted(
+        round(1e3 * stop.command_s, 1) for stop in stops if stop.command_s is not None
+    )
+    found: dict[str, float] = {
+        "trials": len(stops),
+        "flow_median_ms": flow_ms[len(flow_ms) // 2],
+        "flow_worst_ms": flow_ms[-1],
+    }
     return found | ({"command_worst_ms": command_ms[-1]} if command_ms else {})
 
 

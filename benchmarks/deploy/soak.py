@@ -1,8 +1,9 @@
 """A long run of the loop against the twin: lateness, memory, lost records. python benchmarks/deploy/soak.py <folder> <seconds>.
 
-A simulated person follows the advice, and the borehole is another one every 20 s, so that the machine moves all the time. Writes
-`<folder>/soak.json`: lateness of bus and policy, each process's own and shared memory every five minutes, the load, records that
-the log had to drop, and messages in the capture against those that were sent.
+A simulated person follows the advice, and the borehole is another one every 20 s, so that the
+machine moves all the time. Writes `<folder>/soak.json`: lateness of bus and policy, each process's
+own and shared memory every five minutes, the load, records that the log had to drop, and messages
+in the capture against those that were sent.
 """
 
 from __future__ import annotations
@@ -46,15 +47,30 @@ def watched(run: subprocess.Popen[bytes], folder: Path) -> list[dict[str, Any]]:
         if now_s - moved_s >= ELSEWHERE_S:
             moved_s = now_s
             part = folder / "target.part"
-            part.write_text(json.dumps({"center_in_base_m": [round(place.uniform(*ends), 3) for ends in HOLES_M]}))
+            part.write_text(
+                json.dumps(
+                    {"center_in_base_m": [round(place.uniform(*ends), 3) for ends in HOLES_M]}
+                )
+            )
             part.replace(folder / "target.json")
         if now_s - looked_s >= EVERY_S and (folder / "processes.json").exists():
             pids = json.loads((folder / "processes.json").read_text())
-            sizes = {name: size for name, pid in pids.items() if (size := memory_mb(pid)) is not None}
+            sizes = {
+                name: size for name, pid in pids.items() if (size := memory_mb(pid)) is not None
+            }
             if len(sizes) == len(pids):
                 looked_s = now_s
-                own, shared = ({name: round(size[i], 2) for name, size in sizes.items()} for i in range(2))
-                found.append({"t_s": round(now_s - began_s), "load": os.getloadavg()[0], "own_mb": own, "shared_mb": shared})
+                own, shared = (
+                    {name: round(size[i], 2) for name, size in sizes.items()} for i in range(2)
+                )
+                found.append(
+                    {
+                        "t_s": round(now_s - began_s),
+                        "load": os.getloadavg()[0],
+                        "own_mb": own,
+                        "shared_mb": shared,
+                    }
+                )
         time.sleep(LOOK_S)
     return found
 
@@ -75,11 +91,17 @@ def main(folder: Path, seconds: float) -> None:
         steps = np.diff(contents.messages[name].series("Counter")) % modulus
         gaps[name] = int((steps != 1).sum())
     late = [one for one in memory if float(one["t_s"]) >= LONG_S] or memory
-    growth = {name: round(memory[-1]["own_mb"][name] - late[0]["own_mb"][name], 2) for name in memory[-1]["own_mb"]}
+    growth = {
+        name: round(memory[-1]["own_mb"][name] - late[0]["own_mb"][name], 2)
+        for name in memory[-1]["own_mb"]
+    }
     found = {
         "seconds": seconds,
         "cores": os.cpu_count(),
-        "load": {"least": min(one["load"] for one in memory), "most": max(one["load"] for one in memory)},
+        "load": {
+            "least": min(one["load"] for one in memory),
+            "most": max(one["load"] for one in memory),
+        },
         "processes": timing["processes"],
         "log_dropped": timing["log_dropped"],
         "messages": {name: len(messages) for name, messages in contents.messages.items()},
@@ -88,7 +110,9 @@ def main(folder: Path, seconds: float) -> None:
         "memory": memory,
     }
     (folder / "soak.json").write_text(json.dumps(found, indent=1) + "\n")
-    sys.stdout.write(json.dumps({key: found[key] for key in found if key != "memory"}, indent=1) + "\n")
+    sys.stdout.write(
+        json.dumps({key: found[key] for key in found if key != "memory"}, indent=1) + "\n"
+    )
 
 
 if __name__ == "__main__":

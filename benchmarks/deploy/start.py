@@ -1,8 +1,9 @@
 """From the command to an open bus and the first cycle of the policy: [chrt -r 1] python benchmarks/deploy/start.py <file> <trials>.
 
-`brokk preset=machine` on a bus of datagrams, as nothing else is here. Wall time from the command on, and what each process computed
-until the bus was open. With `chrt -r 1` as on a computer that has nothing else to do. The first trial is not counted: modules are
-compiled in it, as once after each installation, unless Python is kept from storing that (`PYTHONDONTWRITEBYTECODE`).
+`brokk preset=machine` on a bus of datagrams, as nothing else is here. Wall time from the command
+on, and what each process computed until the bus was open. With `chrt -r 1` as on a computer that
+has nothing else to do. The first trial is not counted: modules are compiled in it, as once after
+each installation, unless Python is kept from storing that (`PYTHONDONTWRITEBYTECODE`).
 """
 
 from __future__ import annotations
@@ -46,13 +47,20 @@ def trial(folder: Path) -> dict[str, Any]:
     while not (folder / "processes.json").exists():
         time.sleep(0.01)
     pids = json.loads((folder / "processes.json").read_text())
-    computed = {"command": computed_s(run.pid)} | {name: computed_s(pid) for name, pid in pids.items()}
+    computed = {"command": computed_s(run.pid)} | {
+        name: computed_s(pid) for name, pid in pids.items()
+    }
     time.sleep(2.0)
     run.send_signal(signal.SIGINT)
     run.stderr.read()
     run.wait(PATIENCE_S)
     cycle_s = reading.read(folder / "capture.mcap").messages["advice"][0][0] - begun_s
-    return {"bus_open_s": round(open_s, 3), "policy_cycle_s": round(cycle_s, 3), "computed_s": computed, "load": os.getloadavg()[0]}
+    return {
+        "bus_open_s": round(open_s, 3),
+        "policy_cycle_s": round(cycle_s, 3),
+        "computed_s": computed,
+        "load": os.getloadavg()[0],
+    }
 
 
 def main(file: Path, trials: int) -> None:
@@ -65,12 +73,22 @@ def main(file: Path, trials: int) -> None:
     del found[0]
     ahead = os.sched_getscheduler(0) != os.SCHED_OTHER
     summary = {
-        key: {"median": statistics.median(one[key] for one in found), "worst": max(one[key] for one in found)}
+        key: {
+            "median": statistics.median(one[key] for one in found),
+            "worst": max(one[key] for one in found),
+        }
         for key in ("bus_open_s", "policy_cycle_s")
     }
     file.write_text(
         json.dumps(
-            {"ahead": ahead, "bytecode": not sys.dont_write_bytecode, "cores": os.cpu_count(), **summary, "trials": found}, indent=1
+            {
+                "ahead": ahead,
+                "bytecode": not sys.dont_write_bytecode,
+                "cores": os.cpu_count(),
+                **summary,
+                "trials": found,
+            },
+            indent=1,
         )
         + "\n"
     )

@@ -1,7 +1,7 @@
 """Floors of an exam's plants: a base is fitted to the reference of cases without a gap, and runs free through their field.
 
-    brokk mode=exam exam.mix.num_cases=6 'exam.mix.shares={none: 1, faint: 0, one: 0, several: 0, outside: 0}' session.out=<exam>
-    python benchmarks/exam/floors.py <exam> hydraulic 0000 0001 …
+    brokk mode=exam exam.mix.num_cases=6 'exam.mix.shares={none: 1, faint: 0, one: 0, several: 0,
+    outside: 0}' session.out=<exam> python benchmarks/exam/floors.py <exam> hydraulic 0000 0001 …
 
 Prints the root mean square error over 5 s free runs and at their end, all joints together, mrad.
 """
@@ -23,12 +23,15 @@ from brokk_rl.split import by_run
 def main(exam: Path, fit_name: str, cases: list[str], *overrides: str) -> None:
     torch.set_num_threads(1)
     with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", ["mode=identify", f"fit={fit_name}", "identify.recordings=x", *overrides])
+        cfg = hydra.compose(
+            "config", ["mode=identify", f"fit={fit_name}", "identify.recordings=x", *overrides]
+        )
     machine, fit = (instantiate(cfg[name], _convert_="all") for name in ("machine", "fit"))
     for case in cases:
         begun = time.monotonic()
         reference, field = (
-            record.read_all(str(exam / "cases" / case / half / "*.parquet"), machine) for half in ("reference", "field")
+            record.read_all(str(exam / "cases" / case / half / "*.parquet"), machine)
+            for half in ("reference", "field")
         )
         runs = list(by_run(reference).values())
         train, validation = [recording for run in runs[:-1] for recording in run], runs[-1]
@@ -36,7 +39,10 @@ def main(exam: Path, fit_name: str, cases: list[str], *overrides: str) -> None:
             actuator = fit.fit(machine, train, validation, Path(folder), 0, torch.device("cpu"))
             cut = open_loop.windows(field, machine, 5.0, 1.0)
             error = open_loop.free_run(actuator, machine, cut, torch.device("cpu")) - cut.measured
-        over, end = (1000.0 * np.sqrt((part**2).mean((0, 1) if part.ndim == 3 else 0)) for part in (error, error[:, -1]))
+        over, end = (
+            1000.0 * np.sqrt((part**2).mean((0, 1) if part.ndim == 3 else 0))
+            for part in (error, error[:, -1])
+        )
         print(
             f"{exam.name} {case} {fit_name}: over 5 s {np.sqrt((over**2).mean()):.1f} ({np.round(over, 1)}), "
             f"at the end {np.sqrt((end**2).mean()):.1f} mrad, {time.monotonic() - begun:.0f} s",
@@ -45,4 +51,9 @@ def main(exam: Path, fit_name: str, cases: list[str], *overrides: str) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2], [name for name in sys.argv[3:] if "=" not in name], *[x for x in sys.argv[3:] if "=" in x])
+    main(
+        Path(sys.argv[1]),
+        sys.argv[2],
+        [name for name in sys.argv[3:] if "=" not in name],
+        *[x for x in sys.argv[3:] if "=" in x],
+    )

@@ -1,9 +1,11 @@
 """How fast the page is, in a headless Chromium: [chrt -r 1] python benchmarks/page/measure.py [out.json]
 
-Advice at 20 Hz and levers at 50 Hz as from the loop, frames of 640 x 360 px at 3 and at 10 Hz, the 3D scene beside them. Latency is
-from the moment an advice stands in the feed to the moment its frame is through layout and paint, by the browser's clock, translated
-to ours to half the round trip. Of it: on the way from the server to the page, and in the browser until drawn; the rest it waited
-for the server to look. Frame rate and bytes are what the browser has drawn and received.
+Advice at 20 Hz and levers at 50 Hz as from the loop, frames of 640 x 360 px at 3 and at 10 Hz, the
+3D scene beside them. Latency is from the moment an advice stands in the feed to the moment its
+frame is through layout and paint, by the browser's clock, translated
+to ours to half the round trip. Of it: on the way from the server to the page, and in the browser
+until drawn; the rest it waited for the server to look. Frame rate and bytes are what the browser
+has drawn and received.
 """
 
 from __future__ import annotations
@@ -79,7 +81,9 @@ def measure(browser: Any, rate_hz: float, scene: bool) -> dict[str, Any]:
         context = browser.new_context(viewport=SIZE)
         page = context.new_page()
         if not scene:
-            page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))
+            page.route(
+                "**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body="")
+            )
         page.goto(f"http://localhost:{port}/")
         time.sleep(WARM_S)
         Parted.in_browser_ms.clear()
@@ -128,11 +132,15 @@ def main() -> None:
             "browser": f"Chromium {browser.version}, headless",
             "flags": FLAGS,
             "cores": os.cpu_count(),
-            "scheduler": {os.SCHED_OTHER: "ordinary", os.SCHED_FIFO: "fifo", os.SCHED_RR: "rr"}.get(os.sched_getscheduler(0)),
+            "scheduler": {os.SCHED_OTHER: "ordinary", os.SCHED_FIFO: "fifo", os.SCHED_RR: "rr"}.get(
+                os.sched_getscheduler(0)
+            ),
             "window": SIZE,
             "seconds": SECONDS,
         }
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    ).stdout.strip()
     text = json.dumps(facts | {"seconds": SECONDS, "commit": commit, "rows": rows}, indent=1)
     if len(sys.argv) > 1:
         Path(sys.argv[1]).write_text(text + "\n")

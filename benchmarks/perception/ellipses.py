@@ -31,9 +31,13 @@ NONE = np.empty((0, 5))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
-    parser.add_argument("options", nargs="+", help="an option of perception/ellipse, with overrides after it")
+    parser.add_argument(
+        "options", nargs="+", help="an option of perception/ellipse, with overrides after it"
+    )
     parser.add_argument("--count", type=int, default=10, help="pictures of each kind")
     parser.add_argument("--seed", type=int, default=1000)
     given = parser.parse_args()
@@ -43,12 +47,17 @@ def main() -> None:
     for option in given.options:
         detector = build(option)
         for kind, draw in track(list(kinds()), description=option, transient=True):
-            rows.append({"ellipse": option, "kind": kind, **judged(detector, draw, given.count, given.seed)})
+            rows.append(
+                {"ellipse": option, "kind": kind, **judged(detector, draw, given.count, given.seed)}
+            )
             (given.out / "ellipses.json").write_text(json.dumps(rows, indent=1) + "\n")
     table = Table(*rows[0])
     for row in rows:
         table.add_row(
-            *("–" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values())
+            *(
+                "–" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+                for value in row.values()
+            )
         )
     Console().print(table)
 
@@ -56,7 +65,10 @@ def main() -> None:
 def kinds() -> Iterator[tuple[str, Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]]]:
     """Yields each kind of picture and what draws one."""
     for condition in CONDITIONS:
-        yield f"pattern, {condition}", lambda generator, condition=condition: pattern(generator, condition)
+        yield (
+            f"pattern, {condition}",
+            lambda generator, condition=condition: pattern(generator, condition),
+        )
     for style in STYLES:
         yield f"photograph, {style}", lambda generator, style=style: photograph(generator, style)
     for style in HIDDEN:
@@ -71,11 +83,16 @@ def build(option: str) -> EllipseDetector:
     """Returns the detector of an option."""
     name, *overrides = option.split()
     with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", ["mode=perceive", "perceive.input=.", f"perception/ellipse={name}", *overrides])
+        cfg = hydra.compose(
+            "config",
+            ["mode=perceive", "perceive.input=.", f"perception/ellipse={name}", *overrides],
+        )
     return instantiate(cfg.perception.ellipse, _convert_="all").build()
 
 
-def judged(detector: EllipseDetector, draw: Callable, count: int, seed: int) -> dict[str, float | int | None]:
+def judged(
+    detector: EllipseDetector, draw: Callable, count: int, seed: int
+) -> dict[str, float | int | None]:
     """Returns what a detector makes of so many pictures of a kind."""
     hits = found = there = 0
     ms = []
@@ -84,7 +101,11 @@ def judged(detector: EllipseDetector, draw: Callable, count: int, seed: int) -> 
         start = time.perf_counter()
         seen = detector.detect(picture, None, None)
         ms.append(1000 * (time.perf_counter() - start))
-        hits, found, there = hits + (matches(seen, truth) if len(truth) else 0), found + len(seen), there + len(truth)
+        hits, found, there = (
+            hits + (matches(seen, truth) if len(truth) else 0),
+            found + len(seen),
+            there + len(truth),
+        )
     precision, recall = hits / found if found else None, hits / there if there else None
     f = 2 * precision * recall / (precision + recall) if precision and recall else None
     return {"pictures": count, "true": there, "false": found - hits, "precision": precision, "recall": recall, "f": f,

@@ -2,8 +2,9 @@
 
     python benchmarks/perception/masks.py <out.json> <segmenter> [override ...] -- <folder> ...
 
-`<segmenter>` is an option of perception/segmenter, overrides begin with `segmenter.`; folders hold frames with masks
-(`brokk mode=render`), each one is a row. Frames without depth will do for the networks.
+`<segmenter>` is an option of perception/segmenter, overrides begin with `segmenter.`; folders hold
+frames with masks (`brokk mode=render`), each one is a row. Frames without depth will do for the
+networks.
 """
 
 from __future__ import annotations
@@ -37,8 +38,19 @@ def main() -> None:
     for folder in sys.argv[cut + 1 :]:
         segmenter, source = built(name, overrides, folder)
         rows[Path(folder).name] = judged(segmenter, source, Path(folder).name)
-    Path(out).write_text(json.dumps({"segmenter": name, "overrides": overrides, "rows": rows}, indent=1) + "\n")
-    table = Table("frames of", "count", "block IoU", "mouth IoU", "mouths found", "false a frame", "ms", title=name)
+    Path(out).write_text(
+        json.dumps({"segmenter": name, "overrides": overrides, "rows": rows}, indent=1) + "\n"
+    )
+    table = Table(
+        "frames of",
+        "count",
+        "block IoU",
+        "mouth IoU",
+        "mouths found",
+        "false a frame",
+        "ms",
+        title=name,
+    )
     for row, figures in rows.items():
         cells = ("–" if figures[key] is None else f"{figures[key]:.3g}" for key in FIGURES)
         table.add_row(row, str(figures["frames"]), *cells)
@@ -52,7 +64,9 @@ def built(name: str, overrides: list[str], folder: str) -> tuple[Segmenter, Fram
             ["~mode", f"+perception/segmenter@segmenter={name}", "+perception/source@source=folder", f"source.folder={folder}",
              "source.needs=camera", *overrides],
         )  # fmt: skip
-    segmenter, source = (instantiate(cfg[key], _convert_="all").build() for key in ("segmenter", "source"))
+    segmenter, source = (
+        instantiate(cfg[key], _convert_="all").build() for key in ("segmenter", "source")
+    )
     return segmenter, source
 
 
@@ -70,12 +84,17 @@ def judged(segmenter: Segmenter, source: FrameSource, name: str) -> dict[str, fl
             ms.append(1000 * (time.perf_counter() - start))
             label = dataset.read_label(Path(frame.name))
             mouth = np.zeros_like(label.mouth) if masks.mouth is None else masks.mouth > THRESHOLD
-            for channel, (said, known) in enumerate(((masks.block > THRESHOLD, label.block), (mouth, label.mouth))):
+            for channel, (said, known) in enumerate(
+                ((masks.block > THRESHOLD, label.block), (mouth, label.mouth))
+            ):
                 shared[channel] += (said & known).sum()
                 either[channel] += (said | known).sum()
                 real[channel] += known.sum()
             counts += pieces(mouth, label.mouth)
-    block, mouth = (float(a / b) if any_real else None for a, b, any_real in zip(shared, either, real, strict=True))
+    block, mouth = (
+        float(a / b) if any_real else None
+        for a, b, any_real in zip(shared, either, real, strict=True)
+    )
     found, there, false = counts
     return {
         "frames": len(ms), "block": block, "mouth": mouth, "found": float(found / there) if there else None,

@@ -2,9 +2,10 @@
 
     taskset -c 0,1 python benchmarks/perception/speed.py <out.json> --count 6 --threads 2
 
-Renders scenes of several conditions at 1 to 4 m, looks at each several times and takes the shortest: what else runs on the machine
-makes the others longer. Writes the milliseconds of each stage, how much processor time the whole took (which a busy machine changes
-less), the load that there was meanwhile, and the processor's name.
+Renders scenes of several conditions at 1 to 4 m, looks at each several times and takes the
+shortest: what else runs on the machine makes the others longer. Writes the milliseconds of each
+stage, how much processor time the whole took (which a busy machine changes less), the load that
+there was meanwhile, and the processor's name.
 """
 
 from __future__ import annotations
@@ -32,14 +33,20 @@ STAGES = ("segment", "ellipse", "pose", "total", "processor_time")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--option", default="plane_conic")
-    parser.add_argument("--count", type=int, default=6, help="scenes of each condition and distance")
+    parser.add_argument(
+        "--count", type=int, default=6, help="scenes of each condition and distance"
+    )
     parser.add_argument("--threads", type=int, default=2)
     given = parser.parse_args()
     cv2.setNumThreads(given.threads)
-    observer = configured("perception", "mode=perceive", "perceive.input=.", f"perception={given.option}").build()
+    observer = configured(
+        "perception", "mode=perceive", "perceive.input=.", f"perception={given.option}"
+    ).build()
     shortest = []
     kinds = [(condition, distance_m) for condition in CONDITIONS for distance_m in DISTANCES_M]
     for number, (condition, distance_m) in enumerate(track(kinds * given.count, transient=True)):
@@ -49,7 +56,9 @@ def main() -> None:
             start, busy = time.perf_counter(), time.process_time()
             ms = observer.look(frame).ms
             total, spent = time.perf_counter() - start, time.process_time() - busy
-            looks.append([ms.get(stage, 0.0) for stage in STAGES[:-2]] + [1000.0 * total, 1000.0 * spent])
+            looks.append(
+                [ms.get(stage, 0.0) for stage in STAGES[:-2]] + [1000.0 * total, 1000.0 * spent]
+            )
         shortest.append(min(looks, key=lambda look: look[-2]))
     table = {stage: {"median": float(np.median(ms)), "p95": float(np.percentile(ms, 95))}
              for stage, ms in zip(STAGES, np.array(shortest).T, strict=True)}  # fmt: skip
@@ -61,7 +70,12 @@ def main() -> None:
 
 def rendered(condition: str, distance_m: float, number: int) -> Frame:
     """Returns a frame of a scene that is drawn for it."""
-    studio = configured("studio", "mode=render", f"scene={condition}", f"scene.sight.distance_m=[{distance_m},{distance_m}]")
+    studio = configured(
+        "studio",
+        "mode=render",
+        f"scene={condition}",
+        f"scene.sight.distance_m=[{distance_m},{distance_m}]",
+    )
     generator = np.random.default_rng((7, number))
     shot = studio.shot(compose(studio.scene, studio.rig, generator), generator)
     return Frame(
@@ -79,7 +93,9 @@ def configured(key: str, *overrides: str) -> Any:
 def processor() -> str:
     """Returns what the processor calls itself."""
     told = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
-    names = [line.split(":")[1].strip() for line in told.splitlines() if line.startswith("model name")]
+    names = [
+        line.split(":")[1].strip() for line in told.splitlines() if line.startswith("model name")
+    ]
     return names[0] if names else platform.processor() or platform.machine()
 
 

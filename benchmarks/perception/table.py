@@ -1,10 +1,13 @@
 """The table of perception: rendered scenes of each condition and distance, any options of perception side by side.
 
-    python benchmarks/perception/table.py <out> --count 200 --processes 64 plane_conic paper 'plane_conic perception/segmenter=onnx'
+    python benchmarks/perception/table.py <out> --count 200 --processes 64 plane_conic paper
+    'plane_conic perception/segmenter=onnx'
 
-Each scene is rendered, looked at and forgotten; what came of it is a line of `<out>/frames.jsonl`. Called again, it goes on where
-it stopped, with more scenes or more options too. Writes `table.json`, `table.csv`, `table.png`, the error model for `task.noise`
-into `noise.json`, and pictures of what went wrong, with the reasons, into `failures/`. A fixed seed: the same scenes everywhere.
+Each scene is rendered, looked at and forgotten; what came of it is a line of `<out>/frames.jsonl`.
+Called again, it goes on where it stopped, with more scenes or more options too. Writes
+`table.json`, `table.csv`, `table.png`, the error model for `task.noise` into `noise.json`, and
+pictures of what went wrong, with the reasons, into `failures/`. A fixed seed: the same scenes
+everywhere.
 """
 
 from __future__ import annotations
@@ -59,28 +62,48 @@ class Task:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument(
-        "options", nargs="+", help="an option of perception, with overrides after it: 'plane_conic perception.apart=2'"
+        "options",
+        nargs="+",
+        help="an option of perception, with overrides after it: 'plane_conic perception.apart=2'",
     )
-    parser.add_argument("--count", type=int, default=200, help="scenes of each condition and distance")
+    parser.add_argument(
+        "--count", type=int, default=200, help="scenes of each condition and distance"
+    )
     parser.add_argument("--conditions", nargs="+", default=CONDITIONS)
     parser.add_argument("--distances", nargs="+", type=float, default=(1.0, 2.0, 3.0, 4.0))
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=1, help="of the scenes; networks are trained on those of others")
     parser.add_argument(
-        "--pictures", type=int, default=12, help="at most so many pictures of failures of each row of the first option"
+        "--seed", type=int, default=1, help="of the scenes; networks are trained on those of others"
+    )
+    parser.add_argument(
+        "--pictures",
+        type=int,
+        default=12,
+        help="at most so many pictures of failures of each row of the first option",
     )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     path = given.out / "frames.jsonl"
-    done = {(line["condition"], line["distance_m"], line["number"], line["option"]) for line in read(path)}
+    done = {
+        (line["condition"], line["distance_m"], line["number"], line["option"])
+        for line in read(path)
+    }
     tasks = []
-    for number in range(given.count):  # scene by scene over all rows: stopped early, all of them have as many
+    for number in range(
+        given.count
+    ):  # scene by scene over all rows: stopped early, all of them have as many
         for condition in given.conditions:
             for distance_m in given.distances:
-                left = tuple(option for option in given.options if (condition, distance_m, number, option) not in done)
+                left = tuple(
+                    option
+                    for option in given.options
+                    if (condition, distance_m, number, option) not in done
+                )
                 if left:
                     tasks.append(
                         Task(
@@ -102,9 +125,15 @@ def main() -> None:
 def work(tasks: list[Task], path: Path, processes: int) -> None:
     """Renders and looks, in as many processes; each line is written as it comes, so an interruption loses nothing."""
     context = multiprocessing.get_context("spawn")
-    with context.Pool(min(processes, len(tasks)), ready) as pool, path.open("a") as file, Progress() as progress:
+    with (
+        context.Pool(min(processes, len(tasks)), ready) as pool,
+        path.open("a") as file,
+        Progress() as progress,
+    ):
         try:
-            for lines in progress.track(pool.imap_unordered(look, tasks), total=len(tasks), description="scenes"):
+            for lines in progress.track(
+                pool.imap_unordered(look, tasks), total=len(tasks), description="scenes"
+            ):
                 file.writelines(json.dumps(line) + "\n" for line in lines)
                 file.flush()
         except KeyboardInterrupt:
@@ -130,7 +159,12 @@ def look(task: Task) -> list[dict[str, Any]]:
     for option in task.options:
         seer = observer(option)
         tally, sighting = judge(seer, frame, shot.truth)
-        place = {"condition": task.condition, "distance_m": task.distance_m, "number": task.number, "option": option}
+        place = {
+            "condition": task.condition,
+            "distance_m": task.distance_m,
+            "number": task.number,
+            "option": option,
+        }
         lines.append({**place, "tally": asdict(tally)})
         if not tally.is_perfect and option == task.shown:
             name = f"{option.replace(' ', '_').replace('/', '-')}_{task.condition}_{task.distance_m:g}m"
@@ -144,7 +178,8 @@ def show_failure(task: Task, name: str, frame: Frame, sighting: Sighting, seer: 
     if len(list(task.failures.glob(f"{name}_*.png"))) < task.pictures:
         drawing().write(task.failures / f"{name}_{task.number:04d}.png", frame, sighting)
         told = [
-            f"score {hole.score:.2f}, radius {hole.radius_m:.4f} m at {hole.center_m.round(4).tolist()}" for hole in sighting.holes
+            f"score {hole.score:.2f}, radius {hole.radius_m:.4f} m at {hole.center_m.round(4).tolist()}"
+            for hole in sighting.holes
         ]
         told += [seer.explain(one) for one in sighting.rejected]
         (task.failures / f"{name}_{task.number:04d}.txt").write_text("\n".join(told) + "\n")
@@ -152,13 +187,20 @@ def show_failure(task: Task, name: str, frame: Frame, sighting: Sighting, seer: 
 
 @functools.cache
 def renderer(condition: str, distance_m: float) -> Studio:
-    return composed("studio", "mode=render", f"scene={condition}", f"scene.sight.distance_m=[{distance_m},{distance_m}]")
+    return composed(
+        "studio",
+        "mode=render",
+        f"scene={condition}",
+        f"scene.sight.distance_m=[{distance_m},{distance_m}]",
+    )
 
 
 @functools.cache
 def observer(option: str) -> Observer:
     name, *overrides = option.split()
-    return composed("perception", "mode=perceive", f"perception={name}", "perceive.input=.", *overrides).build()
+    return composed(
+        "perception", "mode=perceive", f"perception={name}", "perceive.input=.", *overrides
+    ).build()
 
 
 @functools.cache
@@ -194,16 +236,25 @@ def rows(path: Path, options: list[str]) -> list[dict[str, Any]]:
             tallies[line["option"], line["condition"], line["distance_m"]] += Tally(**line["tally"])
     order = {name: number for number, name in enumerate((*options, *CONDITIONS))}
     found = []
-    for option, condition, distance_m in sorted(tallies, key=lambda key: (order[key[0]], order[key[1]], key[2])):
+    for option, condition, distance_m in sorted(
+        tallies, key=lambda key: (order[key[0]], order[key[1]], key[2])
+    ):
         tally = tallies[option, condition, distance_m]
-        row = {"perception": option, "condition": condition, "distance_m": distance_m, **tally.row()}
+        row = {
+            "perception": option,
+            "condition": condition,
+            "distance_m": distance_m,
+            **tally.row(),
+        }
         other = (
             tallies[BASELINE, condition, distance_m].row()["position_mm_median"]
             if (BASELINE, condition, distance_m) in tallies
             else None
         )
         mine = row["position_mm_median"]
-        found.append({**row, "times_better": other / mine if other and mine else None, **tally.noise()})
+        found.append(
+            {**row, "times_better": other / mine if other and mine else None, **tally.noise()}
+        )
     return found
 
 
@@ -219,11 +270,20 @@ def write(out: Path, found: list[dict[str, Any]]) -> None:
         writer.writerows(found)
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
     for axis, key in zip(axes, ("position_mm_p95", "normal_deg_p95", "recall"), strict=True):
-        for option, condition in dict.fromkeys((row["perception"], row["condition"]) for row in found):
-            line = [row for row in found if (row["perception"], row["condition"]) == (option, condition) and row[key] is not None]
+        for option, condition in dict.fromkeys(
+            (row["perception"], row["condition"]) for row in found
+        ):
+            line = [
+                row
+                for row in found
+                if (row["perception"], row["condition"]) == (option, condition)
+                and row[key] is not None
+            ]
             if line:
                 place = [row["distance_m"] for row in line]
-                axis.plot(place, [row[key] for row in line], marker="o", label=f"{option}, {condition}")
+                axis.plot(
+                    place, [row[key] for row in line], marker="o", label=f"{option}, {condition}"
+                )
         axis.set(xlabel="distance, m", title=key, yscale="linear" if key == "recall" else "log")
     axes[0].legend(fontsize=6)
     figure.savefig(out / "table.png", dpi=150)
@@ -231,7 +291,13 @@ def write(out: Path, found: list[dict[str, Any]]) -> None:
     table = Table("perception", "condition", "m", "frames", *SHOWN)
     for row in found:
         cells = ["–" if row[key] is None else f"{row[key]:.3g}" for key in SHOWN]
-        table.add_row(row["perception"], row["condition"], f"{row['distance_m']:g}", str(row["frames"]), *cells)
+        table.add_row(
+            row["perception"],
+            row["condition"],
+            f"{row['distance_m']:g}",
+            str(row["frames"]),
+            *cells,
+        )
     Console(width=220).print(table)
 
 

@@ -1,7 +1,8 @@
 """Is it a valid actuator, effect, excitation, follower, task, world, finder or link? What these checkers accept is one.
 
-Each builds the object, exercises it against the promises of its Protocol in `brokk_rl.contracts`, and raises an `AssertionError`
-that says which promise was broken. Our own tests run them over every option of each config group; an extension over its own:
+Each builds the object, exercises it against the promises of its Protocol in `brokk_rl.contracts`,
+and raises an `AssertionError` that says which promise was broken. Our own tests run them over every
+option of each config group; an extension over its own:
 
     def test_my_actuator_is_an_actuator():
         check_actuator(MyActuator(gain=1.0), machine)

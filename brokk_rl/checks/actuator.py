@@ -23,17 +23,25 @@ from brokk_rl.machine import Machine
 NUM_STEPS = 20
 
 
-def check_actuator(actuator: Actuator, machine: Machine, device: torch.device | str = "cpu") -> None:
+def check_actuator(
+    actuator: Actuator, machine: Machine, device: torch.device | str = "cpu"
+) -> None:
     """Checks what `Actuator.build` returns against `ActuatorModel`."""
     with own_randomness():
-        check_actuator_model(actuator.build(machine, NUM_ENVS, torch.device(device)), machine, torch.device(device))
+        check_actuator_model(
+            actuator.build(machine, NUM_ENVS, torch.device(device)), machine, torch.device(device)
+        )
 
 
 def check_effect(effect: Effect, machine: Machine, device: torch.device | str = "cpu") -> None:
     """Checks that an effect around the simplest actuator model is again an actuator model."""
     with own_randomness():
         inner = _Proportional(machine, torch.device(device))
-        check_actuator_model(effect.wrap(inner, machine, NUM_ENVS, torch.device(device)), machine, torch.device(device))
+        check_actuator_model(
+            effect.wrap(inner, machine, NUM_ENVS, torch.device(device)),
+            machine,
+            torch.device(device),
+        )
 
 
 def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.device) -> None:
@@ -45,20 +53,35 @@ def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.d
     begin = copies(model.state)
 
     first = _drive(model, machine, device)
-    require(first.shape == (NUM_STEPS, NUM_ENVS, machine.num_joints), f"step: expected {(NUM_ENVS, machine.num_joints)} positions")
     require(
-        first.dtype == torch.float32 and first.device.type == device.type, f"step: expected float32 on {device}, got {first.dtype}"
+        first.shape == (NUM_STEPS, NUM_ENVS, machine.num_joints),
+        f"step: expected {(NUM_ENVS, machine.num_joints)} positions",
     )
-    require(bool(first.isfinite().all()), "step: positions are not finite under full and random commands")
-    require(in_place(model.state, place), "state: a tensor moved or changed its shape; write it in place")
+    require(
+        first.dtype == torch.float32 and first.device.type == device.type,
+        f"step: expected float32 on {device}, got {first.dtype}",
+    )
+    require(
+        bool(first.isfinite().all()),
+        "step: positions are not finite under full and random commands",
+    )
+    require(
+        in_place(model.state, place),
+        "state: a tensor moved or changed its shape; write it in place",
+    )
 
-    require_memory_in_state(model, begin, first, lambda alter: _drive(model, machine, device, alter_first=alter))
+    require_memory_in_state(
+        model, begin, first, lambda alter: _drive(model, machine, device, alter_first=alter)
+    )
 
     model.reset(everywhere)
     history = rest_history(machine, device)
     moved = (model.step(history) - history.q[:, -1]).abs().amax(0).cpu().numpy()
     limit = machine.max_speed * machine.period_s
-    require(bool((moved <= limit).all()), f"reset: at rest and without a command the joints move by {moved} in one period")
+    require(
+        bool((moved <= limit).all()),
+        f"reset: at rest and without a command the joints move by {moved} in one period",
+    )
 
 
 class _Proportional:
@@ -66,7 +89,9 @@ class _Proportional:
 
     def __init__(self, machine: Machine, device: torch.device) -> None:
         self.state: dict[str, torch.Tensor] = {}
-        self._step = torch.as_tensor(machine.max_speed * machine.period_s, dtype=torch.float32, device=device)
+        self._step = torch.as_tensor(
+            machine.max_speed * machine.period_s, dtype=torch.float32, device=device
+        )
 
     def reset(self, mask: torch.Tensor) -> None:
         """Has no memory."""
@@ -75,7 +100,9 @@ class _Proportional:
         return history.q[:, -1] + history.u[:, -1] * self._step
 
 
-def _drive(model: ActuatorModel, machine: Machine, device: torch.device, alter_first: bool = False) -> torch.Tensor:
+def _drive(
+    model: ActuatorModel, machine: Machine, device: torch.device, alter_first: bool = False
+) -> torch.Tensor:
     """Returns the positions under random and full commands, `(T, N, J)`; `alter_first` changes those of environment 0."""
     generator = torch.Generator().manual_seed(0)
     history, found = rest_history(machine, device), []
@@ -87,7 +114,10 @@ def _drive(model: ActuatorModel, machine: Machine, device: torch.device, alter_f
         history.push_u(u.to(device))
         kept = copies(vars(history))
         q = model.step(history).clone()
-        require(all(same(value, kept[name]) for name, value in vars(history).items()), "step: changed the history")
+        require(
+            all(same(value, kept[name]) for name, value in vars(history).items()),
+            "step: changed the history",
+        )
         history.push_q(q)
         found.append(q)
     return torch.stack(found)

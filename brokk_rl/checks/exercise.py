@@ -17,9 +17,13 @@ NUM_ENVS = 4
 def rest_history(machine: Machine, device: torch.device, q: torch.Tensor | None = None) -> History:
     """Returns a history at rest at `q`, or in the middle of the travel."""
     if q is None:
-        q = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32, device=device).repeat(NUM_ENVS, 1)
+        q = torch.as_tensor(
+            (machine.lower + machine.upper) / 2, dtype=torch.float32, device=device
+        ).repeat(NUM_ENVS, 1)
     shape = (NUM_ENVS, machine.num_history, machine.num_joints)
-    return History(q=q[:, None, :].repeat(1, machine.num_history, 1), u=torch.zeros(shape, device=device))
+    return History(
+        q=q[:, None, :].repeat(1, machine.num_history, 1), u=torch.zeros(shape, device=device)
+    )
 
 
 @contextmanager
@@ -39,7 +43,10 @@ def require(condition: bool, message: str) -> None:
 def require_rows(tensors: Mapping[str, torch.Tensor], what: str) -> None:
     """Checks that every tensor has one row per environment."""
     for name, value in tensors.items():
-        require(len(value) == NUM_ENVS, f"{what} '{name}': expected {NUM_ENVS} rows, got shape {tuple(value.shape)}")
+        require(
+            len(value) == NUM_ENVS,
+            f"{what} '{name}': expected {NUM_ENVS} rows, got shape {tuple(value.shape)}",
+        )
 
 
 def places(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -50,7 +57,8 @@ def places(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 def in_place(tensors: Mapping[str, torch.Tensor], before: Mapping[str, torch.Tensor]) -> bool:
     """Says whether all tensors lie where `places` saw them, in the same shape."""
     return tensors.keys() == before.keys() and all(
-        value.data_ptr() == before[name].data_ptr() and value.shape == before[name].shape for name, value in tensors.items()
+        value.data_ptr() == before[name].data_ptr() and value.shape == before[name].shape
+        for name, value in tensors.items()
     )
 
 
@@ -84,7 +92,10 @@ class Stateful(Protocol):
 
 
 def require_memory_in_state(
-    model: Stateful, begin: Mapping[str, torch.Tensor], first: torch.Tensor, run: Callable[[bool], torch.Tensor]
+    model: Stateful,
+    begin: Mapping[str, torch.Tensor],
+    first: torch.Tensor,
+    run: Callable[[bool], torch.Tensor],
 ) -> None:
     """Checks that a reset keeps to its mask, that all memory is in `state`, and that environments do not mix.
 
@@ -99,8 +110,17 @@ def require_memory_in_state(
     some[0] = True
     model.reset(some)
     for name, value in model.state.items():
-        require(same(value[1:], end[name][1:]), f"reset: state '{name}' changed in environments outside the mask")
+        require(
+            same(value[1:], end[name][1:]),
+            f"reset: state '{name}' changed in environments outside the mask",
+        )
     restore(model.state, begin)
-    require(same(run(False), first), "step: from the same state the same commands lead elsewhere; all memory belongs in state")
+    require(
+        same(run(False), first),
+        "step: from the same state the same commands lead elsewhere; all memory belongs in state",
+    )
     restore(model.state, begin)
-    require(same(run(True)[:, 1:], first[:, 1:]), "step: what happens in environment 0 changes the others")
+    require(
+        same(run(True)[:, 1:], first[:, 1:]),
+        "step: what happens in environment 0 changes the others",
+    )

@@ -21,7 +21,9 @@ from brokk_rl.machine import Machine, exclusive_mask
 NUM_STEPS = 60
 
 
-def check_follower(follower: Follower, machine: Machine, device: torch.device | str = "cpu") -> None:
+def check_follower(
+    follower: Follower, machine: Machine, device: torch.device | str = "cpu"
+) -> None:
     """Checks what `Follower.build` returns against `FollowerModel`."""
     place = torch.device(device)
     with own_randomness():
@@ -38,7 +40,8 @@ def _check_model(model: FollowerModel, machine: Machine, device: torch.device) -
     shape = (NUM_STEPS, NUM_ENVS, machine.num_joints)
     require(first.shape == shape, f"step: expected commands of shape {shape[1:]}")
     require(
-        first.dtype == torch.float32 and first.device.type == device.type, f"step: expected float32 on {device}, got {first.dtype}"
+        first.dtype == torch.float32 and first.device.type == device.type,
+        f"step: expected float32 on {device}, got {first.dtype}",
     )
     require(bool(first.isfinite().all()), "step: commands are not finite")
     require(bool((first.abs() <= 1.0).all()), "step: commands leave [-1, 1]")
@@ -46,9 +49,14 @@ def _check_model(model: FollowerModel, machine: Machine, device: torch.device) -
     both = (first[..., exclusive] != 0).any(-1) & (first[..., ~exclusive] != 0).any(-1)
     require(not bool(both.any()), "step: an exclusive joint moves together with others")
     require(bool((first != 0).any()), "step: nothing is ever given")
-    require(in_place(model.state, place), "state: a tensor moved or changed its shape; write it in place")
+    require(
+        in_place(model.state, place),
+        "state: a tensor moved or changed its shape; write it in place",
+    )
 
-    require_memory_in_state(model, begin, first, lambda alter: _follow(model, machine, device, alter_first=alter))
+    require_memory_in_state(
+        model, begin, first, lambda alter: _follow(model, machine, device, alter_first=alter)
+    )
 
     model.reset(everywhere)
     still = torch.zeros(NUM_ENVS, machine.num_joints, device=device)
@@ -56,7 +64,9 @@ def _check_model(model: FollowerModel, machine: Machine, device: torch.device) -
     require(not bool(given.any()), "reset: a new person gives a command that nobody has proposed")
 
 
-def _follow(model: FollowerModel, machine: Machine, device: torch.device, alter_first: bool = False) -> torch.Tensor:
+def _follow(
+    model: FollowerModel, machine: Machine, device: torch.device, alter_first: bool = False
+) -> torch.Tensor:
     """Returns what is given, `(T, N, J)`, where proposals stay for a while, are full, random or none, and change sides."""
     generator = torch.Generator().manual_seed(0)
     exclusive = torch.as_tensor(machine.is_exclusive)

@@ -16,22 +16,36 @@ from brokk_rl.signals import Command
 def check_link(link: Link, machine: Machine, num_runs: int = 1) -> None:
     """Checks a closed link to a machine, real or simulated, or to `num_runs` simulated ones, against `Link`.
 
-    Sends nothing but a standstill, and a command that is no number: it must be refused by a `BrokkError` or sent as a standstill.
+    Sends nothing but a standstill, and a command that is no number: it must be refused by a
+    `BrokkError` or sent as a standstill.
     """
     with link as open_link:
         first = open_link.read()
         shape = (num_runs, machine.num_joints) if num_runs > 1 else (machine.num_joints,)
-        require(np.shape(first.q) == shape, f"read: expected positions of shape {shape}, got {np.shape(first.q)}")
-        require(bool(np.isfinite(np.asarray(first.q)).all()) and math.isfinite(first.t_s), "read: positions or time are not finite")
+        require(
+            np.shape(first.q) == shape,
+            f"read: expected positions of shape {shape}, got {np.shape(first.q)}",
+        )
+        require(
+            bool(np.isfinite(np.asarray(first.q)).all()) and math.isfinite(first.t_s),
+            "read: positions or time are not finite",
+        )
         sent = open_link.send(Command(np.zeros(shape)))
-        require(np.array_equal(np.asarray(sent.u), np.zeros(shape)), f"send: a standstill was sent as {sent.u}")
+        require(
+            np.array_equal(np.asarray(sent.u), np.zeros(shape)),
+            f"send: a standstill was sent as {sent.u}",
+        )
         require(open_link.read().t_s >= first.t_s, "read: time runs backwards")
         for name, value in getattr(open_link, "extra", dict)().items():
             require(
-                np.shape(value) in ((), (num_runs,)), f"extra: '{name}' has shape {np.shape(value)}, expected one number a machine"
+                np.shape(value) in ((), (num_runs,)),
+                f"extra: '{name}' has shape {np.shape(value)}, expected one number a machine",
             )
         try:
             sent = open_link.send(Command(np.full(shape, np.nan)))
         except BrokkError:
             return
-        require(bool((np.asarray(sent.u) == 0).all()), f"send: a command that is no number was sent as {sent.u}")
+        require(
+            bool((np.asarray(sent.u) == 0).all()),
+            f"send: a command that is no number was sent as {sent.u}",
+        )

@@ -9,7 +9,9 @@ from brokk_rl.contracts import Simulator, World
 from brokk_rl.machine import Machine
 
 
-def check_world(simulator: Simulator, machine: Machine, scenes: torch.Tensor, device: torch.device | str = "cpu") -> None:
+def check_world(
+    simulator: Simulator, machine: Machine, scenes: torch.Tensor, device: torch.device | str = "cpu"
+) -> None:
     """Checks what `Simulator.build` returns against `World`.
 
     Args:
@@ -21,16 +23,27 @@ def check_world(simulator: Simulator, machine: Machine, scenes: torch.Tensor, de
     device = torch.device(device)
     world = simulator.build(machine, device, NUM_ENVS)
     tensors = {"q": world.q, "contact_force_n": world.contact_force_n, "faults": world.faults}
-    shapes = {"q": (NUM_ENVS, machine.num_joints), "contact_force_n": (NUM_ENVS,), "faults": (NUM_ENVS,)}
+    shapes = {
+        "q": (NUM_ENVS, machine.num_joints),
+        "contact_force_n": (NUM_ENVS,),
+        "faults": (NUM_ENVS,),
+    }
     for name, value in tensors.items():
         kind = torch.bool if name == "faults" else torch.float32
-        require(tuple(value.shape) == shapes[name], f"{name}: expected shape {shapes[name]}, got {tuple(value.shape)}")
+        require(
+            tuple(value.shape) == shapes[name],
+            f"{name}: expected shape {shapes[name]}, got {tuple(value.shape)}",
+        )
         require(value.dtype == kind, f"{name}: expected {kind}, got {value.dtype}")
-    require(world.num_worlds == NUM_ENVS, f"num_worlds: expected {NUM_ENVS}, got {world.num_worlds}")
+    require(
+        world.num_worlds == NUM_ENVS, f"num_worlds: expected {NUM_ENVS}, got {world.num_worlds}"
+    )
     place = places(tensors)
     home = torch.as_tensor(machine.home, dtype=torch.float32, device=device).repeat(NUM_ENVS, 1)
     everywhere, scenes = torch.ones(NUM_ENVS, dtype=torch.bool, device=device), scenes.to(device)
-    steps = torch.as_tensor(machine.max_speed * machine.period_s * 0.5, dtype=torch.float32, device=device).repeat(NUM_ENVS, 1)
+    steps = torch.as_tensor(
+        machine.max_speed * machine.period_s * 0.5, dtype=torch.float32, device=device
+    ).repeat(NUM_ENVS, 1)
 
     world.reset(everywhere, home, scenes)
     require(bool(torch.allclose(world.q, home, atol=1e-4)), "reset: q is not where the arm was put")
@@ -41,18 +54,29 @@ def check_world(simulator: Simulator, machine: Machine, scenes: torch.Tensor, de
     require(bool((first[-1] != home).any()), "step: the arm does not move")
     seen = {"q": world.q, "contact_force_n": world.contact_force_n, "faults": world.faults}
     require(in_place(seen, place), "step: a tensor moved; refresh it in place")
-    tolerance = 0.0 if device.type == "cpu" else 1e-5  # the order of additions on a GPU is not fixed
+    tolerance = (
+        0.0 if device.type == "cpu" else 1e-5
+    )  # the order of additions on a GPU is not fixed
     world.load_state_dict(stored)
-    require(same(_push(world, steps), first, tolerance), "load_state_dict: the same steps from the same state lead elsewhere")
+    require(
+        same(_push(world, steps), first, tolerance),
+        "load_state_dict: the same steps from the same state lead elsewhere",
+    )
     world.load_state_dict(stored)
     altered = steps.clone()
     altered[0] = 0.0
-    require(same(_push(world, altered)[:, 1:], first[:, 1:], tolerance), "step: what happens in world 0 changes the others")
+    require(
+        same(_push(world, altered)[:, 1:], first[:, 1:], tolerance),
+        "step: what happens in world 0 changes the others",
+    )
     before, some = world.q.clone(), everywhere.clone()
     some[1:] = False
     world.reset(some, home, scenes)
     require(same(world.q[1:], before[1:]), "reset: q changed in worlds outside the mask")
-    require(bool(torch.allclose(world.q[0], home[0], atol=1e-4)), "reset: the world of the mask is not where it was put")
+    require(
+        bool(torch.allclose(world.q[0], home[0], atol=1e-4)),
+        "reset: the world of the mask is not where it was put",
+    )
 
 
 def _push(world: World, steps: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,7 @@
 """`diagnosis.json`: what a diagnosis says, as data. Effects, joints and numbers have the names of the effect registry.
 
-Fields that a reader may rely on stand here; `more` holds whatever else the engine found worth telling, as plain JSON.
+Fields that a reader may rely on stand here; `more` holds whatever else the engine found worth
+telling, as plain JSON.
 """
 
 from __future__ import annotations
@@ -31,8 +32,10 @@ class Selected:
         effect: Its name.
         joints: Joints that have it, in machine order; empty for an effect of the whole machine.
         probability: That the effect, or one of its class (`same_as`), is there.
-        parameters: By name and joint (`machine` for a number that joints do not have), in the unit that the name says.
-        gap_closed: Share of the gap that it closes: its Shapley value in the set of all that are selected.
+        parameters: By name and joint (`machine` for a number that joints do not have), in the unit
+            that the name says.
+        gap_closed: Share of the gap that it closes: its Shapley value in the set of all that are
+            selected.
         same_as: Effects that these recordings cannot tell from it.
         decided_by: What would tell it from those of `same_as`.
     """
@@ -80,7 +83,8 @@ class Where:
     Attributes:
         joints: By joint, with its unit.
         regimes: The largest shares first.
-        stage: On which part of the way from command to estimate; `None` where nothing is to be said.
+        stage: On which part of the way from command to estimate; `None` where nothing is to be
+            said.
     """
 
     joints: Mapping[str, JointGap]
@@ -103,8 +107,8 @@ class Answer:
     """The whole answer.
 
     Attributes:
-        verdict: `effects`; `none` when no effect earns its place; `unknown` when the gap is real and nothing of the library
-            explains it, or the recordings do not allow to tell.
+        verdict: `effects`; `none` when no effect earns its place; `unknown` when the gap is real
+            and nothing of the library explains it, or the recordings do not allow to tell.
         selected: Most probable first; empty unless the verdict is `effects`.
         ranking: All rivals worth naming, `none` and `unknown` among them, most probable first.
         where: Where the gap lies.
@@ -138,7 +142,10 @@ class Answer:
             "stage": self.where.stage,
         }
         gap = self.gap and {
-            **{name: {self.gap.key: getattr(self.gap, name)} for name in ("before", "after", "floor")},
+            **{
+                name: {self.gap.key: getattr(self.gap, name)}
+                for name in ("before", "after", "floor")
+            },
             "closed": None if self.gap.closed is None else _estimate(self.gap.closed),
             "floor_of": self.gap.floor_of,
             "joints": {name: dataclasses.asdict(one) for name, one in self.gap.joints.items()},
@@ -151,7 +158,9 @@ class Answer:
             "ranking": [_listed(dataclasses.asdict(one)) for one in self.ranking],
             "where": where,
             "gap": gap,
-            "next_experiment": None if self.next_experiment is None else _listed(dataclasses.asdict(self.next_experiment)),
+            "next_experiment": None
+            if self.next_experiment is None
+            else _listed(dataclasses.asdict(self.next_experiment)),
             **self.more,
         }
 
@@ -181,17 +190,24 @@ def read(path: Path) -> Answer:
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: cannot be read as a diagnosis ({error})") from error
     except (KeyError, TypeError) as error:
-        raise RecordingError(f"{path}: no diagnosis: {error!r} is missing or of another kind") from error
+        raise RecordingError(
+            f"{path}: no diagnosis: {error!r} is missing or of another kind"
+        ) from error
 
 
 def _answer(found: dict[str, Any]) -> Answer:
     joints, units = {}, {}
     for name, gap in found["where"]["joints"].items():
         units[name] = "m" if "rmse_m" in gap else "rad"
-        joints[name] = JointGap(gap[f"rmse_{units[name]}"], gap[f"floor_{units[name]}"], gap["share"])
+        joints[name] = JointGap(
+            gap[f"rmse_{units[name]}"], gap[f"floor_{units[name]}"], gap["share"]
+        )
     where = Where(
         joints,
-        tuple(RegimeGap(one["joint"], one["regime"], one["share"]) for one in found["where"]["regimes"]),
+        tuple(
+            RegimeGap(one["joint"], one["regime"], one["share"])
+            for one in found["where"]["regimes"]
+        ),
         found["where"]["stage"],
         units,
     )
@@ -201,11 +217,16 @@ def _answer(found: dict[str, Any]) -> Answer:
     return Answer(
         verdict=found["verdict"],
         selected=tuple(_read_selected(one) for one in found["selected"]),
-        ranking=tuple(Ranked(one["effect"], tuple(one["joints"]), one["probability"]) for one in found["ranking"]),
+        ranking=tuple(
+            Ranked(one["effect"], tuple(one["joints"]), one["probability"])
+            for one in found["ranking"]
+        ),
         where=where,
         gap=gap,
         next_experiment=following
-        and NextExperiment(following["excitation"], tuple(following["separates"]), following.get("why", "")),
+        and NextExperiment(
+            following["excitation"], tuple(following["separates"]), following.get("why", "")
+        ),
         reason=found.get("reason", ""),
         more={key: value for key, value in found.items() if key not in known},
     )
@@ -216,7 +237,15 @@ def _read_gap(given: dict[str, Any]) -> Gap:
     before, after, floor = (given[name][key] for name in ("before", "after", "floor"))
     joints = {name: JointClosed(**one) for name, one in given.get("joints", {}).items()}
     floor_of = given.get("floor_of", "reference")
-    return Gap(before, after, floor, _read_estimate(given["closed"]), key.removeprefix("rmse_"), floor_of, joints)
+    return Gap(
+        before,
+        after,
+        floor,
+        _read_estimate(given["closed"]),
+        key.removeprefix("rmse_"),
+        floor_of,
+        joints,
+    )
 
 
 def _selected(one: Selected) -> dict[str, Any]:
@@ -225,7 +254,8 @@ def _selected(one: Selected) -> dict[str, Any]:
         "joints": list(one.joints),
         "probability": one.probability,
         "parameters": {
-            name: {joint: _estimate(value) for joint, value in values.items()} for name, values in one.parameters.items()
+            name: {joint: _estimate(value) for joint, value in values.items()}
+            for name, values in one.parameters.items()
         },
         "gap_closed": None if one.gap_closed is None else _estimate(one.gap_closed),
         "same_as": list(one.same_as),
@@ -239,7 +269,10 @@ def _read_selected(one: dict[str, Any]) -> Selected:
         joints=tuple(one["joints"]),
         probability=one["probability"],
         parameters={
-            name: {joint: Estimate(value["mean"], tuple(value["ci95"])) for joint, value in values.items()}
+            name: {
+                joint: Estimate(value["mean"], tuple(value["ci95"]))
+                for joint, value in values.items()
+            }
             for name, values in one["parameters"].items()
         },
         gap_closed=_read_estimate(one["gap_closed"]),
@@ -257,4 +290,6 @@ def _read_estimate(value: dict[str, Any] | None) -> Estimate | None:
 
 
 def _listed(fields: dict[str, Any]) -> dict[str, Any]:
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in fields.items()}
+    return {
+        key: list(value) if isinstance(value, tuple) else value for key, value in fields.items()
+    }

@@ -1,7 +1,8 @@
 """Whether the machine errs more than the simulator's own floor: permutation tests over blocks, with a bound on false discoveries.
 
-Samples of one recording hang together, so whole recordings change sides, never samples. Where there are too few of them for a small
-p, recordings are cut into parts of `PART_S`, whose dependence (pose, oil) is small against that within a window.
+Samples of one recording hang together, so whole recordings change sides, never samples. Where there
+are too few of them for a small p, recordings are cut into parts of `PART_S`, whose dependence
+(pose, oil) is small against that within a window.
 Axes: `W` windows, `B` blocks, `C` cells.
 """
 
@@ -16,7 +17,8 @@ from scipy.stats import false_discovery_control
 from brokk_rl.diagnosis.free_runs import FreeRuns
 
 FEWEST_PERMUTATIONS = 1000
-"""Below so many ways to distribute recordings over two sides, no cell of some forty could be told from chance."""
+"""Below so many ways to distribute recordings over two sides, no cell of some forty could be told
+from chance."""
 PART_S = 30.0
 DRAWN = 2000
 FALSE_DISCOVERIES = 0.05
@@ -44,13 +46,22 @@ def blocks(field: FreeRuns, reference: FreeRuns) -> Blocks:
     if not few:
         return Blocks(sides[0], sides[1], "recordings")
     cut = [parts(side) for side in (field, reference)]
-    return Blocks(cut[0], cut[1], f"parts of recordings of {PART_S:g} s each (whole ones are too few)")
+    return Blocks(
+        cut[0], cut[1], f"parts of recordings of {PART_S:g} s each (whole ones are too few)"
+    )
 
 
 def parts(runs: FreeRuns) -> np.ndarray:
     """Returns the number of the part of `PART_S` of a recording that each window lies in, `(W,)`."""
-    begin_s = np.array([runs.recordings[s].t_s[r] - runs.recordings[s].t_s[0] for s, r in zip(runs.source, runs.row, strict=True)])
-    return np.unique(np.stack([runs.source, begin_s // PART_S], 1), axis=0, return_inverse=True)[1].ravel()
+    begin_s = np.array(
+        [
+            runs.recordings[s].t_s[r] - runs.recordings[s].t_s[0]
+            for s, r in zip(runs.source, runs.row, strict=True)
+        ]
+    )
+    return np.unique(np.stack([runs.source, begin_s // PART_S], 1), axis=0, return_inverse=True)[
+        1
+    ].ravel()
 
 
 def summed(values: np.ndarray, block: np.ndarray) -> np.ndarray:
@@ -61,12 +72,15 @@ def summed(values: np.ndarray, block: np.ndarray) -> np.ndarray:
 
 
 def excess_p(
-    field: tuple[np.ndarray, np.ndarray], reference: tuple[np.ndarray, np.ndarray], generator: np.random.Generator
+    field: tuple[np.ndarray, np.ndarray],
+    reference: tuple[np.ndarray, np.ndarray],
+    generator: np.random.Generator,
 ) -> np.ndarray:
     """Returns how probable so large a mean would be if field and reference were alike, `(C,)`.
 
     Args:
-        field: Sums and counts of each block, both `(B, C)`; a cell's mean is the ratio of their totals.
+        field: Sums and counts of each block, both `(B, C)`; a cell's mean is the ratio of their
+            totals.
         reference: The same of the reference.
         generator: Draws the permutations.
 
@@ -76,12 +90,19 @@ def excess_p(
     sums, counts = (np.concatenate(pair) for pair in zip(field, reference, strict=True))
     num_field, total = len(field[0]), len(sums)
     sides = np.zeros((DRAWN, total))
-    sides[np.arange(DRAWN)[:, None], generator.random((DRAWN, total)).argsort(1)[:, :num_field]] = 1.0
-    sides = np.concatenate([np.arange(total)[None] < num_field, sides])  # the first is what was seen
+    sides[np.arange(DRAWN)[:, None], generator.random((DRAWN, total)).argsort(1)[:, :num_field]] = (
+        1.0
+    )
+    sides = np.concatenate(
+        [np.arange(total)[None] < num_field, sides]
+    )  # the first is what was seen
     with np.errstate(invalid="ignore", divide="ignore"):
-        difference = sides @ sums / (sides @ counts) - (1.0 - sides) @ sums / ((1.0 - sides) @ counts)
+        difference = sides @ sums / (sides @ counts) - (1.0 - sides) @ sums / (
+            (1.0 - sides) @ counts
+        )
         seen = difference[0]
-        # a draw in which one side never visits the cell says nothing against chance; rounding must not tell equals apart
+        # a draw in which one side never visits the cell says nothing against chance; rounding must
+        # not tell equals apart
         larger = ~(difference < seen - 1e-12 * np.abs(seen))
     return np.where(np.isfinite(seen), larger.mean(0), np.nan)
 

@@ -1,7 +1,9 @@
 """The gap in millimetres at the tool: what each joint's error over a free run, and each stage, means for the tip.
 
-Errors of joints add up as vectors and may cancel. A joint's part is that of its own contribution along the whole error, summed over
-all samples: `Σ (J_j e_j) · d / Σ d · d` with `d = Σ_j J_j e_j`, which adds up to 1. Axes: `W` windows, `K` steps, `J` joints.
+Errors of joints add up as vectors and may cancel. A joint's part is that of its own contribution
+along the whole error, summed over
+all samples: `Σ (J_j e_j) · d / Σ d · d` with `d = Σ_j J_j e_j`, which adds up to 1. Axes: `W`
+windows, `K` steps, `J` joints.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ class Account:
     Attributes:
         tip_rms_m: Root mean square distance between simulated and measured tip, m.
         joint_rms_m: What each joint's error alone would move the tip by, root mean square, m.
-        joint_part: Part of the mean squared distance that each joint answers for; they add up to 1, one below 0 cancels others.
+        joint_part: Part of the mean squared distance that each joint answers for; they add up to 1,
+            one below 0 cancels others.
     """
 
     tip_rms_m: float
@@ -59,7 +62,9 @@ class Budget:
             }
 
         stages = {name: 1e3 * value for name, value in self.stages_m.items()}
-        return {name: account(getattr(self, name)) for name in ("before", "after", "floor")} | {"stages_mm": stages}
+        return {name: account(getattr(self, name)) for name in ("before", "after", "floor")} | {
+            "stages_mm": stages
+        }
 
 
 def account(runs: FreeRuns, machine: Machine) -> Account:

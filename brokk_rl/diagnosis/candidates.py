@@ -1,6 +1,7 @@
 """Free runs of a simulator with effects around it, many candidates side by side.
 
-Axes: `C` candidates, `W` windows, `K` steps, `J` joints, `L` samples before the free run, `H` of which are the history.
+Axes: `C` candidates, `W` windows, `K` steps, `J` joints, `L` samples before the free run, `H` of
+which are the history.
 """
 
 from __future__ import annotations
@@ -47,7 +48,12 @@ class Candidates:
     seed: int
     fixed: Sequence[tuple[Kind, Values]] = ()
 
-    def paths(self, effects: Sequence[tuple[Kind, Values]], count: int = 1, own: Values = MappingProxyType({})) -> np.ndarray:
+    def paths(
+        self,
+        effects: Sequence[tuple[Kind, Values]],
+        count: int = 1,
+        own: Values = MappingProxyType({}),
+    ) -> np.ndarray:
         """Returns measured positions of free runs, `(C, W, K, J)`.
 
         Args:
@@ -58,7 +64,10 @@ class Candidates:
         Raises:
             BrokkError: the model ran into NaN.
         """
-        fixed = [(kind, {name: np.repeat(value, count, 0) for name, value in values.items()}) for kind, values in self.fixed]
+        fixed = [
+            (kind, {name: np.repeat(value, count, 0) for name, value in values.items()})
+            for kind, values in self.fixed
+        ]
         effects = sorted([*effects, *fixed], key=lambda one: one[0].order)
         windows = len(self.cut.q)
         found = np.empty((count * windows, *self.cut.measured.shape[1:]), dtype=np.float32)
@@ -67,25 +76,39 @@ class Candidates:
             found[rows] = self._run(effects, own, rows // windows, rows % windows)
         if not np.isfinite(found).all():
             names = ", ".join(kind.name for kind, _ in effects) or "no effect"
-            raise BrokkError(f"the simulator ran into NaN in a free run with {names}; look at its fit")
+            raise BrokkError(
+                f"the simulator ran into NaN in a free run with {names}; look at its fit"
+            )
         return found.reshape(count, windows, *found.shape[1:])
 
-    def _run(self, effects: Sequence[tuple[Kind, Values]], own: Values, candidate: np.ndarray, window: np.ndarray) -> np.ndarray:
+    def _run(
+        self,
+        effects: Sequence[tuple[Kind, Values]],
+        own: Values,
+        candidate: np.ndarray,
+        window: np.ndarray,
+    ) -> np.ndarray:
         """Returns one free run a row, `(N, K, J)`."""
         cut, count, device = self.cut, len(window), torch.device("cpu")
         size, before = cut.num_history, cut.num_before
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.seed + int(candidate[0]))  # rows of other batches draw other numbers
+            torch.manual_seed(
+                self.seed + int(candidate[0])
+            )  # rows of other batches draw other numbers
             model: Any = self.base.build(self.machine, count, device)
             for name, value in own.items():
                 model.parameters[name].copy_(torch.as_tensor(value[candidate], dtype=torch.float32))
             for kind, values in effects:
                 model = kind.wrap(model, self.machine, count, device)
                 for name, value in values.items():
-                    model.parameters[name].copy_(torch.as_tensor(value[candidate], dtype=torch.float32))
+                    model.parameters[name].copy_(
+                        torch.as_tensor(value[candidate], dtype=torch.float32)
+                    )
                 if kind.running:
                     begun_s = self.running_s[window] - (before - size) * self.machine.period_s
-                    model.parameters[kind.running].copy_(torch.as_tensor(begun_s, dtype=torch.float32)[:, None])
+                    model.parameters[kind.running].copy_(
+                        torch.as_tensor(begun_s, dtype=torch.float32)[:, None]
+                    )
         measure, truth = (getattr(model, name, None) for name in ("measure", "truth"))
         measure = measure if "measurement" in getattr(model, "sides", ()) else None
         u = torch.as_tensor(cut.u[window], dtype=torch.float32)

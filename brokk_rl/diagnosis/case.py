@@ -35,7 +35,8 @@ class Case:
         machine: The machine.
         reference: Recordings that the simulator was built from; empty where it is given.
         field: Recordings of the machine as it is.
-        unseen: More of them, to which nothing is fitted: how far the effects carry is told there too.
+        unseen: More of them, to which nothing is fitted: how far the effects carry is told there
+            too.
     """
 
     machine: Machine
@@ -48,11 +49,15 @@ class Case:
         found = []
         total_s = sum(recording.duration_s for recording in self.field)
         if total_s < LEAST_S:
-            found.append(f"the field recordings last {total_s:.0f} s in all; {LEAST_S:.0f} s or more are needed")
+            found.append(
+                f"the field recordings last {total_s:.0f} s in all; {LEAST_S:.0f} s or more are needed"
+            )
         if open_loop.longest_s(self.field, self.machine) < HORIZON_S:
             found.append(f"no field recording is long enough for a free run of {HORIZON_S:g} s")
         if not self.reference and len(self.field) == 1:
-            found.append("there is one recording only, and no reference: nothing to judge by that it was not fitted to")
+            found.append(
+                "there is one recording only, and no reference: nothing to judge by that it was not fitted to"
+            )
         u = np.concatenate([recording.u for recording in self.field])
         if not (np.abs(u) > COMMANDED).any():
             found.append("no joint is ever commanded in the field recordings")
@@ -70,15 +75,21 @@ def load(folder: Path, machine: Machine) -> Case:
     """Reads a gap case: `reference/*.parquet` and `field/*.parquet`.
 
     Raises:
-        RecordingError: a part is missing, or a recording cannot be used (another machine, NaN, gaps, …).
+        RecordingError: a part is missing, or a recording cannot be used (another machine, NaN,
+            gaps, …).
     """
     if not folder.is_dir():
-        raise RecordingError(f"diagnosis.case={folder}: there is no such folder (seen from {Path.cwd()})")
+        raise RecordingError(
+            f"diagnosis.case={folder}: there is no such folder (seen from {Path.cwd()})"
+        )
     parts = {name: folder / name for name in ("reference", "field")}
     for name, part in parts.items():
         if not any(part.glob("*.parquet")):
             why = "the simulator is fitted to it; without one give diagnosis.field=<glob> and actuator=<simulator>"
-            raise RecordingError(f"{folder}: no {name}/*.parquet; a case has both" + (f" ({why})" if name == "reference" else ""))
+            raise RecordingError(
+                f"{folder}: no {name}/*.parquet; a case has both"
+                + (f" ({why})" if name == "reference" else "")
+            )
     return Case(machine, *(recorded(str(part / "*.parquet"), machine) for part in parts.values()))
 
 
@@ -130,5 +141,14 @@ def parts(recordings: Sequence[Recording]) -> list[Recording]:
             if created := recording.metadata.get("created"):
                 named["created"] = record.later(created, float(recording.t_s[rows][0]))
             t_s = recording.t_s[rows] - recording.t_s[rows][0]
-            found.append(replace(recording, t_s=t_s, u=recording.u[rows], q=recording.q[rows], extra=extra, metadata=named))
+            found.append(
+                replace(
+                    recording,
+                    t_s=t_s,
+                    u=recording.u[rows],
+                    q=recording.q[rows],
+                    extra=extra,
+                    metadata=named,
+                )
+            )
     return found

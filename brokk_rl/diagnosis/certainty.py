@@ -1,8 +1,10 @@
 """How sure an answer is: the chances of what it says, from a few signs, by weights fitted to answers whose truth is known.
 
-Evidence in log likelihood is no probability: simulators, noise and forms of effects are all a little wrong, and so a Bayes factor
-of e to 40 is wrong once in twenty. What it is worth is learned from development exams (`exam.do=calibrate`): logistic regressions
-on signs that mean the same on any machine. `conf/certainty` holds their weights.
+Evidence in log likelihood is no probability: simulators, noise and forms of effects are all a
+little wrong, and so a Bayes factor
+of e to 40 is wrong once in twenty. What it is worth is learned from development exams
+(`exam.do=calibrate`): logistic regressions on signs that mean the same on any machine.
+`conf/certainty` holds their weights.
 Axes: `J` joints.
 """
 
@@ -26,11 +28,13 @@ BY_CHANCE = 1.5
 NATS = 10.0
 """Evidence below is little."""
 MUCH = 50.0
-"""What effects explain is much beyond: then a part that they leave says less, as no form is exactly that of the library."""
+"""What effects explain is much beyond: then a part that they leave says less, as no form is exactly
+that of the library."""
 MOST = 100.0
 """The same of a clue's evidence."""
 TELLING = {STARTS: 50.0, CURVE: 1000.0, TIME: 1000.0, LATER: 1000.0}
-"""The same of single clues: real forms differ most in starts and stops, little in their curve, and not with the running time."""
+"""The same of single clues: real forms differ most in starts and stops, little in their curve, and
+not with the running time."""
 
 
 @spec
@@ -38,10 +42,12 @@ class Certainty:
     """Weights of signs, and how far forms of effects differ.
 
     Attributes:
-        outside: Of the signs that the cause lies outside the library; their weighted sum is the logarithm of the odds.
+        outside: Of the signs that the cause lies outside the library; their weighted sum is the
+            logarithm of the odds.
         right: Of the signs that an effect is rightly named.
         none: Of the signs that there is nothing to find, where nothing was found.
-        form: By stage: standard deviation of what real forms of an effect add to the error of its size, over the size.
+        form: By stage: standard deviation of what real forms of an effect add to the error of its
+            size, over the size.
         temperature: Of effects that were not named: a worth of so much less makes odds of 1 to e.
     """
 
@@ -56,9 +62,13 @@ class Certainty:
         for name, signs in known.items():
             for sign in getattr(self, name):
                 if sign not in signs:
-                    raise ConfigError(f"certainty.{name}: '{sign}' is no sign; {choices(sign, signs)}")
+                    raise ConfigError(
+                        f"certainty.{name}: '{sign}' is no sign; {choices(sign, signs)}"
+                    )
             if missing := [sign for sign in signs if sign not in getattr(self, name)]:
-                raise ConfigError(f"certainty.{name}: expected a number for {', '.join(missing)} too")
+                raise ConfigError(
+                    f"certainty.{name}: expected a number for {', '.join(missing)} too"
+                )
         if min(self.form.values()) < 0 or self.temperature <= 0:
             raise ConfigError("certainty: expected form of 0 or more and temperature above 0")
 
@@ -88,7 +98,9 @@ def outside(findings: Findings) -> dict[str, float]:
     seen = bool(stages & {"kinematics", "sensing"})
     clues = {
         name: float(np.log1p((row / (1.0 + gained / TELLING.get(name, MOST))).max() / NATS))
-        for name, row in zip(CLUES, left, strict=False)  # the curve has not always been a clue of its own
+        for name, row in zip(
+            CLUES, left, strict=False
+        )  # the curve has not always been a clue of its own
     }
     return {
         "constant": 1.0,
@@ -139,4 +151,6 @@ def widened(ends: np.ndarray, form: float) -> np.ndarray:
     """Returns low end, value and high end of a size `(3, …)` with the error of its form added to both sides."""
     low, value, high = ends
     more = 1.96 * form * np.abs(value)
-    return np.stack([value - np.hypot(value - low, more), value, value + np.hypot(high - value, more)])
+    return np.stack(
+        [value - np.hypot(value - low, more), value, value + np.hypot(high - value, more)]
+    )

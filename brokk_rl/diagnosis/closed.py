@@ -40,10 +40,12 @@ class Gap:
     Attributes:
         before: Of the simulator as it was.
         after: With the selected effects.
-        floor: What it would be without any effect: the simulator's on left-out reference recordings; without a reference that of
-            a flexible model on field recordings that it was not fitted to; `None` where neither is known.
+        floor: What it would be without any effect: the simulator's on left-out reference
+            recordings; without a reference that of a flexible model on field recordings that it was
+            not fitted to; `None` where neither is known.
         closed: `(before - after) / (before - floor)`; `None` where there is no gap to close.
-        unit: `rad` or `m`; `travel` on a machine with joints of both kinds, whose errors are taken over their travel.
+        unit: `rad` or `m`; `travel` on a machine with joints of both kinds, whose errors are taken
+            over their travel.
         floor_of: `reference`, `flexible model`, or empty.
         joints: The same joint by joint.
     """

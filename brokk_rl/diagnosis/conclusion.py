@@ -27,8 +27,12 @@ from brokk_rl.inspection import Thresholds
 NEAR = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
 DECIDED_BY = {
-    frozenset({"flow_gain", "encoder_scale"}): "an outside measurement of the angle (inclinometer, laser) at two positions",
-    frozenset({"dead_time", "clock_offset"}): "one clock for commands and positions, or a pulse that both record",
+    frozenset(
+        {"flow_gain", "encoder_scale"}
+    ): "an outside measurement of the angle (inclinometer, laser) at two positions",
+    frozenset(
+        {"dead_time", "clock_offset"}
+    ): "one clock for commands and positions, or a pulse that both record",
 }
 """Measurements that would tell apart what commands and joint positions cannot."""
 
@@ -73,22 +77,32 @@ class Diagnosis:
         repaired = None if unknown else findings.repair
         found = [] if unknown else findings.others
         mean = 0.0 if evidence.mean is None else evidence.mean
-        paths = repaired.after if repaired else evidence.base + mean if found else field.evidence.base
-        reach = Reach(self.base, self.case.machine, paths, repaired and repaired.own, self.generator)
+        paths = (
+            repaired.after if repaired else evidence.base + mean if found else field.evidence.base
+        )
+        reach = Reach(
+            self.base, self.case.machine, paths, repaired and repaired.own, self.generator
+        )
         foretold = reach.foretold()
-        selected = [verdict.other(findings, one, self.certainty, self.case.machine) for one in found]
+        selected = [
+            verdict.other(findings, one, self.certainty, self.case.machine) for one in found
+        ]
         selected += self._selected(findings, reach) if repaired else []
         selected.sort(key=lambda one: -one.probability)
         told = "unknown" if unknown else "effects" if selected else "none"
         after = field.runs(paths) if selected else None
         machine = self.case.machine
-        seen = survey(before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator)
+        seen = survey(
+            before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
+        )
         remainder = self._remainder(findings, reach) if selected else None
         chance = verdict.unknown_chance(findings, self.prices, self.certainty)
         answer = Answer(
             verdict=told,
             selected=tuple(selected),
-            ranking=tuple(verdict.ranking(findings, selected, self.prices, self.certainty, machine, chance)),
+            ranking=tuple(
+                verdict.ranking(findings, selected, self.prices, self.certainty, machine, chance)
+            ),
             where=seen.where(),
             gap=reach.gap(),
             next_experiment=self._next(findings, selected),
@@ -109,15 +123,26 @@ class Diagnosis:
         for kind in chosen:
             swaps = verdict.rivals(findings, kind.name)
             like = verdict.same_as(swaps, verdict.own_gain(findings, kind.name))
-            signs = verdict.named_signs(findings, self.prices, self.certainty, kind.name, swaps, like)
+            signs = verdict.named_signs(
+                findings, self.prices, self.certainty, kind.name, swaps, like
+            )
             joints = findings.repair.joints_of(kind)
-            decided = next((how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)), None)
+            decided = next(
+                (how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)),
+                None,
+            )
             found.append(
                 Selected(
                     effect=kind.name,
-                    joints=tuple(name for name, has in zip(self.case.machine.joint_names, joints, strict=True) if has),
+                    joints=tuple(
+                        name
+                        for name, has in zip(self.case.machine.joint_names, joints, strict=True)
+                        if has
+                    ),
                     probability=certainty.chance(self.certainty.right, signs),
-                    parameters=verdict.numbers(findings, kind, self.case.machine, self.certainty.form[kind.stage]),
+                    parameters=verdict.numbers(
+                        findings, kind, self.case.machine, self.certainty.form[kind.stage]
+                    ),
                     gap_closed=shares[kind.name],
                     same_as=like,
                     decided_by=decided,
@@ -130,7 +155,9 @@ class Diagnosis:
         predictable = verdict.unexplained(findings)
         names = self.case.machine.joint_names
         beyond = reach.beyond()
-        joints = [name for name, more in zip(names, predictable, strict=True) if more or name in beyond]
+        joints = [
+            name for name, more in zip(names, predictable, strict=True) if more or name in beyond
+        ]
         if not joints:
             return None
         told = [name for name, more in zip(names, predictable, strict=True) if more]
@@ -149,19 +176,39 @@ class Diagnosis:
         kinds, rivals = {kind.name: kind for kind in self.kinds}, []
         undecided = next((one for one in selected if one.same_as), None)
         for one in selected:
-            swaps = [] if one.effect not in findings.chosen.names else verdict.rivals(findings, one.effect)
+            swaps = (
+                []
+                if one.effect not in findings.chosen.names
+                else verdict.rivals(findings, one.effect)
+            )
             near = {swap.name: max(0.0, swap.share) for swap in swaps[:3] if swap.share > NEAR}
             if near and (undecided is None or one is undecided):
-                rivals = [separation.Rival(kinds[one.effect], verdict.values(findings, one.effect, one.effect), one.probability)]
+                rivals = [
+                    separation.Rival(
+                        kinds[one.effect],
+                        verdict.values(findings, one.effect, one.effect),
+                        one.probability,
+                    )
+                ]
                 rivals += [
-                    separation.Rival(kinds[name], verdict.values(findings, one.effect, name), share * one.probability)
+                    separation.Rival(
+                        kinds[name],
+                        verdict.values(findings, one.effect, name),
+                        share * one.probability,
+                    )
                     for name, share in near.items()
                 ]
                 break
         noises = self.base.field.evidence.noise or []
-        found = separation.best(self.base.actuator, noises, rivals, self.excitations, self.case.machine, self.generator)
+        found = separation.best(
+            self.base.actuator, noises, rivals, self.excitations, self.case.machine, self.generator
+        )
         if found is None and undecided and undecided.decided_by:
-            return NextExperiment("", (undecided.effect, *undecided.same_as), f"no excitation does; {undecided.decided_by} would")
+            return NextExperiment(
+                "",
+                (undecided.effect, *undecided.same_as),
+                f"no excitation does; {undecided.decided_by} would",
+            )
         return found
 
     def _floor(self) -> FreeRuns | None:
@@ -173,12 +220,19 @@ class Diagnosis:
             recordings += one.recordings
             row.append(one.row)
             paths.append(one.evidence.base)
-        return FreeRuns(recordings, np.concatenate(source), np.concatenate(row), np.concatenate(paths).astype(float))
+        return FreeRuns(
+            recordings,
+            np.concatenate(source),
+            np.concatenate(row),
+            np.concatenate(paths).astype(float),
+        )
 
     def _dead_time_s(self) -> np.ndarray:
         return np.full(self.case.machine.num_joints, self.case.machine.dead_time_s)
 
-    def _more(self, findings: Findings, weighed: Mapping[str, Any], foretold: Estimate | None) -> dict[str, Any]:
+    def _more(
+        self, findings: Findings, weighed: Mapping[str, Any], foretold: Estimate | None
+    ) -> dict[str, Any]:
         names = self.case.machine.joint_names
         rivals = [
             {
@@ -195,12 +249,22 @@ class Diagnosis:
         rivals = sorted(rivals, key=lambda row: -row["score"])[:40]
         clues = tuple(CLUES)
         left = {
-            name: {"clue": clues[best], "earned": float(a[best]), "null": float(b[best]), "scatter": float(c)}
-            for name, a, b, c in zip(names, findings.left.T, findings.left_null.T, findings.scatter, strict=True)
+            name: {
+                "clue": clues[best],
+                "earned": float(a[best]),
+                "null": float(b[best]),
+                "scatter": float(c),
+            }
+            for name, a, b, c in zip(
+                names, findings.left.T, findings.left_null.T, findings.scatter, strict=True
+            )
             for best in [int(np.argmax(a - b))]
         }
         null = [
-            row["null"] for joint in weighed["joints"] for row in joint["subsets"] if len(row["effects"]) == 1 and "null" in row
+            row["null"]
+            for joint in weighed["joints"]
+            for row in joint["subsets"]
+            if len(row["effects"]) == 1 and "null" in row
         ]
         return {
             "evidence": {
@@ -214,15 +278,29 @@ class Diagnosis:
             "predicted_closed": foretold and {"mean": foretold.mean, "ci95": list(foretold.ci95)},
         }
 
-    def _reason(self, told: str, findings: Findings, selected: Sequence[Selected], remainder: Mapping[str, Any] | None) -> str:
+    def _reason(
+        self,
+        told: str,
+        findings: Findings,
+        selected: Sequence[Selected],
+        remainder: Mapping[str, Any] | None,
+    ) -> str:
         if told == "effects":
-            text = "; ".join(f"{one.effect} on {', '.join(one.joints) or 'the machine'}" for one in selected)
-            return text + (f"; an unknown remainder on {', '.join(remainder['joints'])}" if remainder else "")
+            text = "; ".join(
+                f"{one.effect} on {', '.join(one.joints) or 'the machine'}" for one in selected
+            )
+            return text + (
+                f"; an unknown remainder on {', '.join(remainder['joints'])}" if remainder else ""
+            )
         if told == "unknown":
             joints = np.flatnonzero(verdict.unexplained(findings))
             where = ", ".join(self.case.machine.joint_names[j] for j in joints) or "some joints"
             best = certainty.predicted(findings).max(1)
-            clues = [clue for clue, earned in zip(CLUES, best, strict=True) if earned > max(verdict.LEFT, 0.5 * best.max())]
+            clues = [
+                clue
+                for clue, earned in zip(CLUES, best, strict=True)
+                if earned > max(verdict.LEFT, 0.5 * best.max())
+            ]
             if not clues:
                 return f"the gap of {where} is real, and no effect of the library explains it"
             return f"the gap of {where} can be predicted ({'; '.join(clues)}), but by no effect of the library"

@@ -1,8 +1,9 @@
 """What a simulator gets wrong already on the reference: learned there, and taken off in the field before any effect is tried.
 
-A tidy simulator is wrong in the same way wherever the machine goes (a wavy flow curve, a lever that changes, oil that warms up).
-An effect would be named for that in every case. Errors of the simulator on recordings that it was not fitted to are regressed on
-its own motion (Kennedy and O'Hagan's discrepancy, linear), as far as one part of the reference predicts another.
+A tidy simulator is wrong in the same way wherever the machine goes (a wavy flow curve, a lever that
+changes, oil that warms up). An effect would be named for that in every case. Errors of the
+simulator on recordings that it was not fitted to are regressed on its own motion (Kennedy and
+O'Hagan's discrepancy, linear), as far as one part of the reference predicts another.
 Axes: `W` windows, `I` increments, `J` joints, `E` entries (whitened increments), `F` features.
 """
 
@@ -17,7 +18,8 @@ from brokk_rl.diagnosis.noise import SPAN, loss, weight
 from brokk_rl.diagnosis.sizes import fitted
 
 RIDGES = (10.0, 100.0, 1000.0)
-"""Pulls towards no discrepancy, in features of unit size over the noise; that which predicts best is used."""
+"""Pulls towards no discrepancy, in features of unit size over the noise; that which predicts best
+is used."""
 TURNS = 2
 """Increments before and after whose changes of speed may matter."""
 LEVELS = (0.0, 0.25, 0.5, 0.75)
@@ -27,7 +29,8 @@ ORDERS = (1, 2, 3, 4)
 WIDEST = 5.0
 """Faults are no larger than so many times the usual."""
 TOLD = 0.5
-"""Variance of an estimate, over that of its prior, up to which recordings tell anything about a fault."""
+"""Variance of an estimate, over that of its prior, up to which recordings tell anything about a
+fault."""
 WARM_S = 900.0
 """Time in which oil warms up."""
 
@@ -43,9 +46,15 @@ def features(evidence: Evidence, j: int) -> np.ndarray:
     sides, turn = (out, 1.0 - out), np.diff(own, axis=1, prepend=own[:, :1])
     warm = 1.0 - np.exp(-evidence.candidates.running_s / WARM_S)[:, None]
     columns = [own * side for side in sides] + [np.full_like(own, 0.1 * full[j]), own * warm]
-    columns += [own * np.maximum(1.0 - np.abs(size - level) / 0.25, 0.0) * side for level in LEVELS for side in sides]
+    columns += [
+        own * np.maximum(1.0 - np.abs(size - level) / 0.25, 0.0) * side
+        for level in LEVELS
+        for side in sides
+    ]
     columns += [own * np.cos(order * np.arccos(place)) * side for order in ORDERS for side in sides]
-    columns += [np.roll(turn, shift, 1) * side for shift in range(-TURNS, TURNS + 1) for side in sides]
+    columns += [
+        np.roll(turn, shift, 1) * side for shift in range(-TURNS, TURNS + 1) for side in sides
+    ]
     columns += [np.abs(turn), np.abs(np.roll(turn, 1, 1)), np.sign(own) * (size < 0.1) * full[j]]
     for k in range(way.shape[2]):
         if k != j:
@@ -69,7 +78,8 @@ def learned(parts: Sequence[Evidence], field: Evidence) -> tuple[list[np.ndarray
     Joints of which no part predicts the others have none.
 
     Args:
-        parts: The simulator against parts of the reference that it was not fitted to, with their noise.
+        parts: The simulator against parts of the reference that it was not fitted to, with their
+            noise.
         field: The simulator against the field.
     """
     found, of_field = [np.zeros_like(part.way) for part in parts], np.zeros_like(field.way)
@@ -84,8 +94,16 @@ def learned(parts: Sequence[Evidence], field: Evidence) -> tuple[list[np.ndarray
         others = [[k for k in range(len(parts)) if k != out] for out in range(len(parts))]
         best, lowest = None, sum(float(loss(one)) for one in z)
         for pull in RIDGES:
-            betas = [ridge(np.concatenate([x[k] for k in rest]), np.concatenate([z[k] for k in rest]), pull) for rest in others]
-            total = sum(float(loss(one - columns @ beta)) for one, columns, beta in zip(z, x, betas, strict=True))
+            betas = [
+                ridge(
+                    np.concatenate([x[k] for k in rest]), np.concatenate([z[k] for k in rest]), pull
+                )
+                for rest in others
+            ]
+            total = sum(
+                float(loss(one - columns @ beta))
+                for one, columns, beta in zip(z, x, betas, strict=True)
+            )
             if total < lowest:
                 best, lowest = (pull, betas), total
         if best is None:
@@ -93,7 +111,9 @@ def learned(parts: Sequence[Evidence], field: Evidence) -> tuple[list[np.ndarray
         pull, betas = best
         for bias, columns, beta in zip(found, raw, betas, strict=True):
             bias[..., j] = columns @ (beta * by)
-        of_field[..., j] = features(field, j) @ (ridge(np.concatenate(x), np.concatenate(z), pull) * by)
+        of_field[..., j] = features(field, j) @ (
+            ridge(np.concatenate(x), np.concatenate(z), pull) * by
+        )
     return found, of_field
 
 
@@ -107,7 +127,9 @@ def widths(parts: Sequence[Evidence]) -> np.ndarray:
         for z, faults in zip(part.z, part.faults, strict=True):
             lines = WIDEST * faults
             found = fitted(z, [], faults=lines)
-            slack = np.diag(np.linalg.inv((lines * weight(z - found @ lines)) @ lines.T + np.eye(len(lines))))
+            slack = np.diag(
+                np.linalg.inv((lines * weight(z - found @ lines)) @ lines.T + np.eye(len(lines)))
+            )
             squares.append(np.where(slack < TOLD, np.square(found), np.nan))
             chance.append(np.where(slack < TOLD, slack, np.nan))
     told = np.isfinite(squares)

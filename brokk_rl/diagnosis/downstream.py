@@ -1,7 +1,8 @@
 """What a diagnosis is worth to a policy: success before and after retraining in the simulator, the repaired one, on the machine.
 
-The dictionary that `compare` returns is `close_gap.json`. Policies are `before` (as it was), `after` (retrained), and any others
-beside them; plants are `simulator` (as it was), `repaired` (with the found effects) and `machine` (or what stands in for it).
+The dictionary that `compare` returns is `close_gap.json`. Policies are `before` (as it was),
+`after` (retrained), and any others beside them; plants are `simulator` (as it was), `repaired`
+(with the found effects) and `machine` (or what stands in for it).
 """
 
 from __future__ import annotations
@@ -31,19 +32,24 @@ def compare(evaluations: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         evaluations: `evaluation.json` of each plant, all of the same policies.
 
     Returns:
-        Plain JSON data. `fall`: success of the old policy in the simulator less that on the machine; `return`: of the new policy on
-        the machine less that of the old one; `predicted` and `achieved`: the new policy in the repaired simulator and on the
-        machine; `agreement`: of each simulator with the machine about the policies.
+        Plain JSON data. `fall`: success of the old policy in the simulator less that on the
+            machine; `return`: of the new policy on
+        the machine less that of the old one; `predicted` and `achieved`: the new policy in the
+        repaired simulator and on the machine; `agreement`: of each simulator with the machine about
+        the policies.
     """
     rows = {plant: evaluations[plant]["policies"] for plant in PLANTS}
     policies = list(rows["machine"])
-    success = {policy: {plant: _share(rows[plant][policy]) for plant in PLANTS} for policy in policies}
+    success = {
+        policy: {plant: _share(rows[plant][policy]) for plant in PLANTS} for policy in policies
+    }
     return {
         "schema": 1,
         "episodes": evaluations["machine"]["episodes"],
         "success": success,
         "time_to_insert_s": {
-            policy: {plant: rows[plant][policy]["time_to_insert_s"]["median"] for plant in PLANTS} for policy in policies
+            policy: {plant: rows[plant][policy]["time_to_insert_s"]["median"] for plant in PLANTS}
+            for policy in policies
         },
         "fall": difference(success[BEFORE]["simulator"], success[BEFORE]["machine"]),
         "return": difference(success[AFTER]["machine"], success[BEFORE]["machine"]),
@@ -65,8 +71,8 @@ def _share(row: Mapping[str, Any]) -> Share:
 def difference(first: Share, second: Share) -> Share:
     """Returns `first` less `second` with its 95 % interval.
 
-    Source: Newcombe 1998, Statistics in Medicine 17, method 10, from two Wilson intervals. Policies meet the same starts, so their
-    outcomes go together and the interval is rather too wide.
+    Source: Newcombe 1998, Statistics in Medicine 17, method 10, from two Wilson intervals. Policies
+    meet the same starts, so their outcomes go together and the interval is rather too wide.
     """
     mean = first["mean"] - second["mean"]
     (low, high), (lower, higher) = first["ci95"], second["ci95"]
@@ -79,11 +85,15 @@ def agreement(success: Mapping[str, Mapping[str, Share]], plant: str) -> dict[st
     """Returns how well `plant` says which policies do better on the machine, and how well they do.
 
     Returns:
-        `kendall`: Kendall's tau-b of the two orders, 1 when they are the same, `None` when one of them knows no order;
-        `rank_violation`: what a wrong order costs in success on the machine, mean over policies of the worst pair (mean maximum
-        rank violation; Li et al. 2024, SIMPLER), 0 at best; `error`: mean absolute difference of success.
+        `kendall`: Kendall's tau-b of the two orders, 1 when they are the same, `None` when one of
+        them knows no order; `rank_violation`: what a wrong order costs in success on the machine,
+        mean over policies of the worst pair (mean maximum rank violation; Li et al. 2024, SIMPLER),
+        0 at best; `error`: mean absolute difference of success.
     """
-    simulated, real = (np.array([success[policy][place]["mean"] for policy in success]) for place in (plant, "machine"))
+    simulated, real = (
+        np.array([success[policy][place]["mean"] for policy in success])
+        for place in (plant, "machine")
+    )
     known = np.ptp(simulated) > 0 and np.ptp(real) > 0
     tau: Any = stats.kendalltau(simulated, real) if known else None
     return {
@@ -93,7 +103,9 @@ def agreement(success: Mapping[str, Mapping[str, Share]], plant: str) -> dict[st
     }
 
 
-def rank_violation(simulated: Sequence[float] | np.ndarray, real: Sequence[float] | np.ndarray) -> float:
+def rank_violation(
+    simulated: Sequence[float] | np.ndarray, real: Sequence[float] | np.ndarray
+) -> float:
     """Returns the mean over policies of the largest real difference to a policy that the simulator ranks the other way round."""
     simulated, real = np.asarray(simulated, dtype=float), np.asarray(real, dtype=float)
     swapped = (simulated[:, None] < simulated[None]) != (real[:, None] < real[None])

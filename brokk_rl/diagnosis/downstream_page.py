@@ -30,7 +30,10 @@ def write(found: Mapping[str, Any], folder: Path) -> None:
     page = Page("What the diagnosis is worth to the policy", text, tone)
     figure = picture(found)
     figure.savefig(folder / PICTURE, dpi=150)
-    page.picture(figure, "Share of episodes that end in strict success, with Wilson's 95 % intervals; all meet the same starts.")
+    page.picture(
+        figure,
+        "Share of episodes that end in strict success, with Wilson's 95 % intervals; all meet the same starts.",
+    )
     table(page, found)
     page.heading("Predicted and achieved")
     fall, back = found["fall"], found["return"]
@@ -61,7 +64,12 @@ def write(found: Mapping[str, Any], folder: Path) -> None:
     )
     if "retraining" in found:
         page.heading("How it was made")
-        page.facts({**{f"{WORDS[name]}": what for name, what in found["plants"].items()}, **found["retraining"]})
+        page.facts(
+            {
+                **{f"{WORDS[name]}": what for name, what in found["plants"].items()},
+                **found["retraining"],
+            }
+        )
     page.write(folder / PAGE)
 
 
@@ -73,12 +81,18 @@ def table(page: Page, found: Mapping[str, Any]) -> None:
         times = found["time_to_insert_s"][policy]
         cells = [
             Cell(
-                f"{100 * shares[plant]['mean']:.1f}", _note(shares[plant], times[plant]), best=shares is best and plant == "machine"
+                f"{100 * shares[plant]['mean']:.1f}",
+                _note(shares[plant], times[plant]),
+                best=shares is best and plant == "machine",
             )
             for plant in PLANTS
         ]
         rows.append([_name(policy), *cells])
-    page.table(["", *(WORDS[plant] for plant in PLANTS)], rows, f"Strict success, %, of {found['episodes']} episodes")
+    page.table(
+        ["", *(WORDS[plant] for plant in PLANTS)],
+        rows,
+        f"Strict success, %, of {found['episodes']} episodes",
+    )
 
 
 def picture(found: Mapping[str, Any]) -> Figure:
@@ -92,12 +106,22 @@ def picture(found: Mapping[str, Any]) -> Figure:
         mean = np.array([share["mean"] for share in shares])
         low, high = np.array([share["ci95"] for share in shares]).T
         place = np.arange(len(PLANTS)) + (number - (len(policies) - 1) / 2) * width
-        error = 100 * np.maximum(0.0, [mean - low, high - mean])  # rounding must not make it negative
-        axis.bar(place, 100 * mean, 0.92 * width, color=COLOURS.get(policy, GREY), label=_name(policy))
-        axis.errorbar(place, 100 * mean, yerr=error, fmt="none", ecolor="black", elinewidth=1.0, capsize=2.5)
+        error = 100 * np.maximum(
+            0.0, [mean - low, high - mean]
+        )  # rounding must not make it negative
+        axis.bar(
+            place, 100 * mean, 0.92 * width, color=COLOURS.get(policy, GREY), label=_name(policy)
+        )
+        axis.errorbar(
+            place, 100 * mean, yerr=error, fmt="none", ecolor="black", elinewidth=1.0, capsize=2.5
+        )
         for x, share in zip(place, shares, strict=True):
             axis.annotate(
-                f"{100 * share['mean']:.0f}", (x, 100 * share["ci95"][1]), (0, 3), textcoords="offset points", ha="center"
+                f"{100 * share['mean']:.0f}",
+                (x, 100 * share["ci95"][1]),
+                (0, 3),
+                textcoords="offset points",
+                ha="center",
             )
     axis.set_xticks(range(len(PLANTS)), [WORDS[plant] for plant in PLANTS])
     axis.set_ylabel("strict success [%]")
@@ -105,7 +129,12 @@ def picture(found: Mapping[str, Any]) -> Figure:
     axis.set_yticks(range(0, 101, 20))
     axis.tick_params(axis="x", length=0)
     clean(axis)
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=len(policies), frameon=False)
+    figure.legend(
+        *axis.get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=len(policies),
+        frameon=False,
+    )
     return figure
 
 

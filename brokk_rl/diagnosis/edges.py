@@ -1,6 +1,7 @@
 """What single starts and stops show: how much the lateness of starts varies, and how much a joint rings after stops.
 
-Lateness: what the simulator is ahead by shortly after a start, over its speed then. Ringing: how much the measured position shakes
+Lateness: what the simulator is ahead by shortly after a start, over its speed then. Ringing: how
+much the measured position shakes
 after stops, beyond the noise at rest. Axes: `W` windows, `K` steps.
 """
 
@@ -21,22 +22,32 @@ MAD = 1.4826
 """Median absolute deviation to standard deviation."""
 
 
-def figures(runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> dict[tuple[str, str], tuple[float, float]]:
+def figures(
+    runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
+) -> dict[tuple[str, str], tuple[float, float]]:
     """Returns the spread of the lateness of starts (s) as `delay_jitter` and ringing (rad or m) as `compliance`, by joint.
 
     Each with its standard error; joints with fewer than `FEWEST` starts or stops are left out.
     """
     acting = [in_force(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
-    label = [regimes(u, r.q, machine, r.rate_hz) for u, r in zip(acting, runs.recordings, strict=True)]
+    label = [
+        regimes(u, r.q, machine, r.rate_hz) for u, r in zip(acting, runs.recordings, strict=True)
+    ]
     found = {}
     for j, name in enumerate(machine.joint_names):
         late_s = np.array(list(_lateness(runs, runs.cut(label)[..., j], j, machine)))
         if len(late_s) >= FEWEST:
             off = MAD * np.abs(late_s - np.median(late_s))
-            found["delay_jitter", name] = float(np.median(off)), float(off.std() / np.sqrt(len(off)))
+            found["delay_jitter", name] = (
+                float(np.median(off)),
+                float(off.std() / np.sqrt(len(off))),
+            )
         shaken = np.array(list(_ringing(runs, [part[:, j] for part in label], j)))
         if len(shaken) >= FEWEST:
-            found["compliance", name] = float(np.median(shaken)), float(MAD * shaken.std() / np.sqrt(len(shaken)))
+            found["compliance", name] = (
+                float(np.median(shaken)),
+                float(MAD * shaken.std() / np.sqrt(len(shaken))),
+            )
     return found
 
 
@@ -49,8 +60,14 @@ def _lateness(runs: FreeRuns, label: np.ndarray, joint: int, machine: Machine) -
         end = begin + ahead
         if end >= error.shape[1] or not is_start[window, begin + 1 : end].all():
             continue
-        speed = (path[window, end] - path[window, end - ahead // 3]) / (ahead // 3 * machine.period_s)
-        late_s = (error[window, end] - error[window, begin]) / speed if abs(speed) > SLOWEST * machine.max_speed[joint] else np.nan
+        speed = (path[window, end] - path[window, end - ahead // 3]) / (
+            ahead // 3 * machine.period_s
+        )
+        late_s = (
+            (error[window, end] - error[window, begin]) / speed
+            if abs(speed) > SLOWEST * machine.max_speed[joint]
+            else np.nan
+        )
         if np.isfinite(late_s):
             yield float(late_s)
 

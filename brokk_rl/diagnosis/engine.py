@@ -47,8 +47,10 @@ class Prices:
         reference: Times what it earns on reference recordings.
         name: For the effect as such.
         partial: For each joint that lacks an effect with one cause for all joints.
-        share: Of what its joint's set earns: an effect that adds less only mends the form of another.
-        tool: Error of measured tool points over that of the reference from which something unknown is there.
+        share: Of what its joint's set earns: an effect that adds less only mends the form of
+            another.
+        tool: Error of measured tool points over that of the reference from which something unknown
+            is there.
     """
 
     joint: float
@@ -72,9 +74,11 @@ class Findings:
         repair: Its simulation; `None` for the empty set.
         others: Effects that sensors, frames and tool points show.
         left: What each of `remainder.CLUES` earns on what is left, `(clues, J)`.
-        left_null: The same on reference recordings, the most of any part, at the length of the field, `(clues, J)`.
+        left_null: The same on reference recordings, the most of any part, at the length of the
+            field, `(clues, J)`.
         scatter: Mean square of what is left over that of the reference, by joint, `(J,)`.
-        strays: How far free runs with the set stray over those on the reference, each over what its noise lets expect, `(J,)`.
+        strays: How far free runs with the set stray over those on the reference, each over what its
+            noise lets expect, `(J,)`.
         tool_left: Error of measured tool points that is left over that of the reference.
     """
 
@@ -122,7 +126,9 @@ class Search:
         on_sensors = sensors.search(self.case, self.kinds, prices.joint, prices.name)
         on_tool = tool.search(self.case, self.kinds, prices.joint, prices.name)
         evidence = _adjusted(self.base.field.evidence, self.case, [*on_sensors, *on_tool.found])
-        grown, shapes = self._simulated(evidence, tool.is_tracked(self.case.field, self.case.machine))
+        grown, shapes = self._simulated(
+            evidence, tool.is_tracked(self.case.field, self.case.machine)
+        )
         small = {name: rays_of(ways[0].kind, SMALL) for name, ways in grown.items()}
         known = Nulls(self.base, small, grown, plain_joints(evidence), shapes, self.shared)
 
@@ -143,13 +149,18 @@ class Search:
         if late:  # from here on errors scatter after each change of a command
             chancy = replace(evidence, late=changes.spread(error))
             shapes = [
-                {name: [replace(s, change=chancy.rewhitened(evidence, s.change, j)) for s in own] for name, own in mine.items()}
+                {
+                    name: [replace(s, change=chancy.rewhitened(evidence, s.change, j)) for s in own]
+                    for name, own in mine.items()
+                }
                 for j, mine in enumerate(shapes)
             ]
             evidence = chancy
         scatter = np.maximum(1.0, self._scatter(evidence.whitened(error[None])[:, 0]))
         for _ in range(2 if late else int(scatter.max() > SCATTERED)):
-            if late:  # what delays change depends on when commands act, and so on what else delays them
+            if (
+                late
+            ):  # what delays change depends on when commands act, and so on what else delays them
                 evidence = frames.expected(evidence, late, repaired.effects() if repaired else [])
                 wide = around.simulated(evidence, grown, repaired) if wide and repaired else None
             z, grown, shapes = wide or (None, grown, shapes)
@@ -168,7 +179,9 @@ class Search:
         """Effects with one cause for all joints."""
         return library.shared(self.kinds)
 
-    def _simulated(self, evidence: Evidence, tracked: bool) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
+    def _simulated(
+        self, evidence: Evidence, tracked: bool
+    ) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
         """Returns the rays of each effect that free runs can show, and what it does to each joint."""
         grown: dict[str, list[Ray]] = {}
         shapes: list[dict[str, list[Shape]]] = [{} for _ in range(evidence.way.shape[2])]
@@ -193,21 +206,35 @@ class Search:
         tables = self._tables(evidence, grown, shapes, scatter, z)
         self.tell("the same on the reference", 0.7)
         prices = self.prices
-        chosen = choose(tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint)
+        chosen = choose(
+            tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint
+        )
         if z is None and (common := chosen.names & self.shared):
             grown, shapes = tied(common, tables, grown, shapes)
             tables = self._tables(evidence, grown, shapes, scatter, z)
-            chosen = choose(tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint)
+            chosen = choose(
+                tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint
+            )
         repaired = self._repaired(evidence, grown, tables, chosen)
-        if repaired and (kept := holding.kept(evidence, chosen, repaired, price, scatter, self.shared)) != chosen.subsets:
+        if (
+            repaired
+            and (kept := holding.kept(evidence, chosen, repaired, price, scatter, self.shared))
+            != chosen.subsets
+        ):
             chosen = Chosen(kept, chosen.worth)
             repaired = self._repaired(evidence, grown, tables, chosen)
         return tables, chosen, repaired
 
     def _repaired(
-        self, evidence: Evidence, grown: Mapping[str, list[Ray]], tables: Sequence[Table], chosen: Chosen
+        self,
+        evidence: Evidence,
+        grown: Mapping[str, list[Ray]],
+        tables: Sequence[Table],
+        chosen: Chosen,
     ) -> Repair | None:
-        start = [table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)]
+        start = [
+            table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)
+        ]
         return repair(evidence, chosen.subsets, grown, start) if chosen.names else None
 
     def _tables(
@@ -220,16 +247,26 @@ class Search:
     ) -> list[Table]:
         """Returns what sets earn on each joint."""
         tables, flat = [], {name: self.prices.joint * (name not in self.shared) for name in grown}
-        for j, (mine, joint) in enumerate(zip(shapes, plain_joints(evidence, scatter, z), strict=True)):
+        for j, (mine, joint) in enumerate(
+            zip(shapes, plain_joints(evidence, scatter, z), strict=True)
+        ):
             self.tell(f"trying sets on joint {j + 1}", 0.55 + 0.1 * j / len(shapes))
             by = 1.0 / np.sqrt(scatter[j])
-            scaled = {name: [Shape(shape.sizes, shape.change * by) for shape in own] for name, own in mine.items()}
+            scaled = {
+                name: [Shape(shape.sizes, shape.change * by) for shape in own]
+                for name, own in mine.items()
+            }
             tables.append(Table(joint, scaled, evidence.block))
             tables[-1].explore(flat, 3 if z is None else MOST)
         return tables
 
     def _around(
-        self, evidence: Evidence, grown: Mapping[str, list[Ray]], chosen: Chosen, repaired: Repair, price: Price
+        self,
+        evidence: Evidence,
+        grown: Mapping[str, list[Ray]],
+        chosen: Chosen,
+        repaired: Repair,
+        price: Price,
     ) -> tuple[around.Around, list[Table], Chosen, Repair | None]:
         """Goes on from a set whose effects do not add up: simulates all others in its company, fits sizes together."""
         tried, scatter = [repaired], np.ones(self.case.machine.num_joints)
@@ -254,20 +291,36 @@ class Search:
             if not drops or paying == subsets or not any(paying):
                 break
             best = around.without(evidence, wide[1], best, paying)
-        worth = sum(table.score(s).total - price(j, s) for j, (table, s) in enumerate(zip(tables, subsets, strict=True)) if s)
-        return wide, tables, Chosen(subsets, worth - self.prices.name * len(frozenset().union(*subsets))), best
+        worth = sum(
+            table.score(s).total - price(j, s)
+            for j, (table, s) in enumerate(zip(tables, subsets, strict=True))
+            if s
+        )
+        return (
+            wide,
+            tables,
+            Chosen(subsets, worth - self.prices.name * len(frozenset().union(*subsets))),
+            best,
+        )
 
     def _scatter(self, z: np.ndarray) -> np.ndarray:
         """Returns the mean square of errors over the noise `(J, E)` over that of the reference, outliers cut, `(J,)`."""
         nulls = [one.evidence.z for one in self.base.nulls]
-        usual = np.mean(np.minimum(np.concatenate(nulls, 1) ** 2, CUT), 1) if nulls else np.ones(len(z))
+        usual = (
+            np.mean(np.minimum(np.concatenate(nulls, 1) ** 2, CUT), 1) if nulls else np.ones(len(z))
+        )
         return np.mean(np.minimum(z**2, CUT), 1) / usual
 
     def _left(self, beside: Evidence) -> tuple[np.ndarray, np.ndarray]:
         """Returns what clues earn on what is left and, at most, on reference recordings, both `(clues, J)`."""
         nulls = [one.evidence for one in self.base.nulls]
-        earned, on_nulls = remainder.predictable(beside, beside.z), [remainder.predictable(one, one.z) for one in nulls]
-        return earned, remainder.beyond(earned, on_nulls, [beside.z.shape[1] / one.z.shape[1] for one in nulls])
+        earned, on_nulls = (
+            remainder.predictable(beside, beside.z),
+            [remainder.predictable(one, one.z) for one in nulls],
+        )
+        return earned, remainder.beyond(
+            earned, on_nulls, [beside.z.shape[1] / one.z.shape[1] for one in nulls]
+        )
 
     def _strays(self, beside: Evidence) -> np.ndarray:
         own = remainder.strayed(beside, beside.error)
@@ -276,19 +329,34 @@ class Search:
 
 
 def _promised(tables: Sequence[Table], chosen: Chosen) -> float:
-    return sum(table.score(subset).total for table, subset in zip(tables, chosen.subsets, strict=True))
+    return sum(
+        table.score(subset).total for table, subset in zip(tables, chosen.subsets, strict=True)
+    )
 
 
 def _adjusted(evidence: Evidence, case: Case, found: Sequence[Found]) -> Evidence:
     """Returns the evidence where encoders err as was found, and where sensors that scatter more say less."""
-    steady = [(one.kind, one.values()) for one in found if one.kind.target.side == "measurement" and _is_steady(one.kind)]
-    evidence = replace(evidence, candidates=replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady]))
-    rough = [one.joints for one in found if one.kind.target.side == "measurement" and not _is_steady(one.kind)]
+    steady = [
+        (one.kind, one.values())
+        for one in found
+        if one.kind.target.side == "measurement" and _is_steady(one.kind)
+    ]
+    evidence = replace(
+        evidence,
+        candidates=replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady]),
+    )
+    rough = [
+        one.joints
+        for one in found
+        if one.kind.target.side == "measurement" and not _is_steady(one.kind)
+    ]
     if not rough:
         return evidence
     assert evidence.noise is not None, "noise is known by now"
     reading = sensors.readings(case.field, case.reference, case.machine) * np.any(rough, 0)
-    noise = [replace(one, reading=float(more)) for one, more in zip(evidence.noise, reading, strict=True)]
+    noise = [
+        replace(one, reading=float(more)) for one, more in zip(evidence.noise, reading, strict=True)
+    ]
     return replace(evidence, noise=noise)
 
 

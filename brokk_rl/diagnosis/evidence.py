@@ -1,6 +1,7 @@
 """Errors of a simulator on some recordings, and what effects would change about them, divided by the simulator's own noise.
 
-Axes: `C` candidates, `W` windows, `I` increments in a window, `J` joints, `E` entries (increments of all windows, `W` times `I`).
+Axes: `C` candidates, `W` windows, `I` increments in a window, `J` joints, `E` entries (increments
+of all windows, `W` times `I`).
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ from brokk_rl.diagnosis.library import Kind
 from brokk_rl.diagnosis.noise import LONGEST, Noise, increments
 
 GRID = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
-"""Sizes, over the typical one, at which an effect is simulated; in between its doing is interpolated."""
+"""Sizes, over the typical one, at which an effect is simulated; in between its doing is
+interpolated."""
 
 GAIN, FAULT_S, FAULT = 0.01, 0.004, 0.01
-"""What a simulator gets wrong from day to day, and what is no effect: speeds by a percent, times in s, other numbers."""
+"""What a simulator gets wrong from day to day, and what is no effect: speeds by a percent, times in
+s, other numbers."""
 
 UNSURE = 0.5
 """What effects of chance change on average is known up to so much of it: their forms differ."""
@@ -36,7 +39,8 @@ class Ray:
         kind: The effect.
         name: Of the number; empty for all at once.
         sizes: Sizes at which it is simulated, over the typical one, rising, 0 among them.
-        shape: Values of the numbers that only shape the effect, over the typical ones, by name, each `(J,)`; 1 where not given.
+        shape: Values of the numbers that only shape the effect, over the typical ones, by name,
+            each `(J,)`; 1 where not given.
         is_tied: The size is known up to `sizes`, and goes no further.
     """
 
@@ -56,7 +60,9 @@ class Ray:
         for name, part in self.shape.items():
             number = self.kind.numbers[name]
             value = self.kind.clipped(name, part * number.typical)
-            found[name] = np.repeat(value[None] if number.per_joint else value[None, :1], len(size), 0)
+            found[name] = np.repeat(
+                value[None] if number.per_joint else value[None, :1], len(size), 0
+            )
         return found
 
 
@@ -89,9 +95,12 @@ class Evidence:
         noise: Of each joint; `None` while it is still to be found.
         claims: Whether each window says something about each joint, `(W, J)`.
         mean: What effects of chance change on average, which are known already, `(W, K, J)`.
-        bias: Increments that the simulator misses already on the reference, `(W, I, J)`; see `discrepancy`.
-        widths: How large faults of the simulator's own numbers are, over the usual, `(P,)`; see `discrepancy`.
-        late: What each change of a command does when it comes a standard deviation late, `(W, C, I, J)`, where that is by chance.
+        bias: Increments that the simulator misses already on the reference, `(W, I, J)`; see
+            `discrepancy`.
+        widths: How large faults of the simulator's own numbers are, over the usual, `(P,)`; see
+            `discrepancy`.
+        late: What each change of a command does when it comes a standard deviation late, `(W, C, I,
+            J)`, where that is by chance.
         runs: Its free runs without any effect, `(W, K, J)`, where they are known already.
     """
 
@@ -129,7 +138,11 @@ class Evidence:
         still = np.zeros_like(self.start)
         known = 0.0 if self.mean is None else increments(self.mean, still)
         known = known if self.bias is None else known + self.bias
-        return increments(self.candidates.cut.measured, self.start) - increments(paths, self.start) - known
+        return (
+            increments(self.candidates.cut.measured, self.start)
+            - increments(paths, self.start)
+            - known
+        )
 
     @cached_property
     def groups(self) -> list[np.ndarray]:
@@ -137,7 +150,9 @@ class Evidence:
         size = max(1, LONGEST // self.way.shape[1])
         runs = self.candidates.cut.run
         breaks = [0, *(np.flatnonzero(runs[1:] != runs[:-1]) + 1), len(runs)]
-        return [np.arange(i, min(i + size, b)) for a, b in pairwise(breaks) for i in range(a, b, size)]
+        return [
+            np.arange(i, min(i + size, b)) for a, b in pairwise(breaks) for i in range(a, b, size)
+        ]
 
     @cached_property
     def fold(self) -> np.ndarray:
@@ -159,7 +174,10 @@ class Evidence:
     @cached_property
     def _whiteners(self) -> list[list[np.ndarray]]:
         return [
-            [np.linalg.inv(np.linalg.cholesky(self._covariance(group, j))) for j in range(self.way.shape[2])]
+            [
+                np.linalg.inv(np.linalg.cholesky(self._covariance(group, j)))
+                for j in range(self.way.shape[2])
+            ]
             for group in self.groups
         ]
 
@@ -169,7 +187,10 @@ class Evidence:
         found = self.noise[j].covariance(self.way[group, :, j].reshape(1, -1))[0]
         for place, window in enumerate(group if self.late is not None else ()):
             assert self.late is not None, "asked before"
-            own, moved = slice(place * self.way.shape[1], (place + 1) * self.way.shape[1]), self.late[window, ..., j]
+            own, moved = (
+                slice(place * self.way.shape[1], (place + 1) * self.way.shape[1]),
+                self.late[window, ..., j],
+            )
             found[own, own] += moved.T @ moved
         return found
 
@@ -197,7 +218,9 @@ class Evidence:
         count, steps, size = columns.shape
         columns, found = columns * self.claims[:, j, None, None], np.empty((count * steps, size))
         for group, whiteners in zip(self.groups, self._whiteners, strict=True):
-            found[group[0] * steps : (group[-1] + 1) * steps] = whiteners[j] @ columns[group].reshape(-1, size)
+            found[group[0] * steps : (group[-1] + 1) * steps] = whiteners[j] @ columns[
+                group
+            ].reshape(-1, size)
         return found
 
     @cached_property
@@ -208,12 +231,17 @@ class Evidence:
     @cached_property
     def faults(self) -> np.ndarray:
         """What small faults of the simulator itself change, over the noise, `(J, P, E)`, each by its prior standard deviation."""
-        found = [self.whitened((self.way * GAIN * side)[None]) for side in (self.way > 0, self.way < 0)]
+        found = [
+            self.whitened((self.way * GAIN * side)[None]) for side in (self.way > 0, self.way < 0)
+        ]
         candidates = self.candidates
         model: Any = candidates.base.build(candidates.machine, 1, torch.device("cpu"))
         for name, value in (getattr(model, "parameters", None) or {}).items():
             by = FAULT_S if name.endswith("_s") else FAULT
-            moved = increments(candidates.paths([], 1, {name: value.numpy() + by})[0], self.start) - self.way
+            moved = (
+                increments(candidates.paths([], 1, {name: value.numpy() + by})[0], self.start)
+                - self.way
+            )
             found.append(self.whitened(moved[None]))
         lines = np.concatenate(found, 1)
         lines = lines if self.widths is None else lines * self.widths[:, None]
@@ -226,7 +254,9 @@ class Evidence:
         """Returns what an effect on all joints changes at each size of the ray, over the noise, `(J, C, E)`."""
         joints = self.way.shape[2]
         sizes = ray.sizes[ray.sizes != 0.0]
-        paths = self.candidates.paths([(ray.kind, ray.values(np.repeat(sizes[:, None], joints, 1)))], len(sizes))
+        paths = self.candidates.paths(
+            [(ray.kind, ray.values(np.repeat(sizes[:, None], joints, 1)))], len(sizes)
+        )
         changed = np.zeros((len(ray.sizes), *self.way.shape))
         changed[ray.sizes != 0.0] = increments(paths, self.start) - self.way
         return self.whitened(changed)

@@ -1,9 +1,10 @@
 """Frames that are late or lost: hidden delays of single commands, each measured by where its joint ends up.
 
-A command that changes acts a little earlier or later; what one period later would do is simulated. A frame carries the commands of
-all joints: the delays that explain the errors of all of them best, one for each frame that changes a command, scatter no more than
-on the reference where all frames arrive in time; how they scatter tells lost frames (whole periods, seldom) from jitter (parts of
-periods, always).
+A command that changes acts a little earlier or later; what one period later would do is simulated.
+A frame carries the commands of
+all joints: the delays that explain the errors of all of them best, one for each frame that changes
+a command, scatter no more than on the reference where all frames arrive in time; how they scatter
+tells lost frames (whole periods, seldom) from jitter (parts of periods, always).
 Axes: `W` windows, `K` steps, `I` increments, `J` joints, `D` changes of a command, `C` candidates.
 """
 
@@ -43,7 +44,8 @@ DRAWN = 3
 MOST = 300
 """Delays drawn by which those seen are judged."""
 BEYOND = 2.0
-"""The mean of delays by chance is off by so much of itself at most; what joints are late by beyond is an effect of its own."""
+"""The mean of delays by chance is off by so much of itself at most; what joints are late by beyond
+is an effect of its own."""
 SCALES, FREEDOMS = np.linspace(0.7, 1.5, 9), (3.0, 5.0, 7.0, 10.0)
 """Among which the distribution of the errors of delays is found."""
 WIDER = 1.1
@@ -86,7 +88,10 @@ class Usual:
     def of(cls, known: Sequence[Delays]) -> Usual:
         """Returns the most likely one for the delays of recordings in which no frame is late."""
         tried = [cls(scale, freedom) for scale in SCALES for freedom in FREEDOMS]
-        return max(tried, key=lambda one: sum(float(one.log(seen.value, seen.error).sum()) for seen in known))
+        return max(
+            tried,
+            key=lambda one: sum(float(one.log(seen.value, seen.error).sum()) for seen in known),
+        )
 
     def log(self, off: np.ndarray, error: np.ndarray) -> np.ndarray:
         """Returns the logarithm of the density of what delays with these standard errors are off by."""
@@ -122,11 +127,15 @@ class Changes:
         count, windows = int(rank.max(initial=0)), len(cut.u)
         if not count:
             return np.zeros((0, *self.evidence.way.shape))
-        late = [np.where(rank == number, cut.u[:, :-1], cut.u[:, 1:]) for number in range(1, count + 1)]
+        late = [
+            np.where(rank == number, cut.u[:, :-1], cut.u[:, 1:]) for number in range(1, count + 1)
+        ]
         u = np.concatenate([np.repeat(cut.u[None, :, :1], count, 0), np.stack(late)], 2)
         rows = np.tile(np.arange(windows), count)
         many = replace(cut, u=u.reshape(-1, *u.shape[2:]), q=cut.q[rows], run=cut.run[rows])
-        candidates = replace(self.evidence.candidates, cut=many, running_s=self.evidence.candidates.running_s[rows])
+        candidates = replace(
+            self.evidence.candidates, cut=many, running_s=self.evidence.candidates.running_s[rows]
+        )
         paths = candidates.paths([])[0].reshape(count, windows, *self.evidence.base.shape[1:])
         return increments(paths, self.evidence.start) - self.evidence.way
 
@@ -143,16 +152,27 @@ class Changes:
             columns = np.zeros((joints, self.evidence.way.shape[1], len(frames)))
             for j, whiteners in enumerate(self._whiteners if len(frames) else ()):
                 rank = ranks[frames, j]
-                columns[j][:, rank > 0] = whiteners[w] @ self.responses[rank[rank > 0] - 1, w, :, j].T * self.evidence.claims[w, j]
+                columns[j][:, rank > 0] = (
+                    whiteners[w]
+                    @ self.responses[rank[rank > 0] - 1, w, :, j].T
+                    * self.evidence.claims[w, j]
+                )
             telling = np.abs(columns).max((0, 1)) > LEAST
             columns = columns[..., telling]
-            found.append((columns.reshape(joints * columns.shape[1], telling.sum()), np.square(columns).sum(1).argmax(0)))
+            found.append(
+                (
+                    columns.reshape(joints * columns.shape[1], telling.sum()),
+                    np.square(columns).sum(1).argmax(0),
+                )
+            )
         return found
 
     @cached_property
     def _whiteners(self) -> list[np.ndarray]:
         assert self.evidence.noise is not None, "noise is known by now"
-        return [noise.whitener(self.evidence.way[..., j]) for j, noise in enumerate(self.evidence.noise)]
+        return [
+            noise.whitener(self.evidence.way[..., j]) for j, noise in enumerate(self.evidence.noise)
+        ]
 
     @cached_property
     def _every(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -170,9 +190,12 @@ class Changes:
     def delays(self, error: np.ndarray, without: int | None = None) -> Delays:
         """Returns the delays that explain errors `(W, I, J)` (measured less simulated increments) best.
 
-        What a joint alone is late by on average is none of them; `without`: a joint whose errors do not count.
+        What a joint alone is late by on average is none of them; `without`: a joint whose errors do
+        not count.
         """
-        z = np.stack([(w @ error[..., j, None])[..., 0] for j, w in enumerate(self._whiteners)], 1)  # (W, J, I)
+        z = np.stack(
+            [(w @ error[..., j, None])[..., 0] for j, w in enumerate(self._whiteners)], 1
+        )  # (W, J, I)
         always = np.stack([x.sum(1).reshape(z.shape[1:]) for x, _ in self._told])
         share = (always * z).sum((0, 2)) / (np.square(always).sum((0, 2)) + WIDE**-2)
         z = z - share[:, None] * always
@@ -183,8 +206,16 @@ class Changes:
             value.append((matrix @ row.ravel())[sure])
             deviation.append(errors[sure])
             joint.append(most[sure])
-        value, deviation, joint = np.concatenate(value), np.concatenate(deviation), np.concatenate(joint)
-        return Delays(value - np.average(value, weights=deviation**-2) if len(value) else value, deviation, joint)
+        value, deviation, joint = (
+            np.concatenate(value),
+            np.concatenate(deviation),
+            np.concatenate(joint),
+        )
+        return Delays(
+            value - np.average(value, weights=deviation**-2) if len(value) else value,
+            deviation,
+            joint,
+        )
 
     def spread(self, error: np.ndarray) -> np.ndarray:
         """Returns what each change does when it comes late by the standard deviation of the delays seen, `(W, C, I, J)`."""
@@ -194,7 +225,12 @@ class Changes:
 
 
 def search(
-    changes: Changes, error: np.ndarray, nulls: Sequence[Evidence], kinds: Sequence[Kind], price: float, name_price: float
+    changes: Changes,
+    error: np.ndarray,
+    nulls: Sequence[Evidence],
+    kinds: Sequence[Kind],
+    price: float,
+    name_price: float,
 ) -> Found | None:
     """Returns the effect on the arrival of commands that the scatter of hidden delays shows, if any.
 
@@ -212,20 +248,35 @@ def search(
     if not kinds or len(seen.value) < FEWEST or sum(len(one.value) for one in known) < FEWEST:
         return None
     usual = Usual.of(known)
-    if _scatter(seen.value / seen.error) < WIDER * _scatter(np.concatenate([one.value / one.error for one in known])):
+    if _scatter(seen.value / seen.error) < WIDER * _scatter(
+        np.concatenate([one.value / one.error for one in known])
+    ):
         return None
     gains, earned = {}, {}
     for kind in kinds:
         drawn = [_thinned(one) for one in _drawn(changes, kind)]
         gains[kind.name] = np.array([usual.gain(seen, one) for one in drawn])
         best = drawn[int(np.argmax(gains[kind.name]))]
-        by_joint = {int(j): usual.gain(seen.of(j), best) for j in np.unique(seen.joint) if len(seen.of(j).value) >= FEWEST}
-        rest = changes.delays(error, max(by_joint, key=by_joint.__getitem__)) if len(by_joint) > 1 else seen
+        by_joint = {
+            int(j): usual.gain(seen.of(j), best)
+            for j in np.unique(seen.joint)
+            if len(seen.of(j).value) >= FEWEST
+        }
+        rest = (
+            changes.delays(error, max(by_joint, key=by_joint.__getitem__))
+            if len(by_joint) > 1
+            else seen
+        )
         if min(by_joint.values(), default=0.0) < -price or usual.gain(rest, best) < price:
             gains[kind.name] = gains[kind.name] * 0.0  # frames are late for all joints or for none
         share = [len(seen.value) / max(1, len(one.value)) for one in known]
-        earned[kind.name] = max(0.0, *(usual.gain(one, best) * part for one, part in zip(known, share, strict=True)))
-    worth = {name: float(gain.max()) - price - 1.5 * earned[name] - name_price for name, gain in gains.items()}
+        earned[kind.name] = max(
+            0.0, *(usual.gain(one, best) * part for one, part in zip(known, share, strict=True))
+        )
+    worth = {
+        name: float(gain.max()) - price - 1.5 * earned[name] - name_price
+        for name, gain in gains.items()
+    }
     best = max(kinds, key=lambda kind: worth[kind.name])
     if worth[best.name] <= 0:
         return None
@@ -233,31 +284,51 @@ def search(
     machine = changes.evidence.candidates.machine
     parameters = {}
     for name in best.fitted:
-        mean, low, high = (float(v) for v in best.clipped(name, best.numbers[name].none + best.size(name) * ends))
+        mean, low, high = (
+            float(v) for v in best.clipped(name, best.numbers[name].none + best.size(name) * ends)
+        )
         parameters[name] = {joint: Estimate(mean, (low, high)) for joint in machine.joint_names}
     rest = {name: float(gain.max()) for name, gain in gains.items() if name != best.name}
     every = np.ones(machine.num_joints, dtype=bool)
-    return Found(best, every, parameters, worth[best.name], float(gains[best.name].max()), _explained(seen, usual.scale), rest)
+    return Found(
+        best,
+        every,
+        parameters,
+        worth[best.name],
+        float(gains[best.name].max()),
+        _explained(seen, usual.scale),
+        rest,
+    )
 
 
 def expected(evidence: Evidence, found: Found, steady: Sequence[tuple[Kind, Values]]) -> Evidence:
     """Returns the evidence with what the found effect changes on average, and the mean delay that joints share beyond it.
 
-    How delays scatter does not tell their mean: frames that may not overtake each other wait twice as long as others that scatter
-    alike. Frames are late for all joints alike, so that what one joint alone is late by is left for an effect of its own.
+    How delays scatter does not tell their mean: frames that may not overtake each other wait twice
+    as long as others that scatter alike. Frames are late for all joints alike, so that what one
+    joint alone is late by is left for an effect of its own.
 
     Args:
         evidence: The simulator against the field.
         found: The effect.
         steady: Other effects that are there.
     """
-    count, candidates = 4 * DRAWN, replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady])
-    mean = candidates.paths([(found.kind, found.values(count))], count).mean(0) - candidates.paths([])[0]
+    count, candidates = (
+        4 * DRAWN,
+        replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady]),
+    )
+    mean = (
+        candidates.paths([(found.kind, found.values(count))], count).mean(0)
+        - candidates.paths([])[0]
+    )
     u = evidence.candidates.cut.u
     late = replace(evidence.candidates.cut, u=np.concatenate([u[:, :1], u[:, :-1]], 1))
     later = replace(evidence.candidates, cut=late).paths([])[0] - evidence.base
     known = replace(evidence, mean=mean)
-    moved, usual = (known.whitened(increments(one, np.zeros_like(evidence.start))[None])[:, 0] for one in (later, mean))
+    moved, usual = (
+        known.whitened(increments(one, np.zeros_like(evidence.start))[None])[:, 0]
+        for one in (later, mean)
+    )
     shares = [
         fitted(z, [], faults=np.concatenate([faults, WIDE * line[None]]))[-1] * WIDE
         for z, faults, line in zip(known.z, known.faults, moved, strict=True)
@@ -274,7 +345,9 @@ def _drawn(changes: Changes, kind: Kind) -> list[np.ndarray]:
     sizes = np.repeat(SIZES, DRAWN)[:, None]
     values = {}
     for name in kind.fitted:
-        values[name] = np.repeat(kind.clipped(name, kind.numbers[name].none + sizes * kind.size(name)), joints, 1)
+        values[name] = np.repeat(
+            kind.clipped(name, kind.numbers[name].none + sizes * kind.size(name)), joints, 1
+        )
     paths = evidence.candidates.paths([(kind, values)], len(sizes))
     moved = increments(paths, evidence.start) - evidence.way
     found = [changes.delays(one).value for one in moved]
@@ -293,4 +366,8 @@ def _thinned(drawn: np.ndarray) -> np.ndarray:
 
 def _explained(seen: Delays, scale: float) -> float:
     """Returns the share of the scatter of the delays that is more than their errors."""
-    return float(np.clip(1.0 - np.mean((scale * seen.error) ** 2) / max(np.mean(seen.value**2), 1e-12), 0.0, 1.0))
+    return float(
+        np.clip(
+            1.0 - np.mean((scale * seen.error) ** 2) / max(np.mean(seen.value**2), 1e-12), 0.0, 1.0
+        )
+    )

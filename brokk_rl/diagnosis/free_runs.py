@@ -1,6 +1,7 @@
 """Free runs of a simulator beside the recordings that they were cut from.
 
-Labels of what a joint was doing are made on whole recordings and then cut as the free runs were, so that what happened before a
+Labels of what a joint was doing are made on whole recordings and then cut as the free runs were, so
+that what happened before a
 window is not forgotten. Axes: `W` windows, `K` steps, `J` joints, `T` rows of a recording.
 """
 
@@ -28,7 +29,8 @@ class FreeRuns:
     Attributes:
         recordings: Where the windows come from.
         source: Number of the recording of each window, `(W,)`.
-        row: Row of its first simulated position, `(W,)`; the row before is the measured one that it starts at.
+        row: Row of its first simulated position, `(W,)`; the row before is the measured one that it
+            starts at.
         simulated: Positions, `(W, K, J)`, rad or m.
     """
 
@@ -76,7 +78,11 @@ class FreeRuns:
 
 
 def free_runs(
-    actuator: Actuator, recordings: Sequence[Recording], machine: Machine, horizon_s: float, device: torch.device
+    actuator: Actuator,
+    recordings: Sequence[Recording],
+    machine: Machine,
+    horizon_s: float,
+    device: torch.device,
 ) -> FreeRuns:
     """Runs a simulator through recordings from one end to the other, begun anew every `horizon_s`; the last may be shorter.
 
@@ -93,6 +99,8 @@ def free_runs(
         source += [number] * len(cut.q)
         row += [before + steps * window for window in range(len(cut.q))]
     if not cuts:
-        raise RecordingError(f"too little data: a free run needs recordings of more than {before * machine.period_s:g} s")
+        raise RecordingError(
+            f"too little data: a free run needs recordings of more than {before * machine.period_s:g} s"
+        )
     simulated = open_loop.free_run(actuator, machine, open_loop.joined(cuts), device)
     return FreeRuns(recordings, np.array(source), np.array(row), simulated.astype(float))

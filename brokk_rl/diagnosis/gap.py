@@ -34,15 +34,24 @@ def squares(paths: np.ndarray, measured: np.ndarray, machine: Machine) -> np.nda
     return np.square((paths - measured) / size).mean((1, 2))
 
 
-def draws(field: int, floor: int, generator: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
+def draws(
+    field: int, floor: int, generator: np.random.Generator
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns windows of field and floor in bootstraps over blocks, as many as each has."""
     return [(_draw(field, generator), _draw(floor, generator)) for _ in range(DRAWS)]
 
 
-def shares(before: np.ndarray, after: np.ndarray, floor: np.ndarray, drawn: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+def shares(
+    before: np.ndarray,
+    after: np.ndarray,
+    floor: np.ndarray,
+    drawn: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> np.ndarray:
     """Returns the share of the gap that is closed, then the same of each draw, `(1 + B,)`."""
     found = [_share(rmse(before), rmse(after), rmse(floor))]
-    return np.array(found + [_share(rmse(before[f]), rmse(after[f]), rmse(floor[g])) for f, g in drawn])
+    return np.array(
+        found + [_share(rmse(before[f]), rmse(after[f]), rmse(floor[g])) for f, g in drawn]
+    )
 
 
 def estimate(values: np.ndarray) -> Estimate:
@@ -56,7 +65,9 @@ def rmse(square: np.ndarray) -> float:
     return float(np.sqrt(square.mean()))
 
 
-def closed(before: np.ndarray, after: np.ndarray, floor: np.ndarray, generator: np.random.Generator) -> Estimate | None:
+def closed(
+    before: np.ndarray, after: np.ndarray, floor: np.ndarray, generator: np.random.Generator
+) -> Estimate | None:
     """Returns the share of the gap that is closed, with the interval of a bootstrap over blocks of windows.
 
     Args:
@@ -73,7 +84,11 @@ def closed(before: np.ndarray, after: np.ndarray, floor: np.ndarray, generator: 
 def shapley(names: Sequence[str], closed_by: Callable[[frozenset[str]], Any]) -> dict[str, Any]:
     """Returns what each effect closes, a number or an array of them: the mean over all orders of adding them."""
     count, found = len(names), dict.fromkeys(names, 0.0)
-    value = {frozenset(s): closed_by(frozenset(s)) for size in range(count + 1) for s in combinations(names, size)}
+    value = {
+        frozenset(s): closed_by(frozenset(s))
+        for size in range(count + 1)
+        for s in combinations(names, size)
+    }
     for name in names:
         for size in range(count):
             chance = factorial(size) * factorial(count - size - 1) / factorial(count)
@@ -83,7 +98,9 @@ def shapley(names: Sequence[str], closed_by: Callable[[frozenset[str]], Any]) ->
 
 
 def _share(before: float, after: float, floor: float) -> float:
-    floor = min(floor, after)  # no repair is better than the floor: where it is, the floor was measured on harder recordings
+    floor = min(
+        floor, after
+    )  # no repair is better than the floor: where it is, the floor was measured on harder recordings
     return float((before - after) / max(before - floor, 0.02 * before + 1e-12))
 
 

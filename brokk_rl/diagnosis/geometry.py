@@ -1,6 +1,7 @@
 """Measured tool points against forward kinematics: how far off, and which single error of geometry explains it best.
 
-Works on measured positions alone, no simulator takes part: what is off here is off whatever the actuators do.
+Works on measured positions alone, no simulator takes part: what is off here is off whatever the
+actuators do.
 Axes: `S` samples, `J` joints.
 """
 
@@ -54,12 +55,16 @@ def geometry(recordings: Sequence[Recording], machine: Machine) -> Geometry | No
     having = [r for r in recordings if all(column in r.extra for column in COLUMNS)]
     if not having:
         return None
-    seen = np.concatenate([np.stack([r.extra[column] for column in COLUMNS], 1) for r in having]).astype(float)
+    seen = np.concatenate(
+        [np.stack([r.extra[column] for column in COLUMNS], 1) for r in having]
+    ).astype(float)
     q = np.concatenate([r.q for r in having])
     given = np.isfinite(seen).all(1)
     if given.sum() < FEWEST:
         return None
-    pose, jacobian = Kinematics(machine).pose_and_jacobian(torch.as_tensor(q[given], dtype=torch.float32))
+    pose, jacobian = Kinematics(machine).pose_and_jacobian(
+        torch.as_tensor(q[given], dtype=torch.float32)
+    )
     off = seen[given] - pose.tip_in_base_m.numpy()
     whole = float((off**2).sum())
     columns = _columns(machine, q[given], pose, jacobian.tip.numpy())
@@ -68,12 +73,21 @@ def geometry(recordings: Sequence[Recording], machine: Machine) -> Geometry | No
     return Geometry(float(np.sqrt(whole / len(off))), cause, size, unit, explained, len(off))
 
 
-def _columns(machine: Machine, q: np.ndarray, pose: Any, tip: np.ndarray) -> Iterator[tuple[str, str, np.ndarray]]:
+def _columns(
+    machine: Machine, q: np.ndarray, pose: Any, tip: np.ndarray
+) -> Iterator[tuple[str, str, np.ndarray]]:
     """Yields the way in which each error of unit size moves the measured tip, `(S, 3)`, relative to the computed one."""
-    origins, end = pose.joints_in_base_m.numpy().astype(float), pose.tip_in_base_m.numpy().astype(float)
+    origins, end = (
+        pose.joints_in_base_m.numpy().astype(float),
+        pose.tip_in_base_m.numpy().astype(float),
+    )
     points = np.concatenate([origins, end[:, None]], 1)
     for j, joint in enumerate(machine.joints):
-        yield f"encoder_bias {joint.name}", joint.unit, -tip[:, :, j]  # the sensor says too much: the tip is less far
+        yield (
+            f"encoder_bias {joint.name}",
+            joint.unit,
+            -tip[:, :, j],
+        )  # the sensor says too much: the tip is less far
         yield f"encoder_scale {joint.name}", "", -tip[:, :, j] * q[:, j : j + 1]
         link = points[:, j + 1] - points[:, j]
         length = np.linalg.norm(link, axis=1, keepdims=True)

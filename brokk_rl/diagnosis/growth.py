@@ -1,7 +1,9 @@
 """How the error grows over the time of a free run, and what that says about where it comes from.
 
-A sensor's error does not grow; play and an offset are there at once and then stay; a wrong gain or dead band adds up with the way;
-a load that is not modelled adds up faster still. Commands go to and fro, so growth is slower than for one step: bounds are wide.
+A sensor's error does not grow; play and an offset are there at once and then stay; a wrong gain or
+dead band adds up with the way;
+a load that is not modelled adds up faster still. Commands go to and fro, so growth is slower than
+for one step: bounds are wide.
 Axes: `W` windows, `K` steps, `J` joints.
 """
 
@@ -38,10 +40,12 @@ class Growth:
         horizon_s: Times of the free run, s.
         rmse: Error at each, rad or m.
         floor: The same on the reference; `None` without one.
-        early: Slope of log(what exceeds the floor) over log(time), from the first horizon to the second.
+        early: Slope of log(what exceeds the floor) over log(time), from the first horizon to the
+            second.
         late: The same from the second to the last.
         reading: One of `READINGS`.
-        whole_run: Error over whole recordings in one free run each; `None` where that was not computed.
+        whole_run: Error over whole recordings in one free run each; `None` where that was not
+            computed.
     """
 
     horizon_s: tuple[float, ...]
@@ -54,22 +58,37 @@ class Growth:
 
     def plain(self) -> dict[str, Any]:
         """Returns it as plain JSON data."""
-        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in self.__dict__.items()}
+        plain = {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in self.__dict__.items()
+        }
         return plain | {"meaning": READINGS[self.reading]}
 
 
-def growth(runs: FreeRuns, reference: FreeRuns | None, machine: Machine, whole: FreeRuns | None) -> dict[str, Growth]:
+def growth(
+    runs: FreeRuns, reference: FreeRuns | None, machine: Machine, whole: FreeRuns | None
+) -> dict[str, Growth]:
     """Returns the growth of each joint's error."""
     steps = runs.simulated.shape[1]
-    at = [min(max(round(h / machine.period_s), 1), steps) - 1 for h in HORIZONS_S if round(h / machine.period_s) <= steps]
+    at = [
+        min(max(round(h / machine.period_s), 1), steps) - 1
+        for h in HORIZONS_S
+        if round(h / machine.period_s) <= steps
+    ]
     rmse = curve(runs)[at]
     floor = curve(reference)[at] if reference else None
     overall = None if whole is None else np.sqrt(np.nanmean(whole.error**2, (0, 1)))
     found = {}
     for j, name in enumerate(machine.joint_names):
-        beyond = np.sqrt(np.maximum(rmse[:, j] ** 2 - (0.0 if floor is None else floor[:, j] ** 2), 0.0))
+        beyond = np.sqrt(
+            np.maximum(rmse[:, j] ** 2 - (0.0 if floor is None else floor[:, j] ** 2), 0.0)
+        )
         is_sizeable = floor is None or rmse[-1, j] > SIZEABLE * floor[-1, j]
-        early, late = slopes(np.array([(k + 1) * machine.period_s for k in at]), beyond) if is_sizeable else (None, None)
+        early, late = (
+            slopes(np.array([(k + 1) * machine.period_s for k in at]), beyond)
+            if is_sizeable
+            else (None, None)
+        )
         found[name] = Growth(
             tuple((k + 1) * machine.period_s for k in at),
             tuple(map(float, rmse[:, j])),

@@ -1,7 +1,8 @@
 """What adding up promised, held against simulation.
 
-While sets are searched, what an effect does at a size is interpolated and effects are added up. What begins at a threshold can pay
-between two sizes that were simulated and nowhere else; it is dropped before it is named.
+While sets are searched, what an effect does at a size is interpolated and effects are added up.
+What begins at a threshold can pay between two sizes that were simulated and nowhere else; it is
+dropped before it is named.
 Axes: `J` joints.
 """
 
@@ -16,7 +17,12 @@ from brokk_rl.diagnosis.shapes import plain_joints
 
 
 def kept(
-    evidence: Evidence, chosen: Chosen, repaired: Repair, price: Price, scatter: np.ndarray, shared: Subset
+    evidence: Evidence,
+    chosen: Chosen,
+    repaired: Repair,
+    price: Price,
+    scatter: np.ndarray,
+    shared: Subset,
 ) -> tuple[Subset, ...]:
     """Returns the set without effects of no size worth naming, and without joints where it does not pay when it is simulated.
 
@@ -29,9 +35,17 @@ def kept(
         shared: Effects with one cause for all joints: they stay on all of them.
     """
     found = []
-    joints = zip(plain_joints(evidence, scatter), plain_joints(evidence, scatter, repaired.z), strict=True)
+    joints = zip(
+        plain_joints(evidence, scatter), plain_joints(evidence, scatter, repaired.z), strict=True
+    )
     for j, (subset, (before, after)) in enumerate(zip(chosen.subsets, joints, strict=True)):
         earned = float(before.loss.sum() - after.loss.sum()) + before.price - after.price
         pays = earned > price(j, subset)
-        found.append(frozenset(name for name in subset if name in shared or (pays and repaired.size(name, j) >= LEAST)))
+        found.append(
+            frozenset(
+                name
+                for name in subset
+                if name in shared or (pays and repaired.size(name, j) >= LEAST)
+            )
+        )
     return tuple(found)

@@ -15,7 +15,8 @@ from brokk_rl.record import Recording
 FEWEST = 5
 """Ignored stretches below which a condition that they share may be a coincidence."""
 SURE = 0.9
-"""A condition holds in at least this part of the ignored time, and in at most the rest of it of the answered time."""
+"""A condition holds in at least this part of the ignored time, and in at most the rest of it of the
+answered time."""
 SPAN = 3
 """Rows before and after one by which its speed is told."""
 THRESHOLDS = 15
@@ -40,23 +41,33 @@ class Interlock:
 
 
 def interlock(
-    inspected: Sequence[tuple[Recording, Sequence[Finding]]], machine: Machine, joint: int, thresholds: Thresholds
+    inspected: Sequence[tuple[Recording, Sequence[Finding]]],
+    machine: Machine,
+    joint: int,
+    thresholds: Thresholds,
 ) -> Interlock | None:
     """Returns the one condition that tells ignored commands of a joint from obeyed ones, `None` where no simple one does.
 
-    Conditions tried: another joint is commanded, none is, the command's own sign, a joint is beyond a position.
+    Conditions tried: another joint is commanded, none is, the command's own sign, a joint is beyond
+    a position.
     """
     name = machine.joint_names[joint]
     lead = round((machine.dead_time_s + thresholds.settle_s) / machine.period_s)
     ignored, driven, rows, counts = [], [], [], []
     for recording, findings in inspected:
         mask, held = np.zeros((2, recording.num_samples), dtype=bool)
-        mine = [finding for finding in findings if finding.kind == "no motion" and finding.joint == name]
+        mine = [
+            finding for finding in findings if finding.kind == "no motion" and finding.joint == name
+        ]
         for finding in mine:
             mask[finding.row : finding.row + finding.num_rows] = True
         for row, count in runs(np.abs(recording.u[:, joint]) > thresholds.driving):
             held[row + lead : row + count] = True
-        speed = (np.roll(recording.q[:, joint], -SPAN) - np.roll(recording.q[:, joint], SPAN)) * recording.rate_hz / (2 * SPAN)
+        speed = (
+            (np.roll(recording.q[:, joint], -SPAN) - np.roll(recording.q[:, joint], SPAN))
+            * recording.rate_hz
+            / (2 * SPAN)
+        )
         held &= np.abs(speed) > 2.0 * thresholds.still * machine.max_speed[joint]
         ignored.append(mask)
         driven.append(held)
@@ -72,8 +83,17 @@ def interlock(
     q = np.concatenate([recording.q for recording, _ in inspected])
     best = 0.0, 1.0, ""
     for text, condition in _conditions(u, q, machine, joint, thresholds):
-        for delay_s in (0.0, machine.dead_time_s):  # a lock may stop the motion itself, or the command on its way
-            found = _shares(np.roll(condition, round(delay_s / machine.period_s)), ignores, obeys, thresholds, machine)
+        for delay_s in (
+            0.0,
+            machine.dead_time_s,
+        ):  # a lock may stop the motion itself, or the command on its way
+            found = _shares(
+                np.roll(condition, round(delay_s / machine.period_s)),
+                ignores,
+                obeys,
+                thresholds,
+                machine,
+            )
             best = max(best, (*found, text), key=lambda row: row[0] - row[1])
     if best[0] < SURE or best[1] > 1.0 - SURE:
         return None
@@ -83,10 +103,16 @@ def interlock(
 
 
 def _shares(
-    condition: np.ndarray, ignores: np.ndarray, obeys: np.ndarray, thresholds: Thresholds, machine: Machine
+    condition: np.ndarray,
+    ignores: np.ndarray,
+    obeys: np.ndarray,
+    thresholds: Thresholds,
+    machine: Machine,
 ) -> tuple[float, float]:
     """Returns the parts of the ignored and of the obeyed time in which a condition holds, where it has not just changed."""
-    steady = ~_near(np.append(False, np.diff(condition)), round(thresholds.settle_s / machine.period_s))
+    steady = ~_near(
+        np.append(False, np.diff(condition)), round(thresholds.settle_s / machine.period_s)
+    )
     either = steady & ignores, steady & obeys
     if min(mask.sum() for mask in either) < FEWEST:
         return 0.0, 1.0

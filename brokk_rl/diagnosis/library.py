@@ -72,17 +72,24 @@ class Kind:
     @cached_property
     def shaping(self) -> tuple[str, ...]:
         """Numbers that only shape it, such as a time constant."""
-        return tuple(n for n, number in self.numbers.items() if number.none is None and n != self.running)
+        return tuple(
+            n for n, number in self.numbers.items() if number.none is None and n != self.running
+        )
 
     @cached_property
     def neutral(self) -> Any:
         """The spec with every number at its neutral or, for one that has none, at its typical value."""
-        values = {n: number.typical if number.none is None else number.none for n, number in self.numbers.items()}
+        values = {
+            n: number.typical if number.none is None else number.none
+            for n, number in self.numbers.items()
+        }
         if any(field.name == "joints" for field in fields(self.target)):
             values["joints"] = "all"
         return self.target(**values)
 
-    def wrap(self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device) -> Any:
+    def wrap(
+        self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
+    ) -> Any:
         """Returns `model` with the effect around it, at its neutral value; numbers are written into `parameters`."""
         return self.neutral.wrap(model, machine, num_envs, device)
 
@@ -111,7 +118,9 @@ def load(machine: Machine, names: Sequence[str] | None = None) -> list[Kind]:
         try:
             target = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError, ValueError) as error:
-            raise ConfigError(f"effect={option.name}: {path} cannot be imported ({error}); reinstall {option.package}") from error
+            raise ConfigError(
+                f"effect={option.name}: {path} cannot be imported ({error}); reinstall {option.package}"
+            ) from error
         if hasattr(target, "numbers"):  # an option may hold several effects: it is none itself
             found[option.name] = Kind(option.name, target, machine.num_joints)
     for name in names or ():
@@ -135,7 +144,9 @@ def shared(kinds: Iterable[Kind]) -> frozenset[str]:
 def _try(kind: Kind, machine: Machine) -> None:
     """Raises a `ConfigError` when the effect needs what is not known of the machine."""
     device = torch.device("cpu")
-    rest = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32).expand(1, machine.num_history, -1)
+    rest = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32).expand(
+        1, machine.num_history, -1
+    )
     model = kind.wrap(Still(), machine, 1, device)
     with torch.inference_mode():
         model.step(History(q=rest.clone(), u=torch.zeros_like(rest)))

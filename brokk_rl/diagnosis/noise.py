@@ -1,8 +1,10 @@
 """How a simulator errs that lacks nothing: the covariance of its errors on reference recordings that it was not fitted to.
 
-Errors are compared as increments over `SPAN` samples. They have three parts: a sensor's (each increment by itself), one at
-changes of speed, and a speed that wanders by a few percent for some seconds, which is the part that hangs together. Dividing by
-the root of the covariance makes all increments count alike and independent: a wandering speed is then no evidence for another gain.
+Errors are compared as increments over `SPAN` samples. They have three parts: a sensor's (each
+increment by itself), one at changes of speed, and a speed that wanders by a few percent for some
+seconds, which is the part that hangs together. Dividing by
+the root of the covariance makes all increments count alike and independent: a wandering speed is
+then no evidence for another gain.
 Axes: `W` windows, `I` increments, `J` joints, `B` blocks of `S` increments in a row.
 """
 
@@ -50,7 +52,8 @@ class Noise:
         change: The same over the change of speed between neighbouring increments.
         wander: Relative standard deviation of the speed.
         memory: Increments over which a wandering speed forgets.
-        reading: Standard deviation of each position as it is read, rad or m: what one increment gains the next one loses.
+        reading: Standard deviation of each position as it is read, rad or m: what one increment
+            gains the next one loses.
     """
 
     sensor: float
@@ -63,10 +66,16 @@ class Noise:
         """Returns the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `way` `(B, S)`."""
         lag = np.abs(np.subtract.outer(np.arange(way.shape[1]), np.arange(way.shape[1])))
         kept = np.exp(-lag / self.memory)
-        turn = np.abs(np.diff(way, axis=1, prepend=way[:, :1])) + np.abs(np.diff(way, axis=1, append=way[:, -1:]))
+        turn = np.abs(np.diff(way, axis=1, prepend=way[:, :1])) + np.abs(
+            np.diff(way, axis=1, append=way[:, -1:])
+        )
         single = self.sensor**2 + (self.change * turn) ** 2
         read = self.reading**2 * np.clip(2.0 - 3.0 * lag, -1.0, 2.0) * (lag <= 1)
-        return self.wander**2 * way[:, :, None] * way[:, None, :] * kept + single[:, :, None] * np.eye(way.shape[1]) + read
+        return (
+            self.wander**2 * way[:, :, None] * way[:, None, :] * kept
+            + single[:, :, None] * np.eye(way.shape[1])
+            + read
+        )
 
     def strayed(self, way: np.ndarray) -> np.ndarray:
         """Returns the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
@@ -92,6 +101,15 @@ def fit(error: np.ndarray, way: np.ndarray) -> Noise:
         return float(loss(z) + log_size + 0.02 * np.square(x[3] - np.log(10.0)) * 10)
 
     start = np.log([typical, 0.05, max(0.01, 0.5 * np.sqrt(np.mean(error**2)) / size), 10.0])
-    low, high = np.log([typical / 10, 1e-4, 1e-4, 1.0]), np.log([10 * typical + 1e-6, 1.0, 0.5, 200.0])
-    found = minimize(minus_log, start, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)), options={"maxiter": 40})
+    low, high = (
+        np.log([typical / 10, 1e-4, 1e-4, 1.0]),
+        np.log([10 * typical + 1e-6, 1.0, 0.5, 200.0]),
+    )
+    found = minimize(
+        minus_log,
+        start,
+        method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": 40},
+    )
     return Noise(*np.exp(found.x))

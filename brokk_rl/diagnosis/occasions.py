@@ -1,6 +1,7 @@
 """What a joint was doing at each moment: one regime, one direction and one kind of load a sample, so that shares add up.
 
-A joint answers its command a dead time later, so what counts is the command of that time. Axes: `T` rows, `J` joints.
+A joint answers its command a dead time later, so what counts is the command of that time. Axes: `T`
+rows, `J` joints.
 """
 
 from __future__ import annotations
@@ -15,10 +16,20 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.split import COMMANDED
 
-REGIMES = ("hold", "stop", "near an end stop", "after a reversal", "start", "creep", "several joints at once", "cruise")
-"""The first that fits is a sample's only one: at rest (just come to rest: `stop`), else commanded near an end of its travel, else
-shortly after a change of direction (whatever time it rested in between), else shortly after rest, else by a small command, else
-together with other joints, else alone."""
+REGIMES = (
+    "hold",
+    "stop",
+    "near an end stop",
+    "after a reversal",
+    "start",
+    "creep",
+    "several joints at once",
+    "cruise",
+)
+"""The first that fits is a sample's only one: at rest (just come to rest: `stop`), else commanded
+near an end of its travel, else shortly after a change of direction (whatever time it rested in
+between), else shortly after rest, else by a small command, else together with other joints, else
+alone."""
 DIRECTIONS = ("not commanded", "extending", "retracting")
 LOADS = ("not commanded", "level", "lifting", "lowering")
 """Against gravity, with it, or with less than `LEVEL` of the joint's largest load."""
@@ -46,7 +57,9 @@ class Dimension:
     label: list[np.ndarray]
 
 
-def dimensions(recordings: list[Recording], machine: Machine, dead_time_s: np.ndarray) -> list[Dimension]:
+def dimensions(
+    recordings: list[Recording], machine: Machine, dead_time_s: np.ndarray
+) -> list[Dimension]:
     """Returns regime, direction and, where the masses are known, load of all samples.
 
     Args:
@@ -54,13 +67,25 @@ def dimensions(recordings: list[Recording], machine: Machine, dead_time_s: np.nd
         machine: Gives limits, period and masses.
         dead_time_s: Time from command to motion of each joint, `(J,)`.
     """
-    acting = [in_force(recording.u, dead_time_s, 1.0 / recording.rate_hz) for recording in recordings]
+    acting = [
+        in_force(recording.u, dead_time_s, 1.0 / recording.rate_hz) for recording in recordings
+    ]
     found = [
-        Dimension("regime", REGIMES, [regimes(u, r.q, machine, r.rate_hz) for u, r in zip(acting, recordings, strict=True)]),
+        Dimension(
+            "regime",
+            REGIMES,
+            [regimes(u, r.q, machine, r.rate_hz) for u, r in zip(acting, recordings, strict=True)],
+        ),
         Dimension("direction", DIRECTIONS, [directions(u) for u in acting]),
     ]
     if machine.has_bodies:
-        found.append(Dimension("load", LOADS, [loads(u, r.q, machine) for u, r in zip(acting, recordings, strict=True)]))
+        found.append(
+            Dimension(
+                "load",
+                LOADS,
+                [loads(u, r.q, machine) for u, r in zip(acting, recordings, strict=True)],
+            )
+        )
     return found
 
 
@@ -104,7 +129,9 @@ def directions(acting: np.ndarray) -> np.ndarray:
 
 def loads(acting: np.ndarray, q: np.ndarray, machine: Machine) -> np.ndarray:
     """Returns the number of the kind of load of each sample, `(T, J)`."""
-    load = Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
+    load = (
+        Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
+    )
     largest = np.maximum(np.abs(load).max(0), 1e-9)
     pushed = load * np.sign(acting)
     kind = np.where(np.abs(load) < LEVEL * largest, 1, np.where(pushed < 0, 2, 3))

@@ -1,6 +1,7 @@
 """A finished diagnosis: the answer, and the free runs that a report draws, so that it can be made again without computing.
 
-Two files: `diagnosis.json` (the answer) and `diagnosis.npz` (recordings and free runs). Axes: `W` windows, `K` steps, `J` joints.
+Two files: `diagnosis.json` (the answer) and `diagnosis.npz` (recordings and free runs). Axes: `W`
+windows, `K` steps, `J` joints.
 """
 
 from __future__ import annotations
@@ -29,9 +30,11 @@ class Outcome:
 
     Attributes:
         answer: What it says.
-        before: Free runs of the simulator as it was through field recordings that no effect was fitted to.
+        before: Free runs of the simulator as it was through field recordings that no effect was
+            fitted to.
         after: The same with the selected effects; `None` where none was selected.
-        floor: The simulator's through reference recordings that it was not fitted to; `None` without any.
+        floor: The simulator's through reference recordings that it was not fitted to; `None`
+            without any.
     """
 
     answer: Answer
@@ -58,7 +61,9 @@ class Outcome:
             os.replace(temporary, folder / ARRAYS)
         except OSError as error:
             temporary.unlink(missing_ok=True)
-            raise StorageError(f"cannot write {folder / ARRAYS}: {error.strerror or error}; nothing was left behind") from error
+            raise StorageError(
+                f"cannot write {folder / ARRAYS}: {error.strerror or error}; nothing was left behind"
+            ) from error
         self.answer.write(folder / answer.FILE)
 
 
@@ -70,12 +75,18 @@ def load(folder: Path, machine: Machine) -> Outcome:
     """
     try:
         with np.load(folder / ARRAYS, allow_pickle=False) as arrays:
-            found = {name: _unpacked(name, arrays, machine) for name in ("before", "after", "floor")}
+            found = {
+                name: _unpacked(name, arrays, machine) for name in ("before", "after", "floor")
+            }
     except (OSError, ValueError, KeyError) as error:
-        raise RecordingError(f"{folder / ARRAYS}: cannot be read as the arrays of a diagnosis ({error})") from error
+        raise RecordingError(
+            f"{folder / ARRAYS}: cannot be read as the arrays of a diagnosis ({error})"
+        ) from error
     if found["before"] is None:
         raise RecordingError(f"{folder / ARRAYS}: holds no free runs; run mode=diagnose again")
-    return Outcome(answer.read(folder / answer.FILE), found["before"], found["after"], found["floor"])
+    return Outcome(
+        answer.read(folder / answer.FILE), found["before"], found["after"], found["floor"]
+    )
 
 
 def _packed(name: str, runs: FreeRuns) -> dict[str, Any]:
@@ -97,7 +108,9 @@ def _unpacked(name: str, arrays: Any, machine: Machine) -> FreeRuns | None:
         machine=machine.name, joints=machine.joint_names, units=tuple(joint.unit for joint in machine.joints),
         rate_hz=1.0 / machine.period_s, t_s=np.zeros(0), u=np.zeros(0), q=np.zeros(0),
     )  # fmt: skip
-    titles, created, rates = (arrays[f"{name}.{key}"].tolist() for key in ("titles", "created", "rate_hz"))
+    titles, created, rates = (
+        arrays[f"{name}.{key}"].tolist() for key in ("titles", "created", "rate_hz")
+    )
     recordings = [
         replace(
             empty, rate_hz=rate_hz, metadata={"run": title} | ({"created": begun} if begun else {}),
@@ -105,4 +118,9 @@ def _unpacked(name: str, arrays: Any, machine: Machine) -> FreeRuns | None:
         )
         for number, (title, begun, rate_hz) in enumerate(zip(titles, created, rates, strict=True))
     ]  # fmt: skip
-    return FreeRuns(recordings, arrays[f"{name}.source"], arrays[f"{name}.row"], arrays[f"{name}.simulated"].astype(float))
+    return FreeRuns(
+        recordings,
+        arrays[f"{name}.source"],
+        arrays[f"{name}.row"],
+        arrays[f"{name}.simulated"].astype(float),
+    )

@@ -31,7 +31,8 @@ def write(outcome: Outcome, folder: Path, machine: Machine) -> None:
     page = Page(f"What the simulator of {machine.name} lacks", text, tone)
     if figure := pictures.ladder(answer):
         page.picture(
-            figure, "Error over free runs of 5 s on recordings that no effect was fitted to: before, after, and the floor."
+            figure,
+            "Error over free runs of 5 s on recordings that no effect was fitted to: before, after, and the floor.",
         )
     for remark in more.get("sanity", []):
         if remark["severity"] == "bad":
@@ -53,31 +54,51 @@ def _causes(page: Page, outcome: Outcome, machine: Machine) -> None:
     page.heading("Effects")
     if not answer.selected:
         page.text(
-            {"none": "Nothing that could be told from chance.", "unknown": "Nothing that the library of effects knows."}.get(
-                answer.verdict, ""
-            )
+            {
+                "none": "Nothing that could be told from chance.",
+                "unknown": "Nothing that the library of effects knows.",
+            }.get(answer.verdict, "")
         )
     rows = []
     for one in answer.selected:
         closed, interval = wording.estimate(one.gap_closed, 100.0, ".0f")
-        name = Cell(wording.said(one.effect), f"or {', '.join(wording.said(name) for name in one.same_as)}" if one.same_as else "")
+        name = Cell(
+            wording.said(one.effect),
+            f"or {', '.join(wording.said(name) for name in one.same_as)}" if one.same_as else "",
+        )
         first = True
         for number, by_joint in one.parameters.items():
             for joint, value in by_joint.items():
                 size, range_ = wording.estimate(value)
                 head = (
-                    [name, ", ".join(one.joints) or "machine", f"{one.probability:.2f}", Cell(closed, interval)]
+                    [
+                        name,
+                        ", ".join(one.joints) or "machine",
+                        f"{one.probability:.2f}",
+                        Cell(closed, interval),
+                    ]
                     if first
                     else [""] * 4
                 )
                 rows.append([*head, f"{number} {joint}", Cell(size, range_)])
                 first = False
         if first:
-            rows.append([name, ", ".join(one.joints) or "machine", f"{one.probability:.2f}", Cell(closed, interval), "", None])
+            rows.append(
+                [
+                    name,
+                    ", ".join(one.joints) or "machine",
+                    f"{one.probability:.2f}",
+                    Cell(closed, interval),
+                    "",
+                    None,
+                ]
+            )
     if rows:
         columns = ["effect", "joints", "probability", "closes, %", "number", "value"]
         page.table(
-            columns, rows, "With 95 % intervals. 'Closes' is the effect's part of what all of them close together (Shapley value)."
+            columns,
+            rows,
+            "With 95 % intervals. 'Closes' is the effect's part of what all of them close together (Shapley value).",
         )
     for one in answer.selected:
         if text := wording.same_as(one):
@@ -98,7 +119,14 @@ def _causes(page: Page, outcome: Outcome, machine: Machine) -> None:
 
     if isinstance(left := answer.more.get("remainder"), Mapping) and left:
         rows = [
-            [joint, one.get("clue"), *(None if one.get(key) is None else f"{one[key]:.1f}" for key in ("earned", "null"))]
+            [
+                joint,
+                one.get("clue"),
+                *(
+                    None if one.get(key) is None else f"{one[key]:.1f}"
+                    for key in ("earned", "null")
+                ),
+            ]
             for joint, one in left.items()
         ]
         caption = "From what a flexible model still predicts the error that is left, log likelihood, and what it earns by chance"
@@ -114,10 +142,20 @@ def _how_far(page: Page, outcome: Outcome, machine: Machine) -> None:
     rows = []
     for name, one in gap.joints.items():
         floor = None if one.floor is None else f"{1e3 * one.floor:.1f}"
-        row = [f"{name} [m{units[name]}]", f"{1e3 * one.before:.1f}", f"{1e3 * one.after:.1f}", floor, f"{100 * one.share:.0f}"]
+        row = [
+            f"{name} [m{units[name]}]",
+            f"{1e3 * one.before:.1f}",
+            f"{1e3 * one.after:.1f}",
+            floor,
+            f"{100 * one.share:.0f}",
+        ]
         if unseen:
             apart = unseen["joints"][name]
-            row += [f"{1e3 * apart['before']:.1f}", f"{1e3 * apart['after']:.1f}", f"{100 * apart['share']:.0f}"]
+            row += [
+                f"{1e3 * apart['before']:.1f}",
+                f"{1e3 * apart['after']:.1f}",
+                f"{100 * apart['share']:.0f}",
+            ]
         rows.append(row)
     columns = ["joint", "before", "after", "floor", "% less"]
     caption = "Root mean square error of free runs of 5 s on parts of the recordings that sizes were not fitted to"
@@ -140,13 +178,32 @@ def _where(page: Page, outcome: Outcome, machine: Machine) -> None:
     rows = []
     for name, joint in location["joints"].items():
         unit = machine.joints[machine.joint_names.index(name)].unit
-        cells = [f"{1e3 * joint['rmse']:.1f}", f"{1e3 * joint['floor']:.1f}", f"{100 * joint['error']:.0f}"]
-        rows.append([f"{name} [m{unit}]", *cells, Cell(f"{100 * joint['gap']:.0f}", "beyond chance" if joint["is_sure"] else "")])
-    page.table(["joint", "error", "floor", "% of the error", "% of the gap"], rows, "Root mean square error of free runs of 5 s")
+        cells = [
+            f"{1e3 * joint['rmse']:.1f}",
+            f"{1e3 * joint['floor']:.1f}",
+            f"{100 * joint['error']:.0f}",
+        ]
+        rows.append(
+            [
+                f"{name} [m{unit}]",
+                *cells,
+                Cell(f"{100 * joint['gap']:.0f}", "beyond chance" if joint["is_sure"] else ""),
+            ]
+        )
+    page.table(
+        ["joint", "error", "floor", "% of the error", "% of the gap"],
+        rows,
+        "Root mean square error of free runs of 5 s",
+    )
     if not location["has_gap"]:
-        page.text("No joint exceeds its floor beyond what chance explains; shares of the gap are those of chance, then.", "warn")
+        page.text(
+            "No joint exceeds its floor beyond what chance explains; shares of the gap are those of chance, then.",
+            "warn",
+        )
     if location["blocks"]:
-        page.text(f"Tested by exchanging {location['blocks']} between field and reference, with at most 5 % false discoveries.")
+        page.text(
+            f"Tested by exchanging {location['blocks']} between field and reference, with at most 5 % false discoveries."
+        )
 
 
 def _paths(page: Page, outcome: Outcome, machine: Machine) -> None:
@@ -163,7 +220,10 @@ def _growth(page: Page, outcome: Outcome, machine: Machine) -> None:
     if not location:
         return
     page.heading("How the error grows")
-    page.picture(pictures.growth(outcome, machine), "Error over the time of a free run; what exceeds the floor tells its kind.")
+    page.picture(
+        pictures.growth(outcome, machine),
+        "Error over the time of a free run; what exceeds the floor tells its kind.",
+    )
     rows = []
     for name, growth in location["growth"].items():
         unit = machine.joints[machine.joint_names.index(name)].unit
@@ -171,7 +231,11 @@ def _growth(page: Page, outcome: Outcome, machine: Machine) -> None:
         whole = "–" if growth["whole_run"] is None else f"{1e3 * growth['whole_run']:.0f}"
         rows.append([f"{name} [m{unit}]", *errors, whole, READINGS[growth["reading"]]])
     horizons = [f"{value:g} s" for value in next(iter(location["growth"].values()))["horizon_s"]]
-    page.table(["joint", *horizons, "whole run", "reading"], rows, "Root mean square error at the end of free runs")
+    page.table(
+        ["joint", *horizons, "whole run", "reading"],
+        rows,
+        "Root mean square error at the end of free runs",
+    )
 
 
 def _evidence(page: Page, more: Mapping[str, Any]) -> None:
@@ -180,12 +244,18 @@ def _evidence(page: Page, more: Mapping[str, Any]) -> None:
     if figure or probes:
         page.heading("Why these effects and not others")
     if figure:
-        page.picture(figure, "What each rival earns on recordings that it was not fitted to; blue: chosen.")
+        page.picture(
+            figure, "What each rival earns on recordings that it was not fitted to; blue: chosen."
+        )
     if probes:
         page.text(
             "What the simulator's errors look like, by families of effects that leave such traces (compared with the reference):"
         )
-        clear = [probe["text"] + f" – as {wording.said(probe['effect'])} does" for probe in probes if abs(probe["z"]) > 4.0]
+        clear = [
+            probe["text"] + f" – as {wording.said(probe['effect'])} does"
+            for probe in probes
+            if abs(probe["z"]) > 4.0
+        ]
         page.items(clear[:CAUSES] or ["no trace stands out"])
 
 
@@ -202,12 +272,18 @@ def _stages(page: Page, more: Mapping[str, Any]) -> None:
         )
         names = [name for name in ("before", "after", "floor") if budget[name]]
         rows = [
-            [joint, *(f"{budget[name]['joint_rms_mm'][joint]:.1f}" for name in names), f"{100 * part:.0f}"]
+            [
+                joint,
+                *(f"{budget[name]['joint_rms_mm'][joint]:.1f}" for name in names),
+                f"{100 * part:.0f}",
+            ]
             for joint, part in budget["before"]["joint_part"].items()
         ]
         rows.append(["tip", *(f"{budget[name]['tip_rms_mm']:.1f}" for name in names), "100"])
         page.table(
-            ["", *(f"{name}, mm" for name in names), "% before"], rows, "What each joint's error alone moves the tool by, RMS"
+            ["", *(f"{name}, mm" for name in names), "% before"],
+            rows,
+            "What each joint's error alone moves the tool by, RMS",
         )
     rows = [
         [
@@ -227,7 +303,9 @@ def _next(page: Page, outcome: Outcome) -> None:
         return
     page.heading("Next experiment")
     between = (
-        f" It separates {wording.listed([wording.said(name) for name in following.separates])}." if following.separates else ""
+        f" It separates {wording.listed([wording.said(name) for name in following.separates])}."
+        if following.separates
+        else ""
     )
     page.text(f"{following.why}{between}".strip())
     page.code(following.excitation)
@@ -239,13 +317,22 @@ def _sanity(page: Page, more: Mapping[str, Any]) -> None:
         return
     page.heading("Can the recordings be trusted?")
     if not remarks:
-        page.text("Nothing was found against them: clocks, lost frames, interlocks, sensors, exclusive joints.", "good")
+        page.text(
+            "Nothing was found against them: clocks, lost frames, interlocks, sensors, exclusive joints.",
+            "good",
+        )
         return
     rows = [
         [
-            Cell(remark["name"], {"bad": "grave", "warn": "look at it", "note": "good to know"}[remark["severity"]]),
+            Cell(
+                remark["name"],
+                {"bad": "grave", "warn": "look at it", "note": "good to know"}[remark["severity"]],
+            ),
             remark["joint"] or "all",
-            Cell(remark["recording"], f"{remark['from_s']:.1f} to {remark['to_s']:.1f} s, {remark['count']} ×"),
+            Cell(
+                remark["recording"],
+                f"{remark['from_s']:.1f} to {remark['to_s']:.1f} s, {remark['count']} ×",
+            ),
             Cell(remark["amount"], f"{remark['meaning']}. To do: {remark['advice']}"),
         ]
         for remark in remarks
@@ -268,13 +355,19 @@ def _details(page: Page, more: Mapping[str, Any]) -> None:
                     part["joint"],
                     part["category"],
                     *(f"{100 * part[key]:.1f}" for key in ("time", "error", "gap")),
-                    None if part["p"] is None else Cell(f"{part['p']:.4f}", "beyond chance" if part["is_sure"] else ""),
+                    None
+                    if part["p"] is None
+                    else Cell(f"{part['p']:.4f}", "beyond chance" if part["is_sure"] else ""),
                 ]
                 for part in parts
                 if part["time"] > 0
             ]
             caption = "Each column of the error and the gap adds up to 100; p: how probable so much would be by chance."
-            page.table(["joint", name, "% of the time", "% of the error", "% of the gap", "p"], rows, caption)
+            page.table(
+                ["joint", name, "% of the time", "% of the error", "% of the gap", "p"],
+                rows,
+                caption,
+            )
 
 
 def _remark(remark: Mapping[str, Any]) -> str:

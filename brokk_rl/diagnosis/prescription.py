@@ -23,8 +23,18 @@ def write(answer: Answer, kinds: Sequence[Kind], path: Path) -> None:
     """
     by_name = {kind.name: kind for kind in kinds}
     chosen = sorted(answer.selected, key=lambda one: by_name[one.effect].order)
-    lines = ["# @package effect", f"# {answer.verdict}: {answer.reason}", "# taken by effect=@<this file>"]
-    text = yaml.safe_dump({one.effect: _node(one, by_name[one.effect]) for one in chosen}, sort_keys=False) if chosen else ""
+    lines = [
+        "# @package effect",
+        f"# {answer.verdict}: {answer.reason}",
+        "# taken by effect=@<this file>",
+    ]
+    text = (
+        yaml.safe_dump(
+            {one.effect: _node(one, by_name[one.effect]) for one in chosen}, sort_keys=False
+        )
+        if chosen
+        else ""
+    )
     try:
         write_text(path, "\n".join(lines) + "\n" + text)
     except OSError as error:
@@ -37,7 +47,10 @@ def _node(one: Selected, kind: Kind) -> dict:
     if "joints" in target.__annotations__:
         node["joints"] = list(one.joints) or "all"
     for name, number in kind.numbers.items():
-        values = {joint: float(f"{value.mean:.6g}") for joint, value in one.parameters.get(name, {}).items()}
+        values = {
+            joint: float(f"{value.mean:.6g}")
+            for joint, value in one.parameters.get(name, {}).items()
+        }
         if not values:
             node[name] = number.typical if number.none is None else number.none
         elif number.per_joint:

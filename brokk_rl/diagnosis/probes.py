@@ -1,8 +1,9 @@
 """Residual probes: figures that a person can read as evidence for one family of effects or another.
 
-What the simulator's speed has too much, over `SPAN_S`, is explained by what each effect would leave behind: the acceleration (the
-machine moves later), the speed itself (gain), its size (asymmetry), the speed at small or large commands, with others moving, under
-load, later in the day. Each is fitted together with gain and timing, which every simulator gets a little wrong, and compared with
+What the simulator's speed has too much, over `SPAN_S`, is explained by what each effect would leave
+behind: the acceleration (the machine moves later), the speed itself (gain), its size (asymmetry),
+the speed at small or large commands, with others moving, under load, later in the day. Each is
+fitted together with gain and timing, which every simulator gets a little wrong, and compared with
 the same figure on the reference. These figures point; which effect it is, is decided by fitting it.
 Axes: `W` windows, `K` steps, `J` joints, `S` samples.
 """
@@ -65,33 +66,78 @@ class Probe:
 
 PERCENT, MILLI = 1e2, 1e3
 TEXTS = {
-    "dead_time": ("moves {:.0f} ms later than simulated", "moves {:.0f} ms earlier than simulated", MILLI),
-    "flow_gain": ("moves {:.0f} % slower than simulated", "moves {:.0f} % faster than simulated", PERCENT),
-    "asymmetry": ("is {:.0f} % slower extending, faster retracting", "is {:.0f} % faster extending, slower retracting", PERCENT),
-    "dead_band": ("is {:.0f} % slower at small commands", "is {:.0f} % faster at small commands", PERCENT),
-    "saturation": ("is {:.0f} % slower at large commands", "is {:.0f} % faster at large commands", PERCENT),
-    "flow_sharing": ("is {:.0f} % slower while others move", "is {:.0f} % faster while others move", PERCENT),
-    "load_dependence": ("is {:.0f} % slower against its full load", "is {:.0f} % faster against its full load", PERCENT),
-    "thermal_drift": ("loses {:.0f} % of its speed in time", "gains {:.0f} % of speed in time", PERCENT),
-    "backlash": ("falls {:.1f} m{unit} short after reversals", "goes {:.1f} m{unit} further after reversals", MILLI),
+    "dead_time": (
+        "moves {:.0f} ms later than simulated",
+        "moves {:.0f} ms earlier than simulated",
+        MILLI,
+    ),
+    "flow_gain": (
+        "moves {:.0f} % slower than simulated",
+        "moves {:.0f} % faster than simulated",
+        PERCENT,
+    ),
+    "asymmetry": (
+        "is {:.0f} % slower extending, faster retracting",
+        "is {:.0f} % faster extending, slower retracting",
+        PERCENT,
+    ),
+    "dead_band": (
+        "is {:.0f} % slower at small commands",
+        "is {:.0f} % faster at small commands",
+        PERCENT,
+    ),
+    "saturation": (
+        "is {:.0f} % slower at large commands",
+        "is {:.0f} % faster at large commands",
+        PERCENT,
+    ),
+    "flow_sharing": (
+        "is {:.0f} % slower while others move",
+        "is {:.0f} % faster while others move",
+        PERCENT,
+    ),
+    "load_dependence": (
+        "is {:.0f} % slower against its full load",
+        "is {:.0f} % faster against its full load",
+        PERCENT,
+    ),
+    "thermal_drift": (
+        "loses {:.0f} % of its speed in time",
+        "gains {:.0f} % of speed in time",
+        PERCENT,
+    ),
+    "backlash": (
+        "falls {:.1f} m{unit} short after reversals",
+        "goes {:.1f} m{unit} further after reversals",
+        MILLI,
+    ),
     "delay_jitter": ("starts after times that vary by {:.0f} ms", "", MILLI),
     "compliance": ("shakes by {:.2f} m{unit} after stops", "", MILLI),
-    "creep": ("sinks by {:.2f} m{unit}/s without command", "rises by {:.2f} m{unit}/s without command", MILLI),
+    "creep": (
+        "sinks by {:.2f} m{unit}/s without command",
+        "rises by {:.2f} m{unit}/s without command",
+        MILLI,
+    ),
 }
 """What a coefficient above and below 0 says, and its factor."""
 
 
-def probes(runs: FreeRuns, reference: FreeRuns | None, machine: Machine, dead_time_s: np.ndarray) -> list[Probe]:
+def probes(
+    runs: FreeRuns, reference: FreeRuns | None, machine: Machine, dead_time_s: np.ndarray
+) -> list[Probe]:
     """Returns all figures, those that stand out most first.
 
     Args:
         runs: Free runs through field recordings.
-        reference: The same simulator's through reference recordings; `None`: figures are compared with 0.
+        reference: The same simulator's through reference recordings; `None`: figures are compared
+            with 0.
         machine: Gives joints and masses.
         dead_time_s: Time from command to motion of each joint, `(J,)`.
     """
     mine, other = (
-        _coefficients(side, machine, dead_time_s) | edges.figures(side, machine, dead_time_s) if side else {}
+        _coefficients(side, machine, dead_time_s) | edges.figures(side, machine, dead_time_s)
+        if side
+        else {}
         for side in (runs, reference)
     )
     found = []
@@ -110,7 +156,9 @@ def _said(effect: str, value: float, unit: str) -> str:
     return (below if value < 0 else above).format(abs(factor * value), unit=unit)
 
 
-def _coefficients(runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> dict[tuple[str, str], tuple[float, float]]:
+def _coefficients(
+    runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
+) -> dict[tuple[str, str], tuple[float, float]]:
     """Returns the coefficient of each probe and its standard error, by effect and joint."""
     span = max(1, round(SPAN_S / machine.period_s))
     lacks = _change(runs.error, span) / SPAN_S
@@ -124,7 +172,11 @@ def _coefficients(runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> 
         always = np.stack([acceleration[..., j][given], speed[..., j][given]], 1)
         for effect, values in clues.of(j, speed[..., j]):
             column = np.nan_to_num(values[given])
-            rows = always if effect in ("dead_time", "flow_gain") else np.concatenate([always, column[:, None]], 1)
+            rows = (
+                always
+                if effect in ("dead_time", "flow_gain")
+                else np.concatenate([always, column[:, None]], 1)
+            )
             if (np.abs(column) > 0).sum() < FEWEST:
                 continue
             place = {"dead_time": 0, "flow_gain": 1}.get(effect, 2)
@@ -138,11 +190,19 @@ class _Clues:
     def __init__(self, runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> None:
         acting = [in_force(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
         self._u = runs.cut(acting)
-        self._regime = runs.cut([regimes(u, r.q, machine, r.rate_hz) for u, r in zip(acting, runs.recordings, strict=True)])
+        self._regime = runs.cut(
+            [
+                regimes(u, r.q, machine, r.rate_hz)
+                for u, r in zip(acting, runs.recordings, strict=True)
+            ]
+        )
         self._load = None
         if machine.has_bodies:
             gravity = Gravity(machine, torch.device("cpu"))
-            loads = [gravity.load(torch.as_tensor(r.q, dtype=torch.float32)).numpy() for r in runs.recordings]
+            loads = [
+                gravity.load(torch.as_tensor(r.q, dtype=torch.float32)).numpy()
+                for r in runs.recordings
+            ]
             self._load = runs.cut([load / np.maximum(np.abs(load).max(0), 1.0) for load in loads])
         late_s = runs.elapsed_s - runs.elapsed_s.mean()
         self._late = (late_s / max(float(np.ptp(late_s)), 1e-9))[:, None]
@@ -163,7 +223,10 @@ class _Clues:
         yield "saturation", speed * (size > FULL)
         yield "flow_sharing", speed * others
         yield "thermal_drift", speed * self._late
-        yield "backlash", np.sign(u) * (regime == REGIMES.index("after a reversal")) / 0.6  # rad lacking, over the time it takes
+        yield (
+            "backlash",
+            np.sign(u) * (regime == REGIMES.index("after a reversal")) / 0.6,
+        )  # rad lacking, over the time it takes
         if self._load is not None and np.nanmax(np.abs(self._load[..., joint])) > 0.05:
             load = self._load[..., joint]
             yield "load_dependence", -np.sign(u) * load * np.abs(speed)
@@ -176,7 +239,9 @@ def _change(values: np.ndarray, span: int) -> np.ndarray:
     return found
 
 
-def _jackknifed(rows: np.ndarray, target: np.ndarray, block: np.ndarray, place: int) -> tuple[float, float]:
+def _jackknifed(
+    rows: np.ndarray, target: np.ndarray, block: np.ndarray, place: int
+) -> tuple[float, float]:
     """Returns one coefficient of a least-squares fit, and its standard error from leaving out one block at a time."""
     names = np.unique(block)
     grams = np.stack([rows[block == b].T @ rows[block == b] for b in names])
@@ -190,5 +255,7 @@ def _jackknifed(rows: np.ndarray, target: np.ndarray, block: np.ndarray, place: 
     count = len(names)
     if count < 2:
         return value, float("inf")
-    left = np.array([solved(grams.sum(0) - g, crosses.sum(0) - c) for g, c in zip(grams, crosses, strict=True)])
+    left = np.array(
+        [solved(grams.sum(0) - g, crosses.sum(0) - c) for g, c in zip(grams, crosses, strict=True)]
+    )
     return value, float(np.sqrt((count - 1) / count * ((left - left.mean()) ** 2).sum()))

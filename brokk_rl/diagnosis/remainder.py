@@ -1,11 +1,14 @@
 """Whether a flexible model still predicts what is left, and from what: then something is there, and the library has no name for it.
 
-What is left is judged against the simulator with the effects that were found, and by its motion: a joint that a dead band makes
-slow wanders by a part of that slow speed, not of the fast one that the simulator had before.
-Each clue is a small ridge regression of increments on one thing that a machine could depend on: where it stands, the other joints,
-the time it has run, the work it did just before. Small models find what a large one drowns. `FORMS` come first, and the others
-explain what they leave: in starts and stops, and in how speed follows commands, real forms of known effects differ from the
-library's as well. Like an effect, a clue earns the logarithm of a Bayes factor, and is judged by what it earns on the reference.
+What is left is judged against the simulator with the effects that were found, and by its motion: a
+joint that a dead band makes slow wanders by a part of that slow speed, not of the fast one that the
+simulator had before.
+Each clue is a small ridge regression of increments on one thing that a machine could depend on:
+where it stands, the other joints, the time it has run, the work it did just before. Small models
+find what a large one drowns. `FORMS` come first, and the others
+explain what they leave: in starts and stops, and in how speed follows commands, real forms of known
+effects differ from the library's as well. Like an effect, a clue earns the logarithm of a Bayes
+factor, and is judged by what it earns on the reference.
 Axes: `W` windows, `I` increments, `J` joints, `E` entries, `F` features.
 """
 
@@ -24,7 +27,8 @@ from brokk_rl.diagnosis.noise import SPAN, increments, loss, weight
 from brokk_rl.diagnosis.repair import Repair
 
 RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-"""Pulls towards nothing, in features of unit size over the noise; that which makes the errors most likely is used."""
+"""Pulls towards nothing, in features of unit size over the noise; that which makes the errors most
+likely is used."""
 PAST_S = (2.0, 4.0, 8.0, 16.0)
 """Over how long work before may matter."""
 FAR = 9.0
@@ -49,7 +53,9 @@ class Motion:
     def slip(self) -> np.ndarray:
         """What increments lose where motion comes a sample late."""
         q, start = self.evidence.base[..., self.j], self.evidence.start[:, None, self.j]
-        return increments(np.diff(q, axis=1, prepend=start)[..., None], np.zeros((len(q), 1)))[..., 0]
+        return increments(np.diff(q, axis=1, prepend=start)[..., None], np.zeros((len(q), 1)))[
+            ..., 0
+        ]
 
     @cached_property
     def share(self) -> np.ndarray:
@@ -66,7 +72,10 @@ class Motion:
     @cached_property
     def place(self) -> np.ndarray:
         """Positions at both ends of each increment, over the travel, `(2, W, I)`."""
-        machine, end = self.evidence.candidates.machine, self.evidence.start[:, None, self.j] + np.cumsum(self.own, 1)
+        machine, end = (
+            self.evidence.candidates.machine,
+            self.evidence.start[:, None, self.j] + np.cumsum(self.own, 1),
+        )
         low, high = machine.lower[self.j], machine.upper[self.j]
         return np.clip((np.stack([end - self.own, end]) - low) / (high - low), 0.0, 1.0)
 
@@ -80,7 +89,9 @@ class Motion:
         runs, found = self.evidence.candidates.cut.run, np.empty_like(column)
         for run in np.unique(runs):
             mine = runs == run
-            found[mine] = np.asarray(lfilter([0.0, 1.0 - kept], [1.0, -kept], column[mine].ravel())).reshape(-1, column.shape[1])
+            found[mine] = np.asarray(
+                lfilter([0.0, 1.0 - kept], [1.0, -kept], column[mine].ravel())
+            ).reshape(-1, column.shape[1])
         return found
 
     @cached_property
@@ -96,19 +107,32 @@ def repaired(evidence: Evidence, repair: Repair | None) -> Evidence:
     """Returns the evidence of the simulator with the effects that were found, sizes from the half that they were not fitted to."""
     if repair is None:
         return evidence
-    candidates, mean = evidence.candidates, 0.0 if evidence.mean is None else evidence.mean  # `after` has it in, errors have it out
+    candidates, mean = (
+        evidence.candidates,
+        0.0 if evidence.mean is None else evidence.mean,
+    )  # `after` has it in, errors have it out
     fixed = [*candidates.fixed, *repair.effects()]
     return replace(evidence, candidates=replace(candidates, fixed=fixed), runs=repair.after - mean)
 
 
 def _changes(m: Motion) -> list[np.ndarray]:
     """Starts and stops, just before and after."""
-    turn, faster = np.diff(m.own, axis=1, prepend=m.own[:, :1]), np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0
-    return [_late(turn * when * side, by) for by in (-1, 0, 1, 2, 3) for when in (faster, ~faster) for side in m.sides]
+    turn, faster = (
+        np.diff(m.own, axis=1, prepend=m.own[:, :1]),
+        np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0,
+    )
+    return [
+        _late(turn * when * side, by)
+        for by in (-1, 0, 1, 2, 3)
+        for when in (faster, ~faster)
+        for side in m.sides
+    ]
 
 
 def _curve(m: Motion) -> list[np.ndarray]:
-    return [m.own * hat * side for hat in _hats(np.abs(m.share[..., m.j]), 1.0, 8) for side in m.sides]
+    return [
+        m.own * hat * side for hat in _hats(np.abs(m.share[..., m.j]), 1.0, 8) for side in m.sides
+    ]
 
 
 def _position(m: Motion) -> list[np.ndarray]:
@@ -117,7 +141,11 @@ def _position(m: Motion) -> list[np.ndarray]:
 
 def _sensor(m: Motion) -> list[np.ndarray]:
     """An encoder whose error depends on where it stands."""
-    return [np.diff(wave(2 * np.pi * turns * m.place), axis=0)[0] for turns in (0.5, 1, 1.5, 2, 3, 4) for wave in (np.sin, np.cos)]
+    return [
+        np.diff(wave(2 * np.pi * turns * m.place), axis=0)[0]
+        for turns in (0.5, 1, 1.5, 2, 3, 4)
+        for wave in (np.sin, np.cos)
+    ]
 
 
 def _joints(m: Motion) -> list[np.ndarray]:
@@ -126,8 +154,17 @@ def _joints(m: Motion) -> list[np.ndarray]:
     for k in range(m.share.shape[-1]):
         if k != m.j:
             other = m.share[..., k]
-            columns += [m.own * np.abs(other), m.own * (np.abs(other) > FAST), full * other, full * np.maximum(other, 0.0)]
-    return columns + [m.own * hat for hat in _hats(m.work, 2.0, 5)] + [m.own * np.maximum(m.work - at, 0.0) for at in (0.5, 1.0)]
+            columns += [
+                m.own * np.abs(other),
+                m.own * (np.abs(other) > FAST),
+                full * other,
+                full * np.maximum(other, 0.0),
+            ]
+    return (
+        columns
+        + [m.own * hat for hat in _hats(m.work, 2.0, 5)]
+        + [m.own * np.maximum(m.work - at, 0.0) for at in (0.5, 1.0)]
+    )
 
 
 def _time(m: Motion) -> list[np.ndarray]:
@@ -144,8 +181,14 @@ def _past(m: Motion) -> list[np.ndarray]:
     went = np.sign(m.own) * (np.abs(m.share[..., m.j]) > 0.03)
     for past_s in PAST_S:
         kept = np.exp(-SPAN * machine.period_s / past_s)
-        tired, own, way = (m.faded(one, kept) for one in (np.minimum(m.work, 1.0), np.abs(m.share[..., m.j]), went))
-        columns += [m.own * (tired - tired.mean()), m.own * (own - own.mean()), np.abs(m.own) * way]  # the mean is another gain
+        tired, own, way = (
+            m.faded(one, kept) for one in (np.minimum(m.work, 1.0), np.abs(m.share[..., m.j]), went)
+        )
+        columns += [
+            m.own * (tired - tired.mean()),
+            m.own * (own - own.mean()),
+            np.abs(m.own) * way,
+        ]  # the mean is another gain
     return columns
 
 
@@ -168,13 +211,18 @@ FORMS = (STARTS, CURVE)
 
 def predictable(evidence: Evidence, z: np.ndarray) -> np.ndarray:
     """Returns what each clue earns on errors over the noise `z` `(J, E)`, `(clues, J)`."""
-    found, order = np.zeros((len(CLUES), len(z))), [*FORMS, *(name for name in CLUES if name not in FORMS)]
+    found, order = (
+        np.zeros((len(CLUES), len(z))),
+        [*FORMS, *(name for name in CLUES if name not in FORMS)],
+    )
     for j, errors in enumerate(z):
         motion = Motion(evidence, j)
         for name in order:
             x = evidence.whitened_joint(np.stack(CLUES[name](motion), -1), j)
             size = np.sqrt(np.mean(np.square(x), 0))
-            found[list(CLUES).index(name), j], left = _earned(x / np.where(size > 1e-9, size, np.inf), errors)
+            found[list(CLUES).index(name), j], left = _earned(
+                x / np.where(size > 1e-9, size, np.inf), errors
+            )
             errors = left if name in FORMS else errors
     return found
 
@@ -187,7 +235,9 @@ def beyond(earned: np.ndarray, nulls: Sequence[np.ndarray], entries: Sequence[fl
         nulls: The same on each part of the reference.
         entries: Length of the field over that of each part.
     """
-    return np.max([np.zeros_like(earned), *(one * by for one, by in zip(nulls, entries, strict=True))], 0)
+    return np.max(
+        [np.zeros_like(earned), *(one * by for one, by in zip(nulls, entries, strict=True))], 0
+    )
 
 
 def strayed(evidence: Evidence, error: np.ndarray) -> np.ndarray:
@@ -198,10 +248,15 @@ def strayed(evidence: Evidence, error: np.ndarray) -> np.ndarray:
         error: Increments that it misses, `(W, I, J)`.
     """
     assert evidence.noise is not None, "noise is known by now"
-    expected = np.stack([noise.strayed(evidence.way[..., j]).mean(1) for j, noise in enumerate(evidence.noise)], -1)
+    expected = np.stack(
+        [noise.strayed(evidence.way[..., j]).mean(1) for j, noise in enumerate(evidence.noise)], -1
+    )
     if evidence.late is not None:
         expected = expected + np.square(np.cumsum(evidence.late, 2)).sum(1).mean(1)
-    over = np.minimum(np.square(np.cumsum(error, 1)).mean(1) / np.maximum(expected, 1e-18), FAR) * evidence.claims
+    over = (
+        np.minimum(np.square(np.cumsum(error, 1)).mean(1) / np.maximum(expected, 1e-18), FAR)
+        * evidence.claims
+    )
     return over.sum(0) / np.maximum(evidence.claims.sum(0), 1)
 
 
@@ -212,14 +267,21 @@ def _earned(x: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
         beta = ridge(x, z, pull)
         left = z - x @ beta
         told = (x * weight(left)[:, None]).T @ x / pull + np.eye(x.shape[1])
-        gain = float(loss(z) - loss(left)) - 0.5 * pull * float(beta @ beta) - 0.5 * float(np.linalg.slogdet(told)[1])
+        gain = (
+            float(loss(z) - loss(left))
+            - 0.5 * pull * float(beta @ beta)
+            - 0.5 * float(np.linalg.slogdet(told)[1])
+        )
         best, least = (gain, left) if gain > best else (best, least)
     return best, least
 
 
 def _hats(values: np.ndarray, high: float, count: int) -> list[np.ndarray]:
     """Returns `count` + 1 tents over 0 to `high`, whose sum is 1."""
-    return [np.maximum(1.0 - np.abs(np.minimum(values, high) / high * count - place), 0.0) for place in range(count + 1)]
+    return [
+        np.maximum(1.0 - np.abs(np.minimum(values, high) / high * count - place), 0.0)
+        for place in range(count + 1)
+    ]
 
 
 def _late(column: np.ndarray, by: int) -> np.ndarray:

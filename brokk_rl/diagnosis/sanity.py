@@ -1,7 +1,8 @@
 """Whether recordings can be trusted, before any physics: clocks, lost frames, interlocks, sensors, and joints that nobody moved.
 
-What a single stretch shows is found by `brokk_rl.inspection`; here stretches of one kind become one remark a recording, those that
-share a condition an interlock, and what only a whole recording shows (clock, saturation, excitation) is added.
+What a single stretch shows is found by `brokk_rl.inspection`; here stretches of one kind become one
+remark a recording, those that share a condition an interlock, and what only a whole recording shows
+(clock, saturation, excitation) is added.
 Axes: `T` time, `J` joints.
 """
 
@@ -22,13 +23,15 @@ from brokk_rl.record import Recording
 
 Severity = Literal["note", "warn", "bad"]
 IRREGULAR = 0.05
-"""Of the periods further than 10 % from the median, as a part of all, above which a clock is irregular."""
+"""Of the periods further than 10 % from the median, as a part of all, above which a clock is
+irregular."""
 JUMP_PERIODS = 1.15
 """A period so many times the median is a jump; the format refuses those beyond 1.2."""
 CLOCK_PPM = 2000.0
 """Largest deviation of the clock's rate from the stated one; 1e-5 to 4e-3 is what loggers show."""
 AT_EXTREME = 10
-"""So many equal samples on end at the very end of what a sensor ever says, away from the joint's stops, are no coincidence."""
+"""So many equal samples on end at the very end of what a sensor ever says, away from the joint's
+stops, are no coincidence."""
 THIN_S = 10.0
 """A joint commanded for less says nothing about itself."""
 
@@ -39,7 +42,8 @@ class Remark:
 
     Attributes:
         name: What it is.
-        severity: `bad`: conclusions about this joint are likely wrong; `warn`: they may be; `note`: good to know.
+        severity: `bad`: conclusions about this joint are likely wrong; `warn`: they may be; `note`:
+            good to know.
         joint: Joint concerned, `None` where it is all of them.
         recording: Its file's stem or run.
         from_s: Begin of the first stretch.
@@ -82,7 +86,11 @@ TEXTS: dict[str, tuple[Severity, str, str]] = {
         "the load sinks (a leak), or the joint was moved by something that is not logged",
         "log every input; a slow sinking towards the load is the effect 'creep'",
     ),
-    "frozen sensor": ("warn", "the sensor did not measure for a while, then jumped", "check sensor and cable; the motion is real"),
+    "frozen sensor": (
+        "warn",
+        "the sensor did not measure for a while, then jumped",
+        "check sensor and cable; the motion is real",
+    ),
     "lost frames": (
         "note",
         "rows repeat the row before although the machine moves: positions were lost on their way",
@@ -103,14 +111,26 @@ TEXTS: dict[str, tuple[Severity, str, str]] = {
         "rows are not equally spaced in time",
         "stamp rows where they are measured, not where they are written",
     ),
-    "clock jumps": ("warn", "single periods are much longer than the others", "record frame counters"),
-    "clock rate": ("note", "the clock runs faster or slower than the stated rate", "state the true rate, or discipline the clock"),
+    "clock jumps": (
+        "warn",
+        "single periods are much longer than the others",
+        "record frame counters",
+    ),
+    "clock rate": (
+        "note",
+        "the clock runs faster or slower than the stated rate",
+        "state the true rate, or discipline the clock",
+    ),
     "saturated sensor": (
         "bad",
         "the sensor stays at one end of its range, away from the joint's stops: it cannot say more, or a stop is nearer than known",
         "check the sensor's range and the machine's limits",
     ),
-    "joint at rest": ("note", "hardly commanded here: nothing can be said about this joint", "record runs that move it"),
+    "joint at rest": (
+        "note",
+        "hardly commanded here: nothing can be said about this joint",
+        "record runs that move it",
+    ),
 }
 """Severity, meaning and advice of each remark."""
 NAMES = {
@@ -124,18 +144,38 @@ NAMES = {
 """What `brokk_rl.inspection` calls them."""
 
 
-def examine(recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds) -> list[Remark]:
+def examine(
+    recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds
+) -> list[Remark]:
     """Returns what is to be said about recordings of `machine`, the gravest first."""
-    inspected = [(recording, inspect(recording, machine, thresholds).findings) for recording in recordings]
-    locks = list(filter(None, (interlock(inspected, machine, j, thresholds) for j in range(machine.num_joints))))
+    inspected = [
+        (recording, inspect(recording, machine, thresholds).findings) for recording in recordings
+    ]
+    locks = list(
+        filter(
+            None, (interlock(inspected, machine, j, thresholds) for j in range(machine.num_joints))
+        )
+    )
     remarks = [remark for lock in locks for remark in _locked(lock, recordings)]
     locked = {lock.joint for lock in locks}
     for recording, findings in inspected:
         rest = [f for f in findings if not (f.kind == "no motion" and f.joint in locked)]
-        remarks += [*_grouped(recording, rest), *_clock(recording), *_saturated(recording, machine, thresholds)]
+        remarks += [
+            *_grouped(recording, rest),
+            *_clock(recording),
+            *_saturated(recording, machine, thresholds),
+        ]
     remarks += _at_rest(recordings, machine, thresholds)
     order = {"bad": 0, "warn": 1, "note": 2}
-    return sorted(remarks, key=lambda remark: (order[remark.severity], remark.name, remark.joint or "", remark.recording))
+    return sorted(
+        remarks,
+        key=lambda remark: (
+            order[remark.severity],
+            remark.name,
+            remark.joint or "",
+            remark.recording,
+        ),
+    )
 
 
 def name_of(recording: Recording) -> str:
@@ -153,7 +193,18 @@ def _remark(
 ) -> Remark:
     severity, meaning, advice = TEXTS[name]
     where = recording if isinstance(recording, str) else name_of(recording)
-    return Remark(name, severity, joint, where, float(span_s[0]), float(span_s[1]), count, amount, meaning, advice)
+    return Remark(
+        name,
+        severity,
+        joint,
+        where,
+        float(span_s[0]),
+        float(span_s[1]),
+        count,
+        amount,
+        meaning,
+        advice,
+    )
 
 
 def _grouped(recording: Recording, findings: Sequence[Finding]) -> Iterator[Remark]:
@@ -176,7 +227,9 @@ def _locked(lock: Interlock, recordings: Sequence[Recording]) -> Iterator[Remark
         rows = lock.rows[number]
         if len(rows):
             span_s = recording.t_s[rows[0]], recording.t_s[rows[-1]]
-            yield _remark("interlock", lock.joint, recording, span_s, lock.num_stretches[number], lock.text)
+            yield _remark(
+                "interlock", lock.joint, recording, span_s, lock.num_stretches[number], lock.text
+            )
 
 
 def _clock(recording: Recording) -> Iterator[Remark]:
@@ -190,17 +243,32 @@ def _clock(recording: Recording) -> Iterator[Remark]:
         yield _remark("irregular clock", None, recording, whole, int((odd > 0.1).sum()), text)
     elif len(late := np.flatnonzero(period_s > JUMP_PERIODS * median_s)):
         text = f"up to {period_s.max() * 1e3:.1f} ms, median {median_s * 1e3:.1f} ms"
-        yield _remark("clock jumps", None, recording, (recording.t_s[late[0]], recording.t_s[late[-1] + 1]), len(late), text)
+        yield _remark(
+            "clock jumps",
+            None,
+            recording,
+            (recording.t_s[late[0]], recording.t_s[late[-1] + 1]),
+            len(late),
+            text,
+        )
     mean_s = (recording.t_s[-1] - recording.t_s[0]) / len(period_s)
     ppm = 1e6 * (mean_s * recording.rate_hz - 1.0)
     if abs(ppm) > CLOCK_PPM:
         yield _remark(
-            "clock rate", None, recording, whole, 1, f"{ppm:+.0f} ppm: {1.0 / mean_s:.3f} Hz, stated {recording.rate_hz:g} Hz"
+            "clock rate",
+            None,
+            recording,
+            whole,
+            1,
+            f"{ppm:+.0f} ppm: {1.0 / mean_s:.3f} Hz, stated {recording.rate_hz:g} Hz",
         )
 
 
 def _saturated(recording: Recording, machine: Machine, thresholds: Thresholds) -> Iterator[Remark]:
-    margin, back = thresholds.at_limit * (machine.upper - machine.lower), round(machine.dead_time_s * recording.rate_hz)
+    margin, back = (
+        thresholds.at_limit * (machine.upper - machine.lower),
+        round(machine.dead_time_s * recording.rate_hz),
+    )
     for j, name in enumerate(recording.joints):
         q, acting = recording.q[:, j], np.roll(recording.u[:, j], back)
         if np.ptp(q) <= margin[j]:
@@ -218,11 +286,15 @@ def _saturated(recording: Recording, machine: Machine, thresholds: Thresholds) -
                 yield _remark("saturated sensor", name, recording, span_s, len(stuck), text)
 
 
-def _at_rest(recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds) -> Iterator[Remark]:
+def _at_rest(
+    recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds
+) -> Iterator[Remark]:
     if not recordings:
         return
     for j, name in enumerate(machine.joint_names):
-        seconds = sum(float((np.abs(r.u[:, j]) > thresholds.commanded).sum()) / r.rate_hz for r in recordings)
+        seconds = sum(
+            float((np.abs(r.u[:, j]) > thresholds.commanded).sum()) / r.rate_hz for r in recordings
+        )
         if seconds < THIN_S:
             total_s = sum(recording.duration_s for recording in recordings)
             text = f"commanded for {seconds:.1f} s of {total_s:.0f} s"

@@ -1,7 +1,8 @@
 """The search over sets of effects: joint by joint over subsets, then over the names that all joints share.
 
-A set is judged by what it earns on recordings that it was not fitted to, less its price: what the same effect earns on reference
-recordings, where there is nothing to find. Saturation may pay only together with a dead band, so sets are never grown from one
+A set is judged by what it earns on recordings that it was not fitted to, less its price: what the
+same effect earns on reference recordings, where there is nothing to find. Saturation may pay only
+together with a dead band, so sets are never grown from one
 effect alone: each joint keeps the best few of each size.
 Axes: `J` joints, `E` entries.
 """
@@ -23,7 +24,8 @@ KEPT = 5
 NAMES = 12
 """Names among which whole sets are chosen."""
 LEAST = 0.15
-"""Smallest size, over the typical one, that is worth naming: what is smaller any simulator gets wrong."""
+"""Smallest size, over the typical one, that is worth naming: what is smaller any simulator gets
+wrong."""
 SURELY = 1.0
 """Standard errors by which a set must earn more than a simpler one."""
 TRIED = 14
@@ -86,19 +88,30 @@ class Table:
     def _starts(self, names: Sequence[str]) -> list[np.ndarray]:
         """Returns sizes at which a fit of several effects may begin: all somewhat smaller than alone, and the best smaller set.
 
-        What begins at a threshold does nothing below it, and a fit that begins there stays there. So a set also begins where the
-        best set with one effect less ended, with the other at what explains best what that one leaves.
+        What begins at a threshold does nothing below it, and a fit that begins there stays there.
+        So a set also begins where the best set with one effect less ended, with the other at what
+        explains best what that one leaves.
         """
         every = [shape for name in names for shape in self.shapes[name]]
-        starts = [np.array([self.alone(shape) for shape in every]) * (1.0 if len(every) == 1 else 0.7)]
+        starts = [
+            np.array([self.alone(shape) for shape in every]) * (1.0 if len(every) == 1 else 0.7)
+        ]
         tried = self.score if len(names) == 2 else self.scored.get
-        smaller = [(one, new) for new in names if len(names) > 1 and (one := tried(frozenset(names) - {new}))]
+        smaller = [
+            (one, new)
+            for new in names
+            if len(names) > 1 and (one := tried(frozenset(names) - {new}))
+        ]
         if smaller:
             best, new = max(smaller, key=lambda pair: pair[0].total)
             known = [shape for name in sorted(best.sizes) for shape in self.shapes[name]]
-            left = self.joint.z - predicted(known, np.concatenate([best.sizes[name] for name in sorted(best.sizes)]))
+            left = self.joint.z - predicted(
+                known, np.concatenate([best.sizes[name] for name in sorted(best.sizes)])
+            )
             added = [alone(left, shape) for shape in self.shapes[new]]
-            starts.append(np.concatenate([added if name == new else best.sizes[name] for name in names]))
+            starts.append(
+                np.concatenate([added if name == new else best.sizes[name] for name in names])
+            )
         return starts
 
     def alone(self, shape: Shape) -> float:
@@ -120,7 +133,12 @@ class Table:
             return  # a joint without a gap
         for _ in range(2, most + 1):
             before = net(best[0])
-            level = {one | {name} for one in best for name in self.shapes if name not in one and len(one) < most}
+            level = {
+                one | {name}
+                for one in best
+                for name in self.shapes
+                if name not in one and len(one) < most
+            }
             best = sorted({*best, *level}, key=net, reverse=True)[:KEPT]
             if net(best[0]) <= before:
                 return
@@ -162,12 +180,18 @@ def choose(
         share: Part of what a joint's subset earns that each of its effects must add.
         shared: Effects with one cause for all joints; they cost once, as `name_price`.
         partial: What such an effect costs for each joint that could show it and does not.
-        least: No effect that is not shared costs less on a joint; what earns less is not priced at all.
+        least: No effect that is not shared costs less on a joint; what earns less is not priced at
+            all.
     """
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
-        priced = {subset: table.scored[subset].total - price(j, subset) for subset in promising(table, least, share, shared)}
-        worth.append({subset: value for subset, value in priced.items() if value > 0 or subset <= shared})
+        priced = {
+            subset: table.scored[subset].total - price(j, subset)
+            for subset in promising(table, least, share, shared)
+        }
+        worth.append(
+            {subset: value for subset, value in priced.items() if value > 0 or subset <= shared}
+        )
     felt = [shared & table.shapes.keys() for table in tables]
     best = _best(worth, felt, name_price, partial)
     while simpler := _simpler(best, worth, tables, felt, name_price, partial, share):
@@ -175,9 +199,17 @@ def choose(
     return best
 
 
-def _best(worth: Sequence[Mapping[Subset, float]], felt: Sequence[Subset], name_price: float, partial: float) -> Chosen:
+def _best(
+    worth: Sequence[Mapping[Subset, float]],
+    felt: Sequence[Subset],
+    name_price: float,
+    partial: float,
+) -> Chosen:
     """Returns the set of at most `MOST` names that is worth most; each joint takes the best subset of them."""
-    names = sorted({name for by_subset in worth for subset in by_subset for name in subset}, key=lambda n: -_sum(worth, n))[:NAMES]
+    names = sorted(
+        {name for by_subset in worth for subset in by_subset for name in subset},
+        key=lambda n: -_sum(worth, n),
+    )[:NAMES]
     best = Chosen((frozenset(),) * len(worth), 0.0)
     for size in range(1, MOST + 1):
         for chosen in combinations(names, size):
@@ -204,7 +236,12 @@ def _simpler(
 ) -> Chosen | None:
     """Returns a set with fewer names whose loss is within what chance does between blocks, or a small part of the whole."""
     for name in sorted(best.names):
-        other = _best([{s: value for s, value in w.items() if name not in s} for w in worth], felt, name_price, partial)
+        other = _best(
+            [{s: value for s, value in w.items() if name not in s} for w in worth],
+            felt,
+            name_price,
+            partial,
+        )
         if len(other.names) >= len(best.names) or not other.names:
             continue
         lost, whole, blocks = 0.0, 0.0, np.zeros(int(tables[0].block.max()) + 1)
@@ -218,7 +255,9 @@ def _simpler(
     return None
 
 
-def promising(table: Table, least: float, share: float, shared: Subset = frozenset()) -> list[Subset]:
+def promising(
+    table: Table, least: float, share: float, shared: Subset = frozenset()
+) -> list[Subset]:
     """Returns the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most.
 
     An effect that is `shared` by all joints may earn little on each.
@@ -226,7 +265,9 @@ def promising(table: Table, least: float, share: float, shared: Subset = frozens
 
     def pays(subset: Subset) -> bool:
         own = subset - shared
-        return table.scored[subset].total > least * len(own) and _each_adds(subset, own, table, share)
+        return table.scored[subset].total > least * len(own) and _each_adds(
+            subset, own, table, share
+        )
 
     paying = [subset for subset in list(table.scored) if subset and pays(subset)]
     paying.sort(key=lambda s: table.scored[s].total, reverse=True)
@@ -238,9 +279,14 @@ def _each_adds(subset: Subset, own: Subset, table: Table, share: float) -> bool:
     total, sizes = table.scored[subset].total, table.scored[subset].sizes
     if any(np.abs(sizes[name]).max() < LEAST for name in own):
         return False
-    return len(subset) == 1 or all(total - table.score(subset - {name}).total >= share * total for name in own)
+    return len(subset) == 1 or all(
+        total - table.score(subset - {name}).total >= share * total for name in own
+    )
 
 
 def _sum(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
     """Returns the most that a subset with `name` is worth, summed over joints."""
-    return sum(max([value for subset, value in by_subset.items() if name in subset], default=0.0) for by_subset in worth)
+    return sum(
+        max([value for subset, value in by_subset.items() if name in subset], default=0.0)
+        for by_subset in worth
+    )

@@ -1,7 +1,8 @@
 """Noise and coarse steps of a sensor: too small for free runs to show, plain in how the samples scatter.
 
-Each recording is summed up by a few statistics a joint. An effect is put onto recordings of the reference, at several sizes; the
-size whose statistics are nearest to those of the field is the most likely one.
+Each recording is summed up by a few statistics a joint. An effect is put onto recordings of the
+reference, at several sizes; the size whose statistics are nearest to those of the field is the most
+likely one.
 Axes: `T` time, `J` joints, `P` parts of the reference, `F` statistics.
 """
 
@@ -25,7 +26,8 @@ AT_REST, MOVING = 0.01, 0.08
 FEWEST = 20
 """Fewer steps do not show the smallest."""
 BLUR = np.array([0.08, 0.08, 0.03, 0.03, 0.08, 0.08])
-"""Differences in the statistics that say nothing: sensors are not quite the same from day to day."""
+"""Differences in the statistics that say nothing: sensors are not quite the same from day to
+day."""
 MOST = 60.0
 """Evidence is not counted beyond this: the statistics are no exact likelihood."""
 WHITE = 6.0
@@ -52,15 +54,19 @@ def statistics(q: np.ndarray, machine: Machine) -> np.ndarray:
                 found[j, place] = np.log(np.sqrt(np.mean(cut**2)) + TINY)
                 found[j, 2 + place] = np.mean(step[rows, j] < TINY / 2)
                 moved = step[rows, j][step[rows, j] >= TINY / 2]
-                found[j, 4 + place] = np.log(np.quantile(moved, 0.2) if len(moved) > FEWEST else TINY)
+                found[j, 4 + place] = np.log(
+                    np.quantile(moved, 0.2) if len(moved) > FEWEST else TINY
+                )
     return found
 
 
-def readings(field: Sequence[Recording], reference: Sequence[Recording], machine: Machine) -> np.ndarray:
+def readings(
+    field: Sequence[Recording], reference: Sequence[Recording], machine: Machine
+) -> np.ndarray:
     """Returns how far positions in the field scatter as they are read, beyond those of the reference, rad or m, `(J,)`.
 
-    Seen in second differences, at rest or in motion, whichever is more: a joint that rests between two steps of a coarse sensor
-    flickers.
+    Seen in second differences, at rest or in motion, whichever is more: a joint that rests between
+    two steps of a coarse sensor flickers.
     """
     squares = []
     for some in (field, reference):
@@ -76,18 +82,31 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
     field, reference, machine = case.field, parts(case.reference), case.machine
     if len(reference) < 2:
         return []
-    kinds = [kind for kind in kinds if kind.target.side == "measurement" and (kind.target.stochastic or not kind.target.smooth)]
+    kinds = [
+        kind
+        for kind in kinds
+        if kind.target.side == "measurement" and (kind.target.stochastic or not kind.target.smooth)
+    ]
     seen = np.nanmean([statistics(r.q.astype(float), machine) for r in field], 0)
     plain = np.stack([statistics(r.q.astype(float), machine) for r in reference])  # (P, J, F)
     none = _likelihood(seen, plain, plain)
     drawn = {kind.name: [_with(kind, size, reference, machine) for size in SIZES] for kind in kinds}
-    likelihood = {name: np.stack([_likelihood(seen, one, plain) for one in by_size]) for name, by_size in drawn.items()}
+    likelihood = {
+        name: np.stack([_likelihood(seen, one, plain) for one in by_size])
+        for name, by_size in drawn.items()
+    }
     highest = {name: values.max(0) for name, values in likelihood.items()}
     gain = {name: np.minimum(values - none, MOST) for name, values in highest.items()}
-    best = [max(highest, key=lambda name: highest[name][j]) for j in range(machine.num_joints)] if highest else []
+    best = (
+        [max(highest, key=lambda name: highest[name][j]) for j in range(machine.num_joints)]
+        if highest
+        else []
+    )
     found = []
     for kind in kinds:
-        mask = np.array([best[j] == kind.name and gain[kind.name][j] > price for j in range(machine.num_joints)])
+        mask = np.array(
+            [best[j] == kind.name and gain[kind.name][j] > price for j in range(machine.num_joints)]
+        )
         worth = float((gain[kind.name][mask] - price).sum()) - name_price
         if worth <= 0:
             continue
@@ -96,21 +115,40 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
             ends = np.array(interval(SIZES, likelihood[kind.name][:, j]))
             for name in kind.fitted:
                 mean, low, high = kind.numbers[name].none + kind.size(name) * ends
-                parameters.setdefault(name, {})[machine.joint_names[j]] = Estimate(float(mean), (float(low), float(high)))
+                parameters.setdefault(name, {})[machine.joint_names[j]] = Estimate(
+                    float(mean), (float(low), float(high))
+                )
         earned = float(gain[kind.name][mask].sum())
-        rivals = {name: earned - float((highest[kind.name] - highest[name])[mask].sum()) for name in gain if name != kind.name}
-        after = np.stack([drawn[kind.name][int(np.argmax(row))].mean(0)[j] for j, row in enumerate(likelihood[kind.name].T)])
-        closed = 1.0 - np.nansum(np.square((seen - after) / BLUR)[mask]) / np.nansum(np.square((seen - plain.mean(0)) / BLUR)[mask])
-        found.append(Found(kind, mask, parameters, worth, earned, float(np.clip(closed, 0.0, 1.0)), rivals))
+        rivals = {
+            name: earned - float((highest[kind.name] - highest[name])[mask].sum())
+            for name in gain
+            if name != kind.name
+        }
+        after = np.stack(
+            [
+                drawn[kind.name][int(np.argmax(row))].mean(0)[j]
+                for j, row in enumerate(likelihood[kind.name].T)
+            ]
+        )
+        closed = 1.0 - np.nansum(np.square((seen - after) / BLUR)[mask]) / np.nansum(
+            np.square((seen - plain.mean(0)) / BLUR)[mask]
+        )
+        found.append(
+            Found(kind, mask, parameters, worth, earned, float(np.clip(closed, 0.0, 1.0)), rivals)
+        )
     return found
 
 
 def _likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
     """Returns the log likelihood of the field's statistics `(J, F)` where those of the parts `(P, J, F)` are typical, `(J,)`.
 
-    Parts scatter at least as they do without an effect, `plain` `(P, J, F)`: a few of them may agree by chance.
+    Parts scatter at least as they do without an effect, `plain` `(P, J, F)`: a few of them may
+    agree by chance.
     """
-    variance = np.fmax(np.nanvar(drawn, 0, ddof=1), np.nanvar(plain, 0, ddof=1)) * (1.0 + 1.0 / len(drawn)) + BLUR**2
+    variance = (
+        np.fmax(np.nanvar(drawn, 0, ddof=1), np.nanvar(plain, 0, ddof=1)) * (1.0 + 1.0 / len(drawn))
+        + BLUR**2
+    )
     off = np.square(seen - np.nanmean(drawn, 0)) / variance
     return -0.5 * np.nansum(off + np.where(np.isfinite(off), np.log(variance), 0.0), 1)
 

@@ -1,6 +1,7 @@
 """The next experiment: which excitation would separate best what these recordings leave open.
 
-Each rival is simulated on each excitation; how far two of them end up apart, over the simulator's noise, is what one would learn.
+Each rival is simulated on each excitation; how far two of them end up apart, over the simulator's
+noise, is what one would learn.
 Axes: `C` rivals, `K` steps, `J` joints, `I` increments.
 """
 
@@ -63,7 +64,10 @@ def best(
     cut = open_loop.Windows(u, q, np.array(list(programs)), machine.num_history, before)
     apart = _apart(Candidates(actuator, machine, cut, np.zeros(len(u)), 0), noises, rivals)
     chance = {rival.kind.name: rival.probability for rival in rivals}
-    worth = {pair: chance[pair[0]] * chance[pair[1]] * np.minimum(distance, MOST) for pair, distance in apart.items()}
+    worth = {
+        pair: chance[pair[0]] * chance[pair[1]] * np.minimum(distance, MOST)
+        for pair, distance in apart.items()
+    }
     chosen = int(np.argmax(np.sum(list(worth.values()), 0)))
     first, second = max(worth, key=lambda pair: worth[pair][chosen])
     distance = apart[first, second][chosen]
@@ -73,12 +77,17 @@ def best(
     return NextExperiment(list(programs)[chosen], (first, second), why)
 
 
-def _apart(candidates: Candidates, noises: Sequence[Noise], rivals: Sequence[Rival]) -> dict[tuple[str, str], np.ndarray]:
+def _apart(
+    candidates: Candidates, noises: Sequence[Noise], rivals: Sequence[Rival]
+) -> dict[tuple[str, str], np.ndarray]:
     """Returns the expected difference in log likelihood of each pair of rivals in each window, `(W,)`."""
     cut = candidates.cut
     at, count = cut.q[:, cut.num_before - 1], len(cut.q)
     base = increments(candidates.paths([])[0], at)
-    ways = {rival.kind.name: increments(candidates.paths([(rival.kind, rival.values)])[0], at) for rival in rivals}
+    ways = {
+        rival.kind.name: increments(candidates.paths([(rival.kind, rival.values)])[0], at)
+        for rival in rivals
+    }
     found = {pair: np.zeros(count) for pair in combinations(ways, 2)}
     for j, noise in enumerate(noises):
         for first in range(0, base.shape[1], LONGEST):

@@ -20,11 +20,14 @@ from brokk_rl.diagnosis.sizes import Plain, Shape, fitted, plain, predicted
 SHAPES = (0.35, 0.5, 0.7, 1.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
 FINE = tuple(np.geomspace(GRID[0], GRID[-1], 20).round(3).tolist())
-"""Sizes at which an effect is simulated that rings: between those of `GRID` it would be out of step, and only a dull one fits."""
+"""Sizes at which an effect is simulated that rings: between those of `GRID` it would be out of
+step, and only a dull one fits."""
 SMALL = GRID[:4]
-"""Sizes at which effects are simulated on the reference: small ones of the field's, as many effects begin at a threshold."""
+"""Sizes at which effects are simulated on the reference: small ones of the field's, as many effects
+begin at a threshold."""
 THERE = 3.0
-"""Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be there already."""
+"""Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be
+there already."""
 FELT = 1e-3
 """An effect that changes errors over the noise by less does nothing to a joint."""
 
@@ -35,32 +38,52 @@ def rays_of(kind: Kind, grid: Sequence[float] = GRID) -> list[Ray]:
     return rays(kind, fine if kind.shaping and not shared([kind]) else grid)
 
 
-def add(shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray], evidence: Evidence) -> list[Ray]:
+def add(
+    shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray], evidence: Evidence
+) -> list[Ray]:
     """Adds the shapes of an effect to the joints that it does something to.
 
-    Numbers that only shape the effect are tried at several values; each joint keeps the best, and the rays remember them.
+    Numbers that only shape the effect are tried at several values; each joint keeps the best, and
+    the rays remember them.
     """
     kind = ways[0].kind
     trials: list[dict[str, float]] = [{}]
     if not ways[0].shape:
         trials += [{number: part} for number in kind.shaping for part in SHAPES]
-    shaped = [[replace(ray, shape=_all(trial, len(shapes))) if trial else ray for ray in ways] for trial in trials]
+    shaped = [
+        [replace(ray, shape=_all(trial, len(shapes))) if trial else ray for ray in ways]
+        for trial in trials
+    ]
     responses = [[evidence.response(ray) for ray in one] for one in shaped]
     best = np.zeros(len(shapes), dtype=int)
     for j, mine in enumerate(shapes):
         if max(np.abs(response[j]).max() for response in responses[0]) < FELT:
             continue
-        made = [[Shape(ray.sizes, r[j]) for ray, r in zip(ways, response, strict=True)] for response in responses]
+        made = [
+            [Shape(ray.sizes, r[j]) for ray, r in zip(ways, response, strict=True)]
+            for response in responses
+        ]
         if len(made) > 1:
-            best[j] = int(np.argmin([loss(evidence.z[j] - predicted(one, fitted(evidence.z[j], one))) for one in made]))
+            best[j] = int(
+                np.argmin(
+                    [
+                        loss(evidence.z[j] - predicted(one, fitted(evidence.z[j], one)))
+                        for one in made
+                    ]
+                )
+            )
         mine[name] = made[best[j]]
     if len(trials) == 1:
         return list(ways)
-    shape = {number: np.array([trials[b].get(number, 1.0) for b in best]) for number in kind.shaping}
+    shape = {
+        number: np.array([trials[b].get(number, 1.0) for b in best]) for number in kind.shaping
+    }
     return [replace(ray, shape=shape) for ray in ways]
 
 
-def plain_joints(evidence: Evidence, scatter: np.ndarray | None = None, z: np.ndarray | None = None) -> list[Plain]:
+def plain_joints(
+    evidence: Evidence, scatter: np.ndarray | None = None, z: np.ndarray | None = None
+) -> list[Plain]:
     """Returns the errors of each joint with small faults of the simulator, in units of `scatter` times the noise.
 
     Args:
@@ -70,7 +93,10 @@ def plain_joints(evidence: Evidence, scatter: np.ndarray | None = None, z: np.nd
     """
     by = np.ones(len(evidence.z)) if scatter is None else 1.0 / np.sqrt(scatter)
     z = evidence.z if z is None else z
-    return [plain(one * part, lines * part) for one, lines, part in zip(z, evidence.faults, by, strict=True)]
+    return [
+        plain(one * part, lines * part)
+        for one, lines, part in zip(z, evidence.faults, by, strict=True)
+    ]
 
 
 def _all(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:
@@ -105,9 +131,13 @@ class Nulls:
         """Returns what the subset earns on joint `j` in each part of the reference, and the length of the field over the part's."""
         if not self.tables:
             parts = [one.evidence for one in self.base.nulls]
-            self.tables = [[Table(joint, {}, part.block) for joint in plain_joints(part)] for part in parts]
+            self.tables = [
+                [Table(joint, {}, part.block) for joint in plain_joints(part)] for part in parts
+            ]
         for name in subset - self.known:
-            ways = [replace(ray, shape=self.grown[name][0].shape) for ray in self.rays[name]]  # shaped as they are in the field
+            ways = [
+                replace(ray, shape=self.grown[name][0].shape) for ray in self.rays[name]
+            ]  # shaped as they are in the field
             for tables, one in zip(self.tables, self.base.nulls, strict=True):
                 add([table.shapes for table in tables], name, ways, one.evidence)
             self.known.add(name)
@@ -120,7 +150,8 @@ class Nulls:
     def earned(self, j: int, subset: frozenset[str]) -> float:
         """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
 
-        Of a cause that all joints share the mean: its price adds up over the joints, and the most of each adds up to too much.
+        Of a cause that all joints share the mean: its price adds up over the joints, and the most
+        of each adds up to too much.
         """
         found = [max(0.0, scored.total * part) for scored, part in self._scored(j, subset)]
         return float((np.mean if subset <= self.shared else max)(found)) if found else 0.0

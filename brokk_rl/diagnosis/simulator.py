@@ -65,8 +65,9 @@ class Base:
     Attributes:
         actuator: Fitted to the whole reference, or given.
         field: Against the field.
-        nulls: Fits that left out a part of the reference, each against that part; without a reference flexible models that left out
-            a part of the field; empty where there are too few recordings for either.
+        nulls: Fits that left out a part of the reference, each against that part; without a
+            reference flexible models that left out a part of the field; empty where there are too
+            few recordings for either.
         is_flexible: `nulls` are flexible models of the field.
     """
 
@@ -94,20 +95,33 @@ def held(actuator: Actuator, begun: Begun, machine: Machine, seed: int) -> Held:
         row += rows.tolist()
         running += (begun_s + recording.t_s[rows]).tolist()
     if not cuts:
-        raise RecordingError(f"too little data: no recording is long enough for a free run of {HORIZON_S:g} s")
+        raise RecordingError(
+            f"too little data: no recording is long enough for a free run of {HORIZON_S:g} s"
+        )
     windows = open_loop.joined(cuts)
     claims = np.ones((len(windows.q), machine.num_joints), dtype=bool)
     candidates = Candidates(actuator, machine, windows, np.array(running), seed)
-    return Held([recording for recording, _ in begun], Evidence(candidates, None, claims), np.array(source), np.array(row))
+    return Held(
+        [recording for recording, _ in begun],
+        Evidence(candidates, None, claims),
+        np.array(source),
+        np.array(row),
+    )
 
 
 def fitted(
-    case: Case, fit: ActuatorFit, folder: Path, seed: int, device: torch.device, refined: Callable[[Base], Base] = lambda base: base
+    case: Case,
+    fit: ActuatorFit,
+    folder: Path,
+    seed: int,
+    device: torch.device,
+    refined: Callable[[Base], Base] = lambda base: base,
 ) -> Base:
     """Returns a simulator fitted to the reference, and fits that leave a part of it out.
 
-    A fit that knows how to `refit` is fitted anew to each rest, all others once to two thirds: the price of a fit that takes long.
-    `refined` may change the simulator before what it gets wrong is learned; see `already`.
+    A fit that knows how to `refit` is fitted anew to each rest, all others once to two thirds: the
+    price of a fit that takes long. `refined` may change the simulator before what it gets wrong is
+    learned; see `already`.
 
     Raises:
         RecordingError: too little reference.
@@ -123,7 +137,13 @@ def fitted(
     field = held(actuator, _begun(case.field), machine, seed)
     if changes := tuning.changes([one.evidence for one in nulls]):
         actuator = tuning.changed(actuator, changes, machine)
-        nulls = _noised([one.with_base(tuning.changed(one.evidence.candidates.base, changes, machine)) for one in nulls], machine)
+        nulls = _noised(
+            [
+                one.with_base(tuning.changed(one.evidence.candidates.base, changes, machine))
+                for one in nulls
+            ],
+            machine,
+        )
         field = field.with_base(actuator)
     field = replace(field, evidence=replace(field.evidence, claims=_known(case, field)))
     return learned(refined(Base(actuator, field, nulls)), machine)
@@ -131,20 +151,30 @@ def fitted(
 
 def learned(base: Base, machine: Machine) -> Base:
     """Returns the same simulator, with what it gets wrong on the reference taken off, and the noise of what is left."""
-    biases, of_field = discrepancy.learned([one.evidence for one in base.nulls], base.field.evidence)
-    nulls = [replace(one, evidence=replace(one.evidence, bias=bias)) for one, bias in zip(base.nulls, biases, strict=True)]
+    biases, of_field = discrepancy.learned(
+        [one.evidence for one in base.nulls], base.field.evidence
+    )
+    nulls = [
+        replace(one, evidence=replace(one.evidence, bias=bias))
+        for one, bias in zip(base.nulls, biases, strict=True)
+    ]
     nulls = _noised(nulls, machine)
     widths = discrepancy.widths([one.evidence for one in nulls])
     nulls = [replace(one, evidence=replace(one.evidence, widths=widths)) for one in nulls]
-    field = replace(base.field.evidence, noise=nulls[0].evidence.noise, bias=of_field, widths=widths)
+    field = replace(
+        base.field.evidence, noise=nulls[0].evidence.noise, bias=of_field, widths=widths
+    )
     return replace(base, field=replace(base.field, evidence=field), nulls=nulls)
 
 
-def given(case: Case, actuator: Actuator, fit: ActuatorFit, folder: Path, seed: int, device: torch.device) -> Base:
+def given(
+    case: Case, actuator: Actuator, fit: ActuatorFit, folder: Path, seed: int, device: torch.device
+) -> Base:
     """Returns a configured simulator held against the field, and flexible models of the field that leave a part of it out.
 
-    There is no reference that would tell how a machine errs that lacks nothing: what `fit` does not explain of recordings that it
-    was not fitted to takes its place, as noise, price and floor. Where it cannot be fitted the noise is that of the simulator.
+    There is no reference that would tell how a machine errs that lacks nothing: what `fit` does not
+    explain of recordings that it was not fitted to takes its place, as noise, price and floor.
+    Where it cannot be fitted the noise is that of the simulator.
     """
     machine = case.machine
     field = held(actuator, _begun(case.field), machine, seed)
@@ -155,7 +185,12 @@ def given(case: Case, actuator: Actuator, fit: ActuatorFit, folder: Path, seed: 
     except RecordingError as error:
         log.warning("no floor: a flexible model cannot be fitted to the field (%s)", error)
     known = nulls[0].evidence.noise if nulls else noises([field], machine)
-    return Base(actuator, replace(field, evidence=replace(field.evidence, noise=known)), nulls, is_flexible=bool(nulls))
+    return Base(
+        actuator,
+        replace(field, evidence=replace(field.evidence, noise=known)),
+        nulls,
+        is_flexible=bool(nulls),
+    )
 
 
 def _crosswise(
@@ -169,7 +204,9 @@ def _crosswise(
 ) -> tuple[Actuator, list[Held]]:
     """Returns a fit, and fits that left out a part of the recordings' `pieces`, each held against that part, their noise known."""
     begun = _begun(pieces)
-    fold = np.arange(len(pieces)) % FOLDS  # in turns: what is left out is of the same making as what is fitted to
+    fold = (
+        np.arange(len(pieces)) % FOLDS
+    )  # in turns: what is left out is of the same making as what is fitted to
     refit: Any = getattr(fit, "refit", None)
     nulls = []
     if refit:
@@ -200,7 +237,10 @@ def noises(nulls: Sequence[Held], machine: Machine) -> list[Noise]:
     """Returns the noise of each joint from a simulator's errors on recordings that it was not fitted to."""
     found = []
     for j in range(machine.num_joints):
-        error, way = ([_rows(getattr(one.evidence, name)[..., j]) for one in nulls] for name in ("error", "way"))
+        error, way = (
+            [_rows(getattr(one.evidence, name)[..., j]) for one in nulls]
+            for name in ("error", "way")
+        )
         found.append(noise.fit(np.concatenate(error), np.concatenate(way)))
     return found
 

@@ -1,10 +1,11 @@
 """Which sizes of some effects explain a joint's errors best, and how much more likely that makes the recordings.
 
-What a set of effects earns is the logarithm of its Bayes factor against the simulator alone, by Laplace's approximation: the
-likelihood at the best sizes, less what large sizes and large faults of the simulator are unlikely, less the price of fitting them.
+What a set of effects earns is the logarithm of its Bayes factor against the simulator alone, by
+Laplace's approximation: the likelihood at the best sizes, less what large sizes and large faults of
+the simulator are unlikely, less the price of fitting them.
 
-What an effect does at a size is interpolated between the sizes at which it was simulated, and effects are added up: both are near
-enough for choosing, and what is chosen is simulated again.
+What an effect does at a size is interpolated between the sizes at which it was simulated, and
+effects are added up: both are near enough for choosing, and what is chosen is simulated again.
 Axes: `E` entries (whitened increments), `S` sizes of a ray.
 """
 
@@ -26,7 +27,8 @@ ENOUGH = 0.02
 FAULTS = 6.0
 """Faults of a simulator are no larger, in standard deviations."""
 PRIOR = 1.0
-"""Standard deviation of a size, over the typical one: tells nothing where the recordings do, and settles what they leave open."""
+"""Standard deviation of a size, over the typical one: tells nothing where the recordings do, and
+settles what they leave open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +40,12 @@ class Shape:
 
     def at(self, size: float) -> tuple[np.ndarray, np.ndarray]:
         """Returns the change at a size and its slope over the size, each `(E,)`."""
-        cell = min(max(int(np.searchsorted(self.sizes, size, side="right")) - 1, 0), len(self.sizes) - 2)
-        slope = (self.change[cell + 1] - self.change[cell]) / (self.sizes[cell + 1] - self.sizes[cell])
+        cell = min(
+            max(int(np.searchsorted(self.sizes, size, side="right")) - 1, 0), len(self.sizes) - 2
+        )
+        slope = (self.change[cell + 1] - self.change[cell]) / (
+            self.sizes[cell + 1] - self.sizes[cell]
+        )
         return self.change[cell] + (size - self.sizes[cell]) * slope, slope
 
 
@@ -61,7 +67,8 @@ def fitted(
         z: Errors over the noise, `(E,)`.
         shapes: What effects change.
         start: Sizes from which the search begins; `None`: what each would be alone.
-        faults: What small faults of the simulator change, in standard deviations of theirs, `(P, E)`.
+        faults: What small faults of the simulator change, in standard deviations of theirs, `(P,
+            E)`.
         used: Weight of each entry, `(E,)`; `None`: all count.
 
     Returns:
@@ -80,23 +87,36 @@ def fitted(
     precision = np.concatenate([np.full(count, PRIOR**-2.0), np.ones(len(lines))])
 
     def left_at(at: np.ndarray) -> np.ndarray:
-        return z - at[count:] @ lines - sum((shape.at(one)[0] for shape, one in zip(shapes, at, strict=False)), np.zeros(len(z)))
+        return (
+            z
+            - at[count:] @ lines
+            - sum(
+                (shape.at(one)[0] for shape, one in zip(shapes, at, strict=False)), np.zeros(len(z))
+            )
+        )
 
     def total(left: np.ndarray, at: np.ndarray) -> float:
-        return 0.5 * (FREEDOM + 1.0) * float(used @ np.log1p(np.square(left) / FREEDOM)) + 0.5 * float(precision @ np.square(at))
+        return 0.5 * (FREEDOM + 1.0) * float(
+            used @ np.log1p(np.square(left) / FREEDOM)
+        ) + 0.5 * float(precision @ np.square(at))
 
     left = left_at(size)
     now, damping = total(left, size), 1e-3
     for _ in range(STEPS):
         slope = _slopes(shapes, lines, size)
         weighted = slope * (weight(left) * used)
-        normal, gradient = weighted @ slope.T + np.diag(precision), weighted @ left - precision * size
+        normal, gradient = (
+            weighted @ slope.T + np.diag(precision),
+            weighted @ left - precision * size,
+        )
         free = ~((size <= low) & (gradient < 0.0) | (size >= high) & (gradient > 0.0))
         gain = 0.0
         for _ in range(3):
             damped = (normal + damping * np.diag(np.diag(normal)))[np.ix_(free, free)]
             trial = size.copy()
-            trial[free] = np.clip(size[free] + np.linalg.solve(damped, gradient[free]), low[free], high[free])
+            trial[free] = np.clip(
+                size[free] + np.linalg.solve(damped, gradient[free]), low[free], high[free]
+            )
             remains = left_at(trial)
             then = total(remains, trial)
             if then < now - 1e-9:
@@ -109,16 +129,22 @@ def fitted(
 
 
 def _slopes(shapes: Sequence[Shape], lines: np.ndarray, size: np.ndarray) -> np.ndarray:
-    return np.concatenate([*(shape.at(one)[1][None] for shape, one in zip(shapes, size, strict=False)), lines])
+    return np.concatenate(
+        [*(shape.at(one)[1][None] for shape, one in zip(shapes, size, strict=False)), lines]
+    )
 
 
 def alone(z: np.ndarray, shape: Shape, used: np.ndarray | None = None) -> float:
     """Returns the best of the simulated sizes and those `PARTS` of the way between them: some begin just there."""
     used = np.ones(len(z)) if used is None else used
     between = [(1.0 - part) * shape.change[:-1] + part * shape.change[1:] for part in PARTS]
-    trials = np.concatenate([shape.sizes, *((1.0 - part) * shape.sizes[:-1] + part * shape.sizes[1:] for part in PARTS)])
+    trials = np.concatenate(
+        [shape.sizes, *((1.0 - part) * shape.sizes[:-1] + part * shape.sizes[1:] for part in PARTS)]
+    )
     left = z - np.concatenate([shape.change, *between])
-    totals = 0.5 * (FREEDOM + 1.0) * np.log1p(np.square(left) / FREEDOM) @ used + 0.5 * np.square(trials / PRIOR)
+    totals = 0.5 * (FREEDOM + 1.0) * np.log1p(np.square(left) / FREEDOM) @ used + 0.5 * np.square(
+        trials / PRIOR
+    )
     return float(trials[int(np.argmin(totals))])
 
 
@@ -147,14 +173,20 @@ def plain(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray) -> Plain:
     return Plain(z, lines, loss(left[:, None], axis=1), _price(left, [], lines, whole))
 
 
-def earned(joint: Plain, shapes: Sequence[Shape], start: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def earned(
+    joint: Plain, shapes: Sequence[Shape], start: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns by how much shapes make the errors more likely, entry by entry `(E,)`, and their best sizes.
 
     Prices of sizes and faults are spread over the entries.
     """
     whole = fitted(joint.z, shapes, start, joint.faults)
     count = len(shapes)
-    left = joint.z - whole[count:] @ joint.faults - (predicted(shapes, whole[:count]) if shapes else 0.0)
+    left = (
+        joint.z
+        - whole[count:] @ joint.faults
+        - (predicted(shapes, whole[:count]) if shapes else 0.0)
+    )
     saved = joint.price - _price(left, shapes, joint.faults, whole)
     return joint.loss - loss(left[:, None], axis=1) + saved / len(left), whole[:count]
 
@@ -173,5 +205,7 @@ def crossed(z: np.ndarray, shapes: Sequence[Shape], fold: np.ndarray) -> np.ndar
     for half in (0, 1):
         other = fold == half
         if shapes and other.any() and not other.all():
-            change[other] = predicted(shapes, fitted(z, shapes, used=np.where(other, 0.0, 1.0)))[other]
+            change[other] = predicted(shapes, fitted(z, shapes, used=np.where(other, 0.0, 1.0)))[
+                other
+            ]
     return change

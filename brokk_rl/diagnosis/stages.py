@@ -1,6 +1,7 @@
 """On which part of the way from command to estimate the gap lies: timing, actuation, sensing, kinematics, perception, contact.
 
-Timing, actuation and sensing share the gap of the joints; kinematics and perception are errors of their own, told in millimetres.
+Timing, actuation and sensing share the gap of the joints; kinematics and perception are errors of
+their own, told in millimetres.
 """
 
 from __future__ import annotations
@@ -30,10 +31,12 @@ STAGE_OF: dict[str, Stage] = {
 }  # fmt: skip
 """Stage of each effect; all others are of the actuation."""
 CONTACT_N = 200.0
-"""More than this at the tool is contact, not the noise of a force that is computed from pressures."""
+"""More than this at the tool is contact, not the noise of a force that is computed from
+pressures."""
 EXPLAINED, FAR = 0.05, 1.5
-"""Poses differ, and with them what a measured tool point has of noise: only what one error of geometry explains so much of, or what
-is so many times the reference's, counts as an error of kinematics."""
+"""Poses differ, and with them what a measured tool point has of noise: only what one error of
+geometry explains so much of, or what is so many times the reference's, counts as an error of
+kinematics."""
 NEAR_M = 0.5
 """A hole further than this from the tip is not the one that is touched."""
 TARGET = ("target_x_m", "target_y_m", "target_z_m")
@@ -71,17 +74,25 @@ class Known:
     reference_geometry: Geometry | None
 
 
-def stages(known: Known, runs: FreeRuns, reference: FreeRuns | None, machine: Machine) -> list[StageFinding]:
+def stages(
+    known: Known, runs: FreeRuns, reference: FreeRuns | None, machine: Machine
+) -> list[StageFinding]:
     """Returns what each stage has to do with the gap, those about which something can be said."""
     whole_m = _beyond(known.budget) if known.budget else None
     found = _of_joints(known, runs, reference, machine, whole_m)
-    found += list(filter(None, (_kinematics(known), perception(runs.recordings, machine), _contact(runs))))
+    found += list(
+        filter(None, (_kinematics(known), perception(runs.recordings, machine), _contact(runs)))
+    )
     return found
 
 
 def foremost(findings: Sequence[StageFinding], has_gap: bool) -> Stage | None:
     """Returns the stage that matters most at the tool (without geometry: by its part of the gap); `None` without a gap."""
-    those = [f for f in findings if f.stage in ("timing", "actuation", "sensing", "kinematics", "perception")]
+    those = [
+        f
+        for f in findings
+        if f.stage in ("timing", "actuation", "sensing", "kinematics", "perception")
+    ]
     those = [f for f in those if has_gap or f.stage in ("kinematics", "perception")]
     weighed = [(f.rms_m if f.rms_m is not None else f.part or 0.0, f.stage) for f in those]
     weighed = [pair for pair in weighed if pair[0] > 0.0]
@@ -95,11 +106,22 @@ def _beyond(budget: Budget) -> float:
 
 
 def _of_joints(
-    known: Known, runs: FreeRuns, reference: FreeRuns | None, machine: Machine, whole_m: float | None
+    known: Known,
+    runs: FreeRuns,
+    reference: FreeRuns | None,
+    machine: Machine,
+    whole_m: float | None,
 ) -> list[StageFinding]:
-    noise, floor = measurement_noise(runs.recordings), measurement_noise(reference.recordings) if reference else None
+    noise, floor = (
+        measurement_noise(runs.recordings),
+        measurement_noise(reference.recordings) if reference else None,
+    )
     parts, texts = {"timing": 0.0, "sensing": 0.0}, {"timing": [], "sensing": []}
-    late = {probe.joint: probe for probe in known.probes if probe.effect == "dead_time" and probe.is_clear}
+    late = {
+        probe.joint: probe
+        for probe in known.probes
+        if probe.effect == "dead_time" and probe.is_clear
+    }
     span = max(1, round(SPAN_S / machine.period_s))
     speed = (runs.simulated[:, span:] - runs.simulated[:, :-span]) / SPAN_S
     for j, (name, joint) in enumerate(known.location.joints.items()):
@@ -115,16 +137,24 @@ def _of_joints(
             parts["sensing"] += joint.gap * min(1.0, more / excess)
             unit = machine.joints[j].unit
             before = 0.0 if floor is None else 1e3 * floor[j]
-            texts["sensing"].append(f"{name} has {1e3 * noise[j]:.2f} m{unit} of noise, {before:.2f} on the reference")
-    timing, sensing = min(parts["timing"], 1.0), min(parts["sensing"], 1.0 - min(parts["timing"], 1.0))
+            texts["sensing"].append(
+                f"{name} has {1e3 * noise[j]:.2f} m{unit} of noise, {before:.2f} on the reference"
+            )
+    timing, sensing = (
+        min(parts["timing"], 1.0),
+        min(parts["sensing"], 1.0 - min(parts["timing"], 1.0)),
+    )
     rows = {"timing": timing, "sensing": sensing, "actuation": 1.0 - timing - sensing}
     sayings = {
-        "timing": "; ".join(texts["timing"]) or "no joint moves earlier or later than simulated, beyond what the reference shows",
+        "timing": "; ".join(texts["timing"])
+        or "no joint moves earlier or later than simulated, beyond what the reference shows",
         "sensing": "; ".join(texts["sensing"]) or "no sensor is noisier than on the reference",
         "actuation": "what is left of the joints' gap",
     }
     return [
-        StageFinding(stage, part, None if whole_m is None else whole_m * float(np.sqrt(part)), sayings[stage])
+        StageFinding(
+            stage, part, None if whole_m is None else whole_m * float(np.sqrt(part)), sayings[stage]
+        )
         for stage, part in rows.items()
     ]
 
@@ -132,9 +162,12 @@ def _of_joints(
 def measurement_noise(recordings: Sequence[Recording]) -> np.ndarray:
     """Returns the noise of each sensor, standard deviation, `(J,)`: from third differences, which smooth motion hardly has.
 
-    The median makes edges of motions, which are few, count little. White noise of 1 has third differences of sqrt(20).
+    The median makes edges of motions, which are few, count little. White noise of 1 has third
+    differences of sqrt(20).
     """
-    third = np.concatenate([np.diff(recording.q.astype(float), 3, axis=0) for recording in recordings])
+    third = np.concatenate(
+        [np.diff(recording.q.astype(float), 3, axis=0) for recording in recordings]
+    )
     return np.median(np.abs(third), 0) / 0.6745 / np.sqrt(20.0)
 
 
@@ -168,7 +201,11 @@ def perception(recordings: Sequence[Recording], machine: Machine) -> StageFindin
         if all(column in recording.extra for column in COLUMNS):
             tip = np.stack([recording.extra[column] for column in COLUMNS], 1).astype(float)
         else:
-            tip = Kinematics(machine).pose(torch.as_tensor(recording.q, dtype=torch.float32)).tip_in_base_m.numpy()
+            tip = (
+                Kinematics(machine)
+                .pose(torch.as_tensor(recording.q, dtype=torch.float32))
+                .tip_in_base_m.numpy()
+            )
         touches = recording.extra["force_n"] > CONTACT_N
         first = touches & ~np.append(False, touches[:-1])
         distance = np.linalg.norm(tip - target, axis=1)[first]
@@ -176,7 +213,9 @@ def perception(recordings: Sequence[Recording], machine: Machine) -> StageFindin
     if not off:
         return None
     rms_m = float(np.sqrt(np.mean(np.square(off))))
-    text = f"at {len(off)} touches the tip is {1e3 * rms_m:.0f} mm (RMS) from the estimated borehole"
+    text = (
+        f"at {len(off)} touches the tip is {1e3 * rms_m:.0f} mm (RMS) from the estimated borehole"
+    )
     return StageFinding("perception", None, rms_m, text)
 
 
@@ -191,5 +230,8 @@ def _contact(runs: FreeRuns) -> StageFinding | None:
     part = float(square[touching].sum() / max(square.sum(), np.finfo(float).tiny))
     time = float(touching.sum() / np.isfinite(force).sum())
     return StageFinding(
-        "contact", None, None, f"{100 * part:.0f} % of the squared error lies in contact, {100 * time:.0f} % of the time"
+        "contact",
+        None,
+        None,
+        f"{100 * part:.0f} % of the squared error lies in contact, {100 * time:.0f} % of the time",
     )

@@ -40,7 +40,10 @@ def write(folder: Path, stages: Mapping[str, str], withheld: Mapping[str, Any]) 
     page = Page("A gap, found and closed", text, tone)
     if repair:
         figure = downstream_page.picture(repair)
-        page.picture(figure, "Strict success with Wilson's 95 % intervals; all policies meet the same starts.")
+        page.picture(
+            figure,
+            "Strict success with Wilson's 95 % intervals; all policies meet the same starts.",
+        )
     _stages(page, folder, stages)
     _simulator(page, _json(folder / "simulator" / "identification.json"))
     _policy(page, {name: _json(folder / name / "evaluation.json") for name in EVALUATED})
@@ -57,12 +60,17 @@ def write(folder: Path, stages: Mapping[str, str], withheld: Mapping[str, Any]) 
     page.write(folder / PAGE)
 
 
-def _summary(found: Answer | None, repair: Mapping[str, Any] | None, withheld: Mapping[str, Any]) -> tuple[str, Tone]:
+def _summary(
+    found: Answer | None, repair: Mapping[str, Any] | None, withheld: Mapping[str, Any]
+) -> tuple[str, Tone]:
     if found is None:
         return "The story goes on.", "plain"
     if not found.selected:
         verdict = "nothing" if found.verdict == "none" else "something that it does not know"
-        return f"The diagnosis found {verdict}; the machine has {_listed(withheld)}. {found.reason}", "bad"
+        return (
+            f"The diagnosis found {verdict}; the machine has {_listed(withheld)}. {found.reason}",
+            "bad",
+        )
     named = {name for one in found.selected for name in (one.effect, *one.same_as)}
     right = (
         "as it is"
@@ -77,7 +85,9 @@ def _summary(found: Answer | None, repair: Mapping[str, Any] | None, withheld: M
 
 
 def _listed(withheld: Mapping[str, Any]) -> str:
-    return wording.listed([wording.said(name) + wording.on(_joints(node)) for name, node in withheld.items()])
+    return wording.listed(
+        [wording.said(name) + wording.on(_joints(node)) for name, node in withheld.items()]
+    )
 
 
 def _joints(node: Mapping[str, Any]) -> list[str]:
@@ -96,13 +106,19 @@ def _stages(page: Page, folder: Path, stages: Mapping[str, str]) -> None:
         seconds = _seconds(record)
         whole_s += seconds or 0.0
         rows.append(
-            [name, Cell(title, f"{record['outcome']}; {record['mode']}"), None if seconds is None else f"{seconds / 60:.1f}"]
+            [
+                name,
+                Cell(title, f"{record['outcome']}; {record['mode']}"),
+                None if seconds is None else f"{seconds / 60:.1f}",
+            ]
         )
     rows.append(["", "all", f"{whole_s / 60:.1f}"])
     page.table(["stage", "what for", "minutes"], rows)
     with page.details("The commands"):
         records = (read_record(folder / name) for name in stages)
-        page.code("\n\n".join(f"brokk {' '.join(record['command'][1:])}" for record in records if record))
+        page.code(
+            "\n\n".join(f"brokk {' '.join(record['command'][1:])}" for record in records if record)
+        )
 
 
 def _seconds(record: Mapping[str, Any]) -> float | None:
@@ -117,7 +133,10 @@ def _simulator(page: Page, found: Mapping[str, Any] | None) -> None:
         return
     page.heading("The simulator")
     models = list(next(iter(found["joints"].values())))
-    rows = [[joint, *(f"{1e3 * one[model]['5']['rmse']:.1f}" for model in models)] for joint, one in found["joints"].items()]
+    rows = [
+        [joint, *(f"{1e3 * one[model]['5']['rmse']:.1f}" for model in models)]
+        for joint, one in found["joints"].items()
+    ]
     page.table(
         ["joint", *models],
         rows,
@@ -154,12 +173,20 @@ def _found(page: Page, found: Answer, withheld: Mapping[str, Any]) -> None:
             for joint, value in by_joint.items():
                 size, interval = wording.estimate(value)
                 rows.append(
-                    [wording.said(one.effect), joint, number, Cell(size, interval), _true(withheld, one.effect, number, joint)]
+                    [
+                        wording.said(one.effect),
+                        joint,
+                        number,
+                        Cell(size, interval),
+                        _true(withheld, one.effect, number, joint),
+                    ]
                 )
     if rows:
         page.table(["effect", "joint", "number", "found", "withheld"], rows)
     if figure := pictures.ladder(found):
-        page.picture(figure, "Error over free runs of 5 s on recordings that no effect was fitted to.")
+        page.picture(
+            figure, "Error over free runs of 5 s on recordings that no effect was fitted to."
+        )
 
 
 def _true(withheld: Mapping[str, Any], effect: str, number: str, joint: str) -> str | None:

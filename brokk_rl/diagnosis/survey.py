@@ -37,10 +37,19 @@ class Survey:
 
     def where(self) -> Where:
         """Returns the fields `where` of `diagnosis.json`: shares are those of what exceeds the floor."""
-        joints = {name: JointGap(j.rmse, j.floor, j.gap) for name, j in self.location.joints.items()}
-        regimes = [RegimeGap(p.joint, p.category, p.gap) for p in self.location.largest() if p.gap > 0.0]
+        joints = {
+            name: JointGap(j.rmse, j.floor, j.gap) for name, j in self.location.joints.items()
+        }
+        regimes = [
+            RegimeGap(p.joint, p.category, p.gap) for p in self.location.largest() if p.gap > 0.0
+        ]
         stage = foremost(self.stages, self.location.has_gap)
-        return Where(joints, tuple(regimes[:LISTED]), stage, {joint.name: joint.unit for joint in self.machine.joints})
+        return Where(
+            joints,
+            tuple(regimes[:LISTED]),
+            stage,
+            {joint.name: joint.unit for joint in self.machine.joints},
+        )
 
     def more(self) -> dict[str, Any]:
         """Returns further fields of `diagnosis.json`, plain JSON data."""
@@ -68,7 +77,8 @@ def survey(
 
     Args:
         before: Free runs of the simulator as it was through field recordings.
-        floor: The same through reference recordings that it was not fitted to; `None`: there is no floor.
+        floor: The same through reference recordings that it was not fitted to; `None`: there is no
+            floor.
         after: Free runs with the selected effects, for the budget; `None` without.
         machine: The machine.
         thresholds: When a stretch of a recording is worth telling.
@@ -79,10 +89,23 @@ def survey(
     location = locate(before, floor, machine, dead_time_s, generator, whole)
     clues = probes(before, floor, machine, dead_time_s)
     shapes = [geometry(runs.recordings, machine) if runs else None for runs in (before, floor)]
-    accounts = [account(runs, machine) if runs and machine.has_bodies else None for runs in (before, after, floor)]
+    accounts = [
+        account(runs, machine) if runs and machine.has_bodies else None
+        for runs in (before, after, floor)
+    ]
     budget = Budget(accounts[0], accounts[1], accounts[2], {}) if accounts[0] else None
     rows = stages(Known(location, clues, budget, shapes[0], shapes[1]), before, floor, machine)
     if budget:
-        of_geometry = {row.stage: row.rms_m for row in rows if row.part is None and row.rms_m is not None}
+        of_geometry = {
+            row.stage: row.rms_m for row in rows if row.part is None and row.rms_m is not None
+        }
         budget = Budget(budget.before, budget.after, budget.floor, of_geometry)
-    return Survey(examine(before.recordings, machine, thresholds), location, clues, rows, budget, shapes[0], machine)
+    return Survey(
+        examine(before.recordings, machine, thresholds),
+        location,
+        clues,
+        rows,
+        budget,
+        shapes[0],
+        machine,
+    )

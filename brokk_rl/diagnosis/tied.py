@@ -1,6 +1,7 @@
 """One cause for all joints has one size: clocks that are apart by so much, oil that is so much too thin.
 
-An effect that all joints share is first sized joint by joint. Where it is chosen, its size is the same for all from then on,
+An effect that all joints share is first sized joint by joint. Where it is chosen, its size is the
+same for all from then on,
 nearly: what a joint needs beyond that is another effect, and shows as one.
 Axes: `J` joints, `S` sizes of a ray.
 """
@@ -17,7 +18,8 @@ from brokk_rl.diagnosis.search import Subset, Table
 from brokk_rl.diagnosis.sizes import Shape
 
 PLAY = 0.3
-"""Sizes may differ by so much of what they have in common: an effect's form is not quite the same on all joints."""
+"""Sizes may differ by so much of what they have in common: an effect's form is not quite the same
+on all joints."""
 
 Rays = Mapping[str, Sequence[Ray]]
 Shapes = Sequence[Mapping[str, Sequence[Shape]]]
@@ -27,12 +29,17 @@ def tied(
     names: Subset, tables: Sequence[Table], grown: Rays, shapes: Shapes
 ) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
     """Returns rays and shapes with those of the effects `names` bounded to about the size that the joints agree on."""
-    rays, narrow = {name: list(ways) for name, ways in grown.items()}, [{n: list(s) for n, s in mine.items()} for mine in shapes]
+    rays, narrow = (
+        {name: list(ways) for name, ways in grown.items()},
+        [{n: list(s) for n, s in mine.items()} for mine in shapes],
+    )
     for name in names:
         scored = [table.score(frozenset({name})) for table in tables if name in table.shapes]
         for place, ray in enumerate(rays[name]):
             size = np.array([one.sizes[name][place] for one in scored])
-            told = np.array([max(one.total, 0.0) for one in scored]) / np.maximum(np.square(size), 1e-6)
+            told = np.array([max(one.total, 0.0) for one in scored]) / np.maximum(
+                np.square(size), 1e-6
+            )
             common = median(size, told)
             if common == 0.0:
                 continue
@@ -41,7 +48,9 @@ def tied(
             for mine in narrow:
                 if name in mine:
                     shape = mine[name][place]
-                    mine[name][place] = Shape(ends, np.stack([shape.at(float(size))[0] for size in ends]))
+                    mine[name][place] = Shape(
+                        ends, np.stack([shape.at(float(size))[0] for size in ends])
+                    )
     return rays, narrow
 
 

@@ -33,7 +33,8 @@ STEP = 0.2
 LEAST_M = 3e-4
 """No instrument is better."""
 LEAST = 0.3
-"""Smallest size, over the typical one, that is worth naming: trackers see millimetres that no drawing and no zero hold."""
+"""Smallest size, over the typical one, that is worth naming: trackers see millimetres that no
+drawing and no zero hold."""
 
 
 Fit = tuple[float, np.ndarray, np.ndarray]
@@ -55,7 +56,9 @@ def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
     if not machine.has_bodies:
         return False
     given = [
-        np.isfinite(np.stack([r.extra[column] for column in COLUMNS])).all(0).sum() / r.rate_hz for r in recordings if _is_seen(r)
+        np.isfinite(np.stack([r.extra[column] for column in COLUMNS])).all(0).sum() / r.rate_hz
+        for r in recordings
+        if _is_seen(r)
     ]
     return sum(given) >= FEWEST
 
@@ -66,7 +69,8 @@ class Seen:
 
     Attributes:
         found: Errors of geometry and encoders.
-        left: Root mean square of what they leave over that of the reference; 1 where nothing is measured.
+        left: Root mean square of what they leave over that of the reference; 1 where nothing is
+            measured.
     """
 
     found: Sequence[Found]
@@ -78,14 +82,28 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
     field, reference, machine = case.field, case.reference, case.machine
     if not is_tracked(field, machine):
         return Seen([], 1.0)
-    kinds = [k for k in kinds if not k.target.stochastic and k.target.smooth and k.target.side in ("kinematics", "measurement")]
+    kinds = [
+        k
+        for k in kinds
+        if not k.target.stochastic
+        and k.target.smooth
+        and k.target.side in ("kinematics", "measurement")
+    ]
     q, seen, ways = _samples(field, machine)
-    off, causes = _untimed((seen - _points(None, {}, q, machine)).ravel(), ways), _causes(kinds, q, ways, machine)
+    off, causes = (
+        _untimed((seen - _points(None, {}, q, machine)).ravel(), ways),
+        _causes(kinds, q, ways, machine),
+    )
     everything = np.concatenate([cause.columns for cause in causes], 1)
-    size_m = usual_m = max(LEAST_M, float(np.std(off - everything @ np.linalg.lstsq(everything, off, rcond=1e-9)[0])))
+    size_m = usual_m = max(
+        LEAST_M, float(np.std(off - everything @ np.linalg.lstsq(everything, off, rcond=1e-9)[0]))
+    )
     if is_tracked(reference, machine):
         at, known, moved = _samples(reference, machine)
-        usual_m = max(LEAST_M, float(np.std(_untimed((known - _points(None, {}, at, machine)).ravel(), moved))))
+        usual_m = max(
+            LEAST_M,
+            float(np.std(_untimed((known - _points(None, {}, at, machine)).ravel(), moved))),
+        )
         size_m = max(size_m, usual_m)
     straight, chosen = off, ()
     for _ in range(TURNS):  # what errors do is straight about what was found, not about nothing
@@ -99,8 +117,15 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
     sizes = zip(chosen, _split(causes, chosen, fits[chosen][1]), strict=False)
     large = tuple(c for c, own in sizes if _size(causes[c], own) >= LEAST)
     names = dict.fromkeys(causes[c].kind.name for c in large)
-    left = straight - np.concatenate([causes[c].columns for c in chosen], 1) @ fits[chosen][1] if chosen else straight
-    return Seen([_found(name, large, causes, fits, worth, machine) for name in names], float(np.std(left)) / usual_m)
+    left = (
+        straight - np.concatenate([causes[c].columns for c in chosen], 1) @ fits[chosen][1]
+        if chosen
+        else straight
+    )
+    return Seen(
+        [_found(name, large, causes, fits, worth, machine) for name in names],
+        float(np.std(left)) / usual_m,
+    )
 
 
 def _compared(
@@ -126,7 +151,12 @@ def _found(
     machine: Machine,
 ) -> Found:
     gain, values, covariance = fits[best]
-    deviation, parameters, mask, place = np.sqrt(np.diag(covariance)), {}, np.zeros(machine.num_joints, dtype=bool), 0
+    deviation, parameters, mask, place = (
+        np.sqrt(np.diag(covariance)),
+        {},
+        np.zeros(machine.num_joints, dtype=bool),
+        0,
+    )
     kind = next(causes[c].kind for c in best if causes[c].kind.name == name)
     for c in best:
         cause = causes[c]
@@ -145,13 +175,19 @@ def _found(
     for c, cause in enumerate(causes):
         swapped = tuple(sorted({*rest, c}))
         if cause.kind is not kind and swapped in fits:
-            rivals[cause.kind.name] = max(rivals.get(cause.kind.name, -np.inf), fits[swapped][0] - fits[rest][0])
-    without = max(value for chosen, value in worth.items() if not any(causes[c].kind is kind for c in chosen))
+            rivals[cause.kind.name] = max(
+                rivals.get(cause.kind.name, -np.inf), fits[swapped][0] - fits[rest][0]
+            )
+    without = max(
+        value for chosen, value in worth.items() if not any(causes[c].kind is kind for c in chosen)
+    )
     closed = float(np.clip(own / max(gain, 1e-9), 0.0, 1.0))
     return Found(kind, mask, parameters, worth[best] - without, own, closed, rivals)
 
 
-def _causes(kinds: Sequence[Kind], q: np.ndarray, ways: np.ndarray, machine: Machine) -> list[_Cause]:
+def _causes(
+    kinds: Sequence[Kind], q: np.ndarray, ways: np.ndarray, machine: Machine
+) -> list[_Cause]:
     """Returns the errors that move the tool point at all, other than along the ways that it goes."""
     plain, found = _points(None, {}, q, machine), []
     for kind in kinds:
@@ -160,7 +196,10 @@ def _causes(kinds: Sequence[Kind], q: np.ndarray, ways: np.ndarray, machine: Mac
             columns = []
             for name in kind.fitted:
                 step = STEP * kind.size(name)
-                moved = _points(kind, {name: _value(kind, name, joint, step, machine)}, q, machine) - plain
+                moved = (
+                    _points(kind, {name: _value(kind, name, joint, step, machine)}, q, machine)
+                    - plain
+                )
                 columns.append(_untimed(moved.ravel() / step, ways))
             column = np.stack(columns, 1)
             if np.abs(column).max() > 1e-6:
@@ -170,25 +209,42 @@ def _causes(kinds: Sequence[Kind], q: np.ndarray, ways: np.ndarray, machine: Mac
 
 def _value(kind: Kind, name: str, joint: int | None, by: float, machine: Machine) -> np.ndarray:
     """Returns a number of an effect that is `by` more than neutral on a joint, or on all, `(J,)` or `(1,)`."""
-    value = np.full(machine.num_joints if kind.numbers[name].per_joint else 1, kind.numbers[name].none, dtype=float)
+    value = np.full(
+        machine.num_joints if kind.numbers[name].per_joint else 1,
+        kind.numbers[name].none,
+        dtype=float,
+    )
     value[slice(None) if joint is None else joint] += by
     return value
 
 
 def _bent(cause: _Cause, values: np.ndarray, q: np.ndarray, machine: Machine) -> np.ndarray:
     """Returns by how much an error of some size moves the tool point other than in proportion, `(D,)`."""
-    given = {n: _value(cause.kind, n, cause.joint, value, machine) for n, value in zip(cause.names, values, strict=True)}
+    given = {
+        n: _value(cause.kind, n, cause.joint, value, machine)
+        for n, value in zip(cause.names, values, strict=True)
+    }
     steps = {n: STEP * cause.kind.size(n) for n in cause.names}
-    small = [_points(cause.kind, {n: _value(cause.kind, n, cause.joint, by, machine)}, q, machine) for n, by in steps.items()]
+    small = [
+        _points(cause.kind, {n: _value(cause.kind, n, cause.joint, by, machine)}, q, machine)
+        for n, by in steps.items()
+    ]
     plain = _points(None, {}, q, machine)
-    line = sum((value / by * (one - plain) for value, by, one in zip(values, steps.values(), small, strict=True)), np.zeros(()))
+    line = sum(
+        (
+            value / by * (one - plain)
+            for value, by, one in zip(values, steps.values(), small, strict=True)
+        ),
+        np.zeros(()),
+    )
     return (_points(cause.kind, given, q, machine) - plain - line).ravel()
 
 
 def _untimed(off: np.ndarray, ways: np.ndarray) -> np.ndarray:
     """Returns errors `(D,)` without their part along the ways `(D, 2)` that the tool point goes.
 
-    Instruments beside the machine have a clock of their own: a period between them and the encoders moves the tool by centimetres.
+    Instruments beside the machine have a clock of their own: a period between them and the encoders
+    moves the tool by centimetres.
     """
     return off - ways @ np.linalg.lstsq(ways, off, rcond=1e-9)[0]
 
@@ -196,7 +252,9 @@ def _untimed(off: np.ndarray, ways: np.ndarray) -> np.ndarray:
 def _fit(causes: Sequence[_Cause], off: np.ndarray, size_m: float) -> Fit:
     """Returns what a set of errors earns, their numbers (as differences from neutral), and their covariance."""
     x = np.concatenate([cause.columns for cause in causes], 1)
-    unit = np.concatenate([[abs(cause.kind.size(name)) for name in cause.names] for cause in causes])
+    unit = np.concatenate(
+        [[abs(cause.kind.size(name)) for name in cause.names] for cause in causes]
+    )
     # instruments err together for a while: a sample a second counts as a third of one
     normal = x.T @ x / size_m**2 / 3.0 + np.diag(1.0 / (3.0 * unit) ** 2)
     covariance = np.linalg.inv(normal)
@@ -210,27 +268,42 @@ def _split(causes: Sequence[_Cause], chosen: Sequence[int], values: np.ndarray) 
 
 
 def _size(cause: _Cause, values: np.ndarray) -> float:
-    return max(abs(value / cause.kind.size(name)) for name, value in zip(cause.names, values, strict=True))
+    return max(
+        abs(value / cause.kind.size(name)) for name, value in zip(cause.names, values, strict=True)
+    )
 
 
-def _samples(recordings: Sequence[Recording], machine: Machine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _samples(
+    recordings: Sequence[Recording], machine: Machine
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns positions, measured tool points and the ways of a period to and from them, `(D, 2)`, about once a second."""
     having = [r for r in recordings if _is_seen(r)]
     every = max(1, round(having[0].rate_hz))
-    seen = np.concatenate([np.stack([r.extra[column] for column in COLUMNS], 1)[::every] for r in having]).astype(float)
+    seen = np.concatenate(
+        [np.stack([r.extra[column] for column in COLUMNS], 1)[::every] for r in having]
+    ).astype(float)
     q = [r.q.astype(float) for r in having]
     steps = [np.diff(_points(None, {}, one, machine), axis=0) for one in q]
     none = np.zeros((1, 3))
-    ways = [np.stack([np.concatenate([none, one]), np.concatenate([one, none])], -1)[::every] for one in steps]
+    ways = [
+        np.stack([np.concatenate([none, one]), np.concatenate([one, none])], -1)[::every]
+        for one in steps
+    ]
     given = np.isfinite(seen).all(1)
-    return np.concatenate([one[::every] for one in q])[given], seen[given], np.concatenate(ways)[given].reshape(-1, 2)
+    return (
+        np.concatenate([one[::every] for one in q])[given],
+        seen[given],
+        np.concatenate(ways)[given].reshape(-1, 2),
+    )
 
 
 def _is_seen(recording: Recording) -> bool:
     return all(column in recording.extra for column in COLUMNS)
 
 
-def _points(kind: Kind | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine) -> np.ndarray:
+def _points(
+    kind: Kind | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine
+) -> np.ndarray:
     """Returns where the tool point is at measured positions, with an effect or none, `(S, 3)`."""
     at, device = torch.as_tensor(q, dtype=torch.float32), torch.device("cpu")
     kinematics = Kinematics(machine, device)

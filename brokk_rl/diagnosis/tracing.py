@@ -1,9 +1,10 @@
 """Squared errors of free runs by what they belong to, so that the parts add up to all of it.
 
-An error of position stays after what caused it is over, so it is traced back to where it arose: the error of a window is the sum
-of its increments, `e = Σ_c e_c` with `e_c` those of the samples in category `c`, and `Σ_t e_c(t) e(t)` is the part of the squared
-error that category `c` answers for. The parts add up exactly; one below 0 works against the others. Frequency bands add up by
-Parseval's theorem, recordings and running time by themselves.
+An error of position stays after what caused it is over, so it is traced back to where it arose: the
+error of a window is the sum of its increments, `e = Σ_c e_c` with `e_c` those of the samples in
+category `c`, and `Σ_t e_c(t) e(t)` is the part of the squared error that category `c` answers for.
+The parts add up exactly; one below 0 works against the others. Frequency bands add up by Parseval's
+theorem, recordings and running time by themselves.
 Axes: `W` windows, `K` steps, `J` joints, `C` categories.
 """
 
@@ -24,7 +25,8 @@ BANDS_HZ = (0.3, 1.0, 3.0)
 AGES = 4
 """Parts into which the running time is cut."""
 SPAN_S = 0.25
-"""Tests look at what is added to the error within this time: it hangs together less than the error itself, which stays."""
+"""Tests look at what is added to the error within this time: it hangs together less than the error
+itself, which stays."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,10 @@ class Sums:
     Attributes:
         categories: Their names.
         square: Part of the squared error.
-        tested: By what field and reference are compared: of a band, its part of the squared error; else what was added to the error
-            within `SPAN_S`: within a category its size (a few windows would decide its square), of a joint as a whole its square
+        tested: By what field and reference are compared: of a band, its part of the squared error;
+            else what was added to the error
+            within `SPAN_S`: within a category its size (a few windows would decide its square), of
+                a joint as a whole its square
             (in the mean size a short regime would drown).
         count: Samples.
     """
@@ -62,13 +66,20 @@ def traced(error: np.ndarray, label: np.ndarray, num_categories: int) -> np.ndar
 def by_joint(runs: FreeRuns, machine: Machine) -> Sums:
     """Returns the sums of each joint as a single category."""
     count = np.isfinite(runs.error).sum(1)[..., None].astype(float)
-    return Sums(("",), np.nansum(runs.error**2, 1)[..., None], (_added(runs, machine) ** 2).sum(1)[..., None], count)
+    return Sums(
+        ("",),
+        np.nansum(runs.error**2, 1)[..., None],
+        (_added(runs, machine) ** 2).sum(1)[..., None],
+        count,
+    )
 
 
 def by_occasion(runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> dict[str, Sums]:
     """Returns the sums by regime, direction, load (where masses are known) and frequency."""
     every = dimensions(list(runs.recordings), machine, dead_time_s)
-    return {dimension.name: _arisen(runs, dimension, machine) for dimension in every} | {"frequency": _bands(runs, machine)}
+    return {dimension.name: _arisen(runs, dimension, machine) for dimension in every} | {
+        "frequency": _bands(runs, machine)
+    }
 
 
 def by_time(runs: FreeRuns, machine: Machine) -> dict[str, Sums]:
@@ -82,7 +93,10 @@ def by_time(runs: FreeRuns, machine: Machine) -> dict[str, Sums]:
         return Sums(names, whole.square * belongs, whole.tested * belongs, whole.count * belongs)
 
     ages = tuple(f"{low:.0f} to {high:.0f} s" for low, high in pairwise(edges))
-    return {"running time": sums(ages, age), "recording": sums(tuple(map(name_of, runs.recordings)), runs.source)}
+    return {
+        "running time": sums(ages, age),
+        "recording": sums(tuple(map(name_of, runs.recordings)), runs.source),
+    }
 
 
 def _added(runs: FreeRuns, machine: Machine) -> np.ndarray:
@@ -93,7 +107,11 @@ def _added(runs: FreeRuns, machine: Machine) -> np.ndarray:
 
 
 def _arisen(runs: FreeRuns, dimension: Dimension, machine: Machine) -> Sums:
-    label, error, added = runs.cut(dimension.label), np.nan_to_num(runs.error), _added(runs, machine)
+    label, error, added = (
+        runs.cut(dimension.label),
+        np.nan_to_num(runs.error),
+        _added(runs, machine),
+    )
     names = dimension.categories
     square = (traced(runs.error, label, len(names)) * error).sum(2)
     belongs = np.stack([label == c for c in range(len(names))])
@@ -108,7 +126,13 @@ def _bands(runs: FreeRuns, machine: Machine) -> Sums:
     hertz = np.fft.rfftfreq(error.shape[1], machine.period_s)
     power[:, (hertz > 0) & (hertz < 0.5 / machine.period_s - 1e-9)] *= 2.0  # the mirrored half
     edges = (0.0, *BANDS_HZ, np.inf)
-    square = np.stack([power[:, (hertz >= low) & (hertz < high)].sum(1) for low, high in pairwise(edges)], 2)
-    names = (f"below {BANDS_HZ[0]:g} Hz", *(f"{a:g} to {b:g} Hz" for a, b in pairwise(BANDS_HZ)), f"above {BANDS_HZ[-1]:g} Hz")
+    square = np.stack(
+        [power[:, (hertz >= low) & (hertz < high)].sum(1) for low, high in pairwise(edges)], 2
+    )
+    names = (
+        f"below {BANDS_HZ[0]:g} Hz",
+        *(f"{a:g} to {b:g} Hz" for a, b in pairwise(BANDS_HZ)),
+        f"above {BANDS_HZ[-1]:g} Hz",
+    )
     count = np.repeat(np.isfinite(runs.error).sum(1)[..., None].astype(float), len(names), 2)
     return Sums(names, square, square, count)

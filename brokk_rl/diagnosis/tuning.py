@@ -1,7 +1,8 @@
 """The last touch on a simulator: its own numbers, by free runs through reference recordings that it was not fitted to.
 
-A fit and a diagnosis weigh errors differently, and a dead time that is ten milliseconds off is evidence for a delay in every case.
-Only for simulators whose numbers can be set (`parameters`); what changes is the same for all parts that were left out.
+A fit and a diagnosis weigh errors differently, and a dead time that is ten milliseconds off is
+evidence for a delay in every case. Only for simulators whose numbers can be set (`parameters`);
+what changes is the same for all parts that were left out.
 Axes: `F` parts of the reference, `P` numbers, `J` joints, `E` entries.
 """
 
@@ -48,22 +49,38 @@ def changes(parts: Sequence[Evidence]) -> dict[str, np.ndarray]:
         for j in range(now.shape[1]):
             weighted = slopes[j] * weight(errors[j])
             normal = weighted @ slopes[j].T + np.eye(len(names)) / FREE**2
-            step[:, j] = np.linalg.solve(normal, weighted @ errors[j] - (now - start)[:, j] / size[:, 0] / FREE**2)
-        now = np.clip(np.where(better, now + step * size, (now + best) / 2), np.minimum(start, 0.0), np.maximum(start, most))
-    return {name: row for name, row in zip(names, best - start, strict=True) if np.abs(row).max() > 0}
+            step[:, j] = np.linalg.solve(
+                normal, weighted @ errors[j] - (now - start)[:, j] / size[:, 0] / FREE**2
+            )
+        now = np.clip(
+            np.where(better, now + step * size, (now + best) / 2),
+            np.minimum(start, 0.0),
+            np.maximum(start, most),
+        )
+    return {
+        name: row for name, row in zip(names, best - start, strict=True) if np.abs(row).max() > 0
+    }
 
 
 def changed(actuator: Actuator, by: dict[str, np.ndarray], machine: Machine) -> Actuator:
     """Returns `actuator` with its numbers changed."""
     model: Any = actuator.build(machine, 1, torch.device("cpu"))
     tables: Any = {
-        name: dict(zip(machine.joint_names, (model.parameters[name][0].numpy() + row).clip(0.0).tolist(), strict=True))
+        name: dict(
+            zip(
+                machine.joint_names,
+                (model.parameters[name][0].numpy() + row).clip(0.0).tolist(),
+                strict=True,
+            )
+        )
         for name, row in by.items()
     }
     return dataclasses.replace(actuator, **tables)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
-def _linear(parts: Sequence[Evidence], names: list[str], now: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _linear(
+    parts: Sequence[Evidence], names: list[str], now: np.ndarray, size: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns errors over the noise of all parts, `(J, E)`, and what a finite difference of each number takes off, `(J, P, E)`."""
     count = len(names)
     varied = np.repeat(now[None], count + 1, 0)  # (P + 1, P, J)
@@ -71,7 +88,9 @@ def _linear(parts: Sequence[Evidence], names: list[str], now: np.ndarray, size: 
         varied[p + 1, p] += size[p]
     errors, slopes = [], []
     for part in parts:
-        paths = part.candidates.paths([], count + 1, {name: varied[:, p] for p, name in enumerate(names)})
+        paths = part.candidates.paths(
+            [], count + 1, {name: varied[:, p] for p, name in enumerate(names)}
+        )
         z = part.whitened(part.error_of(paths))
         errors.append(z[:, 0])
         slopes.append(z[:, :1] - z[:, 1:])

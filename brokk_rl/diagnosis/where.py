@@ -1,8 +1,9 @@
 """Where the gap lies: error of free runs beyond the floor, by joint, regime, direction, load, frequency and time, with tests.
 
-The floor is the error of the same simulator on reference recordings that it was not fitted to; what exceeds it,
-beyond one standard error, is the gap. Each way of sorting splits error and gap completely: parts add up to 1 over joints and
-categories.
+The floor is the error of the same simulator on reference recordings that it was not fitted to; what
+exceeds it,
+beyond one standard error, is the gap. Each way of sorting splits error and gap completely: parts
+add up to 1 over joints and categories.
 Axes: `W` windows, `J` joints, `C` categories.
 """
 
@@ -13,7 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.diagnosis.blocks import FALSE_DISCOVERIES, adjusted, blocks, excess_p, standard_error, summed
+from brokk_rl.diagnosis.blocks import (
+    FALSE_DISCOVERIES,
+    adjusted,
+    blocks,
+    excess_p,
+    standard_error,
+    summed,
+)
 from brokk_rl.diagnosis.free_runs import FreeRuns
 from brokk_rl.diagnosis.growth import Growth, growth
 from brokk_rl.diagnosis.tracing import Sums, by_joint, by_occasion, by_time
@@ -30,9 +38,11 @@ class Part:
         joint: The joint.
         category: The category.
         time: Part of the joint's time that it takes.
-        error: Its part of the whole squared error of all joints; those of one dimension add up to 1.
+        error: Its part of the whole squared error of all joints; those of one dimension add up to
+            1.
         gap: Its part of what exceeds the floor; they add up to 1 as well, none is below 0.
-        p: How probable so large an excess would be by chance; `None` without a floor, or where the reference never was.
+        p: How probable so large an excess would be by chance; `None` without a floor, or where the
+            reference never was.
         is_sure: It holds with at most 5 % false discoveries among all that are sure.
     """
 
@@ -46,7 +56,10 @@ class Part:
 
     def plain(self) -> dict[str, Any]:
         """Returns it as plain JSON data."""
-        return {name: round(value, 6) if isinstance(value, float) else value for name, value in self.__dict__.items()}
+        return {
+            name: round(value, 6) if isinstance(value, float) else value
+            for name, value in self.__dict__.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -76,10 +89,12 @@ class Location:
 
     Attributes:
         joints: By joint.
-        parts: By dimension (`regime`, `direction`, `load`, `frequency`, `running time`, `recording`).
+        parts: By dimension (`regime`, `direction`, `load`, `frequency`, `running time`,
+            `recording`).
         growth: By joint.
         blocks: What changed sides in the tests; empty without a reference.
-        has_gap: A joint exceeds its floor for sure; without a reference there is no telling, and this is true.
+        has_gap: A joint exceeds its floor for sure; without a reference there is no telling, and
+            this is true.
     """
 
     joints: dict[str, JointError]
@@ -122,7 +137,8 @@ def locate(
 
     Args:
         runs: Free runs through field recordings.
-        reference: The same simulator's through reference recordings that it was not fitted to; `None`: there is no floor.
+        reference: The same simulator's through reference recordings that it was not fitted to;
+            `None`: there is no floor.
         machine: Gives joints, limits, period and masses.
         dead_time_s: Time from command to motion of each joint, `(J,)`.
         generator: Draws the permutations.
@@ -140,10 +156,18 @@ def locate(
 class _Judge:
     """Holds both sides against each other: what exceeds the floor, and how sure that is."""
 
-    def __init__(self, runs: FreeRuns, reference: FreeRuns | None, machine: Machine, generator: np.random.Generator) -> None:
+    def __init__(
+        self,
+        runs: FreeRuns,
+        reference: FreeRuns | None,
+        machine: Machine,
+        generator: np.random.Generator,
+    ) -> None:
         self._machine, self._generator = machine, generator
         alike = len({joint.unit for joint in machine.joints}) == 1
-        self._weight = np.ones(machine.num_joints) if alike else (machine.upper - machine.lower) ** -2.0
+        self._weight = (
+            np.ones(machine.num_joints) if alike else (machine.upper - machine.lower) ** -2.0
+        )
         self._mine = by_joint(runs, machine)
         self._floor = by_joint(reference, machine) if reference else None
         self._blocks = blocks(runs, reference) if reference else None
@@ -162,7 +186,9 @@ class _Judge:
         p = self._p(self._mine, self._floor)[:, 0]
         sure = adjusted(p) <= FALSE_DISCOVERIES
         return {
-            name: JointError(rmse[j], floor[j], float(error[j]), float(gap[j]), _known(p[j]), bool(sure[j]))
+            name: JointError(
+                rmse[j], floor[j], float(error[j]), float(gap[j]), _known(p[j]), bool(sure[j])
+            )
             for j, name in enumerate(self._machine.joint_names)
         }
 
@@ -172,7 +198,9 @@ class _Judge:
         expected = self._floor_mean()[:, None] * count
         if floor is not None:
             seen = floor.count.sum(0)
-            expected = np.where(seen > 0, floor.square.sum(0) / np.maximum(seen, 1.0) * count, expected)
+            expected = np.where(
+                seen > 0, floor.square.sum(0) / np.maximum(seen, 1.0) * count, expected
+            )
         chance = self._chance(sums, floor) * count
         rows = zip(square - expected - chance, square - expected, square, strict=True)
         excess = np.stack([_first_positive(*row) for row in rows])
@@ -184,7 +212,15 @@ class _Judge:
         p = self._p(sums, floor)
         sure = adjusted(p) <= FALSE_DISCOVERIES
         return [
-            Part(name, category, float(time[j, c]), float(error[j, c]), float(gap[j, c]), _known(p[j, c]), bool(sure[j, c]))
+            Part(
+                name,
+                category,
+                float(time[j, c]),
+                float(error[j, c]),
+                float(gap[j, c]),
+                _known(p[j, c]),
+                bool(sure[j, c]),
+            )
             for j, name in enumerate(self._machine.joint_names)
             for c, category in enumerate(sums.categories)
         ]
@@ -199,7 +235,10 @@ class _Judge:
             return np.zeros(shape)
         square = np.zeros(shape)
         for sums, block in ((mine, self._blocks.field), (floor, self._blocks.reference)):
-            totals = (summed(values.reshape(len(block), -1), block) for values in (sums.square, sums.count))
+            totals = (
+                summed(values.reshape(len(block), -1), block)
+                for values in (sums.square, sums.count)
+            )
             square += np.nan_to_num(standard_error(*totals).reshape(shape)) ** 2
         return np.sqrt(square)
 
@@ -209,7 +248,10 @@ class _Judge:
         if floor is None or self._blocks is None:
             return np.full(shape, np.nan)
         field, reference = (
-            (summed(sums.tested.reshape(len(block), -1), block), summed(sums.count.reshape(len(block), -1), block))
+            (
+                summed(sums.tested.reshape(len(block), -1), block),
+                summed(sums.count.reshape(len(block), -1), block),
+            )
             for sums, block in ((mine, self._blocks.field), (floor, self._blocks.reference))
         )
         return excess_p(field, reference, self._generator).reshape(shape)
@@ -217,7 +259,10 @@ class _Judge:
 
 def _first_positive(*choices: np.ndarray) -> np.ndarray:
     """Returns the positive part of the first choice that has any."""
-    return next((np.maximum(choice, 0.0) for choice in choices if (choice > 0).any()), np.zeros_like(choices[-1]))
+    return next(
+        (np.maximum(choice, 0.0) for choice in choices if (choice > 0).any()),
+        np.zeros_like(choices[-1]),
+    )
 
 
 def _mean(sums: Sums) -> np.ndarray:

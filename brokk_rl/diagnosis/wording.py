@@ -21,11 +21,20 @@ def headline(answer: Answer) -> tuple[str, Tone]:
         told += "; " + _floor(gap) + "."
     told += _tool(answer)
     if answer.verdict == "none":
-        return f"No gap: the simulator is as right about these recordings as about its own.{told}", "good"
+        return (
+            f"No gap: the simulator is as right about these recordings as about its own.{told}",
+            "good",
+        )
     if answer.verdict == "unknown":
         place = _place(answer)
-        because = f" {answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}." if answer.reason else ""
-        start = f"There is a gap that no effect of the library explains{place}" if place else "There is no telling"
+        because = (
+            f" {answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}." if answer.reason else ""
+        )
+        start = (
+            f"There is a gap that no effect of the library explains{place}"
+            if place
+            else "There is no telling"
+        )
         return f"{start}.{because}{told}", "warn"
     names = listed([named(one) for one in answer.selected])
     closed = gap.closed if gap else None
@@ -49,14 +58,20 @@ def _tool(answer: Answer) -> str:
     cause = str((answer.more.get("geometry") or {}).get("cause") or "").split(" ")[0]
     if cause not in {one.effect for one in answer.selected}:
         return ""
-    texts = [stage["text"] for stage in answer.more.get("stages", ()) if stage["stage"] == "kinematics"]
+    texts = [
+        stage["text"] for stage in answer.more.get("stages", ()) if stage["stage"] == "kinematics"
+    ]
     return "".join(f" {text[0].upper()}{text[1:]}." for text in texts)
 
 
 def _floor(gap: Gap) -> str:
     if gap.floor is None:
         return "without a reference, and with too little data for a flexible model, the floor is not known"
-    whose = "" if gap.floor_of == "reference" else f", that of a {gap.floor_of} on field recordings it was not fitted to"
+    whose = (
+        ""
+        if gap.floor_of == "reference"
+        else f", that of a {gap.floor_of} on field recordings it was not fitted to"
+    )
     return f"the floor is {size(gap.floor, gap.unit)}{whose}"
 
 
@@ -97,12 +112,18 @@ def left(answer: Answer) -> str:
         return ""
     remainder = answer.more.get("unknown_remainder")
     above = 0.0 if gap.floor is None else max(gap.after**2 - gap.floor**2, 0.0) ** 0.5
-    beyond = f"{size(above, gap.unit)} beyond the floor" if gap.floor is not None else size(gap.after, gap.unit)
+    beyond = (
+        f"{size(above, gap.unit)} beyond the floor"
+        if gap.floor is not None
+        else size(gap.after, gap.unit)
+    )
     if remainder:
-        return (
-            f"An unknown remainder is left on {listed(remainder['joints'])} ({beyond}): {remainder['reason']}, but no effect does."
-        )
-    return f"What is left, {beyond}, is within what the simulator errs by anyway." if gap.floor is not None else ""
+        return f"An unknown remainder is left on {listed(remainder['joints'])} ({beyond}): {remainder['reason']}, but no effect does."
+    return (
+        f"What is left, {beyond}, is within what the simulator errs by anyway."
+        if gap.floor is not None
+        else ""
+    )
 
 
 def estimate(value: Estimate | None, factor: float = 1.0, style: str = ".3g") -> tuple[str, str]:
@@ -119,13 +140,23 @@ def _place(answer: Answer) -> str:
     joint, gap = max(answer.where.joints.items(), key=lambda pair: pair[1].share)
     regime = next((one for one in answer.where.regimes if one.joint == joint), None)
     text = f"; {100 * gap.share:.0f} % of it lies in {joint}"
-    return text + (f", most of that ({100 * regime.share:.0f} %) {occasion(regime.regime)}" if regime else "")
+    return text + (
+        f", most of that ({100 * regime.share:.0f} %) {occasion(regime.regime)}" if regime else ""
+    )
 
 
 def occasion(regime: str) -> str:
     """Returns a regime as a phrase of a sentence."""
-    phrases = {"hold": "at rest", "stop": "just after stops", "start": "at starts", "creep": "at small commands"}
-    phrases |= {"cruise": "at larger commands, alone", "several joints at once": "while several joints move"}
+    phrases = {
+        "hold": "at rest",
+        "stop": "just after stops",
+        "start": "at starts",
+        "creep": "at small commands",
+    }
+    phrases |= {
+        "cruise": "at larger commands, alone",
+        "several joints at once": "while several joints move",
+    }
     return phrases.get(regime, regime)
 
 

@@ -59,22 +59,40 @@ def gather(
         RecordingError: no recording is long enough to search for a dead time in.
     """
     machine, model = identified.machine, identified.model
-    judging = [(cut, done) for cut, done in zip(identified.cuts, identified.done, strict=True) if cut is not None]
+    judging = [
+        (cut, done)
+        for cut, done in zip(identified.cuts, identified.done, strict=True)
+        if cut is not None
+    ]
     cut = open_loop.joined([cut for cut, _ in judging])
-    predicted = {name: np.concatenate([done[name].predicted for _, done in judging]) for name in judging[0][1]}
+    predicted = {
+        name: np.concatenate([done[name].predicted for _, done in judging])
+        for name in judging[0][1]
+    }
     scores = Scores(predicted, cut, machine, resampling)
     kept = identified.done[-1][model]
     last = identified.stages[-1]
     fitted_to = members(last.train) + members(last.validation)
     delays = dead_time.delays(fitted_to, machine, delaying)
-    acting_s = np.array([delay.value_s if delay and delay.is_found else machine.dead_time_s for delay in delays.values()])
+    acting_s = np.array(
+        [
+            delay.value_s if delay and delay.is_found else machine.dead_time_s
+            for delay in delays.values()
+        ]
+    )
     result: dict[str, Any] = {
         "schema": 1, "machine": machine.name, "model": model, "fit_seconds": round(kept.seconds, 2), "use": kept.use,
         "fold_seconds": [round(done[model].seconds, 2) for done in identified.done[:-1]],
     }  # fmt: skip
     result |= _errors(scores, identified)
     result["delay_s"] = {
-        joint: delay and {"value": delay.value_s, "ci95": list(delay.ci95_s), "explained": delay.explained, "found": delay.is_found}
+        joint: delay
+        and {
+            "value": delay.value_s,
+            "ci95": list(delay.ci95_s),
+            "explained": delay.explained,
+            "found": delay.is_found,
+        }
         for joint, delay in delays.items()
     }
     result["regimes"] = by_regime(scores, acting_s)
@@ -94,27 +112,46 @@ def _errors(scores: Scores, identified: Identified) -> dict[str, Any]:
     """Returns `joints`, `overall`, `one_step`, `against` and `missing`."""
     machine, model = identified.machine, identified.model
     names, units = machine.joint_names, [joint.unit for joint in machine.joints]
-    found: dict[str, Any] = {"joints": {joint: {} for joint in names}, "overall": {}, "one_step": {joint: {} for joint in names}}
+    found: dict[str, Any] = {
+        "joints": {joint: {} for joint in names},
+        "overall": {},
+        "one_step": {joint: {} for joint in names},
+    }
     keys = {horizon_s: f"{horizon_s:g}" for horizon_s in identified.wanted_s}
     for name in scores.predicted:
         rows = {key: scores.at(name, h) for h, key in keys.items() if h in identified.horizons_s}
         for j, joint in enumerate(names):
-            found["joints"][joint][name] = {key: rows[key][j] if key in rows else None for key in keys.values()}
-        found["overall"][name] = {key: overall(rows[key], units) if key in rows else None for key in keys.values()}
+            found["joints"][joint][name] = {
+                key: rows[key][j] if key in rows else None for key in keys.values()
+            }
+        found["overall"][name] = {
+            key: overall(rows[key], units) if key in rows else None for key in keys.values()
+        }
         rmse, again = scores.rmse(name)
         for j, joint in enumerate(names):
             first = float(rmse[0, j])
             found["one_step"][joint][name] = {
                 "rmse": first, "ci95": interval(again[:, 0, j]), "percent": float(100 * first / scores.travel[j])
             }  # fmt: skip
-    found["against"] = {rival: {joint: {} for joint in (*names, "overall")} for rival in scores.predicted if rival != model}
+    found["against"] = {
+        rival: {joint: {} for joint in (*names, "overall")}
+        for rival in scores.predicted
+        if rival != model
+    }
     for rival, table in found["against"].items():
         for h, key in keys.items():
-            rows = scores.against(model, rival, h) if h in identified.horizons_s else [None] * (len(names) + 1)
+            rows = (
+                scores.against(model, rival, h)
+                if h in identified.horizons_s
+                else [None] * (len(names) + 1)
+            )
             for joint, row in zip(table, rows, strict=True):
                 table[joint][key] = row
     judged = [recording for stage in identified.stages for recording in members(stage.test)]
-    longest_s, before_s = open_loop.longest_s(judged, machine), open_loop.num_before(machine) * machine.period_s
+    longest_s, before_s = (
+        open_loop.longest_s(judged, machine),
+        open_loop.num_before(machine) * machine.period_s,
+    )
     reason = f"the longest recording judged by leaves {longest_s:.1f} s after the {before_s:.2f} s before a free run"
     found["missing"] = {key: reason for h, key in keys.items() if h not in identified.horizons_s}
     return found
@@ -124,7 +161,9 @@ def _data(identified: Identified, fitted_to: Sequence[Recording], scores: Scores
     """Returns what was fitted to and judged by: how much, which runs, and how far each joint was excited."""
     machine, last = identified.machine, identified.stages[-1]
     judged = [recording for stage in identified.stages for recording in members(stage.test)]
-    u, q = (np.concatenate([getattr(recording, name) for recording in fitted_to]) for name in ("u", "q"))
+    u, q = (
+        np.concatenate([getattr(recording, name) for recording in fitted_to]) for name in ("u", "q")
+    )
     moved_s, judged_s = commanded_s(fitted_to), commanded_s(judged)
     tested = {name for stage in identified.stages for name in stage.test}
     return {
@@ -133,7 +172,8 @@ def _data(identified: Identified, fitted_to: Sequence[Recording], scores: Scores
         "test": _facts(judged, len(tested)),
         "windows": len(scores.cut.q),
         "runs": [
-            {"stage": stage.name or "fit"} | {part: list(getattr(stage, part)) for part in ("train", "validation", "test")}
+            {"stage": stage.name or "fit"}
+            | {part: list(getattr(stage, part)) for part in ("train", "validation", "test")}
             for stage in identified.stages
         ],
         "excitation": {
@@ -153,5 +193,7 @@ def _facts(recordings: Sequence[Recording], num_runs: int) -> dict[str, Any]:
         "runs": num_runs,
         "recordings": len(recordings),
         "minutes": round(sum(recording.duration_s for recording in recordings) / 60.0, 1),
-        "sources": sorted({recording.metadata.get("source", "unknown") for recording in recordings}),
+        "sources": sorted(
+            {recording.metadata.get("source", "unknown") for recording in recordings}
+        ),
     }

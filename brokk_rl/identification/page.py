@@ -19,7 +19,11 @@ PAGE = "identification.html"
 
 
 def write(
-    folder: Path, result: Mapping[str, Any], findings: Sequence[Finding], drawings: Mapping[str, Figure], machine: Machine
+    folder: Path,
+    result: Mapping[str, Any],
+    findings: Sequence[Finding],
+    drawings: Mapping[str, Figure],
+    machine: Machine,
 ) -> None:
     """Writes the pictures as `<stem>.png` and the page `identification.html` into `folder`.
 
@@ -30,8 +34,12 @@ def write(
         try:
             figure.savefig(folder / f"{stem}.png", dpi=DPI)
         except OSError as error:
-            raise StorageError(f"cannot write {folder / f'{stem}.png'}: {error.strerror or error}") from error
-    page = Page(f"{result['model']}, actuator model of {machine.name}", findings[0].text, findings[0].tone)
+            raise StorageError(
+                f"cannot write {folder / f'{stem}.png'}: {error.strerror or error}"
+            ) from error
+    page = Page(
+        f"{result['model']}, actuator model of {machine.name}", findings[0].text, findings[0].tone
+    )
     for finding in findings[1:]:
         page.text(finding.text, finding.tone)
     _use(page, result, machine)
@@ -53,14 +61,18 @@ def write(
 def _use(page: Page, result: Mapping[str, Any], machine: Machine) -> None:
     page.heading("Use it")
     if not result["use"]:
-        page.text(f"No option of the group actuator loads {result['model']}: it is there to compare with.")
+        page.text(
+            f"No option of the group actuator loads {result['model']}: it is there to compare with."
+        )
         return
     use = result["use"]
     if machine.mjcf is None:
         page.text(
             f"{machine.name} is known by its joints only; with a model of its bodies (mjcf) policies can be trained through this:"
         )
-    page.code(f"brokk mode=train {use}\nbrokk mode=evaluate policy.folder=<run folder> {use}\nbrokk mode=bench {use}")
+    page.code(
+        f"brokk mode=train {use}\nbrokk mode=evaluate policy.folder=<run folder> {use}\nbrokk mode=bench {use}"
+    )
 
 
 def _errors(page: Page, result: Mapping[str, Any], folder: Path, machine: Machine) -> None:
@@ -72,10 +84,18 @@ def _errors(page: Page, result: Mapping[str, Any], folder: Path, machine: Machin
         for number, (name, figures) in enumerate(models.items()):
             first = result["one_step"][joint]
             cells = [_percent(first[name], [row["percent"] for row in first.values()], unit)]
-            cells += [_percent(figures[h], [row[h]["percent"] for row in models.values() if row[h]], unit) for h in horizons]
+            cells += [
+                _percent(figures[h], [row[h]["percent"] for row in models.values() if row[h]], unit)
+                for h in horizons
+            ]
             rows.append([joint if number == 0 else "", name, *cells])
     for number, (name, figures) in enumerate(result["overall"].items()):
-        cells = [_percent(figures[h], [row[h]["percent"] for row in result["overall"].values() if row[h]], "") for h in horizons]
+        cells = [
+            _percent(
+                figures[h], [row[h]["percent"] for row in result["overall"].values() if row[h]], ""
+            )
+            for h in horizons
+        ]
         rows.append(["all joints" if number == 0 else "", name, None, *cells])
     windows, judged = result["data"]["windows"], result["data"]["test"]
     caption = (
@@ -84,11 +104,18 @@ def _errors(page: Page, result: Mapping[str, Any], folder: Path, machine: Machin
     )
     page.table(["joint", "model", "one step", *(f"{h} s" for h in horizons)], rows, caption)
     page.picture(
-        folder / "error_over_horizon.png", "Error over the time of the free run. Bands: 95 % intervals from resampling whole runs."
+        folder / "error_over_horizon.png",
+        "Error over the time of the free run. Bands: 95 % intervals from resampling whole runs.",
     )
     last = [h for h in horizons if result["overall"][result["model"]][h]][-1]
     rows = [
-        [joint, *(f"{models[result['model']][last][key]:.4f}" for key in ("path_mean", "end_mean", "path_rmse", "rmse"))]
+        [
+            joint,
+            *(
+                f"{models[result['model']][last][key]:.4f}"
+                for key in ("path_mean", "end_mean", "path_rmse", "rmse")
+            ),
+        ]
         for joint, models in result["joints"].items()
     ]
     with page.details(f"Along the path and at its end, {result['model']} over {last} s"):
@@ -108,7 +135,12 @@ def _against(page: Page, result: Mapping[str, Any]) -> None:
             [
                 "all joints" if joint == "overall" else joint,
                 *(
-                    row and Cell(f"{row['reduction_percent']:.0f}", _range(row["reduction_ci95"], ".0f"), _surely_better(row))
+                    row
+                    and Cell(
+                        f"{row['reduction_percent']:.0f}",
+                        _range(row["reduction_ci95"], ".0f"),
+                        _surely_better(row),
+                    )
                     for row in figures.values()
                 ),
             ]
@@ -134,7 +166,12 @@ def _regimes(page: Page, result: Mapping[str, Any], folder: Path) -> None:
             figure = cell["models"][model]
             shares = f"{100 * cell['time']:.0f}", f"{100 * figure['share']:.0f}"
             rows.append(
-                [joint if number == 0 else "", regime, *shares, Cell(f"{figure['drift_per_s']:.5f}", _range(figure["ci95"], ".5f"))]
+                [
+                    joint if number == 0 else "",
+                    regime,
+                    *shares,
+                    Cell(f"{figure['drift_per_s']:.5f}", _range(figure["ci95"], ".5f")),
+                ]
             )
     with page.details(f"The same for {model} in figures"):
         page.table(
@@ -156,7 +193,11 @@ def _dead_time(page: Page, result: Mapping[str, Any], folder: Path, machine: Mac
         [joint, Cell(f"{delay['value']:.2f}", _range(delay["ci95"], ".3f")), f"{100 * delay['explained']:.1f}"]
         for joint, delay in result["delay_s"].items()
     ]  # fmt: skip
-    page.table(["joint", "dead time, s", "% explained"], rows, f"machine '{machine.name}': dead_time_s = {machine.dead_time_s:g}")
+    page.table(
+        ["joint", "dead time, s", "% explained"],
+        rows,
+        f"machine '{machine.name}': dead_time_s = {machine.dead_time_s:g}",
+    )
 
 
 def _data(page: Page, result: Mapping[str, Any]) -> None:
@@ -170,7 +211,11 @@ def _data(page: Page, result: Mapping[str, Any]) -> None:
             f"{data[part]['minutes']:.1f}",
             "; ".join(data[part]["sources"]),
         ]
-        for label, part in (("to fit to", "train"), ("to stop by", "validation"), ("to judge by", "test"))
+        for label, part in (
+            ("to fit to", "train"),
+            ("to stop by", "validation"),
+            ("to judge by", "test"),
+        )
     ]
     page.table(["", "runs", "files", "minutes", "source"], rows)
     rows = [
@@ -181,7 +226,9 @@ def _data(page: Page, result: Mapping[str, Any]) -> None:
         for joint, facts in data["excitation"].items()
     ]  # fmt: skip
     page.table(
-        ["joint", "commanded to fit, min", "to judge, min", "% of travel", "commands"], rows, "How far each joint was excited"
+        ["joint", "commanded to fit, min", "to judge, min", "% of travel", "commands"],
+        rows,
+        "How far each joint was excited",
     )
     if result["folds"]:
         folds = result["folds"]
@@ -189,11 +236,17 @@ def _data(page: Page, result: Mapping[str, Any]) -> None:
             f"Cross-validation in {folds} folds: each run was judged once, by a model fitted to the others; then the model that is "
             "kept was fitted to all runs less those that stop the fit. Errors are those of the folds' models."
         )
-    page.text(f"Fitted in {result['fit_seconds']:.1f} s on {result['device']}, seed {result['seed']}.")
+    page.text(
+        f"Fitted in {result['fit_seconds']:.1f} s on {result['device']}, seed {result['seed']}."
+    )
     with page.details("Which runs went where"):
         for stage in data["runs"]:
             page.heading(stage["stage"], 3)
-            for label, part in (("to fit to", "train"), ("to stop by", "validation"), ("to judge by", "test")):
+            for label, part in (
+                ("to fit to", "train"),
+                ("to stop by", "validation"),
+                ("to judge by", "test"),
+            ):
                 page.text(f"{label}: {', '.join(stage[part]) or 'none'}")
 
 

@@ -1,7 +1,8 @@
 """Where a model fails: how fast its free runs drift while a joint rests, moves alone or with others, reverses, or nears a stop.
 
-Each free run is cut into seconds; a second belongs to a joint's regimes by the commands that were acting in it (those of a dead
-time before) and by where the joint was. What counts is the error that is added within the second, not what was there before.
+Each free run is cut into seconds; a second belongs to a joint's regimes by the commands that were
+acting in it (those of a dead time before) and by where the joint was. What counts is the error that
+is added within the second, not what was there before.
 Axes: `W` windows, `S` seconds of a window, `J` joints.
 """
 
@@ -67,8 +68,9 @@ def memberships(scores: Scores, delay_s: np.ndarray) -> dict[str, np.ndarray]:
 def by_regime(scores: Scores, delay_s: np.ndarray) -> dict[str, dict[str, dict[str, Any]]]:
     """Returns, by joint and regime, the part of the `time` spent in it and, by model, the drift.
 
-    Drift: root mean square of the error added within a second, `drift_per_s` in rad/s or m/s with `ci95`, and `share` of all that
-    the model's squared drift amounts to. Regimes overlap (a large command can also be a reversal), so shares do not add up to 1.
+    Drift: root mean square of the error added within a second, `drift_per_s` in rad/s or m/s with
+    `ci95`, and `share` of all that the model's squared drift amounts to. Regimes overlap (a large
+    command can also be a reversal), so shares do not add up to 1.
     """
     members = memberships(scores, delay_s)
     steps = _steps(scores)
@@ -91,7 +93,11 @@ def by_regime(scores: Scores, delay_s: np.ndarray) -> dict[str, dict[str, dict[s
             table[joint][regime] = {
                 "time": float(inside[..., j].sum() / whole[..., j].sum()),
                 "models": {
-                    name: {"drift_per_s": float(np.sqrt(mean[j])), "ci95": interval(np.sqrt(again[:, j])), "share": float(share[j])}
+                    name: {
+                        "drift_per_s": float(np.sqrt(mean[j])),
+                        "ci95": interval(np.sqrt(again[:, j])),
+                        "share": float(share[j]),
+                    }
                     for name, ((mean, again), share) in drift.items()
                 },
             }

@@ -1,7 +1,7 @@
 """Errors of free runs with intervals, and whether one model is really better than another.
 
-Everything is sums over the windows of each run, so that resampling whole runs is one matrix product. All models are resampled
-alike, which makes differences between them paired.
+Everything is sums over the windows of each run, so that resampling whole runs is one matrix
+product. All models are resampled alike, which makes differences between them paired.
 Axes: `W` windows, `R` runs, `B` resamples, `K` steps, `J` joints.
 """
 
@@ -43,8 +43,12 @@ class Scores:
     def __post_init__(self) -> None:
         self._runs, self._number = np.unique(self.cut.run, return_inverse=True)
         count = len(self._runs)
-        self.weights = self.generator.multinomial(count, np.full(count, 1.0 / count), size=RESAMPLED).astype(float)
-        self.error = {name: path.astype(float) - self.cut.measured for name, path in self.predicted.items()}
+        self.weights = self.generator.multinomial(
+            count, np.full(count, 1.0 / count), size=RESAMPLED
+        ).astype(float)
+        self.error = {
+            name: path.astype(float) - self.cut.measured for name, path in self.predicted.items()
+        }
         self.travel = np.asarray(self.machine.upper - self.machine.lower, dtype=float)
         self._mean_squares = {name: self.mean(error**2) for name, error in self.error.items()}
 
@@ -61,10 +65,13 @@ class Scores:
     def ratio(self, totals: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mean where each window holds `counts` values of sum `totals`, both `(W, …)`, and that of each resample.
 
-        NaN where there is no value at all; the resamples also where only one run has any: it says nothing about other runs.
+        NaN where there is no value at all; the resamples also where only one run has any: it says
+        nothing about other runs.
         """
         shape = totals.shape[1:]
-        total, count = (self._by_run(values).reshape(self.num_runs, -1) for values in (totals, counts))
+        total, count = (
+            self._by_run(values).reshape(self.num_runs, -1) for values in (totals, counts)
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = total.sum(0) / count.sum(0)
             resampled = (self.weights @ total) / (self.weights @ count)
@@ -83,8 +90,9 @@ class Scores:
     def at(self, name: str, horizon_s: float) -> list[dict[str, Any]]:
         """Returns the error of a model at a horizon, joint by joint.
 
-        `rmse` of the position at the end, rad or m, with `ci95`; `percent` of the joint's travel; over the same windows `path_rmse`
-        and `path_mean` (absolute) along the path and `end_mean` at its end.
+        `rmse` of the position at the end, rad or m, with `ci95`; `percent` of the joint's travel;
+        over the same windows `path_rmse` and `path_mean` (absolute) along the path and `end_mean`
+        at its end.
         """
         step = self.step(horizon_s)
         error = self.error[name][np.isfinite(self.cut.measured[:, step, 0])]
@@ -104,13 +112,24 @@ class Scores:
     def against(self, name: str, rival: str, horizon_s: float) -> list[dict[str, Any]]:
         """Returns by how much a model's error at a horizon differs from a rival's, joint by joint, then for the mean over joints.
 
-        `difference` in rad or m (below 0: better than the rival; in % of travel for the mean) and `reduction_percent`, the part of
-        the rival's error that is gone, each with an interval from resampling the same runs for both.
+        `difference` in rad or m (below 0: better than the rival; in % of travel for the mean) and
+        `reduction_percent`, the part of the rival's error that is gone, each with an interval from
+        resampling the same runs for both.
         """
         step = self.step(horizon_s)
-        (mine, mine_again), (other, other_again) = ([part[..., step, :] for part in self.rmse(key)] for key in (name, rival))
-        rows = [[values[..., j] for values in (mine, other, mine_again, other_again)] for j in range(len(self.travel))]
-        rows.append([(100.0 * values / self.travel).mean(-1) for values in (mine, other, mine_again, other_again)])
+        (mine, mine_again), (other, other_again) = (
+            [part[..., step, :] for part in self.rmse(key)] for key in (name, rival)
+        )
+        rows = [
+            [values[..., j] for values in (mine, other, mine_again, other_again)]
+            for j in range(len(self.travel))
+        ]
+        rows.append(
+            [
+                (100.0 * values / self.travel).mean(-1)
+                for values in (mine, other, mine_again, other_again)
+            ]
+        )
         return [_difference(*row) for row in rows]
 
     def _by_run(self, values: np.ndarray) -> np.ndarray:
@@ -130,11 +149,17 @@ def interval(resampled: np.ndarray) -> list[float] | None:
 
 def overall(rows: Sequence[dict[str, Any]], units: Sequence[str]) -> dict[str, float]:
     """Returns means over joints; those in rad or m only where all joints have the same unit."""
-    keys = ("rmse", "percent", "path_rmse", "path_mean", "end_mean") if len(set(units)) == 1 else ("percent",)
+    keys = (
+        ("rmse", "percent", "path_rmse", "path_mean", "end_mean")
+        if len(set(units)) == 1
+        else ("percent",)
+    )
     return {key: float(np.mean([row[key] for row in rows])) for key in keys}
 
 
-def _difference(mine: np.ndarray, other: np.ndarray, mine_again: np.ndarray, other_again: np.ndarray) -> dict[str, Any]:
+def _difference(
+    mine: np.ndarray, other: np.ndarray, mine_again: np.ndarray, other_again: np.ndarray
+) -> dict[str, Any]:
     floor = np.finfo(float).tiny  # a rival without any error cannot be bettered
     return {
         "difference": float(mine - other),

@@ -1,6 +1,7 @@
 """The fits of an identification one after another, each remembered when it is done, so that an interrupted run goes on.
 
-With one split there is one stage; with cross-validation one for each fold, and a last one that fits the model that is kept.
+With one split there is one stage; with cross-validation one for each fold, and a last one that fits
+the model that is kept.
 """
 
 from __future__ import annotations
@@ -68,7 +69,8 @@ class Fitted:
     Attributes:
         predicted: Positions in free runs through the stage's windows, `(W, K, J)`.
         seconds: Time the fit took in the process that finished it.
-        use: Overrides that make other modes use the model; empty where no option of `actuator` can load it.
+        use: Overrides that make other modes use the model; empty where no option of `actuator` can
+            load it.
     """
 
     predicted: np.ndarray
@@ -82,7 +84,13 @@ def members(part: Mapping[str, Sequence[Recording]]) -> list[Recording]:
 
 
 def fitted(
-    stage: Stage, name: str, fit: ActuatorFit, folder: Path, machine: Machine, cut: open_loop.Windows | None, device: torch.device
+    stage: Stage,
+    name: str,
+    fit: ActuatorFit,
+    folder: Path,
+    machine: Machine,
+    cut: open_loop.Windows | None,
+    device: torch.device,
 ) -> Fitted:
     """Fits a model and lets it run freely through windows, or returns what an earlier process left of the same fit.
 
@@ -92,20 +100,32 @@ def fitted(
     """
     path = folder / FREE_RUNS / f"{name}.npz"
     shape = () if cut is None else cut.q.shape
-    key = hashlib.sha256(repr((fit, machine.fingerprint(), stage.digest, shape)).encode()).hexdigest()
+    key = hashlib.sha256(
+        repr((fit, machine.fingerprint(), stage.digest, shape)).encode()
+    ).hexdigest()
     if path.exists():
         return _remembered(path, key)
-    log.info("%sfitting %s to %d runs", f"{stage.name}: " if stage.name else "", name, len(stage.train))
+    log.info(
+        "%sfitting %s to %d runs", f"{stage.name}: " if stage.name else "", name, len(stage.train)
+    )
     folder.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
-    actuator = fit.fit(machine, members(stage.train), members(stage.validation), folder, stage.seed, device)
+    actuator = fit.fit(
+        machine, members(stage.train), members(stage.validation), folder, stage.seed, device
+    )
     seconds = time.monotonic() - began
-    predicted = np.zeros((0, 0, machine.num_joints)) if cut is None else open_loop.free_run(actuator, machine, cut, device)
+    predicted = (
+        np.zeros((0, 0, machine.num_joints))
+        if cut is None
+        else open_loop.free_run(actuator, machine, cut, device)
+    )
     found = Fitted(predicted, seconds, use(actuator, folder, name))
     part = path.with_name(f".{path.name}.{os.getpid()}.npz")
     try:
         path.parent.mkdir(exist_ok=True)
-        np.savez_compressed(part, predicted=predicted.astype(np.float32), seconds=seconds, use=found.use, key=key)
+        np.savez_compressed(
+            part, predicted=predicted.astype(np.float32), seconds=seconds, use=found.use, key=key
+        )
         part.replace(path)
     except OSError as error:
         raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
@@ -123,7 +143,10 @@ def use(actuator: Actuator, folder: Path, name: str) -> str:
     if checkpoint is None:
         return ""
     for option in registry.options():
-        if option.group == "actuator" and (yaml.safe_load(option.path.read_text()) or {}).get("_target_") == target:
+        if (
+            option.group == "actuator"
+            and (yaml.safe_load(option.path.read_text()) or {}).get("_target_") == target
+        ):
             return f"actuator={option.name} actuator.checkpoint={checkpoint}"
     return ""
 
@@ -139,4 +162,6 @@ def _remembered(path: Path, key: str) -> Fitted:
             )
         return Fitted(values["predicted"], float(values["seconds"]), str(values["use"]))
     except (OSError, ValueError, KeyError, EOFError) as error:
-        raise StorageError(f"{path} cannot be read ({error}); delete it, and this fit is done again") from error
+        raise StorageError(
+            f"{path} cannot be read ({error}); delete it, and this fit is done again"
+        ) from error

@@ -16,7 +16,8 @@ HOLD, LINEAR = "hold", "arx"
 HEADLINE_S = 5.0
 """The horizon by which models are compared, where the recordings are long enough."""
 THIN_S = 120.0
-"""A joint that is commanded for less than this in the recordings to fit to is too little excited."""
+"""A joint that is commanded for less than this in the recordings to fit to is too little
+excited."""
 THIN_TRAVEL = 0.4
 """So is one that saw less than this part of its travel, …"""
 THIN_COMMAND = 0.5
@@ -24,7 +25,8 @@ THIN_COMMAND = 0.5
 FEW_RUNS = 6
 """Runs to judge by below which an interval from resampling them is coarse."""
 DELAY_TOLERANCE_S = 0.05
-"""The machine's dead time may differ from that of its joints by this much, s: a control period at 20 Hz."""
+"""The machine's dead time may differ from that of its joints by this much, s: a control period at
+20 Hz."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,11 @@ class Finding:
 
 def verdict(result: Mapping[str, Any], machine: Machine) -> list[Finding]:
     """Returns the sentences of the verdict on an `identification.json`, the answer first."""
-    given = [horizon for horizon, value in result["overall"][result["model"]].items() if value is not None]
+    given = [
+        horizon
+        for horizon, value in result["overall"][result["model"]].items()
+        if value is not None
+    ]
     horizon = f"{HEADLINE_S:g}" if f"{HEADLINE_S:g}" in given else given[-1]
     findings = [_comparison(result, horizon), _worst(result, given[-1], machine)]
     findings += _dead_time(result, machine) + _excitation(result) + _judged_by(result)
@@ -55,24 +61,39 @@ def _comparison(result: Mapping[str, Any], horizon: str) -> Finding:
     mine = f"{model}: {overall[model]:.2f} % of travel after {horizon} s in a free run, mean over joints"
     rival = LINEAR if model != LINEAR else HOLD
     if model == HOLD:
-        return Finding("plain", f"{mine}; this is the error of a machine that stands still, and no model.")
+        return Finding(
+            "plain", f"{mine}; this is the error of a machine that stands still, and no model."
+        )
     against = result["against"][rival]
     total, rows = against["overall"][horizon], [against[joint][horizon] for joint in joints]
-    better = [joint for joint, row in zip(joints, rows, strict=True) if row["ci95"] and row["ci95"][1] < 0]
-    worse = [joint for joint, row in zip(joints, rows, strict=True) if row["ci95"] and row["ci95"][0] > 0]
+    better = [
+        joint for joint, row in zip(joints, rows, strict=True) if row["ci95"] and row["ci95"][1] < 0
+    ]
+    worse = [
+        joint for joint, row in zip(joints, rows, strict=True) if row["ci95"] and row["ci95"][0] > 0
+    ]
     change = total["reduction_percent"]
     text = f"{mine}, against {overall[rival]:.2f} % of {rival}: {abs(change):.0f} % {'less' if change >= 0 else 'more'}"
     if total["reduction_ci95"]:
         low, high = total["reduction_ci95"]
         text += f" (95 %: {low:.0f} to {high:.0f} % less)"
     if total["ci95"] is None:
-        return Finding("warn", f"{text}. Judged by one run only, so there is no saying whether that holds for others.")
+        return Finding(
+            "warn",
+            f"{text}. Judged by one run only, so there is no saying whether that holds for others.",
+        )
     text += f". Better beyond doubt on {_named(better, joints)}"
     text += f", worse on {_named(worse, joints)}." if worse else "."
     strongest = min(overall, key=lambda name: overall[name])
     if strongest not in (model, rival):
         text += f" The best of those compared is {strongest} with {overall[strongest]:.2f} %."
-    tone = "good" if total["ci95"][1] < 0 and not worse else "bad" if total["ci95"][0] > 0 or len(worse) > len(better) else "warn"
+    tone = (
+        "good"
+        if total["ci95"][1] < 0 and not worse
+        else "bad"
+        if total["ci95"][0] > 0 or len(worse) > len(better)
+        else "warn"
+    )
     return Finding(tone, text)
 
 
@@ -81,10 +102,11 @@ def _worst(result: Mapping[str, Any], horizon: str, machine: Machine) -> Finding
     rows = {joint: models[model][horizon] for joint, models in result["joints"].items()}
     joint = max(rows, key=lambda name: rows[name]["percent"])
     unit = machine.joints[machine.joint_names.index(joint)].unit
-    text = (
-        f"Worst joint: {joint}, {rows[joint]['percent']:.2f} % of its travel ({rows[joint]['rmse']:.2g} {unit}) after {horizon} s."
-    )
-    shares = {name: cell["models"][model]["share"] / cell["time"] for name, cell in result["regimes"][joint].items()}
+    text = f"Worst joint: {joint}, {rows[joint]['percent']:.2f} % of its travel ({rows[joint]['rmse']:.2g} {unit}) after {horizon} s."
+    shares = {
+        name: cell["models"][model]["share"] / cell["time"]
+        for name, cell in result["regimes"][joint].items()
+    }
     if shares:
         regime = max(shares, key=lambda name: shares[name])
         cell = result["regimes"][joint][regime]
@@ -101,18 +123,38 @@ def _dead_time(result: Mapping[str, Any], machine: Machine) -> list[Finding]:
         return []
     history_s = machine.num_history * machine.period_s
     values = [delay["value"] for delay in known.values()]
-    span = f"{min(values):.2f} s" if max(values) - min(values) < RESOLUTION_S / 2 else f"{min(values):.2f} to {max(values):.2f} s"
+    span = (
+        f"{min(values):.2f} s"
+        if max(values) - min(values) < RESOLUTION_S / 2
+        else f"{min(values):.2f} to {max(values):.2f} s"
+    )
     stated = f"machine '{machine.name}' says {machine.dead_time_s:g} s"
     found: list[Finding] = []
     lost = [joint for joint, delay in known.items() if not delay["found"]]
     if lost:
-        found.append(Finding("warn", f"The dead time of {', '.join(lost)} is not found: the motion does not follow the command."))
-    long = [joint for joint, delay in known.items() if delay["found"] and delay["ci95"][1] > history_s]
+        found.append(
+            Finding(
+                "warn",
+                f"The dead time of {', '.join(lost)} is not found: the motion does not follow the command.",
+            )
+        )
+    long = [
+        joint for joint, delay in known.items() if delay["found"] and delay["ci95"][1] > history_s
+    ]
     if long:
         count = int(np.ceil(max(known[joint]["ci95"][1] for joint in long) / machine.period_s)) + 2
         text = f"The dead time of {', '.join(long)} may exceed the history of {history_s:.2f} s: models miss the command that acts."
-        found.append(Finding("bad", f"{text} Set num_history of machine '{machine.name}' to {count} or more and fit again."))
-    off = [joint for joint, delay in known.items() if abs(delay["value"] - machine.dead_time_s) > DELAY_TOLERANCE_S]
+        found.append(
+            Finding(
+                "bad",
+                f"{text} Set num_history of machine '{machine.name}' to {count} or more and fit again.",
+            )
+        )
+    off = [
+        joint
+        for joint, delay in known.items()
+        if abs(delay["value"] - machine.dead_time_s) > DELAY_TOLERANCE_S
+    ]
     if off:
         text = f"Dead time {span}, but {stated}: correct dead_time_s ({', '.join(off)})."
         found.append(Finding("warn", text))
@@ -130,12 +172,18 @@ def _excitation(result: Mapping[str, Any]) -> list[Finding]:
             lacks.append(f"commanded for {facts['commanded_s']:.0f} s only")
         if facts["travel"] < THIN_TRAVEL:
             lacks.append(f"seen over {100 * facts['travel']:.0f} % of its travel")
-        for sign, value in (("+", facts["largest_command"][1]), ("-", -facts["largest_command"][0])):
+        for sign, value in (
+            ("+", facts["largest_command"][1]),
+            ("-", -facts["largest_command"][0]),
+        ):
             if value < THIN_COMMAND:
                 lacks.append(f"no command beyond {sign}{value:.2g}")
         if lacks:
             found.append(
-                Finding("warn", f"{joint} is too little excited: {'; '.join(lacks)}. Record more of it before trusting its model.")
+                Finding(
+                    "warn",
+                    f"{joint} is too little excited: {'; '.join(lacks)}. Record more of it before trusting its model.",
+                )
             )
     return found
 
@@ -145,23 +193,38 @@ def _judged_by(result: Mapping[str, Any]) -> list[Finding]:
     idle = [joint for joint, facts in data["excitation"].items() if facts["judged_s"] <= 0]
     if idle:
         found.append(
-            Finding("warn", f"{', '.join(idle)} never moves by command in the runs judged by: its errors there say nothing.")
+            Finding(
+                "warn",
+                f"{', '.join(idle)} never moves by command in the runs judged by: its errors there say nothing.",
+            )
         )
     if data["test"]["runs"] < FEW_RUNS:
         found.append(
-            Finding("warn", f"Judged by {data['test']['runs']} runs: intervals from so few are coarse, most likely too narrow.")
+            Finding(
+                "warn",
+                f"Judged by {data['test']['runs']} runs: intervals from so few are coarse, most likely too narrow.",
+            )
         )
-    found += [Finding("warn", f"No figure at {horizon} s: {reason}.") for horizon, reason in result["missing"].items()]
+    found += [
+        Finding("warn", f"No figure at {horizon} s: {reason}.")
+        for horizon, reason in result["missing"].items()
+    ]
     return found
 
 
 def _named(some: list[str], every: list[str]) -> str:
     if not some:
         return "no joint"
-    return f"all {len(every)} joints" if len(some) == len(every) else f"{len(some)} of {len(every)} joints ({', '.join(some)})"
+    return (
+        f"all {len(every)} joints"
+        if len(some) == len(every)
+        else f"{len(some)} of {len(every)} joints ({', '.join(some)})"
+    )
 
 
 def _regime_phrase(regime: str) -> str:
-    return {"at rest": "when it should rest", "alone": "when it moves alone", "with others": "when it moves with others"}.get(
-        regime, regime if regime.startswith(("after", "near")) else f"at {regime}"
-    )
+    return {
+        "at rest": "when it should rest",
+        "alone": "when it moves alone",
+        "with others": "when it moves with others",
+    }.get(regime, regime if regime.startswith(("after", "near")) else f"at {regime}")

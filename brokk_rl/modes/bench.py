@@ -30,8 +30,14 @@ log = logging.getLogger(__name__)
 
 CALLS = 10
 """Of one thing before it is the turn of the next."""
-RATES: tuple[str, ...] = ("batch_env_steps_per_s", "physics_env_steps_per_s", "env_steps_per_s", "train_env_steps_per_s")
-"""In the order of what each has to do: MuJoCo's own batch (CPU only), with drive and contacts, the control step, training."""
+RATES: tuple[str, ...] = (
+    "batch_env_steps_per_s",
+    "physics_env_steps_per_s",
+    "env_steps_per_s",
+    "train_env_steps_per_s",
+)
+"""In the order of what each has to do: MuJoCo's own batch (CPU only), with drive and contacts, the
+control step, training."""
 
 
 @spec
@@ -39,11 +45,12 @@ class Sizes:
     """What to measure.
 
     Attributes:
-        num_envs: Numbers of environments, one row each; of each process where `torchrun` starts several.
+        num_envs: Numbers of environments, one row each; of each process where `torchrun` starts
+            several.
         seconds: Least time of each measurement.
         iterations: Training iterations timed, after one to warm up.
-        against: `benchmark.json` of one process with the same numbers of environments, to compare several processes with; `null`
-            for no comparison.
+        against: `benchmark.json` of one process with the same numbers of environments, to compare
+            several processes with; `null` for no comparison.
     """
 
     num_envs: tuple[int, ...]
@@ -53,7 +60,9 @@ class Sizes:
 
     def check(self) -> None:
         if not self.num_envs or min(self.num_envs) < 1:
-            raise ConfigError(f"bench.num_envs: expected one or more positive numbers, got {list(self.num_envs)}")
+            raise ConfigError(
+                f"bench.num_envs: expected one or more positive numbers, got {list(self.num_envs)}"
+            )
 
 
 @spec
@@ -90,13 +99,31 @@ class Bench:
         alone = _alone(self.bench)
         device = self.session.torch_device()
         plant = Plant(
-            machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect, follower=self.follower
+            machine=self.machine,
+            sim=self.sim,
+            task=self.task,
+            actuator=self.actuator,
+            effects=self.effect,
+            follower=self.follower,
         )
         with Group(device) as group:
-            rows = [_compared(row, alone.get(row["num_envs"])) for row in self._rows(plant, device, group)]
+            rows = [
+                _compared(row, alone.get(row["num_envs"]))
+                for row in self._rows(plant, device, group)
+            ]
         if group.rank.first:
-            name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu, {torch.get_num_threads()} threads"
-            results = {"device": name, "ranks": group.rank.count, **rows[-1], "versions": versions(), "rows": rows}
+            name = (
+                torch.cuda.get_device_name(device)
+                if device.type == "cuda"
+                else f"cpu, {torch.get_num_threads()} threads"
+            )
+            results = {
+                "device": name,
+                "ranks": group.rank.count,
+                **rows[-1],
+                "versions": versions(),
+                "rows": rows,
+            }
             write_json(self.session.folder / "benchmark.json", results)
             _print(rows)
         return float(rows[-1]["train_env_steps_per_s"])
@@ -108,7 +135,9 @@ class Bench:
             loop = plant.build(device, num_envs, self.rl.num_starts, self.session.stream("starts"))
             rows.append(_over_ranks(group.all(self._measure(loop, device, group))))
             log.info(
-                "%d environments: %s", num_envs, ", ".join(f"{k} {v:,.0f}" for k, v in rows[-1].items() if k.endswith("_per_s"))
+                "%d environments: %s",
+                num_envs,
+                ", ".join(f"{k} {v:,.0f}" for k, v in rows[-1].items() if k.endswith("_per_s")),
             )
         return rows
 
@@ -116,7 +145,11 @@ class Bench:
         num = loop.num_envs
         still = torch.zeros(num, self.machine.num_joints, device=device)
         graphs = device.type == "cuda" and loop.world.supports_graphs
-        physics = capture(lambda: loop.world.step(still), device).replay if graphs else lambda: loop.world.step(still)
+        physics = (
+            capture(lambda: loop.world.step(still), device).replay
+            if graphs
+            else lambda: loop.world.step(still)
+        )
         loop.capture(self.rl.fuse)
         action = torch.zeros(num, loop.num_actions, device=device)
         steps = {"physics_env_steps_per_s": physics, "env_steps_per_s": lambda: loop.step(action)}
@@ -126,7 +159,12 @@ class Bench:
         seconds = self._in_turn(steps, loop, device)
         runner_steps = int(self.rl.runner["num_steps_per_env"])
         book = Logbook(
-            self.session.folder, Off().open(self.session.folder, {}), loop.statistics, num * runner_steps, 1.0, lambda *_: 0.0
+            self.session.folder,
+            Off().open(self.session.folder, {}),
+            loop.statistics,
+            num * runner_steps,
+            1.0,
+            lambda *_: 0.0,
         )
         runner = Runner(loop, self.rl, self.session.folder, device, book, group)
         runner.learn(1)
@@ -136,14 +174,23 @@ class Bench:
         runner.learn(self.bench.iterations)
         _wait(device)
         train_s = (time.perf_counter() - start) / (self.bench.iterations * runner_steps)
-        rates = {name: num / value for name, value in seconds.items()} | {"train_env_steps_per_s": num / train_s}
-        return {"num_envs": num, **{name: rates[name] for name in RATES if name in rates}, "graph": loop.graph_active}
+        rates = {name: num / value for name, value in seconds.items()} | {
+            "train_env_steps_per_s": num / train_s
+        }
+        return {
+            "num_envs": num,
+            **{name: rates[name] for name in RATES if name in rates},
+            "graph": loop.graph_active,
+        }
 
-    def _in_turn(self, steps: dict[str, Callable[[], object]], loop: ControlLoop, device: torch.device) -> dict[str, float]:
+    def _in_turn(
+        self, steps: dict[str, Callable[[], object]], loop: ControlLoop, device: torch.device
+    ) -> dict[str, float]:
         """Returns the seconds that one call of each takes, the median over at least `bench.seconds`.
 
-        A few calls of each at a time, so that what else the computer does meets all alike. What is no control step moves arms at
-        rest at their starts, and the control loop finds its worlds as it left them.
+        A few calls of each at a time, so that what else the computer does meets all alike. What is
+        no control step moves arms at rest at their starts, and the control loop finds its worlds as
+        it left them.
         """
         rest = loop.world.state_dict()
         spent: dict[str, list[float]] = {name: [] for name in steps}
@@ -170,7 +217,11 @@ def _over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
         return rows[0]
     rates = [name for name in rows[0] if name.endswith("_per_s")]
     per_rank = [{name: row[name] for name in rates} for row in rows]
-    return rows[0] | {name: sum(row[name] for row in rows) for name in rates} | {"ranks": len(rows), "per_rank": per_rank}
+    return (
+        rows[0]
+        | {name: sum(row[name] for row in rows) for name in rates}
+        | {"ranks": len(rows), "per_rank": per_rank}
+    )
 
 
 def _alone(sizes: Sizes) -> dict[int, dict[str, Any]]:
@@ -181,7 +232,9 @@ def _alone(sizes: Sizes) -> dict[int, dict[str, Any]]:
         found = json.loads(Path(sizes.against).read_text())
         rows = {row["num_envs"]: row for row in found["rows"]}
     except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"bench.against: {sizes.against} is no benchmark.json ({error!r})") from error
+        raise ConfigError(
+            f"bench.against: {sizes.against} is no benchmark.json ({error!r})"
+        ) from error
     missing = [num for num in sizes.num_envs if num not in rows]
     if found.get("ranks") != 1 or missing:
         raise ConfigError(
@@ -198,7 +251,13 @@ def _compared(row: dict[str, Any], alone: dict[str, Any] | None) -> dict[str, An
     if alone is None:
         return row
     ranks = row.get("ranks", 1)
-    return row | {"weak_scaling": {name: row[name] / (ranks * alone[name]) for name in RATES if name in row and name in alone}}
+    return row | {
+        "weak_scaling": {
+            name: row[name] / (ranks * alone[name])
+            for name in RATES
+            if name in row and name in alone
+        }
+    }
 
 
 def _wait(device: torch.device) -> None:
@@ -208,15 +267,28 @@ def _wait(device: torch.device) -> None:
 
 def _print(rows: list[dict[str, Any]]) -> None:
     names = [name for name in RATES if name in rows[0]]
-    heads: dict[str, str] = dict(zip(RATES, ("mujoco.batch alone /s", "physics /s", "control step /s", "training /s"), strict=True))
+    heads: dict[str, str] = dict(
+        zip(
+            RATES,
+            ("mujoco.batch alone /s", "physics /s", "control step /s", "training /s"),
+            strict=True,
+        )
+    )
     table = Table("environments", *(heads[name] for name in names), "CUDA graph")
     for row in rows:
         texts = []
         for name in names:
-            shares = [row[kind][name] for kind in ("of_batch", "weak_scaling") if name in row.get(kind, {})]
+            shares = [
+                row[kind][name]
+                for kind in ("of_batch", "weak_scaling")
+                if name in row.get(kind, {})
+            ]
             texts.append(" ".join([f"{row[name]:,.0f}", *(f"({share:.2f})" for share in shares)]))
         table.add_row(f"{row['num_envs']:,}", *texts, "yes" if row["graph"] else "no")
-    notes = {"of_batch": "of mujoco.batch alone", "weak_scaling": "of one process times their number"}
+    notes = {
+        "of_batch": "of mujoco.batch alone",
+        "weak_scaling": "of one process times their number",
+    }
     told = [text for kind, text in notes.items() if kind in rows[0]]
     table.caption = f"In brackets: rate {'; '.join(told)}." if told else None
     Console().print(table)

@@ -22,7 +22,9 @@ class Found(Protocol):
 class Checklist(Protocol):
     """What knows the checks."""
 
-    def run(self, machine: Machine, session: Session, say: Callable[[str], None]) -> Sequence[Found]:
+    def run(
+        self, machine: Machine, session: Session, say: Callable[[str], None]
+    ) -> Sequence[Found]:
         """Runs them; `say` tells the operator what to do."""
         ...
 
@@ -42,5 +44,7 @@ class Bringup:
             LinkError: nothing is heard from the machine.
         """
         console = Console()
-        found = self.bringup.run(self.machine, self.session, lambda text: console.print(text, highlight=False))
+        found = self.bringup.run(
+            self.machine, self.session, lambda text: console.print(text, highlight=False)
+        )
         return float(sum(not one.passed for one in found))

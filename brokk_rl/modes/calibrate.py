@@ -47,7 +47,8 @@ class Calibrate:
             How uncertain a point is at the distance of the work, by the calibration alone, m.
 
         Raises:
-            FrameError: what was recorded does not tell where the camera is; the message says what is missing.
+            FrameError: what was recorded does not tell where the camera is; the message says what
+                is missing.
         """
         told = self.calibration.calibrate(self.machine)
         path = self.session.folder / FILE
@@ -77,7 +78,10 @@ def _show(told: dict[str, Any]) -> None:
             table.add_row(f"zero of {name}", f"{zero['mean']:+.4f} ± {zero['std']:.4f} rad")
     if clock := told.get("clock"):
         trust = "" if clock["trusted"] else ", too little motion to believe it"
-        table.add_row("camera's clock", f"{clock['offset_s']:+.3f} s (correlation {clock['correlation']:.2f}{trust})")
+        table.add_row(
+            "camera's clock",
+            f"{clock['offset_s']:+.3f} s (correlation {clock['correlation']:.2f}{trust})",
+        )
     for one in told["missing"]:
         table.add_row("missing", one)
     Console().print(table)

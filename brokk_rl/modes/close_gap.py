@@ -55,11 +55,13 @@ class CloseGap:
         actuator: The simulator's actuator, as it was.
         effect: Its effects, as it was.
         found: Effects that the diagnosis found; the repaired simulator has them too.
-        randomisation: Effects around these while training, so that the policy does not rely on exact numbers.
+        randomisation: Effects around these while training, so that the policy does not rely on
+            exact numbers.
         stand_in: The machine.
         follower: Who stands between policy and machine.
         policy: The policy as it was.
-        panel: Policies beside it, by name, to see whether simulator and machine put them in the same order.
+        panel: Policies beside it, by name, to see whether simulator and machine put them in the
+            same order.
         warm: Retrain from the network of `policy`; false: from a fresh one.
         rl: How to train.
         tracking: Where figures of the training go beside the run folder.
@@ -96,14 +98,19 @@ class CloseGap:
                 raise ConfigError(f"panel.{name}: this name is taken; give another")
         for one, other in (("effect", self.effect), ("randomisation", self.randomisation)):
             if both := sorted(set(other) & set(self.found)):
-                raise ConfigError(f"close_gap: {', '.join(both)} stands in '{one}' and in 'found'; rename it in one of them")
+                raise ConfigError(
+                    f"close_gap: {', '.join(both)} stands in '{one}' and in 'found'; rename it in one of them"
+                )
         if self.resume is not None and Path(self.resume).resolve() != self.session.folder.resolve():
-            raise ConfigError(f"resume={self.resume}: an interrupted run goes on in its folder; add session.out={self.resume}")
+            raise ConfigError(
+                f"resume={self.resume}: an interrupted run goes on in its folder; add session.out={self.resume}"
+            )
 
     def run(self) -> float:
         """Writes `close_gap.json`, `.html` and `.png`; returns the strict success of the retrained policy on the machine.
 
-        Below the run folder lie `retrained/` (as `mode=train` leaves it) and an `evaluation.json` for each plant.
+        Below the run folder lie `retrained/` (as `mode=train` leaves it) and an `evaluation.json`
+        for each plant.
         """
         folder = self.session.folder
         policies: dict[str, PolicySpec] = {
@@ -112,7 +119,9 @@ class CloseGap:
             **self.panel,
         }
         plants = self._plants()
-        evaluations = {name: self._evaluated(name, plant, policies) for name, plant in plants.items()}
+        evaluations = {
+            name: self._evaluated(name, plant, policies) for name, plant in plants.items()
+        }
         trained = json.loads((folder / RETRAINED / CONTRACT).read_text())["trained"]
         found = downstream.compare(evaluations) | {
             "plants": {name: _described(plant) for name, plant in plants.items()},
@@ -132,12 +141,19 @@ class CloseGap:
 
     def _plants(self) -> dict[str, Plant]:
         known = Plant(
-            machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect, follower=self.follower
+            machine=self.machine,
+            sim=self.sim,
+            task=self.task,
+            actuator=self.actuator,
+            effects=self.effect,
+            follower=self.follower,
         )
         return {
             "simulator": known,
             "repaired": replace(known, effects=self.effect | self.found),
-            "machine": replace(known, actuator=self.stand_in.actuator, effects=self.stand_in.effect),
+            "machine": replace(
+                known, actuator=self.stand_in.actuator, effects=self.stand_in.effect
+            ),
         }
 
     def _training_plant(self) -> Plant:
@@ -160,14 +176,18 @@ class CloseGap:
         ).run()  # fmt: skip
         return place
 
-    def _evaluated(self, name: str, plant: Plant, policies: dict[str, PolicySpec]) -> dict[str, Any]:
+    def _evaluated(
+        self, name: str, plant: Plant, policies: dict[str, PolicySpec]
+    ) -> dict[str, Any]:
         """Returns `evaluation.json` on a plant; one that an interrupted run has written is kept."""
         place = self.session.folder / name
         if (place / EVALUATION).exists():
             return json.loads((place / EVALUATION).read_text())
         place.mkdir(exist_ok=True)
         log.info("on the %s", downstream_page.WORDS[name])
-        return evaluate_policies(plant, self.evaluation, replace(self.session, out=str(place)), policies)[0]
+        return evaluate_policies(
+            plant, self.evaluation, replace(self.session, out=str(place)), policies
+        )[0]
 
 
 def _described(plant: Plant) -> str:
@@ -176,7 +196,9 @@ def _described(plant: Plant) -> str:
 
 def _show(found: dict[str, Any], folder: Path) -> None:
     console = Console()
-    view = Table("strict success", *(downstream_page.WORDS[plant] for plant in downstream.PLANTS), box=None)
+    view = Table(
+        "strict success", *(downstream_page.WORDS[plant] for plant in downstream.PLANTS), box=None
+    )
     for policy, shares in found["success"].items():
         name = downstream_page.NAMES.get(policy, policy)
         view.add_row(name, *(downstream.said(shares[plant]) for plant in downstream.PLANTS))

@@ -38,7 +38,8 @@ class Collection:
         num_runs: Runs side by side, each on a machine of its own; a real machine has one.
         run_minutes: Length of each run; its oil warms up over this time.
         file_minutes: A run is cut into files of this length.
-        flush_s: The file that grows is written again after this time, so that even a power failure costs no more.
+        flush_s: The file that grows is written again after this time, so that even a power failure
+            costs no more.
         only_plan: Stop after `plan.png` and `plan.json`, before anything moves.
         approach: How start poses are taken up.
         guards: Bounds that no program can exceed.
@@ -56,7 +57,9 @@ class Collection:
         if self.num_runs < 1:
             raise ConfigError(f"collect.num_runs: expected 1 or more, got {self.num_runs}")
         if not 0 < self.file_minutes <= self.run_minutes:
-            raise ConfigError(f"collect: expected 0 < file_minutes <= run_minutes, got {self.file_minutes} and {self.run_minutes}")
+            raise ConfigError(
+                f"collect: expected 0 < file_minutes <= run_minutes, got {self.file_minutes} and {self.run_minutes}"
+            )
         if self.flush_s <= 0:
             raise ConfigError(f"collect.flush_s: expected more than 0, got {self.flush_s}")
 
@@ -82,7 +85,12 @@ class Collect:
         self.session.seed_all()
         settings, run_s = self.collect, self.collect.run_minutes * 60.0
         plan = schedule(
-            self.excitation, self.machine, settings.approach, settings.num_runs, run_s, self.session.generator("collect")
+            self.excitation,
+            self.machine,
+            settings.approach,
+            settings.num_runs,
+            run_s,
+            self.session.generator("collect"),
         )
         self._show(plan)
         if settings.only_plan:
@@ -92,12 +100,19 @@ class Collect:
         with link as opened, Progress(transient=True) as progress:
             task = progress.add_task(f"{settings.num_runs} runs", total=run_s)
             try:
-                for sample in drive(opened, self._runner(plan), self.machine, settings.num_runs, run_s):
+                for sample in drive(
+                    opened, self._runner(plan), self.machine, settings.num_runs, run_s
+                ):
                     writer.add(sample)
                     progress.advance(task, self.machine.period_s)
             finally:
                 writer.close()  # what was recorded before an interruption is kept
-        log.info("%d recordings of %.1f minutes in all in %s", writer.files, writer.recorded_s / 60.0, self._folder)
+        log.info(
+            "%d recordings of %.1f minutes in all in %s",
+            writer.files,
+            writer.recorded_s / 60.0,
+            self._folder,
+        )
 
     @property
     def _folder(self) -> Path:
@@ -109,14 +124,35 @@ class Collect:
     def _show(self, plan: Plan) -> None:
         """Tries the plan out on a nominal machine; writes picture and figures."""
         machine, count = self.machine, self.collect.num_runs
-        track = Track(drive(Nominal(machine, count), self._runner(plan), machine, count, plan.run_s))
+        track = Track(
+            drive(Nominal(machine, count), self._runner(plan), machine, count, plan.run_s)
+        )
         summary = account.summary(plan, track, machine)
         write_json(self.session.folder / "plan.json", summary)
-        picture.draw_plan(plan, track, machine, predicted_tool_speed(machine, track.q[:, 0]), self.session.folder / "plan.png")
-        unplayed = {entry["name"] for run in summary["runs"] for entry in run if entry["cut_s"] > CUT * entry["program_s"]}
+        picture.draw_plan(
+            plan,
+            track,
+            machine,
+            predicted_tool_speed(machine, track.q[:, 0]),
+            self.session.folder / "plan.png",
+        )
+        unplayed = {
+            entry["name"]
+            for run in summary["runs"]
+            for entry in run
+            if entry["cut_s"] > CUT * entry["program_s"]
+        }
         if unplayed:
-            log.warning("plan: no time for %s in some of the runs; raise collect.run_minutes", ", ".join(sorted(unplayed)))
-        log.info("plan: %d segments in the first of %d runs; see %s", len(plan.runs[0]), count, self.session.folder / "plan.png")
+            log.warning(
+                "plan: no time for %s in some of the runs; raise collect.run_minutes",
+                ", ".join(sorted(unplayed)),
+            )
+        log.info(
+            "plan: %d segments in the first of %d runs; see %s",
+            len(plan.runs[0]),
+            count,
+            self.session.folder / "plan.png",
+        )
 
     def _metadata(self, plan: Plan) -> dict[str, str]:
         return {
@@ -134,8 +170,20 @@ class Writer:
         recorded_s: Time recorded, all runs together.
     """
 
-    def __init__(self, machine: Machine, plan: Plan, folder: Path, settings: Collection, metadata: dict[str, str]) -> None:
-        self._plan, self._folder, self._period_s, self._flush_s = plan, folder, machine.period_s, settings.flush_s
+    def __init__(
+        self,
+        machine: Machine,
+        plan: Plan,
+        folder: Path,
+        settings: Collection,
+        metadata: dict[str, str],
+    ) -> None:
+        self._plan, self._folder, self._period_s, self._flush_s = (
+            plan,
+            folder,
+            machine.period_s,
+            settings.flush_s,
+        )
         self._per_file = max(2, round(settings.file_minutes * 60.0 / machine.period_s))
         self._names = [f"{'-'.join(plan.names)}_{n:02d}" for n in range(len(plan.runs))]
         self._created, self._begin_s = record.now(), 0.0
@@ -184,7 +232,10 @@ class Writer:
             return
         samples = self._samples
         track, begin_s = Track(samples), samples[0].t_s
-        extra = {name: np.stack([sample.extra[name] for sample in samples], 1) for name in samples[0].extra}
+        extra = {
+            name: np.stack([sample.extra[name] for sample in samples], 1)
+            for name in samples[0].extra
+        }
         for n, name in enumerate(self._names):
             notes = account.notes(track, n, self._plan.runs[n], self._period_s)
             metadata = {
@@ -195,6 +246,11 @@ class Writer:
             }
             columns = {key: values[n] for key, values in extra.items()}
             recording = replace(
-                self._template, t_s=track.t_s - begin_s, u=track.u[:, n], q=track.q[:, n], extra=columns, metadata=metadata
+                self._template,
+                t_s=track.t_s - begin_s,
+                u=track.u[:, n],
+                q=track.q[:, n],
+                extra=columns,
+                metadata=metadata,
             )
             record.write(recording, self._folder / f"{name}_{self._part:02d}.parquet")

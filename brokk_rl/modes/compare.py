@@ -17,7 +17,17 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from brokk_rl.comparison_picture import MEASURES, RATES, REACHED, SUCCESS, Curve, as_table, draw, draw_learning, unlike_most
+from brokk_rl.comparison_picture import (
+    MEASURES,
+    RATES,
+    REACHED,
+    SUCCESS,
+    Curve,
+    as_table,
+    draw,
+    draw_learning,
+    unlike_most,
+)
 from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import student, wilson
 from brokk_rl.session import RESOLVED, Session, read_record, write_json, write_text
@@ -63,7 +73,10 @@ class Compare:
         results = [result for run in runs for result in run.results(columns)]
         groups = grouped(results)
         folder = self.session.folder
-        write_json(folder / "comparison.json", {"schema": 1, "columns": columns, "groups": groups, "runs": results})
+        write_json(
+            folder / "comparison.json",
+            {"schema": 1, "columns": columns, "groups": groups, "runs": results},
+        )
         write_text(folder / "comparison.csv", as_csv(columns, results))
         draw(groups).savefig(folder / "comparison.png", dpi=150)
         self._learning(runs, columns)
@@ -75,19 +88,34 @@ class Compare:
         trained = [(run, curve) for run in runs if (curve := progress(run.folder))]
         if not trained:
             return
-        variations = unlike_most([{"variation": {column: run.says(column) for column in columns}} for run, _ in trained])
+        variations = unlike_most(
+            [{"variation": {column: run.says(column) for column in columns}} for run, _ in trained]
+        )
         curves: dict[str, list[Curve]] = {}
         lines = []
         for (run, curve), variation in zip(trained, variations, strict=True):
             seed = run.record.get("seed")
             curves.setdefault(variation, []).append(curve)
-            reached = next((curve["seconds"][row] for row, rate in enumerate(curve[SUCCESS]) if rate >= REACHED), None)
-            when = f"after {reached:.1f} s" if reached is not None else f"not in {curve['seconds'][-1]:.0f} s"
+            reached = next(
+                (
+                    curve["seconds"][row]
+                    for row, rate in enumerate(curve[SUCCESS])
+                    if rate >= REACHED
+                ),
+                None,
+            )
+            when = (
+                f"after {reached:.1f} s"
+                if reached is not None
+                else f"not in {curve['seconds'][-1]:.0f} s"
+            )
             log.info("%s: strict success of %.2f while learning %s", run.folder.name, REACHED, when)
             rows = list(zip(*curve.values(), strict=True))
             lines += [(run.folder, seed, *row) for row in rows[:: -(-len(rows) // MOST_ROWS)]]
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([("folder", "seed", *PROGRESS_COLUMNS), *lines])
+        csv.writer(text, lineterminator="\n").writerows(
+            [("folder", "seed", *PROGRESS_COLUMNS), *lines]
+        )
         write_text(self.session.folder / "learning.csv", text.getvalue())
         draw_learning(curves).savefig(self.session.folder / "learning.png", dpi=150)
 
@@ -113,7 +141,11 @@ class Run:
     @property
     def choices(self) -> dict[str, Any]:
         """Options of the config groups that say what was run."""
-        found = {key: value for key, value in self.record.get("choices", {}).items() if key not in NOT_COMPARED}
+        found = {
+            key: value
+            for key, value in self.record.get("choices", {}).items()
+            if key not in NOT_COMPARED
+        }
         if "actuator" in self.evaluation:
             found.setdefault("actuator", self.evaluation["actuator"])
         return found
@@ -125,7 +157,9 @@ class Run:
     @property
     def overridden(self) -> set[str]:
         """Dotted keys that were set by hand or by the sweep."""
-        keys = {override.partition("=")[0].lstrip("+~") for override in self.record.get("overrides", ())}
+        keys = {
+            override.partition("=")[0].lstrip("+~") for override in self.record.get("overrides", ())
+        }
         return {key for key in keys if "." in key and key.split(".")[0] not in NOT_COMPARED}
 
     def results(self, columns: Sequence[str]) -> list[dict[str, Any]]:
@@ -139,7 +173,12 @@ class Run:
             if EVALUATED_ON in columns:
                 variation[EVALUATED_ON] = self.choices.get("actuator")
             seed = made.record.get("seed", self.evaluation.get("seed"))
-            about = {"folder": str(self.folder), "policy": policy, "seed": seed, "variation": variation}
+            about = {
+                "folder": str(self.folder),
+                "policy": policy,
+                "seed": seed,
+                "variation": variation,
+            }
             found.append({**about, **_figures(self.folder, figures)})
         return found
 
@@ -173,7 +212,9 @@ def load(folder: Path) -> Run:
         path = folder / RESOLVED
         values = _flat(yaml.safe_load(path.read_text())) if path.exists() else {}
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); evaluate the run again or leave it out of compare.runs") from error
+        raise ConfigError(
+            f"{path} cannot be read ({error}); evaluate the run again or leave it out of compare.runs"
+        ) from error
     return Run(folder, evaluation, read_record(folder) or {}, values, _training(folder, values))
 
 
@@ -185,21 +226,35 @@ def progress(folder: Path) -> Curve | None:
     with path.open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row.get(SUCCESS)]
     try:
-        return {name: [float(row[name]) for row in rows] for name in PROGRESS_COLUMNS} if rows else None
+        return (
+            {name: [float(row[name]) for row in rows] for name in PROGRESS_COLUMNS}
+            if rows
+            else None
+        )
     except (KeyError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); leave the run out of compare.runs") from error
+        raise ConfigError(
+            f"{path} cannot be read ({error}); leave the run out of compare.runs"
+        ) from error
 
 
 def differing(runs: Sequence[Run]) -> list[str]:
     """Returns what differs between the runs: choices of groups first, then single values that were overridden.
 
-    An evaluation of a trained policy counts as what the policy was trained with; on what it was evaluated is then a column.
+    An evaluation of a trained policy counts as what the policy was trained with; on what it was
+    evaluated is then a column.
     """
     made = [run.training or run for run in runs]
     groups = sorted({key for run in made for key in run.choices})
     groups = [key for key in groups if len({repr(run.choices.get(key)) for run in made}) > 1]
     above = {key for run in made for key in run.overridden}
-    keys = sorted({key for run in made for key in run.values if any(key == top or key.startswith(top + ".") for top in above)})
+    keys = sorted(
+        {
+            key
+            for run in made
+            for key in run.values
+            if any(key == top or key.startswith(top + ".") for top in above)
+        }
+    )
     keys = [key for key in keys if len({repr(run.values.get(key)) for run in made}) > 1]
     elsewhere = [EVALUATED_ON] if any(run.training for run in runs) else []
     return groups + keys + elsewhere
@@ -211,7 +266,11 @@ def _training(folder: Path, values: dict[str, Any]) -> Run | None:
     if not isinstance(named, str):
         return None
     for place in (Path(named), folder.parent / Path(named).name):
-        if place.resolve() != folder.resolve() and (place / EVALUATION).is_file() and (place / RESOLVED).is_file():
+        if (
+            place.resolve() != folder.resolve()
+            and (place / EVALUATION).is_file()
+            and (place / RESOLVED).is_file()
+        ):
             return load(place)
     return None
 
@@ -219,8 +278,8 @@ def _training(folder: Path, values: dict[str, Any]) -> Run | None:
 def grouped(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Returns one entry for each policy and variation, over its seeds.
 
-    A rate of several seeds has Student's interval over the seeds, as training differs from seed to seed; that of a single run has
-    Wilson's over its episodes.
+    A rate of several seeds has Student's interval over the seeds, as training differs from seed to
+    seed; that of a single run has Wilson's over its episodes.
     """
     sets: dict[str, list[dict[str, Any]]] = {}
     for result in results:
@@ -231,7 +290,10 @@ def grouped(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             "variation": members[0]["variation"],
             "seeds": [member["seed"] for member in members],
             "runs": len(members),
-            **{name: _over_seeds([member[name] for member in members], name in RATES) for name in (*RATES, *MEASURES)},
+            **{
+                name: _over_seeds([member[name] for member in members], name in RATES)
+                for name in (*RATES, *MEASURES)
+            },
         }
         for members in sets.values()
     ]
@@ -248,7 +310,16 @@ def as_csv(columns: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
         setting = [result["variation"][column] for column in columns]
         rates, measures = ([result[name]["mean"] for name in names] for names in (RATES, MEASURES))
         writer.writerow(
-            [result["folder"], result["policy"], result["seed"], *setting, result["episodes"], *rates, *ends, *measures]
+            [
+                result["folder"],
+                result["policy"],
+                result["seed"],
+                *setting,
+                result["episodes"],
+                *rates,
+                *ends,
+                *measures,
+            ]
         )
     return text.getvalue()
 
@@ -262,7 +333,10 @@ def _figures(folder: Path, evaluation: dict[str, Any]) -> dict[str, Any]:
         raise ConfigError(f"{folder / EVALUATION} lacks {error}; evaluate the run again") from error
     found: dict[str, Any] = {"episodes": episodes}
     for name, rate in rates.items():
-        found[name] = {"mean": rate, "ci95": None if rate is None else wilson(rate * episodes, episodes)}
+        found[name] = {
+            "mean": rate,
+            "ci95": None if rate is None else wilson(rate * episodes, episodes),
+        }
     for name in MEASURES:
         found[name] = {"mean": _number(evaluation.get(name)), "ci95": None}
     return found

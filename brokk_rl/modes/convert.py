@@ -59,7 +59,9 @@ class Convert:
         by_name: dict[str, Path] = {}
         for path in logs:
             if (other := by_name.setdefault(path.stem, path)) is not path:
-                raise RecordingError(f"convert.input: {other} and {path} would become the same recording; rename one")
+                raise RecordingError(
+                    f"convert.input: {other} and {path} would become the same recording; rename one"
+                )
         pieces = {path: self.reader.read(path, self.machine) for path in logs}
         folder = self.session.folder / FOLDER
         for path, recordings in pieces.items():

@@ -36,8 +36,10 @@ class Subject:
 
     Attributes:
         case: Folder with `reference/` and `field/`; or `null`.
-        field: Glob or globs of recordings of the machine as it is, held against `actuator`; instead of a case.
-        unseen: Glob or globs of further recordings of the machine as it is, to which nothing is fitted: how far the effects carry.
+        field: Glob or globs of recordings of the machine as it is, held against `actuator`; instead
+            of a case.
+        unseen: Glob or globs of further recordings of the machine as it is, to which nothing is
+            fitted: how far the effects carry.
         effects: Names of the effects to choose among; `null`: all that are registered.
         prices: What an effect must earn.
         certainty: How sure what is said is.
@@ -64,7 +66,8 @@ class Diagnose:
     Attributes:
         session: Folder, seed, device.
         machine: The machine that was recorded.
-        fit: How the simulator is made from `reference/`; without one, the flexible model that tells what could be explained at all.
+        fit: How the simulator is made from `reference/`; without one, the flexible model that tells
+            what could be explained at all.
         actuator: The simulator that `diagnosis.field` is held against.
         thresholds: When a stretch of a recording is worth telling.
         excitation: Experiments that could follow, by name.
@@ -83,7 +86,8 @@ class Diagnose:
         """Writes `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
 
         Raises:
-            RecordingError: a recording cannot be used, or there is too little data to fit a simulator to.
+            RecordingError: a recording cannot be used, or there is too little data to fit a
+                simulator to.
             ConfigError: neither a case nor an actuator is given, or an effect is unknown.
             StorageError: something could not be written.
         """
@@ -96,8 +100,12 @@ class Diagnose:
             base = self._base(given, kinds)
             generator = self.session.generator("diagnosis")
             prices, certainty = self.diagnosis.prices, self.diagnosis.certainty
-            work = Diagnosis(given, base, kinds, prices, certainty, self.thresholds, self.excitation, generator)
-            outcome = work.run(lambda doing, done: progress.update(task, description=doing, completed=done))
+            work = Diagnosis(
+                given, base, kinds, prices, certainty, self.thresholds, self.excitation, generator
+            )
+            outcome = work.run(
+                lambda doing, done: progress.update(task, description=doing, completed=done)
+            )
         folder = self.session.folder
         outcome.save(folder)
         prescription.write(outcome.answer, kinds, folder / prescription.FILE)
@@ -111,14 +119,25 @@ class Diagnose:
             return replace(case.load(Path(subject.case), self.machine), unseen=unseen)
         assert subject.field is not None, "checked by Subject"
         if self.actuator is None:
-            raise ConfigError("diagnosis.field needs a simulator to hold it against: add actuator=<name>")
+            raise ConfigError(
+                "diagnosis.field needs a simulator to hold it against: add actuator=<name>"
+            )
         return Case(self.machine, [], case.recorded(subject.field, self.machine), unseen)
 
     def _base(self, given: Case, kinds: Sequence[Kind]) -> Base:
-        seed, device, folder = self.session.stream("base"), self.session.torch_device(), self.session.folder
+        seed, device, folder = (
+            self.session.stream("base"),
+            self.session.torch_device(),
+            self.session.folder,
+        )
         if given.reference:
             return simulator.fitted(
-                given, self.fit, folder / "base", seed, device, lambda base: already.refined(base, kinds, self.machine)
+                given,
+                self.fit,
+                folder / "base",
+                seed,
+                device,
+                lambda base: already.refined(base, kinds, self.machine),
             )
         assert self.actuator is not None, "there is one where there is no reference"
         return simulator.given(given, self.actuator, self.fit, folder / "flexible", seed, device)
@@ -134,7 +153,14 @@ def _show(found: Answer, folder: Path) -> None:
             for joint, value in values.items()
         ]
         closes = f"{100 * one.gap_closed.mean:.0f} %" if one.gap_closed else ""
-        table.add_row(one.effect, " ".join(one.joints), f"{one.probability:.2f}", "\n".join(told), closes, " ".join(one.same_as))
+        table.add_row(
+            one.effect,
+            " ".join(one.joints),
+            f"{one.probability:.2f}",
+            "\n".join(told),
+            closes,
+            " ".join(one.same_as),
+        )
     console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False)
     if found.selected:
         console.print(table)

@@ -34,7 +34,8 @@ class Finding:
     """One line of the report.
 
     Attributes:
-        level: `fail` where something essential does not work, `warn` where something optional does not.
+        level: `fail` where something essential does not work, `warn` where something optional does
+            not.
         text: What was found.
         advice: What to do about it.
     """
@@ -73,7 +74,9 @@ class Doctor:
         failed = False
         for topic, finding in self.findings():
             advice = f"\n[dim]→ {finding.advice}[/dim]" if finding.advice else ""
-            table.add_row(f"[{COLORS[finding.level]}]{finding.level}[/]", topic, finding.text + advice)
+            table.add_row(
+                f"[{COLORS[finding.level]}]{finding.level}[/]", topic, finding.text + advice
+            )
             failed |= finding.level == "fail"
         Console().print(table)
         if failed:
@@ -97,7 +100,9 @@ class Doctor:
             try:
                 for finding in examine():
                     yield topic, finding
-            except Exception as error:  # whatever breaks in a foreign package must not hide the rest of the report
+            except (
+                Exception
+            ) as error:  # whatever breaks in a foreign package must not hide the rest of the report
                 yield topic, Finding("warn", f"cannot tell: {type(error).__name__}: {error}")
 
 
@@ -110,7 +115,9 @@ def python() -> Iterator[Finding]:
         yield Finding("ok", text)
     else:
         yield Finding(
-            "fail", f"{text}, but the project wants {wanted}", "make again the environment with such a Python: make clean setup"
+            "fail",
+            f"{text}, but the project wants {wanted}",
+            "make again the environment with such a Python: make clean setup",
         )
 
 
@@ -118,10 +125,18 @@ def packages() -> Iterator[Finding]:
     """Installed packages against what the project asks for."""
     about = _metadata()
     if about is None:
-        yield Finding("warn", f"{DISTRIBUTION} runs from its sources and is not installed; versions are not checked", "make setup")
+        yield Finding(
+            "warn",
+            f"{DISTRIBUTION} runs from its sources and is not installed; versions are not checked",
+            "make setup",
+        )
         return
     wanted = [Requirement(line) for line in metadata.requires(DISTRIBUTION) or ()]
-    wanted = [requirement for requirement in wanted if requirement.marker is None or requirement.marker.evaluate()]
+    wanted = [
+        requirement
+        for requirement in wanted
+        if requirement.marker is None or requirement.marker.evaluate()
+    ]
     fit = 0
     for requirement in wanted:
         try:
@@ -133,7 +148,9 @@ def packages() -> Iterator[Finding]:
             fit += 1
         else:
             yield Finding(
-                "warn", f"{requirement.name} {version} is installed, the project wants {requirement.specifier}", "make setup"
+                "warn",
+                f"{requirement.name} {version} is installed, the project wants {requirement.specifier}",
+                "make setup",
             )
     yield Finding("ok", f"{fit} of {len(wanted)} as wanted; {DISTRIBUTION} {about['Version']}")
 
@@ -142,10 +159,14 @@ def processor() -> Iterator[Finding]:
     """Cores that this process may use, and threads that torch does use."""
     import torch
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     text = f"{cores} cores ({os.cpu_count()} in all), torch uses {torch.get_num_threads()} threads"
     if torch.get_num_threads() > cores:
-        yield Finding("warn", text, f"more threads than cores slow each other down: OMP_NUM_THREADS={cores}")
+        yield Finding(
+            "warn", text, f"more threads than cores slow each other down: OMP_NUM_THREADS={cores}"
+        )
     else:
         yield Finding("ok", text)
 
@@ -157,7 +178,9 @@ def torch_devices() -> Iterator[Finding]:
     built = f"{torch.__version__}, built for CUDA {torch.version.cuda or 'none'}"
     driver = driver_version()
     if torch.cuda.is_available():
-        names = ", ".join(torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count()))
+        names = ", ".join(
+            torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())
+        )
         yield Finding("ok", f"{built}, driver {driver or 'unknown'}: {names}")
     elif driver:
         advice = "the driver may be too old for this CUDA, or CUDA_VISIBLE_DEVICES hides the GPU"
@@ -170,7 +193,9 @@ def driver_version() -> str | None:
     """Returns the version of the NVIDIA driver, `None` when there is none."""
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
-        lines = subprocess.run(query, capture_output=True, text=True, check=True, timeout=20).stdout.split()
+        lines = subprocess.run(
+            query, capture_output=True, text=True, check=True, timeout=20
+        ).stdout.split()
     except (OSError, subprocess.SubprocessError):
         return None
     return lines[0] if lines else None
@@ -193,7 +218,11 @@ def cuda_graphs() -> Iterator[Finding]:
 def warp() -> Iterator[Finding]:
     """Version of Warp, and its kernel cache, which saves a minute or two of compiling at each start."""
     cache = probe.kernel_cache()
-    size = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) if cache.exists() else 0
+    size = (
+        sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
+        if cache.exists()
+        else 0
+    )
     yield Finding("ok", f"{probe.warp_version()}, kernel cache {cache} ({size / 2**20:.1f} MiB)")
 
 
@@ -205,7 +234,11 @@ def rendering() -> Iterator[Finding]:
     else:
         asked = os.environ.get("MUJOCO_GL")
         tried = f"MUJOCO_GL={asked}" if asked else f"any of {', '.join(probe.RENDERERS)}"
-        yield Finding("warn", f"MuJoCo cannot draw with {tried}: no videos", "install libegl1 and libgl1, or libosmesa6")
+        yield Finding(
+            "warn",
+            f"MuJoCo cannot draw with {tried}: no videos",
+            "install libegl1 and libgl1, or libosmesa6",
+        )
 
 
 def disk(folder: Path, min_free_gib: float) -> Iterator[Finding]:
@@ -216,7 +249,9 @@ def disk(folder: Path, min_free_gib: float) -> Iterator[Finding]:
             pass
     except OSError as error:
         yield Finding(
-            "fail", f"cannot write into {place}: {error.strerror}", "work in a folder of your own, or give session.out=<folder>"
+            "fail",
+            f"cannot write into {place}: {error.strerror}",
+            "work in a folder of your own, or give session.out=<folder>",
         )
         return
     free_gib = shutil.disk_usage(place).free / 2**30
@@ -234,17 +269,25 @@ def import_names() -> Iterator[Finding]:
     owned = 0
     for name in IMPORT_NAMES:
         found = util.find_spec(name)
-        folder = Path(next(iter(found.submodule_search_locations))) if found and found.submodule_search_locations else None
+        folder = (
+            Path(next(iter(found.submodule_search_locations)))
+            if found and found.submodule_search_locations
+            else None
+        )
         if folder != home / name:
             place = folder or (found.origin if found else None)
             yield Finding(
-                "fail", f"'{name}' is {place or 'missing'}, not {home / name}", "install the project in an environment of its own"
+                "fail",
+                f"'{name}' is {place or 'missing'}, not {home / name}",
+                "install the project in an environment of its own",
             )
         else:
             owned += 1
     for distribution in metadata.distributions():
         name = distribution.metadata["Name"]
-        tops = {path.parts[0].removesuffix(".py") for path in distribution.files or () if path.parts}
+        tops = {
+            path.parts[0].removesuffix(".py") for path in distribution.files or () if path.parts
+        }
         if name != DISTRIBUTION and (clash := sorted(tops.intersection(IMPORT_NAMES))):
             yield Finding(
                 "warn",

@@ -35,7 +35,8 @@ class Evaluation:
 
     Attributes:
         episodes: Number of episodes, one from each start.
-        seed: Seed of starts and noise; the same for every policy and run, so that results can be compared.
+        seed: Seed of starts and noise; the same for every policy and run, so that results can be
+            compared.
         num_recorded: Episodes recorded, of which the video shows one.
         video: Whether to render a video.
     """
@@ -47,7 +48,9 @@ class Evaluation:
 
     def check(self) -> None:
         if not 1 <= self.num_recorded <= self.episodes:
-            raise ConfigError(f"evaluation: expected 1 <= num_recorded <= episodes, got {self.num_recorded} and {self.episodes}")
+            raise ConfigError(
+                f"evaluation: expected 1 <= num_recorded <= episodes, got {self.num_recorded} and {self.episodes}"
+            )
 
 
 @spec
@@ -81,7 +84,12 @@ class Evaluate:
     def run(self) -> float:
         """Evaluates; returns the strict success of the policy."""
         plant = Plant(
-            machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect, follower=self.follower
+            machine=self.machine,
+            sim=self.sim,
+            task=self.task,
+            actuator=self.actuator,
+            effects=self.effect,
+            follower=self.follower,
         )
         policies = {type(self.policy).__name__.lower(): self.policy} | self.rivals
         results, _ = evaluate_policies(plant, self.evaluation, self.session, policies)
@@ -97,10 +105,12 @@ def evaluate_policies(
         plant: What to evaluate on.
         evaluation: How.
         session: Where to write, and on which device.
-        policies: By name; the first is the one in question and stands at the top of `evaluation.json`.
+        policies: By name; the first is the one in question and stands at the top of
+            `evaluation.json`.
 
     Returns:
-        The content of `evaluation.json`, and observation vectors `(B, O)` that the first policy met.
+        The content of `evaluation.json`, and observation vectors `(B, O)` that the first policy
+        met.
     """
     device = session.torch_device()
     torch.manual_seed(evaluation.seed)  # from which effects and followers draw, too
@@ -115,7 +125,9 @@ def evaluate_policies(
         log.info("evaluating %s over %d episodes", name, evaluation.episodes)
         loop.load_state_dict(fresh)  # every policy meets the same machines and persons
         acting = policy.build(loop, session.seed)
-        table[name], recorded[name], seen[name] = evaluate(loop, acting, starts, evaluation.seed, evaluation.num_recorded)
+        table[name], recorded[name], seen[name] = evaluate(
+            loop, acting, starts, evaluation.seed, evaluation.num_recorded
+        )
     first = next(iter(policies))
     results = {
         **table[first],
@@ -128,7 +140,9 @@ def evaluate_policies(
     write_json(session.folder / "evaluation.json", results)
     _print(table)
     if evaluation.video:
-        shown = next((episode for episode in recorded[first] if episode.success), recorded[first][0])
+        shown = next(
+            (episode for episode in recorded[first] if episode.success), recorded[first][0]
+        )
         path = render_video(plant.machine, shown, session.folder / "insertion.mp4")
         log.info("video of one episode: %s", path)
     return results, seen[first]
@@ -136,7 +150,14 @@ def evaluate_policies(
 
 def _print(table: dict[str, Any]) -> None:
     view = Table(
-        "policy", "strict success", "95 %", "paper's success", "time to insert", "lateral error", "peak force", "valve travel"
+        "policy",
+        "strict success",
+        "95 %",
+        "paper's success",
+        "time to insert",
+        "lateral error",
+        "peak force",
+        "valve travel",
     )
     for name, row in table.items():
         strict, time = row["success_strict"], row["time_to_insert_s"]["median"]

@@ -51,24 +51,37 @@ class Export:
         """Exports.
 
         Raises:
-            CheckpointError: The checkpoint cannot be used, or the exported file says something else than the network.
+            CheckpointError: The checkpoint cannot be used, or the exported file says something else
+                than the network.
         """
         path = find_checkpoint(Path(self.checkpoint))
         cpu = torch.device("cpu")
         content = read_checkpoint(path, cpu)
         self.machine.check_fingerprint(content.get("fingerprint", {}), str(path))
         plant = Plant(
-            machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects={}, follower=self.follower
+            machine=self.machine,
+            sim=self.sim,
+            task=self.task,
+            actuator=self.actuator,
+            effects={},
+            follower=self.follower,
         )
         loop = plant.build(cpu, self.num_checked, self.num_checked, self.session.stream("starts"))
         config = self.rl.runner_config()
         actor = make_actor(config["actor"], config["obs_groups"], loop)
         actor.load_state_dict(content["actor_state_dict"])
         _, _, observations = evaluate(loop, Network(actor, loop), loop.starts, self.session.seed, 1)
-        facts = {"checkpoint": str(path), "env_steps": content["book"]["env_steps"], "seconds": content["book"]["seconds"]}
+        facts = {
+            "checkpoint": str(path),
+            "env_steps": content["book"]["env_steps"],
+            "seconds": content["book"]["seconds"],
+        }
         facts["follower"] = follower_of(path.parent)
         contract = write_bundle(self.session.folder, actor, self.rl, loop, facts)
         largest = export_onnx(self.session.folder, actor, loop.task, contract, observations)
         log.info(
-            "%s: onnxruntime and torch differ by at most %.1e over %d observations", self.session.folder, largest, len(observations)
+            "%s: onnxruntime and torch differ by at most %.1e over %d observations",
+            self.session.folder,
+            largest,
+            len(observations),
         )

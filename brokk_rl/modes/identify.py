@@ -39,12 +39,16 @@ class Identification:
 
     Attributes:
         recordings: Glob, or list of globs, of recordings to fit to.
-        test: Glob or globs of unseen recordings to judge by, best of another excitation; `null` sets a part of `recordings` aside.
-        folds: Cross-validation: each run is judged once, by a model fitted to the other folds; then one model is fitted to all runs
+        test: Glob or globs of unseen recordings to judge by, best of another excitation; `null`
+            sets a part of `recordings` aside.
+        folds: Cross-validation: each run is judged once, by a model fitted to the other folds; then
+            one model is fitted to all runs
             and kept. For few recordings. `null`: one split.
-        hold_out: One part in so many is kept from the fit to stop it by, and another one to judge by (without `test`).
+        hold_out: One part in so many is kept from the fit to stop it by, and another one to judge
+            by (without `test`).
         stride_s: Distance between the beginnings of two free runs.
-        threads: CPU threads for the fit; the networks are so small that one is fastest, above all beside other work.
+        threads: CPU threads for the fit; the networks are so small that one is fastest, above all
+            beside other work.
     """
 
     recordings: str | tuple[str, ...]
@@ -62,7 +66,9 @@ class Identification:
         if self.stride_s <= 0:
             raise ConfigError(f"identify.stride_s: expected more than 0, got {self.stride_s}")
         if self.folds is not None and self.folds < 2:
-            raise ConfigError(f"identify.folds: expected 2 or more, or null for one split, got {self.folds}")
+            raise ConfigError(
+                f"identify.folds: expected 2 or more, or null for one split, got {self.folds}"
+            )
         if self.folds is not None and self.test is not None:
             raise ConfigError("identify: folds and test are two ways of judging; give one of them")
 
@@ -75,9 +81,11 @@ class Identify:
         session: Folder, seed, device.
         machine: The machine that was recorded.
         fit: The model that is kept.
-        baselines: What it is compared with, by name: `hold`, `arx`, and any more (`+fit@baselines.<name>=<fit>`).
+        baselines: What it is compared with, by name: `hold`, `arx`, and any more
+            (`+fit@baselines.<name>=<fit>`).
         identify: What to fit to and what to judge by.
-        resume: Run folder of an interrupted identification to go on with; the same as `session.out`.
+        resume: Run folder of an interrupted identification to go on with; the same as
+            `session.out`.
     """
 
     session: Session
@@ -89,7 +97,9 @@ class Identify:
 
     def check(self) -> None:
         if lacking := {HOLD, LINEAR} - self.baselines.keys():
-            raise ConfigError(f"baselines: {' and '.join(sorted(lacking))} must be among them; no error means anything by itself")
+            raise ConfigError(
+                f"baselines: {' and '.join(sorted(lacking))} must be among them; no error means anything by itself"
+            )
         if self.baselines.get(self.fit.name, self.fit) != self.fit:
             raise ConfigError(
                 f"baselines.{self.fit.name} differs from fit, but has its name; give it another: +fit@baselines.<name>=…"
@@ -99,7 +109,8 @@ class Identify:
         """Writes the model, `identification.json`, pictures and `identification.html`; returns the error at the longest horizon.
 
         Returns:
-            Root mean square error at 10 s (or the longest horizon that fits), % of travel, mean over joints.
+            Root mean square error at 10 s (or the longest horizon that fits), % of travel, mean
+            over joints.
 
         Raises:
             RecordingError: a recording cannot be used, or there is too little data.
@@ -110,7 +121,9 @@ class Identify:
         self.session.seed_all()
         stages = self._stages()
         judged = [recording for stage in stages for recording in members(stage.test)]
-        horizons_s = [h for h in HORIZONS_S if h <= open_loop.longest_s(judged, self.machine) + 1e-9]
+        horizons_s = [
+            h for h in HORIZONS_S if h <= open_loop.longest_s(judged, self.machine) + 1e-9
+        ]
         cuts = [self._cut(stage, horizons_s) for stage in stages]
         models = {self.fit.name: self.fit, **self.baselines}
         done: list[dict[str, Fitted]] = []
@@ -118,9 +131,18 @@ class Identify:
         with _threads(self.identify.threads):
             for stage, cut in zip(stages, cuts, strict=True):
                 chosen = models if cut or not self.identify.folds else {self.fit.name: self.fit}
-                done.append({name: self._fitted(stage, name, fit, cut, device) for name, fit in chosen.items()})
-        identified = Identified(self.machine, self.fit.name, stages, cuts, done, tuple(horizons_s), HORIZONS_S)
-        result, findings, drawings = gather(identified, self.session.generator("resample"), self.session.generator("delay"))
+                done.append(
+                    {
+                        name: self._fitted(stage, name, fit, cut, device)
+                        for name, fit in chosen.items()
+                    }
+                )
+        identified = Identified(
+            self.machine, self.fit.name, stages, cuts, done, tuple(horizons_s), HORIZONS_S
+        )
+        result, findings, drawings = gather(
+            identified, self.session.generator("resample"), self.session.generator("delay")
+        )
         result |= {"device": str(device), "seed": self.session.seed, "folds": self.identify.folds}
         folder = self.session.folder
         write_json(folder / "identification.json", result)
@@ -132,23 +154,36 @@ class Identify:
         if self.resume is None:
             return
         if Path(self.resume).resolve() != self.session.folder.resolve():
-            raise ConfigError(f"resume={self.resume}: an identification goes on in its own folder; add session.out={self.resume}")
+            raise ConfigError(
+                f"resume={self.resume}: an identification goes on in its own folder; add session.out={self.resume}"
+            )
         if not (read_record(self.session.folder) or {}).get("resumed"):
-            raise ConfigError(f"resume={self.resume}: there is no run to go on with; leave resume away to begin one")
+            raise ConfigError(
+                f"resume={self.resume}: there is no run to go on with; leave resume away to begin one"
+            )
 
     def _stages(self) -> list[Stage]:
         """Returns the fits to do, each with whole runs to fit to, to stop by, and to judge by."""
         options, folder = self.identify, self.session.folder
         runs = by_run(record.read_all(options.recordings, self.machine))
         if options.folds:
-            check_commanded(runs, self.machine, 3, "for every fold to have one to fit to and one to stop by")
+            check_commanded(
+                runs, self.machine, 3, "for every fold to have one to fit to and one to stop by"
+            )
             if len(runs) < options.folds:
-                raise RecordingError(f"too little data: identify.folds={options.folds}, but there are {len(runs)} runs")
+                raise RecordingError(
+                    f"too little data: identify.folds={options.folds}, but there are {len(runs)} runs"
+                )
             stages = []
             for number, tested in enumerate(
-                split(runs, dict.fromkeys(map(str, range(options.folds)), 1.0 / options.folds)).values()
+                split(
+                    runs, dict.fromkeys(map(str, range(options.folds)), 1.0 / options.folds)
+                ).values()
             ):
-                name, rest = f"fold {number + 1} of {options.folds}", {key: runs[key] for key in runs if key not in tested}
+                name, rest = (
+                    f"fold {number + 1} of {options.folds}",
+                    {key: runs[key] for key in runs if key not in tested},
+                )
                 test = {key: runs[key] for key in tested}
                 stages.append(self._stage(name, folder / "folds" / str(number + 1), rest, test))
             return [*stages, self._stage("all runs", folder, runs, {})]
@@ -158,7 +193,10 @@ class Identify:
             check_commanded(runs, self.machine, 2, "one to fit to and one to stop the fit by")
             return [self._stage("", folder, runs, test)]
         check_commanded(
-            runs, self.machine, 3, "one to fit to, one to stop the fit by and one to judge by (identify.test, or folds)"
+            runs,
+            self.machine,
+            3,
+            "one to fit to, one to stop the fit by and one to judge by (identify.test, or folds)",
         )
         share = 1.0 / options.hold_out
         parts = split(runs, {"rest": 1.0 - share, "test": share})
@@ -166,11 +204,20 @@ class Identify:
         return [self._stage("", folder, rest, test)]
 
     def _stage(self, name: str, folder: Path, rest: Runs, test: Runs) -> Stage:
-        check_commanded(rest, self.machine, 2, f"{f'in {name} ' if name else ''}one to fit to and one to stop the fit by")
+        check_commanded(
+            rest,
+            self.machine,
+            2,
+            f"{f'in {name} ' if name else ''}one to fit to and one to stop the fit by",
+        )
         share = 1.0 / self.identify.hold_out
         parts = split(rest, {"train": 1.0 - share, "validation": share})
-        train, validation = ({key: rest[key] for key in parts[part]} for part in ("train", "validation"))
-        return Stage(name, folder, self.session.stream(f"fit {name}".strip()), train, validation, test)
+        train, validation = (
+            {key: rest[key] for key in parts[part]} for part in ("train", "validation")
+        )
+        return Stage(
+            name, folder, self.session.stream(f"fit {name}".strip()), train, validation, test
+        )
 
     def _check_unseen(self, runs: Runs, test: Runs) -> None:
         files = [{r.path.resolve() for r in members(part) if r.path} for part in (runs, test)]
@@ -182,10 +229,21 @@ class Identify:
     def _cut(self, stage: Stage, horizons_s: Sequence[float]) -> open_loop.Windows | None:
         if not stage.test and self.identify.folds:
             return None
-        shortest, longest = (horizons_s[0], horizons_s[-1]) if horizons_s else (HORIZONS_S[0], HORIZONS_S[0])
-        return open_loop.windows(members(stage.test), self.machine, longest, self.identify.stride_s, shortest)
+        shortest, longest = (
+            (horizons_s[0], horizons_s[-1]) if horizons_s else (HORIZONS_S[0], HORIZONS_S[0])
+        )
+        return open_loop.windows(
+            members(stage.test), self.machine, longest, self.identify.stride_s, shortest
+        )
 
-    def _fitted(self, stage: Stage, name: str, fit: ActuatorFit, cut: open_loop.Windows | None, device: torch.device) -> Fitted:
+    def _fitted(
+        self,
+        stage: Stage,
+        name: str,
+        fit: ActuatorFit,
+        cut: open_loop.Windows | None,
+        device: torch.device,
+    ) -> Fitted:
         folder = stage.folder if name == self.fit.name else stage.folder / "baselines" / name
         return fitted(stage, name, fit, folder, self.machine, cut, device)
 
@@ -203,18 +261,38 @@ def _threads(count: int) -> Iterator[None]:
 
 def _show(result: Mapping, findings: Sequence[Finding], folder: Path) -> None:
     horizons = list(result["overall"][result["model"]])
-    table = Table(title="error at the end of free runs on unseen runs (RMSE, rad or m; last rows: % of travel)", box=None)
+    table = Table(
+        title="error at the end of free runs on unseen runs (RMSE, rad or m; last rows: % of travel)",
+        box=None,
+    )
     for column in ("joint", "model", *(f"{horizon} s" for horizon in horizons), "dead time"):
-        table.add_column(column, justify="left" if column in ("joint", "model") else "right", no_wrap=True)
-    blocks = [(joint, models, "rmse", 4, result["delay_s"][joint]) for joint, models in result["joints"].items()]
-    for joint, models, key, digits, delay in (*blocks, ("all joints", result["overall"], "percent", 2, None)):
+        table.add_column(
+            column, justify="left" if column in ("joint", "model") else "right", no_wrap=True
+        )
+    blocks = [
+        (joint, models, "rmse", 4, result["delay_s"][joint])
+        for joint, models in result["joints"].items()
+    ]
+    for joint, models, key, digits, delay in (
+        *blocks,
+        ("all joints", result["overall"], "percent", 2, None),
+    ):
         for row, name in enumerate(models):
             cells = []
             for horizon in horizons:
-                given = {other: rows[horizon][key] for other, rows in models.items() if rows[horizon]}
+                given = {
+                    other: rows[horizon][key] for other, rows in models.items() if rows[horizon]
+                }
                 text = f"{given[name]:.{digits}f}" if given else "–"
-                cells.append(f"[bold]{text}[/]" if given and given[name] == min(given.values()) else text)
-            table.add_row("" if row else joint, name, *cells, "" if row or delay is None else f"{delay['value']:.2f} s")
+                cells.append(
+                    f"[bold]{text}[/]" if given and given[name] == min(given.values()) else text
+                )
+            table.add_row(
+                "" if row else joint,
+                name,
+                *cells,
+                "" if row or delay is None else f"{delay['value']:.2f} s",
+            )
     console = Console()
     console.print(table)
     for finding in findings:

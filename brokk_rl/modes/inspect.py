@@ -35,7 +35,8 @@ class Subject:
 
     Attributes:
         recordings: Glob, or list of globs, of recordings.
-        pictures: One picture a recording up to so many recordings, beyond that those with the most findings; an overview always.
+        pictures: One picture a recording up to so many recordings, beyond that those with the most
+            findings; an overview always.
     """
 
     recordings: str | tuple[str, ...]
@@ -71,7 +72,11 @@ class Inspected:
             "created": metadata.get("created"),
             "oil_c": _range(self.recording.extra.get("oil_c")) if self.recording else None,
             "breaches": [asdict(breach) for breach in self.breaches],
-            **(asdict(self.inspection) if self.inspection else {"timing": None, "joints": None, "findings": []}),
+            **(
+                asdict(self.inspection)
+                if self.inspection
+                else {"timing": None, "joints": None, "findings": []}
+            ),
         }
 
 
@@ -97,18 +102,28 @@ class Inspect:
         result = {
             "schema": 1,
             "machine": self.machine.name,
-            "delay_s": self._delays([one.recording for one in inspected if one.recording and not one.breaches]),
+            "delay_s": self._delays(
+                [one.recording for one in inspected if one.recording and not one.breaches]
+            ),
             "joints": self._overall(inspected),
             "remarks": [*_resampled(inspected), *_clocks(inspected)],
             "recordings": [one.plain() for one in inspected],
         }
         write_json(folder / "inspection.json", result)
         pictures = {"overview": folder / "overview.png"}
-        inspection_picture.overview(pictures["overview"], {one.path.stem: _drawn(one) for one in inspected})
+        inspection_picture.overview(
+            pictures["overview"], {one.path.stem: _drawn(one) for one in inspected}
+        )
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
             if one.recording and one.inspection:
                 pictures[one.path.name] = folder / f"{one.path.stem}.png"
-                inspection_picture.recording(pictures[one.path.name], one.recording, self.machine, one.inspection, one.breaches)
+                inspection_picture.recording(
+                    pictures[one.path.name],
+                    one.recording,
+                    self.machine,
+                    one.inspection,
+                    one.breaches,
+                )
         self._page(result, inspected, pictures).write(folder / "inspection.html")
         self._show(result, inspected)
         log.info("report: %s", folder / "inspection.html")
@@ -117,7 +132,9 @@ class Inspect:
         recording, breaches = record.examine(path, self.machine)
         if recording is None or recording.num_samples < 2:
             return Inspected(path, None, breaches, None)
-        return Inspected(path, recording, breaches, inspect(recording, self.machine, self.thresholds))
+        return Inspected(
+            path, recording, breaches, inspect(recording, self.machine, self.thresholds)
+        )
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
         """Returns the dead time of each joint from all sound recordings, `None` where they do not tell."""
@@ -126,7 +143,9 @@ class Inspect:
         except RecordingError:
             return dict.fromkeys(self.machine.joint_names)
         return {
-            name: None if delay is None else {"value": delay.value_s, "ci95": list(delay.ci95_s), "explained": delay.explained}
+            name: None
+            if delay is None
+            else {"value": delay.value_s, "ci95": list(delay.ci95_s), "explained": delay.explained}
             for name, delay in found.items()
         }
 
@@ -134,28 +153,59 @@ class Inspect:
         """Returns the figures of each joint over all recordings: extremes, and means weighted by duration."""
         table = {}
         known = [one for one in inspected if one.inspection]
-        hours = np.array([one.inspection.timing["duration_s"] or 0.0 for one in known if one.inspection])
-        for name, lower, upper in zip(self.machine.joint_names, self.machine.lower, self.machine.upper, strict=True):
+        hours = np.array(
+            [one.inspection.timing["duration_s"] or 0.0 for one in known if one.inspection]
+        )
+        for name, lower, upper in zip(
+            self.machine.joint_names, self.machine.lower, self.machine.upper, strict=True
+        ):
             rows = [one.inspection.joints[name] for one in known if one.inspection]
-            entry: dict[str, float | None] = {"lower_limit": float(lower), "upper_limit": float(upper)}
+            entry: dict[str, float | None] = {
+                "lower_limit": float(lower),
+                "upper_limit": float(upper),
+            }
             for key in rows[0] if rows else ():
-                values = np.array([np.nan if row[key] is None else row[key] for row in rows], dtype=float)
+                values = np.array(
+                    [np.nan if row[key] is None else row[key] for row in rows], dtype=float
+                )
                 there = np.isfinite(values)
                 if not there.any():
                     entry[key] = None
                 elif key in ("lowest", "highest", "fastest"):
-                    entry[key] = float(values[there].min() if key == "lowest" else values[there].max())
+                    entry[key] = float(
+                        values[there].min() if key == "lowest" else values[there].max()
+                    )
                 elif key in ("noise", "step"):
                     entry[key] = float(np.median(values[there]))
                 else:
-                    entry[key] = float(np.average(values[there], weights=np.maximum(hours[there], 1e-9)))
-            counts = Counter(f.kind for one in known if one.inspection for f in one.inspection.findings if f.joint == name)
-            table[name] = {**entry, **{f"num_{kind.replace(' ', '_')}": counts[kind] for kind in KINDS}}
+                    entry[key] = float(
+                        np.average(values[there], weights=np.maximum(hours[there], 1e-9))
+                    )
+            counts = Counter(
+                f.kind
+                for one in known
+                if one.inspection
+                for f in one.inspection.findings
+                if f.joint == name
+            )
+            table[name] = {
+                **entry,
+                **{f"num_{kind.replace(' ', '_')}": counts[kind] for kind in KINDS},
+            }
         return table
 
     def _figures(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         """Returns heading and cells of the table of joints."""
-        head = ["joint", "measured", "limits", "commanded", "at limit", "noise", "step", "dead time"]
+        head = [
+            "joint",
+            "measured",
+            "limits",
+            "commanded",
+            "at limit",
+            "noise",
+            "step",
+            "dead time",
+        ]
         rows = []
         for joint in self.machine.joints:
             entry, delay = result["joints"][joint.name], result["delay_s"][joint.name]
@@ -171,9 +221,14 @@ class Inspect:
 
     def _counts(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         """Returns heading and cells of the table of findings by joint."""
-        counts = Counter((f["joint"], f["kind"]) for entry in result["recordings"] for f in entry["findings"])
+        counts = Counter(
+            (f["joint"], f["kind"]) for entry in result["recordings"] for f in entry["findings"]
+        )
         names = [*self.machine.joint_names, None]
-        return ["joint", *KINDS], [[name or "all at once", *(str(counts[name, kind] or "–") for kind in KINDS)] for name in names]
+        return ["joint", *KINDS], [
+            [name or "all at once", *(str(counts[name, kind] or "–") for kind in KINDS)]
+            for name in names
+        ]
 
     def _show(self, result: dict[str, Any], inspected: Sequence[Inspected]) -> None:
         console = Console()
@@ -185,25 +240,42 @@ class Inspect:
         for title, (head, rows) in tables.items():
             table = Table(title=title, box=None, padding=(0, 1, 0, 0), title_justify="left")
             for name in head:
-                table.add_column(name, justify="left" if name in ("file", "joint") else "right", overflow="fold")
+                table.add_column(
+                    name, justify="left" if name in ("file", "joint") else "right", overflow="fold"
+                )
             for row in rows:
                 table.add_row(*row)
             console.print(table)
         for one in inspected:
             for breach in one.breaches:
-                console.print(f"{one.path}: {breach}", markup=False, highlight=False, soft_wrap=True)
+                console.print(
+                    f"{one.path}: {breach}", markup=False, highlight=False, soft_wrap=True
+                )
         for remark in result["remarks"]:
             console.print(remark, markup=False, highlight=False, soft_wrap=True)
 
-    def _page(self, result: dict[str, Any], inspected: Sequence[Inspected], pictures: dict[str, Path]) -> Page:
+    def _page(
+        self, result: dict[str, Any], inspected: Sequence[Inspected], pictures: dict[str, Path]
+    ) -> Page:
         broken = sum(bool(one.breaches) for one in inspected)
-        minutes = sum((one.inspection.timing["duration_s"] or 0.0) for one in inspected if one.inspection) / 60.0
-        counts = Counter(f.kind for one in inspected if one.inspection for f in one.inspection.findings)
-        told = ", ".join(f"{count} × {kind}" for kind, count in counts.most_common()) or "nothing that wants an explanation"
+        minutes = (
+            sum((one.inspection.timing["duration_s"] or 0.0) for one in inspected if one.inspection)
+            / 60.0
+        )
+        counts = Counter(
+            f.kind for one in inspected if one.inspection for f in one.inspection.findings
+        )
+        told = (
+            ", ".join(f"{count} × {kind}" for kind, count in counts.most_common())
+            or "nothing that wants an explanation"
+        )
         summary = f"{len(inspected)} recordings, {minutes:.1f} minutes; {broken} break the format. Found: {told}."
         page = Page(f"Recordings of {self.machine.name}", summary, "bad" if broken else "plain")
         page.heading("Joints")
-        page.table(*self._figures(result), "Shares are of the time; noise and step in the unit of the joint.")
+        page.table(
+            *self._figures(result),
+            "Shares are of the time; noise and step in the unit of the joint.",
+        )
         page.heading("Findings")
         page.table(*self._counts(result))
         page.items([f"{kind}: {meaning}" for kind, meaning in KINDS.items()])
@@ -221,7 +293,15 @@ class Inspect:
                 page.items([str(breach) for breach in one.breaches])
             if one.inspection and one.inspection.findings:
                 rows = [
-                    [f.kind, f.joint or "all", str(f.row), str(f.num_rows), f"{f.t_s:.2f}", f"{f.duration_s:.2f}", f.text]
+                    [
+                        f.kind,
+                        f.joint or "all",
+                        str(f.row),
+                        str(f.num_rows),
+                        f"{f.t_s:.2f}",
+                        f"{f.duration_s:.2f}",
+                        f.text,
+                    ]
                     for f in one.inspection.findings
                 ]
                 with page.details(f"{len(rows)} findings"):
@@ -231,7 +311,11 @@ class Inspect:
 
 def _resampled(inspected: Sequence[Inspected]) -> list[str]:
     """Returns at what rates logs of other programs were, whose recordings have even periods only since they were converted."""
-    rates = {one.recording.run: one.recording.metadata.get("resampled_from") for one in inspected if one.recording}
+    rates = {
+        one.recording.run: one.recording.metadata.get("resampled_from")
+        for one in inspected
+        if one.recording
+    }
     return [f"run {run}: resampled from {rate}" for run, rate in rates.items() if rate]
 
 
@@ -241,16 +325,28 @@ def _clocks(inspected: Sequence[Inspected]) -> list[str]:
     for one in inspected:
         if one.recording:
             parts.setdefault(one.recording.run, []).append(one)
-    without = [one.path.name for one in inspected if one.recording and "created" not in one.recording.metadata]
+    without = [
+        one.path.name
+        for one in inspected
+        if one.recording and "created" not in one.recording.metadata
+    ]
     if without:
-        remarks.append(f"{len(without)} recordings do not say when they began (brokk.created): no warm-up can be read across files")
+        remarks.append(
+            f"{len(without)} recordings do not say when they began (brokk.created): no warm-up can be read across files"
+        )
     for run, members in parts.items():
         try:
-            starts = sorted((datetime.fromisoformat(one.recording.metadata["created"]), one) for one in members)  # type: ignore[union-attr]
+            starts = sorted(
+                (datetime.fromisoformat(one.recording.metadata["created"]), one) for one in members
+            )  # type: ignore[union-attr]
         except (KeyError, ValueError, TypeError):
             continue
         for (begin, one), (following, other) in pairwise(starts):
-            overlap_s = one.recording.duration_s - (following - begin).total_seconds() if one.recording else 0.0
+            overlap_s = (
+                one.recording.duration_s - (following - begin).total_seconds()
+                if one.recording
+                else 0.0
+            )
             if overlap_s > 1.0:
                 remarks.append(
                     f"run {run}: {other.path.name} begins {overlap_s:.1f} s before {one.path.name} ends; look at the clock"
@@ -260,7 +356,9 @@ def _clocks(inspected: Sequence[Inspected]) -> list[str]:
 
 def _drawn(one: Inspected) -> inspection_picture.Line:
     duration_s = one.recording.duration_s if one.recording else 0.0
-    return inspection_picture.Line(duration_s, one.inspection.findings if one.inspection else [], len(one.breaches))
+    return inspection_picture.Line(
+        duration_s, one.inspection.findings if one.inspection else [], len(one.breaches)
+    )
 
 
 def _file_row(one: Inspected) -> list[str]:

@@ -30,7 +30,9 @@ class List:
         entries = registry.options()
         groups = sorted({option.group for option in entries})
         if self.list.group and self.list.group not in groups:
-            raise ConfigError(f"list.group: there is no group '{self.list.group}'; {choices(self.list.group, groups)}")
+            raise ConfigError(
+                f"list.group: there is no group '{self.list.group}'; {choices(self.list.group, groups)}"
+            )
         table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
         table.add_column(no_wrap=True)
         table.add_column()
@@ -38,6 +40,8 @@ class List:
             table.add_row(f"[bold]{group}[/bold]", "")
             for option in entries:
                 if option.group == group:
-                    origin = "" if option.package == registry.CORE else f" [dim]({option.package})[/dim]"
+                    origin = (
+                        "" if option.package == registry.CORE else f" [dim]({option.package})[/dim]"
+                    )
                     table.add_row(f"  {option.name}", option.summary() + origin)
         Console().print(table)

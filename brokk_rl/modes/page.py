@@ -25,7 +25,14 @@ class FeedSource(Protocol):
 class Served(Protocol):
     """A spec in `conf/page`: how the page is served."""
 
-    def serve(self, stop: Callable[[], bool], machine: Machine, feed: Any, session: Session, tell: Callable[[str], None]) -> None:
+    def serve(
+        self,
+        stop: Callable[[], bool],
+        machine: Machine,
+        feed: Any,
+        session: Session,
+        tell: Callable[[str], None],
+    ) -> None:
         """Serves until `stop` says so; tells the link to open."""
         ...
 

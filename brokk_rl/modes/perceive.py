@@ -20,7 +20,16 @@ from rich.table import Table
 from brokk_rl.contracts import PerceptionBackend
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session, write_json, write_text
-from brokk_rl.sight import Ellipse, HolePose, Observer, Overlay, Rejection, Sighting, SourceSpec, Target
+from brokk_rl.sight import (
+    Ellipse,
+    HolePose,
+    Observer,
+    Overlay,
+    Rejection,
+    Sighting,
+    SourceSpec,
+    Target,
+)
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 
@@ -45,7 +54,9 @@ class Looking:
 
     def check(self) -> None:
         if self.frames is not None and self.frames < 1:
-            raise ConfigError(f"perceive.frames: expected 1 or more, or null for all, got {self.frames}")
+            raise ConfigError(
+                f"perceive.frames: expected 1 or more, or null for all, got {self.frames}"
+            )
 
 
 @dataclass(frozen=True)
@@ -61,7 +72,10 @@ class Entry:
         """Returns it as plain JSON data."""
         if self.sighting is None:
             return {"name": self.name, "refused": self.refused}
-        plain: dict[str, Any] = {"name": self.name, "ms": {k: round(v, 3) for k, v in self.sighting.ms.items()}}
+        plain: dict[str, Any] = {
+            "name": self.name,
+            "ms": {k: round(v, 3) for k, v in self.sighting.ms.items()},
+        }
         if until == "ellipses":
             return plain | {"ellipses": [_ellipse(one) for one in self.sighting.ellipses]}
         return plain | {
@@ -104,7 +118,9 @@ class Perceive:
         """
         built = self.perception.build()
         if not hasattr(built, "look"):
-            raise ConfigError("this option of perception does not look at pictures; choose perception=plane_conic or paper")
+            raise ConfigError(
+                "this option of perception does not look at pictures; choose perception=plane_conic or paper"
+            )
         observer = cast(Observer, built)
         folder = self.session.folder
         entries: list[Entry] = []
@@ -113,19 +129,26 @@ class Perceive:
                 entries.append(entry)
                 if frame is not None and entry.sighting is not None and self.perceive.pictures:
                     (folder / "overlays").mkdir(exist_ok=True)
-                    self.overlay.write(folder / "overlays" / f"{entry.name}.png", frame, entry.sighting)
+                    self.overlay.write(
+                        folder / "overlays" / f"{entry.name}.png", frame, entry.sighting
+                    )
         finally:
             if any(entry.sighting for entry in entries):
                 self._write(folder, entries, observer)
         if entries and not any(entry.sighting for entry in entries):
-            raise FrameError(f"none of {len(entries)} frames can be used. The first: {entries[0].refused}")
+            raise FrameError(
+                f"none of {len(entries)} frames can be used. The first: {entries[0].refused}"
+            )
         self._show(entries)
         log.info("holes: %s", folder / "holes.json")
 
     def _entries(self, observer: Observer) -> Iterator[tuple[Entry, Frame | None]]:
         """Yields each frame of the source with what came out of it."""
         only_ellipses = self.perceive.until == "ellipses"
-        with (self.gallery if only_ellipses else self.source).build() as source, Progress(transient=True) as progress:
+        with (
+            (self.gallery if only_ellipses else self.source).build() as source,
+            Progress(transient=True) as progress,
+        ):
             total = _least(source.num_frames, self.perceive.frames)
             task = progress.add_task("looking", total=total)
             number = 0
@@ -147,7 +170,12 @@ class Perceive:
         if only_ellipses:
             start = time.perf_counter()
             found = observer.ellipses(frame)
-            return Entry(name, Sighting([], [], found, None, {"ellipse": 1000.0 * (time.perf_counter() - start)}), None, None)
+            return Entry(
+                name,
+                Sighting([], [], found, None, {"ellipse": 1000.0 * (time.perf_counter() - start)}),
+                None,
+                None,
+            )
         try:
             sighting = observer.look(frame)
         except FrameError as error:
@@ -156,13 +184,19 @@ class Perceive:
         return Entry(name, sighting, observer.follow(sighting, frame.t_s), None)
 
     def _write(self, folder: Path, entries: list[Entry], observer: Observer) -> None:
-        write_json(folder / "holes.json", {"schema": 1, "frames": [entry.plain(self.perceive.until) for entry in entries]})
+        write_json(
+            folder / "holes.json",
+            {"schema": 1, "frames": [entry.plain(self.perceive.until) for entry in entries]},
+        )
         if self.perceive.until == "ellipses":
             return
         lines = []
         for entry in entries:
             lines.append(f"{entry.name}: {entry.refused or _told(entry.sighting)}")
-            lines += [f"  {observer.explain(one)}" for one in (entry.sighting.rejected if entry.sighting else ())]
+            lines += [
+                f"  {observer.explain(one)}"
+                for one in (entry.sighting.rejected if entry.sighting else ())
+            ]
         write_text(folder / "explain.txt", "\n".join(lines) + "\n")
 
     def _show(self, entries: list[Entry]) -> None:
@@ -172,15 +206,23 @@ class Perceive:
         if self.perceive.until == "ellipses":
             table.add_row("ellipses", str(sum(len(one.ellipses) for one in used)))
         else:
-            table.add_row("holes", f"{sum(len(one.holes) for one in used)} in {sum(bool(one.holes) for one in used)} frames")
-            counts = Counter(f"{one.stage}: {one.reason}" for sighting in used for one in sighting.rejected)
+            table.add_row(
+                "holes",
+                f"{sum(len(one.holes) for one in used)} in {sum(bool(one.holes) for one in used)} frames",
+            )
+            counts = Counter(
+                f"{one.stage}: {one.reason}" for sighting in used for one in sighting.rejected
+            )
             for reason, count in counts.most_common():
                 table.add_row("refused", f"{count} × {reason}")
             if target := next((entry.target for entry in reversed(entries) if entry.target), None):
                 place = ", ".join(f"{value:.3f}" for value in target.pose.center_m)
                 std = 1000.0 * math.sqrt(float(np.trace(target.pose.cov_m2)))
                 stale = ", stale" if target.stale else ""
-                table.add_row("target", f"({place}) m in {target.pose.frame}, ±{std:.1f} mm, {target.num_frames} frames{stale}")
+                table.add_row(
+                    "target",
+                    f"({place}) m in {target.pose.frame}, ±{std:.1f} mm, {target.num_frames} frames{stale}",
+                )
         for stage in used[0].ms if used else ():
             table.add_row(f"ms, {stage}", f"{median(one.ms.get(stage, 0.0) for one in used):.0f}")
         Console().print(table)
@@ -212,4 +254,11 @@ def _rejection(one: Rejection) -> dict[str, Any]:
 
 
 def _ellipse(one: Ellipse) -> dict[str, float]:
-    return {"x": one.x, "y": one.y, "a": one.a, "b": one.b, "theta_rad": one.theta_rad, "score": one.score}
+    return {
+        "x": one.x,
+        "y": one.y,
+        "a": one.a,
+        "b": one.b,
+        "theta_rad": one.theta_rad,
+        "score": one.score,
+    }

@@ -38,7 +38,8 @@ class Stage:
         command: Arguments of `brokk`; `{folder}` stands for the run folder of the story.
         takes: Groups (`sim`, `task`, `rl`, `evaluation`) and `device` that it takes from the story.
         links: Links made before it, both ends below the run folder: where, and to what.
-        needs: A file below the run folder without whose content the story ends before this stage; `null`: nothing.
+        needs: A file below the run folder without whose content the story ends before this stage;
+            `null`: nothing.
         resumes: Whether an interrupted one goes on with `resume=`; otherwise it begins anew.
     """
 
@@ -52,7 +53,9 @@ class Stage:
     def check(self) -> None:
         for name in self.takes:
             if name not in (*HANDED_ON, "device"):
-                raise ConfigError(f"a stage takes '{name}', which the story does not have; {choices(name, (*HANDED_ON, 'device'))}")
+                raise ConfigError(
+                    f"a stage takes '{name}', which the story does not have; {choices(name, (*HANDED_ON, 'device'))}"
+                )
 
 
 @spec
@@ -65,9 +68,11 @@ class Rehearse:
         task: Task of the stages.
         rl: How stages train.
         evaluation: How stages evaluate.
-        withheld: Effects that the machine has and that no stage but it is told of: `<folder>/given/withheld.yaml`.
+        withheld: Effects that the machine has and that no stage but it is told of:
+            `<folder>/given/withheld.yaml`.
         stages: The story, in order.
-        resume: Run folder of an interrupted story; finished stages are kept. The same as `session.out`.
+        resume: Run folder of an interrupted story; finished stages are kept. The same as
+            `session.out`.
     """
 
     session: Session
@@ -81,9 +86,13 @@ class Rehearse:
 
     def check(self) -> None:
         if not self.stages:
-            raise ConfigError("mode=rehearse has no story of its own; give one, as in experiment=gap_loop")
+            raise ConfigError(
+                "mode=rehearse has no story of its own; give one, as in experiment=gap_loop"
+            )
         if self.resume is not None and Path(self.resume).resolve() != self.session.folder.resolve():
-            raise ConfigError(f"resume={self.resume}: a story goes on in its folder; add session.out={self.resume}")
+            raise ConfigError(
+                f"resume={self.resume}: a story goes on in its folder; add session.out={self.resume}"
+            )
 
     def run(self) -> None:
         """Runs the stages that are not finished; writes `story.html` after each of them.
@@ -114,7 +123,9 @@ class Rehearse:
         (folder / GIVEN).mkdir(exist_ok=True)
         for name, node in given.items():
             head = "# @package effect\n" if name == "withheld" else ""
-            write_text(folder / GIVEN / f"{name}.yaml", head + yaml.safe_dump(node, sort_keys=False))
+            write_text(
+                folder / GIVEN / f"{name}.yaml", head + yaml.safe_dump(node, sort_keys=False)
+            )
         return given
 
     def _play(self, name: str, stage: Stage, folder: Path, given: dict[str, Any]) -> None:
@@ -126,7 +137,9 @@ class Rehearse:
             path.unlink(missing_ok=True)
             path.symlink_to(folder / target)
         words = [word.replace(FOLDER, str(folder)) for word in stage.command]
-        words += [f"{group}=@{folder / GIVEN / group}.yaml" for group in stage.takes if group != "device"]
+        words += [
+            f"{group}=@{folder / GIVEN / group}.yaml" for group in stage.takes if group != "device"
+        ]
         words += [f"session.device={self.session.device}"] if "device" in stage.takes else []
         words += [f"session.out={place}"]
         if place.exists():

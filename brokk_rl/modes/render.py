@@ -52,7 +52,9 @@ class Rendering:
 
     def check(self) -> None:
         if self.count < 1 or self.first < 0:
-            raise ConfigError(f"render: expected count of 1 or more and first of 0 or more, got {self.count} and {self.first}")
+            raise ConfigError(
+                f"render: expected count of 1 or more and first of 0 or more, got {self.count} and {self.first}"
+            )
 
 
 @spec
@@ -73,7 +75,9 @@ class Render:
         """
         folder = self.session.folder / FOLDER
         if self.resume is not None and Path(self.resume).resolve() != self.session.folder.resolve():
-            raise ConfigError(f"resume={self.resume}: rendering goes on in its own folder; add session.out={self.resume}")
+            raise ConfigError(
+                f"resume={self.resume}: rendering goes on in its own folder; add session.out={self.resume}"
+            )
         self.studio.prepare(folder)
         numbers = range(self.render.first, self.render.first + self.render.count)
         done = 0

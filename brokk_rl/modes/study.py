@@ -13,7 +13,14 @@ from brokk_rl.spec import spec
 class Steps(Protocol):
     """What a study is made of; the room of the machine's computer has it."""
 
-    def run(self, machine: Machine, session: Session, ground: TrialGround, guided: Operator, unguided: Operator) -> float | None:
+    def run(
+        self,
+        machine: Machine,
+        session: Session,
+        ground: TrialGround,
+        guided: Operator,
+        unguided: Operator,
+    ) -> float | None:
         """Does the step that was asked for; simulated operators work on `ground`, with advice shown and without."""
         ...
 

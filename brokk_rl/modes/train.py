@@ -44,7 +44,8 @@ class Train:
         rl: How to train.
         tracking: Where figures go beside the run folder.
         evaluation: How to evaluate at the end.
-        start_from: Policy (`policy.folder`) with whose network training begins; `null` for a fresh one.
+        start_from: Policy (`policy.folder`) with whose network training begins; `null` for a fresh
+            one.
         resume: Run folder, or checkpoint, from which to go on.
     """
 
@@ -70,19 +71,36 @@ class Train:
         device, folder = self.session.torch_device(), self.session.folder
         self.session.seed_all()
         plant = Plant(
-            machine=self.machine, sim=self.sim, task=self.task, actuator=self.actuator, effects=self.effect, follower=self.follower
+            machine=self.machine,
+            sim=self.sim,
+            task=self.task,
+            actuator=self.actuator,
+            effects=self.effect,
+            follower=self.follower,
         )
-        loop = plant.build(device, self.rl.num_envs, self.rl.num_starts, self.session.stream("starts"))
+        loop = plant.build(
+            device, self.rl.num_envs, self.rl.num_starts, self.session.stream("starts")
+        )
         loop.capture(self.rl.fuse)
         state = "active" if loop.graph_active else "not used (they need sim=warp on a GPU)"
         group = Group(device)
-        where = f"{device}, in each of {group.rank.count} processes" if group.together else str(device)
-        log.info("%d environments on %s, %s; CUDA graphs: %s", loop.num_envs, where, type(loop.world).__name__, state)
+        where = (
+            f"{device}, in each of {group.rank.count} processes" if group.together else str(device)
+        )
+        log.info(
+            "%d environments on %s, %s; CUDA graphs: %s",
+            loop.num_envs,
+            where,
+            type(loop.world).__name__,
+            state,
+        )
         self.session.seed_all()  # capturing has drawn random numbers
 
         steps = loop.num_envs * int(self.rl.runner["num_steps_per_env"]) * group.rank.count
         tracking = self.tracking if group.rank.first else Off()
-        tracker = tracking.open(folder, {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed})
+        tracker = tracking.open(
+            folder, {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed}
+        )
         book = Logbook(
             folder, tracker, lambda: group.pooled(loop.statistics()), steps, self.rl.max_fault_rate, self.rl.budget.share_spent,
             quiet=not group.rank.first,
@@ -91,21 +109,41 @@ class Train:
             runner = Runner(loop, self.rl, folder, device, book, group)
             if checkpoint:
                 runner.load(str(checkpoint))
-                log.info("going on from %s: %d control steps, %.0f s", checkpoint, book.env_steps, book.seconds)
+                log.info(
+                    "going on from %s: %d control steps, %.0f s",
+                    checkpoint,
+                    book.env_steps,
+                    book.seconds,
+                )
             elif self.start_from:
                 begin_with(runner.alg.actor, self.start_from, self.machine)
             runner.run()
         if not group.rank.first:
             return None
 
-        facts = {"env_steps": book.env_steps, "seconds": book.seconds, "seed": self.session.seed, "device": str(device)}
+        facts = {
+            "env_steps": book.env_steps,
+            "seconds": book.seconds,
+            "seed": self.session.seed,
+            "device": str(device),
+        }
         facts["follower"] = follower_of(folder)
         actor = runner.alg.get_policy()
         contract = write_bundle(folder, actor, self.rl, loop, facts)
         draw_curves(folder / PROGRESS, folder / "learning_curves.png")
-        policies = {"trained": Trained(folder=str(folder)), "classical": Classical(), "untrained": Untrained(training=self.rl)}
+        policies = {
+            "trained": Trained(folder=str(folder)),
+            "classical": Classical(),
+            "untrained": Untrained(training=self.rl),
+        }
         results, observations = evaluate_policies(plant, self.evaluation, self.session, policies)
-        export_onnx(folder, actor, self.task.build(self.machine, 1, torch.device("cpu")), contract, observations)
+        export_onnx(
+            folder,
+            actor,
+            self.task.build(self.machine, 1, torch.device("cpu")),
+            contract,
+            observations,
+        )
         log.info("run folder: %s", folder)
         return float(results["success_strict"]["mean"])
 
@@ -137,5 +175,7 @@ def find_checkpoint(path: Path) -> Path:
         return path
     found = checkpoints(path) if path.is_dir() else []
     if not found:
-        raise CheckpointError(f"resume={path}: there is no checkpoint (model_<iteration>.pt) to go on from")
+        raise CheckpointError(
+            f"resume={path}: there is no checkpoint (model_<iteration>.pt) to go on from"
+        )
     return found[-1]

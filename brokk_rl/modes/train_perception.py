@@ -48,19 +48,34 @@ class TrainPerception:
             CheckpointError: an interrupted training cannot go on.
         """
         if self.resume is not None and self.resume != self.session.out:
-            raise ConfigError(f"resume={self.resume}: a training goes on in its own folder; add session.out={self.resume}")
+            raise ConfigError(
+                f"resume={self.resume}: a training goes on in its own folder; add session.out={self.resume}"
+            )
         result = self.training.fit(self.session, self.resume is not None)
         write_json(self.session.folder / "training.json", result)
         _show(result)
-        log.info("perception/segmenter=onnx perception.segmenter.weights=%s", self.session.folder / "segmenter.onnx")
+        log.info(
+            "perception/segmenter=onnx perception.segmenter.weights=%s",
+            self.session.folder / "segmenter.onnx",
+        )
         return result["conditions"]["all"]["mouth"]
 
 
 def _show(result: dict[str, Any]) -> None:
     table = Table(title="on unseen frames", box=None)
-    for name in ("condition", "frames", "overlap of blocks", "overlap of mouths", "mouths found", "false mouths a frame"):
+    for name in (
+        "condition",
+        "frames",
+        "overlap of blocks",
+        "overlap of mouths",
+        "mouths found",
+        "false mouths a frame",
+    ):
         table.add_column(name, justify="left" if name == "condition" else "right")
     for name, row in result["conditions"].items():
-        shares = ("–" if row[key] is None else f"{row[key]:.3f}" for key in ("block", "mouth", "found", "false"))
+        shares = (
+            "–" if row[key] is None else f"{row[key]:.3f}"
+            for key in ("block", "mouth", "found", "false")
+        )
         table.add_row(name, str(row["frames"]), *shares)
     Console().print(table)

@@ -14,7 +14,9 @@ from brokk_rl.spec import spec
 class TwinSpec(Protocol):
     """What behaves as gateway and machine."""
 
-    def run(self, stop: Callable[[], bool], machine: Machine, plant: Connection, session: Session) -> None:
+    def run(
+        self, stop: Callable[[], bool], machine: Machine, plant: Connection, session: Session
+    ) -> None:
         """Runs until `stop` says so."""
         ...
 

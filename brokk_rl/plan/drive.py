@@ -16,7 +16,8 @@ from brokk_rl.signals import Command, JointState
 from brokk_rl.spec import spec
 
 DUE = 0.9
-"""Part of a control period after which a new state counts as due: states that come at the machine's own rate jitter."""
+"""Part of a control period after which a new state counts as due: states that come at the machine's
+own rate jitter."""
 SILENCE_S = 1.0
 """Time without a new state after which a link counts as lost."""
 
@@ -44,10 +45,13 @@ class Sample:
     extra: Mapping[str, np.ndarray]
 
 
-def drive(link: Link, runner: Runner, machine: Machine, num_runs: int, run_s: float) -> Iterator[Sample]:
+def drive(
+    link: Link, runner: Runner, machine: Machine, num_runs: int, run_s: float
+) -> Iterator[Sample]:
     """Plays the runner's plan over an open link, one sample a control period, until it is done or `run_s` is over.
 
-    What is not needed at once belongs between two samples: the loop sleeps only until the next control period is due.
+    What is not needed at once belongs between two samples: the loop sleeps only until the next
+    control period is due.
 
     Raises:
         LinkError: the link fell silent, or said something that makes no sense.
@@ -61,14 +65,27 @@ def drive(link: Link, runner: Runner, machine: Machine, num_runs: int, run_s: fl
         before, form = state.t_s, np.shape(state.q)
         q = np.asarray(state.q, dtype=np.float64)
         if q.size != np.prod(shape) or not np.isfinite(q).all():
-            raise LinkError(f"link: expected {shape} finite positions at {state.t_s:.2f} s, got {q}")
+            raise LinkError(
+                f"link: expected {shape} finite positions at {state.t_s:.2f} s, got {q}"
+            )
         q = q.reshape(shape)
         u = runner.command(q)
         phase, segment, played = runner.phase.copy(), runner.segment.copy(), runner.played
         sent = np.array(link.send(Command(u.reshape(form))).u, dtype=np.float64).reshape(shape)
         runner.took(sent)
-        columns = {name: np.array(np.broadcast_to(value, (num_runs,)), dtype=np.float64) for name, value in extra().items()}
-        yield Sample(t_s=state.t_s, q=q.copy(), u=sent, phase=phase, segment=segment, played=played, extra=columns)
+        columns = {
+            name: np.array(np.broadcast_to(value, (num_runs,)), dtype=np.float64)
+            for name, value in extra().items()
+        }
+        yield Sample(
+            t_s=state.t_s,
+            q=q.copy(),
+            u=sent,
+            phase=phase,
+            segment=segment,
+            played=played,
+            extra=columns,
+        )
 
 
 def _next(link: Link, due_s: float) -> JointState:
@@ -101,9 +118,15 @@ class Nominal:
     """A machine as its file has it: dead time, full speed times command, stops; `N` of them, or one alone without that axis."""
 
     def __init__(self, machine: Machine, num_runs: int, alone: bool = False) -> None:
-        self._machine, self._t_s, self._form = machine, 0.0, (machine.num_joints,) if alone else (num_runs, machine.num_joints)
+        self._machine, self._t_s, self._form = (
+            machine,
+            0.0,
+            (machine.num_joints,) if alone else (num_runs, machine.num_joints),
+        )
         self._q = np.tile(machine.home, (num_runs, 1))
-        self._in_flight = np.zeros((round(machine.dead_time_s / machine.period_s) + 1, *self._q.shape))
+        self._in_flight = np.zeros(
+            (round(machine.dead_time_s / machine.period_s) + 1, *self._q.shape)
+        )
 
     def read(self) -> JointState:
         """Returns the true positions."""
@@ -112,9 +135,13 @@ class Nominal:
     def send(self, command: Command) -> Command:
         """Moves on by one control period."""
         machine = self._machine
-        u = np.nan_to_num(np.asarray(command.u, dtype=float), nan=0.0, posinf=0.0, neginf=0.0).clip(-1.0, 1.0)
+        u = np.nan_to_num(np.asarray(command.u, dtype=float), nan=0.0, posinf=0.0, neginf=0.0).clip(
+            -1.0, 1.0
+        )
         self._in_flight = np.concatenate([self._in_flight[1:], u.reshape(1, *self._q.shape)])
-        self._q = (self._q + self._in_flight[0] * machine.max_speed * machine.period_s).clip(machine.lower, machine.upper)
+        self._q = (self._q + self._in_flight[0] * machine.max_speed * machine.period_s).clip(
+            machine.lower, machine.upper
+        )
         self._t_s += machine.period_s
         return Command(u)
 

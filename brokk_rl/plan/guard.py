@@ -13,8 +13,10 @@ class Guards:
 
     Attributes:
         max_command: Largest command.
-        max_tool_speed_m_s: Largest speed of the tool point, predicted from the machine's nominal speeds; commands that would
-            exceed it are scaled down together. `null`: no bound. Needs a machine whose geometry is known.
+        max_tool_speed_m_s: Largest speed of the tool point, predicted from the machine's nominal
+            speeds; commands that would
+            exceed it are scaled down together. `null`: no bound. Needs a machine whose geometry is
+                known.
     """
 
     max_command: float
@@ -22,9 +24,13 @@ class Guards:
 
     def check(self) -> None:
         if not 0 < self.max_command <= 1:
-            raise ConfigError(f"collect.guards.max_command: expected (0, 1], got {self.max_command}")
+            raise ConfigError(
+                f"collect.guards.max_command: expected (0, 1], got {self.max_command}"
+            )
         if self.max_tool_speed_m_s is not None and self.max_tool_speed_m_s <= 0:
-            raise ConfigError(f"collect.guards.max_tool_speed_m_s: expected more than 0 or null, got {self.max_tool_speed_m_s}")
+            raise ConfigError(
+                f"collect.guards.max_tool_speed_m_s: expected more than 0 or null, got {self.max_tool_speed_m_s}"
+            )
 
 
 class ToolSpeed:

@@ -1,12 +1,16 @@
 """Plays a plan on `N` machines at once: approaches in closed loop, programs in open loop, both within the guards.
 
-    approach --arrived or given up--> rest --over--> play --program over--> approach of the next segment … done
+    approach --arrived or given up--> rest --over--> play --program over--> approach of the next
+    segment … done
                                                       |  ^
-                                        near a stop   v  | program passes zero     (segments that go `home` at the stops)
+                                        near a stop   v  | program passes zero     (segments that go
+                                        `home` at the stops)
                                                     return --arrived--> wait
 
-A program runs on by the clock while its joint is brought home, so a segment always lasts as long as its program. A segment that
-repeats another plays the commands that were really sent then, turns at the stops included: only so are the two comparable.
+A program runs on by the clock while its joint is brought home, so a segment always lasts as long as
+its program. A segment that
+repeats another plays the commands that were really sent then, turns at the stops included: only so
+are the two comparable.
 """
 
 import logging
@@ -21,9 +25,11 @@ from brokk_rl.plan.schedule import Approach, Plan
 log = logging.getLogger(__name__)
 
 REPEAT_MARGIN = 0.25
-"""Stop margin of a repeat, of that of the original: the small difference of their starts must not turn it back earlier."""
+"""Stop margin of a repeat, of that of the original: the small difference of their starts must not
+turn it back earlier."""
 SPEED_WINDOW = 4
-"""Control periods over which the measured speed is taken; one period alone would be mostly noise."""
+"""Control periods over which the measured speed is taken; one period alone would be mostly
+noise."""
 
 
 APPROACH, REST, PLAY, RETURN, WAIT, DONE = range(6)
@@ -69,10 +75,15 @@ class Runner:
         far = np.abs(error) > self._approach.tolerance * self._travel
         self._advance(q, far)
 
-        program, before = self._program[self._rows, self._index], self._program[self._rows, np.maximum(self._index - 1, 0)]
+        program, before = (
+            self._program[self._rows, self._index],
+            self._program[self._rows, np.maximum(self._index - 1, 0)],
+        )
         program = program * (self.phase == PLAY)[:, None]
         low, high = self._low[self._rows, self.segment], self._high[self._rows, self.segment]
-        self._turned = np.where(program * before > 0, self._turned, 1.0)  # until the program passes zero
+        self._turned = np.where(
+            program * before > 0, self._turned, 1.0
+        )  # until the program passes zero
         outward = np.minimum(slow, fast) < low, np.maximum(slow, fast) > high
         demand = program * self._turned
         leaving = ((demand < 0) & outward[0]) | ((demand > 0) & outward[1])
@@ -128,10 +139,15 @@ class Runner:
         moving = MOVES[phase]
         arrived = moving & (~far.any(1) | late)
         for n in np.flatnonzero(arrived & far.any(1)):
-            joints = [f"{self._machine.joint_names[j]} ({q[n, j]:.3f})" for j in np.flatnonzero(far[n])]
+            joints = [
+                f"{self._machine.joint_names[j]} ({q[n, j]:.3f})" for j in np.flatnonzero(far[n])
+            ]
             name = self._plan.runs[n][self.segment[n]].name
             log.warning(
-                "run %d: way to the start of %s given up, out of place: %s; going on from there", n, name, ", ".join(joints)
+                "run %d: way to the start of %s given up, out of place: %s; going on from there",
+                n,
+                name,
+                ", ".join(joints),
             )
         phase[arrived] += 1  # rest, or wait
         rest = round(self._approach.rest_s / self._machine.period_s)
@@ -144,18 +160,23 @@ class Runner:
     def _rest_positions(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns where the joints would come to rest if the commands ended now, each `(N, J)`.
 
-        First from the commands on their way at the machine's nominal speeds, then from the measured speed: whichever reaches
-        further counts at the stops, so that a machine faster than its file is caught too.
+        First from the commands on their way at the machine's nominal speeds, then from the measured
+        speed: whichever reaches further counts at the stops, so that a machine faster than its file
+        is caught too.
         """
         assert self._seen is not None
         period_s = self._machine.period_s
         measured = (q - self._seen[0]) / (SPEED_WINDOW * period_s)
-        return q + self._in_flight.sum(1) * self._speed * period_s, q + measured * self._machine.dead_time_s
+        return q + self._in_flight.sum(
+            1
+        ) * self._speed * period_s, q + measured * self._machine.dead_time_s
 
     def _toward(self, error: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Returns commands that take the joints to their targets: first those that may move together, then the exclusive ones."""
         approach, exclusive = self._approach, self._machine.is_exclusive
-        size = np.clip(np.abs(error) / (self._speed * approach.settle_s), approach.smallest, approach.level)
+        size = np.clip(
+            np.abs(error) / (self._speed * approach.settle_s), approach.smallest, approach.level
+        )
         first = far[:, ~exclusive].any(1)
         return np.sign(error) * size * far * exclusive_mask(exclusive, ~first)
 
@@ -163,15 +184,24 @@ class Runner:
         """Returns the commands within the guards; exclusive joints wait for the others, whatever a program says."""
         exclusive = self._machine.is_exclusive
         together = (u[:, ~exclusive] != 0).any(1)
-        u = np.where(exclusive & together[:, None], 0.0, u).clip(-self._guards.max_command, self._guards.max_command)
+        u = np.where(exclusive & together[:, None], 0.0, u).clip(
+            -self._guards.max_command, self._guards.max_command
+        )
         if self._tool_speed is None:
             return u
         speed_m_s = self._tool_speed.of(q, u * self._speed)
-        return u * np.minimum(1.0, self._guards.max_tool_speed_m_s / np.maximum(speed_m_s, 1e-9))[:, None]
+        return (
+            u
+            * np.minimum(1.0, self._guards.max_tool_speed_m_s / np.maximum(speed_m_s, 1e-9))[
+                :, None
+            ]
+        )
 
     def _patience(self, q: np.ndarray) -> np.ndarray:
         """Returns the control periods after which the way from `q` to the start of the present segment is given up, `(N,)`."""
-        needed_s = self._approach.duration_s(self._machine, q, self._start[self._rows, self.segment])
+        needed_s = self._approach.duration_s(
+            self._machine, q, self._start[self._rows, self.segment]
+        )
         return np.ceil(self._approach.patience * needed_s / self._machine.period_s).astype(int)
 
     def _pack(self) -> None:
@@ -186,8 +216,14 @@ class Runner:
         self._at_zero = np.zeros((count, length), dtype=bool)
         self._start = np.tile(machine.home, (count, most, 1))
         self._low, self._high = np.zeros_like(self._start), np.zeros_like(self._start)
-        self._begin, self._end = np.zeros((count, most), dtype=int), np.zeros((count, most), dtype=int)
-        self._goes_home, self._original = np.zeros((count, most), dtype=bool), np.full((count, most), -1)
+        self._begin, self._end = (
+            np.zeros((count, most), dtype=int),
+            np.zeros((count, most), dtype=int),
+        )
+        self._goes_home, self._original = (
+            np.zeros((count, most), dtype=bool),
+            np.full((count, most), -1),
+        )
         for n, run in enumerate(runs):
             end, names = 0, [segment.name for segment in run]
             for i, segment in enumerate(run):

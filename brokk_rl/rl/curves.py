@@ -11,7 +11,11 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 PANELS = (
-    ("Success", (("episode/success_strict", "strict"), ("episode/success_paper", "paper's criterion")), (0.0, 1.0)),
+    (
+        "Success",
+        (("episode/success_strict", "strict"), ("episode/success_paper", "paper's criterion")),
+        (0.0, 1.0),
+    ),
     ("Return", (("episode/return", "return per episode"),), None),
     ("Episode length (control steps)", (("episode/length", "length"),), None),
     ("Peak contact force (N)", (("episode/peak_force_n", "mean over episodes"),), None),
@@ -39,6 +43,10 @@ def draw_curves(progress: Path, picture: Path) -> None:
             axis.legend(frameon=False, fontsize=8)
     for axis in axes[1]:
         axis.set_xlabel("control steps, millions")
-    figure.suptitle(f"{progress.parent.name}: {rows[-1]['seconds'] / 60:.1f} minutes of training", x=0.01, ha="left")
+    figure.suptitle(
+        f"{progress.parent.name}: {rows[-1]['seconds'] / 60:.1f} minutes of training",
+        x=0.01,
+        ha="left",
+    )
     figure.savefig(picture, dpi=130)
     plt.close(figure)

@@ -1,7 +1,8 @@
 """Several processes that train one policy, one a GPU (or several on a CPU, to try it).
 
-rsl-rl averages gradients and normalisers over them; here is what goes around it: the process group, what the first decides for all,
-figures over all environments, and the proof that all still hold the same policy.
+rsl-rl averages gradients and normalisers over them; here is what goes around it: the process group,
+what the first decides for all, figures over all environments, and the proof that all still hold the
+same policy.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ class Group:
     """The processes that train together, a context manager; in a process that is alone nothing here costs anything.
 
     Args:
-        device: Where this process computes: NCCL between GPUs, gloo between CPUs and for what lies on the host.
+        device: Where this process computes: NCCL between GPUs, gloo between CPUs and for what lies
+            on the host.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -40,17 +42,24 @@ class Group:
             dist.init_process_group(backend, rank=self.rank.index, world_size=self.rank.count)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
+    ) -> None:
         if not self.together:
             return
         if error is None:
             dist.barrier()
             dist.destroy_process_group()
             return
-        if self.device.type == "cpu":  # gloo's threads must end before the interpreter does, or it aborts
+        if (
+            self.device.type == "cpu"
+        ):  # gloo's threads must end before the interpreter does, or it aborts
             dist.destroy_process_group()
-        if isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and _from_a_collective(str(error))):
-            # between GPUs nothing is destroyed after an error: NCCL would wait for those that are gone
+        if isinstance(error, dist.DistError) or (
+            isinstance(error, RuntimeError) and _from_a_collective(str(error))
+        ):
+            # between GPUs nothing is destroyed after an error: NCCL would wait for those that are
+            # gone
             raise DistributedError(
                 f"rank {self.rank.index}: another process of this training has ended; its own message says why "
                 f"({str(error).splitlines()[0]})"
@@ -88,12 +97,19 @@ class Group:
     def pooled(self, figures: Mapping[str, float]) -> dict[str, float]:
         """Returns the figures of all environments of all processes; see `ControlLoop.statistics`.
 
-        Means over episodes weigh by the number of episodes; the fault rate by control steps, which are as many everywhere.
+        Means over episodes weigh by the number of episodes; the fault rate by control steps, which
+        are as many everywhere.
         """
         parts = self.all(dict(figures))
         episodes = sum(part["episodes"] for part in parts)
-        pooled = {name: sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes) for name in figures}
-        return pooled | {"episodes": episodes, "fault_rate": sum(part["fault_rate"] for part in parts) / len(parts)}
+        pooled = {
+            name: sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes)
+            for name in figures
+        }
+        return pooled | {
+            "episodes": episodes,
+            "fault_rate": sum(part["fault_rate"] for part in parts) / len(parts),
+        }
 
     def check_same(self, state: Mapping[str, torch.Tensor]) -> None:
         """Proves that all processes hold the same numbers, bit for bit.
@@ -117,7 +133,9 @@ def fingerprint(state: Mapping[str, torch.Tensor]) -> str:
     digest = hashlib.sha256()
     for name, value in state.items():
         digest.update(name.encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+        digest.update(
+            value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
+        )
     return digest.hexdigest()
 
 
@@ -131,4 +149,7 @@ def _on_host(state: Any) -> Any:
 
 def _from_a_collective(text: str) -> bool:
     """Whether a RuntimeError is the end of a connection: gloo has no class of its own for it."""
-    return any(word in text for word in ("gloo", "NCCL", "Connection closed by peer", "Connection reset by peer"))
+    return any(
+        word in text
+        for word in ("gloo", "NCCL", "Connection closed by peer", "Connection reset by peer")
+    )

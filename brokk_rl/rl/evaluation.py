@@ -43,13 +43,14 @@ def evaluate(
     Args:
         loop: As many environments as starts.
         policy: Acts.
-        starts: Each entry `(N, …)`; the same starts and seed give every policy the same holes, errors and noise.
+        starts: Each entry `(N, …)`; the same starts and seed give every policy the same holes,
+            errors and noise.
         seed: Seed of the noise.
         num_recorded: Episodes recorded.
 
     Returns:
-        The fields of `evaluation.json` (without `seed`, `actuator`, `policy`), the recorded episodes, and some hundreds of
-        observation vectors `(B, O)`.
+        The fields of `evaluation.json` (without `seed`, `actuator`, `policy`), the recorded
+        episodes, and some hundreds of observation vectors `(B, O)`.
     """
     torch.manual_seed(seed)
     loop.begin(starts)
@@ -71,12 +72,19 @@ def evaluate(
         for name, value in loop.finished.items():
             figures[name] = torch.where(now, value, figures[name])
         reason = torch.where(now, loop.reason, reason)
-        tape.append(tuple(part[:num_recorded].clone() for part in (loop.end_q, loop.end_u, loop.end_force_n, running)))
+        tape.append(
+            tuple(
+                part[:num_recorded].clone()
+                for part in (loop.end_q, loop.end_u, loop.end_force_n, running)
+            )
+        )
         running &= ~done
     return _summary(figures, reason, loop), _episodes(tape, starts, figures, loop), torch.cat(seen)
 
 
-def _summary(figures: dict[str, torch.Tensor], reason: torch.Tensor, loop: ControlLoop) -> dict[str, Any]:
+def _summary(
+    figures: dict[str, torch.Tensor], reason: torch.Tensor, loop: ControlLoop
+) -> dict[str, Any]:
     table = {name: value.cpu().numpy() for name, value in figures.items()}
     strict, paper = table["success_strict"] > 0, table["success_paper"] > 0
     times = table["time_to_insert_s"][strict]
@@ -92,7 +100,9 @@ def _summary(figures: dict[str, torch.Tensor], reason: torch.Tensor, loop: Contr
         "lateral_error_m": float(table["lateral_error_m"].mean()),
         "peak_force_n": float(table["peak_force_n"].mean()),
         "valve_travel": float(table["valve_travel"].mean()),
-        "terminations": {name: int((endings == index).sum()) for index, name in enumerate(loop.task.reasons)},
+        "terminations": {
+            name: int((endings == index).sum()) for index, name in enumerate(loop.task.reasons)
+        },
     }
 
 
@@ -102,7 +112,10 @@ def _share(happened: np.ndarray) -> dict[str, Any]:
 
 
 def _episodes(
-    tape: list[tuple[torch.Tensor, ...]], starts: Starts, figures: dict[str, torch.Tensor], loop: ControlLoop
+    tape: list[tuple[torch.Tensor, ...]],
+    starts: Starts,
+    figures: dict[str, torch.Tensor],
+    loop: ControlLoop,
 ) -> list[Episode]:
     q, u, force, running = (torch.stack(parts).cpu().numpy() for parts in zip(*tape, strict=True))
     episodes = []

@@ -23,10 +23,12 @@ from brokk_rl.rl.policy import CONTRACT, ONNX
 from brokk_rl.session import write_json
 
 TOLERANCE = 1e-3
-"""Largest difference of a command (of 2 full strokes) between torch and onnxruntime over recorded observations."""
+"""Largest difference of a command (of 2 full strokes) between torch and onnxruntime over recorded
+observations."""
 
 GOLDEN, NUM_GOLDEN = "golden.json", 16
-"""Observations and the network's own answers: whoever runs the file elsewhere compares with them first."""
+"""Observations and the network's own answers: whoever runs the file elsewhere compares with them
+first."""
 
 
 class _Plain(torch.nn.Module):
@@ -36,7 +38,10 @@ class _Plain(torch.nn.Module):
         super().__init__()
         assert actor.distribution is not None
         self.groups = list(actor.obs_groups)
-        self.normalizer, self.mlp = copy.deepcopy(actor.obs_normalizer).cpu(), copy.deepcopy(actor.mlp).cpu()
+        self.normalizer, self.mlp = (
+            copy.deepcopy(actor.obs_normalizer).cpu(),
+            copy.deepcopy(actor.mlp).cpu(),
+        )
         self.output = actor.distribution.as_deterministic_output_module()
 
     def forward(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -44,7 +49,13 @@ class _Plain(torch.nn.Module):
         return self.output(self.mlp(self.normalizer(latent)))
 
 
-def export_onnx(folder: Path, actor: MLPModel, task: TaskProcess, contract: dict[str, Any], observations: torch.Tensor) -> float:
+def export_onnx(
+    folder: Path,
+    actor: MLPModel,
+    task: TaskProcess,
+    contract: dict[str, Any],
+    observations: torch.Tensor,
+) -> float:
     """Writes `policy.onnx`: from the observation vector to masked commands, with the contract as metadata; and `golden.json`.
 
     Args:
@@ -52,7 +63,8 @@ def export_onnx(folder: Path, actor: MLPModel, task: TaskProcess, contract: dict
         actor: The network.
         task: The policy's task, built on the CPU: constants of a GPU would travel with the file.
         contract: What `write_bundle` returned.
-        observations: Recorded observation vectors, `(B, O)`, over which file and network are compared.
+        observations: Recorded observation vectors, `(B, O)`, over which file and network are
+            compared.
 
     Returns:
         The largest difference of a command between onnxruntime and torch.
@@ -74,12 +86,14 @@ def export_onnx(folder: Path, actor: MLPModel, task: TaskProcess, contract: dict
         logging.getLogger("torch.onnx").setLevel(level)
         expected = module(observations.cpu()).numpy()
     model = onnx.load(part)
-    onnx.helper.set_model_props(model, {f"brokk.{key}": _text(value) for key, value in contract.items() if key != "network"})
+    onnx.helper.set_model_props(
+        model, {f"brokk.{key}": _text(value) for key, value in contract.items() if key != "network"}
+    )
     onnx.save(model, part)
     session = onnxruntime.InferenceSession(part.read_bytes(), providers=["CPUExecutionProvider"])
     found = session.run(None, {"observation": observations.cpu().numpy().astype(np.float32)})[0]
-    # at the edge of a mask or of the dead band the last bit of a float decides between two commands; such rows are counted, not
-    # compared
+    # at the edge of a mask or of the dead band the last bit of a float decides between two
+    # commands; such rows are counted, not compared
     difference = np.abs(found - expected).max(1)
     off = difference > TOLERANCE
     if off.mean() > 0.005:

@@ -11,10 +11,13 @@ from torch._dynamo.exc import BackendCompilerFailed
 from brokk_rl.errors import ConfigError
 
 WARM_UP = 3
-"""Calls before the capture: kernels are compiled and buffers allocated before anything is recorded."""
+"""Calls before the capture: kernels are compiled and buffers allocated before anything is
+recorded."""
 
 
-def capture(step: Callable[[], None], device: torch.device, gradients: bool = False) -> torch.cuda.CUDAGraph:
+def capture(
+    step: Callable[[], None], device: torch.device, gradients: bool = False
+) -> torch.cuda.CUDAGraph:
     """Returns a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses.
 
     Args:
@@ -30,7 +33,8 @@ def capture(step: Callable[[], None], device: torch.device, gradients: bool = Fa
                 step()
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
-        # gradients remember the stream on which they were first added up; NCCL has a thread that asks for events meanwhile
+        # gradients remember the stream on which they were first added up; NCCL has a thread that
+        # asks for events meanwhile
         with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
             step()
     return graph

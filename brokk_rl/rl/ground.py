@@ -8,7 +8,16 @@ import numpy as np
 import torch
 from rich.progress import track
 
-from brokk_rl.contracts import Actuator, Effect, FollowerModel, OperatorModel, OperatorView, Simulator, Task, TrialBatch
+from brokk_rl.contracts import (
+    Actuator,
+    Effect,
+    FollowerModel,
+    OperatorModel,
+    OperatorView,
+    Simulator,
+    Task,
+    TrialBatch,
+)
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -29,7 +38,8 @@ class Simulated:
         actuator: How commands become motion.
         effect: Effects around the actuator model, by name.
         policy: Who advises, a spec of `conf/policy`.
-        assumed: Hands of the operator as the advice assumes them; the task's advice takes its numbers from here.
+        assumed: Hands of the operator as the advice assumes them; the task's advice takes its
+            numbers from here.
         noise: Standard deviation of recorded positions, rad or m.
         settle_s: Time for which a recording goes on after the insertion.
     """
@@ -43,9 +53,13 @@ class Simulated:
     noise: float
     settle_s: float
 
-    def run(self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel) -> list[Recording]:
+    def run(
+        self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
+    ) -> list[Recording]:
         """See `brokk_rl.contracts.TrialGround`."""
-        device = torch.device("cpu")  # a few hundred trials are as fast on a CPU, and operators are numpy
+        device = torch.device(
+            "cpu"
+        )  # a few hundred trials are as fast on a CPU, and operators are numpy
         torch.manual_seed(session.stream("ground"))
         num = len(trials.q)
         world = self.sim.build(machine, device, num)
@@ -54,14 +68,21 @@ class Simulated:
             model = effect.wrap(model, machine, num, device)
         levers = Levers(operators, trials.guided)
         task = self.task.build(machine, num, device)
-        starts = {key: value[:1].expand(num, *value.shape[1:]).clone() for key, value in task.starts(1, 0).items()}
+        starts = {
+            key: value[:1].expand(num, *value.shape[1:]).clone()
+            for key, value in task.starts(1, 0).items()
+        }
         loop = ControlLoop(machine, world, model, levers, task, starts | _begun(machine, trials))
         if task.max_episode_steps * machine.period_s < trials.limit_s:
-            raise ConfigError(f"ground.task.episode_s: expected at least the trials' limit of {trials.limit_s:g} s")
+            raise ConfigError(
+                f"ground.task.episode_s: expected at least the trials' limit of {trials.limit_s:g} s"
+            )
         levers.loop = loop
         return self._drive(loop, levers, session, trials)
 
-    def _drive(self, loop: ControlLoop, levers: Levers, session: Session, trials: TrialBatch) -> list[Recording]:
+    def _drive(
+        self, loop: ControlLoop, levers: Levers, session: Session, trials: TrialBatch
+    ) -> list[Recording]:
         machine, policy = loop.machine, self.policy.build(loop, session.seed)
         loop.begin(loop.starts)
         running = np.ones(len(trials.q), bool)
@@ -71,7 +92,10 @@ class Simulated:
             "running": [running.copy()],
         }
         groups = loop.get_observations()
-        steps, left = round(trials.limit_s / machine.period_s), np.full(len(trials.q), round(self.settle_s / machine.period_s))
+        steps, left = (
+            round(trials.limit_s / machine.period_s),
+            np.full(len(trials.q), round(self.settle_s / machine.period_s)),
+        )
         for _ in track(range(steps), "simulated operators at work", transient=True):
             groups, _, done, _ = loop.step(policy.act(dict(groups.items())))  # type: ignore[arg-type]
             rows["q"].append(loop.end_q.numpy().copy())
@@ -81,7 +105,14 @@ class Simulated:
             rows["running"].append(running.copy())
             if not running.any():
                 break
-        return _recordings(machine, {name: np.stack(part) for name, part in rows.items()}, levers, session, trials, self.noise)
+        return _recordings(
+            machine,
+            {name: np.stack(part) for name, part in rows.items()},
+            levers,
+            session,
+            trials,
+            self.noise,
+        )
 
 
 class Levers(FollowerModel):
@@ -122,12 +153,22 @@ def _begun(machine: Machine, trials: TrialBatch) -> dict[str, torch.Tensor]:
     """Returns starts of the control loop for the study's places; the block stands with its side to the machine."""
     num, rim = len(trials.q), trials.rim_in_base_m
     scene = np.column_stack((rim, np.arctan2(rim[:, 1], rim[:, 0]), np.ones(num), trials.radius_m))
-    made: dict[str, Any] = {"q": trials.q, "scene": scene, "target_m": rim, "closeness": np.zeros(num)}
+    made: dict[str, Any] = {
+        "q": trials.q,
+        "scene": scene,
+        "target_m": rim,
+        "closeness": np.zeros(num),
+    }
     return {name: torch.as_tensor(value, dtype=torch.float32) for name, value in made.items()}
 
 
 def _recordings(
-    machine: Machine, rows: dict[str, np.ndarray], levers: Levers, session: Session, trials: TrialBatch, noise: float
+    machine: Machine,
+    rows: dict[str, np.ndarray],
+    levers: Levers,
+    session: Session,
+    trials: TrialBatch,
+    noise: float,
 ) -> list[Recording]:
     given, shown = np.stack(levers.given), np.stack(levers.shown)
     generator = session.generator("ground noise")
@@ -135,10 +176,15 @@ def _recordings(
     for n in range(len(trials.q)):
         num = int(rows["running"][:, n].sum())  # samples from which a command was in force
         num = min(num, len(given))
-        q = rows["q"][: num + 1, n] + noise * generator.standard_normal((num + 1, machine.num_joints))
+        q = rows["q"][: num + 1, n] + noise * generator.standard_normal(
+            (num + 1, machine.num_joints)
+        )
         advice = np.concatenate((shown[:num, n], shown[num - 1 : num, n]))
         extra = {"force_n": rows["force_n"][: num + 1, n]}
-        extra |= {f"target_{axis}_m": np.full(num + 1, trials.rim_in_base_m[n, i]) for i, axis in enumerate("xyz")}
+        extra |= {
+            f"target_{axis}_m": np.full(num + 1, trials.rim_in_base_m[n, i])
+            for i, axis in enumerate("xyz")
+        }
         if trials.guided[n]:
             extra |= {f"advice_{name}": advice[:, j] for j, name in enumerate(machine.joint_names)}
         found.append(
@@ -151,7 +197,10 @@ def _recordings(
                 u=np.concatenate((given[:num, n], np.zeros((1, machine.num_joints), np.float32))),
                 q=q.astype(np.float32),
                 extra=extra,
-                metadata={"source": "simulated operator, simulated machine", "seed": str(session.seed)},
+                metadata={
+                    "source": "simulated operator, simulated machine",
+                    "seed": str(session.seed),
+                },
             )
         )
     return found

@@ -9,7 +9,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.rl.policy import located, read_bundle
 
 OWN = "distribution."
-"""Exploration belongs to the training that begins, not to the policy: one that has settled explores no more."""
+"""Exploration belongs to the training that begins, not to the policy: one that has settled explores
+no more."""
 
 
 def begin_with(actor: torch.nn.Module, folder: str, machine: Machine) -> None:

@@ -1,7 +1,7 @@
 """What a training run writes down and shows while it runs.
 
-Takes the place of rsl-rl's logger in the runner: that one reads finished episodes back to the host in every step, this one asks the
-control loop for its sums once an iteration.
+Takes the place of rsl-rl's logger in the runner: that one reads finished episodes back to the host
+in every step, this one asks the control loop for its sums once an iteration.
 """
 
 from __future__ import annotations
@@ -27,10 +27,12 @@ class Logbook:
     Args:
         folder: Run folder.
         tracker: Where figures go beside `progress.csv`.
-        statistics: Returns the figures of the finished episodes since it was last asked; see `ControlLoop.statistics`.
+        statistics: Returns the figures of the finished episodes since it was last asked; see
+            `ControlLoop.statistics`.
         steps_per_iteration: Control steps of all environments (and ranks) in one iteration.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world.
-        share_done: Returns how much of the run's budget is spent, 0 to 1, from control steps and seconds.
+        share_done: Returns how much of the run's budget is spent, 0 to 1, from control steps and
+            seconds.
         quiet: Count only, show and write nothing: of several processes the first writes for all.
     """
 
@@ -47,7 +49,11 @@ class Logbook:
         self.log_dir = str(folder)
         self.writer: Tracker | None = tracker
         self.env_steps, self.seconds = 0, 0.0
-        self._statistics, self._steps, self._max_fault_rate = statistics, steps_per_iteration, max_fault_rate
+        self._statistics, self._steps, self._max_fault_rate = (
+            statistics,
+            steps_per_iteration,
+            max_fault_rate,
+        )
         self._share_done, self._quiet = share_done, quiet
         self._path = folder / PROGRESS
         self._rows: list[dict[str, Any]] = []
@@ -87,7 +93,15 @@ class Logbook:
     def stop_logging_writer(self) -> None:
         """The tracker stays open until the whole run ends."""
 
-    def log(self, *, it: int, collect_time: float, learn_time: float, loss_dict: dict[str, float], **rest: Any) -> None:
+    def log(
+        self,
+        *,
+        it: int,
+        collect_time: float,
+        learn_time: float,
+        loss_dict: dict[str, float],
+        **rest: Any,
+    ) -> None:
         """Writes the figures of one iteration.
 
         Raises:
@@ -104,7 +118,11 @@ class Logbook:
                 f"overflowed its contact buffers (limit {self._max_fault_rate:.2%}). Look at the drive's stiffness, the time step "
                 "(sim.substeps) and the sizes of the buffers (sim)."
             )
-        episode = {f"episode/{name}": value for name, value in found.items() if name not in ("episodes", "fault_rate")}
+        episode = {
+            f"episode/{name}": value
+            for name, value in found.items()
+            if name not in ("episodes", "fault_rate")
+        }
         figures = {
             "env_steps": float(self.env_steps),
             "seconds": self.seconds,
@@ -125,7 +143,9 @@ class Logbook:
         if self.writer is not None:
             self.writer.log(figures, it)
         text = f"{figures['rate/env_steps_per_s']:,.0f} steps/s  success {figures.get('episode/success_strict', 0.0):.2f}"
-        self._bar.update(self._job, completed=self._share_done(self.env_steps, self.seconds), figures=text)
+        self._bar.update(
+            self._job, completed=self._share_done(self.env_steps, self.seconds), figures=text
+        )
 
     def flush(self) -> None:
         """Appends what is new to `progress.csv`; called with every checkpoint, so that both tell the same story."""
@@ -149,7 +169,9 @@ class Logbook:
         if not self._path.exists() or self._quiet:
             return
         with self._path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if float(row["env_steps"]) <= self.env_steps]
+            rows = [
+                row for row in csv.DictReader(file) if float(row["env_steps"]) <= self.env_steps
+            ]
         self._path.unlink()
         self._rows, self._pending = rows, len(rows)
         self.flush()

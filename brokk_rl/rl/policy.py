@@ -1,8 +1,8 @@
 """Policies that can be evaluated, and the bundle in which a trained one leaves the trainer.
 
-A bundle is a folder (or a run folder) with `policy.safetensors` (weights of the actor), `policy.json` (the contract: machine,
-rate, order and scale of observations and commands) and `policy.onnx` (everything from the observation vector to the masked
-command, for the machine).
+A bundle is a folder (or a run folder) with `policy.safetensors` (weights of the actor),
+`policy.json` (the contract: machine, rate, order and scale of observations and commands) and
+`policy.onnx` (everything from the observation vector to the masked command, for the machine).
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ class Trained:
     """A trained policy.
 
     Attributes:
-        folder: Run folder of `mode=train`, any folder with a policy bundle, or `package:path` for one that ships with a package.
+        folder: Run folder of `mode=train`, any folder with a policy bundle, or `package:path` for
+            one that ships with a package.
     """
 
     folder: str
@@ -72,7 +73,8 @@ class Trained:
         """Returns the policy.
 
         Raises:
-            CheckpointError: The bundle is missing, corrupt, holds NaN, or was made for another machine or task.
+            CheckpointError: The bundle is missing, corrupt, holds NaN, or was made for another
+                machine or task.
         """
         contract, weights = read_bundle(located(self.folder), loop.machine)
         actor = make_actor(contract["network"]["actor"], contract["network"]["obs_groups"], loop)
@@ -122,19 +124,31 @@ class Network:
         return self.actor(TensorDict(groups, batch_size=[len(next(iter(groups.values())))]))
 
 
-def make_actor(config: dict[str, Any], obs_groups: dict[str, list[str]], loop: ControlLoop) -> MLPModel:
+def make_actor(
+    config: dict[str, Any], obs_groups: dict[str, list[str]], loop: ControlLoop
+) -> MLPModel:
     """Returns an actor network of rsl-rl for the observation groups of `loop`."""
     actor_class, arguments = resolve_class(json.loads(json.dumps(config)))
-    missing = [name for name in obs_groups["actor"] if name not in set(loop.get_observations().keys())]
+    missing = [
+        name for name in obs_groups["actor"] if name not in set(loop.get_observations().keys())
+    ]
     if missing:
-        raise ConfigError(f"rl.runner.obs_groups.actor: the task gives no group {', '.join(missing)}")
-    return actor_class(loop.get_observations(), obs_groups, "actor", loop.num_actions, **arguments).to(loop.device)
+        raise ConfigError(
+            f"rl.runner.obs_groups.actor: the task gives no group {', '.join(missing)}"
+        )
+    return actor_class(
+        loop.get_observations(), obs_groups, "actor", loop.num_actions, **arguments
+    ).to(loop.device)
 
 
-def write_bundle(folder: Path, actor: MLPModel, training: Training, loop: ControlLoop, facts: dict[str, Any]) -> dict[str, Any]:
+def write_bundle(
+    folder: Path, actor: MLPModel, training: Training, loop: ControlLoop, facts: dict[str, Any]
+) -> dict[str, Any]:
     """Writes weights and contract of a policy into `folder`; returns the contract."""
     config = training.runner_config()
-    weights = {name: value.detach().cpu().contiguous() for name, value in actor.state_dict().items()}
+    weights = {
+        name: value.detach().cpu().contiguous() for name, value in actor.state_dict().items()
+    }
     machine = loop.machine
     contract = {
         "schema": SCHEMA,
@@ -146,7 +160,10 @@ def write_bundle(folder: Path, actor: MLPModel, training: Training, loop: Contro
         "exclusive": list(machine.exclusive),
         "command": {"range": [-1.0, 1.0], "order": list(machine.joint_names), "masked": True},
         "observation": loop.task.describe(),
-        "network": {"actor": config["actor"], "obs_groups": {"actor": config["obs_groups"]["actor"]}},
+        "network": {
+            "actor": config["actor"],
+            "obs_groups": {"actor": config["obs_groups"]["actor"]},
+        },
         "trained": facts,
     }
     part = folder / f".{WEIGHTS}.part"
@@ -159,7 +176,9 @@ def write_bundle(folder: Path, actor: MLPModel, training: Training, loop: Contro
 def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Returns contract and weights of the bundle in `folder`; see `Trained.build` for errors."""
     if not (folder / CONTRACT).exists():
-        raise CheckpointError(f"{folder} holds no policy ({CONTRACT} is missing); give the folder of a finished training run")
+        raise CheckpointError(
+            f"{folder} holds no policy ({CONTRACT} is missing); give the folder of a finished training run"
+        )
     try:
         contract = json.loads((folder / CONTRACT).read_text())
         weights = load_file(folder / WEIGHTS)
@@ -170,5 +189,7 @@ def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[st
     machine.check_fingerprint(contract.get("fingerprint", {}), f"the policy in {folder}")
     bad = [name for name, value in weights.items() if not torch.isfinite(value).all()]
     if bad:
-        raise CheckpointError(f"the policy in {folder} holds NaN or infinite weights in {', '.join(bad[:3])}")
+        raise CheckpointError(
+            f"the policy in {folder} holds NaN or infinite weights in {', '.join(bad[:3])}"
+        )
     return contract, weights

@@ -1,9 +1,11 @@
 """rsl-rl's PPO without the host in its loops.
 
-rsl-rl reads the divergence and three losses back to the host after each mini-batch, and launches a few hundred small kernels for
-it, some seventy more in each control step; on a GPU that takes longer than the arithmetic. Here the learning rate and the losses
-stay on the device, and acting, storing and a mini-batch are one replay of a CUDA graph each. Where several processes train together
-a mini-batch is two graphs, and between them one sum over all processes of a single buffer: every gradient and the divergence.
+rsl-rl reads the divergence and three losses back to the host after each mini-batch, and launches a
+few hundred small kernels for it, some seventy more in each control step; on a GPU that takes longer
+than the arithmetic. Here the learning rate and the losses stay on the device, and acting, storing
+and a mini-batch are one replay of a CUDA graph each. Where several processes train together a
+mini-batch is two graphs, and between them one sum over all processes of a single buffer: every
+gradient and the divergence.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ class DevicePPO(PPO):
     _mini_batch: Sequence[Callable[[], None]] | None = None
     """What one step of the optimiser consists of."""
     _gathered: torch.Tensor
-    """Gradients of all parameters, of which `grad` of each is a view, and at the end the divergence."""
+    """Gradients of all parameters, of which `grad` of each is a view, and at the end the
+    divergence."""
     _rows: torch.Tensor
     _advantages: torch.Tensor
     _rate: torch.Tensor
@@ -52,7 +55,11 @@ class DevicePPO(PPO):
         return self._rollout.act(obs)
 
     def process_env_step(
-        self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, torch.Tensor]
+        self,
+        obs: TensorDict,
+        rewards: torch.Tensor,
+        dones: torch.Tensor,
+        extras: dict[str, torch.Tensor],
     ) -> None:
         """Stores a step; see `rsl_rl.algorithms.PPO.process_env_step`."""
         if self._rollout is None:
@@ -96,7 +103,10 @@ class DevicePPO(PPO):
         saved = super().save()
         optimizer = saved["optimizer_state_dict"]
         plain = {"lr": self.learning_rate, "capturable": False, "fused": None}
-        return saved | {"optimizer_state_dict": optimizer | {"param_groups": [g | plain for g in optimizer["param_groups"]]}}
+        return saved | {
+            "optimizer_state_dict": optimizer
+            | {"param_groups": [g | plain for g in optimizer["param_groups"]]}
+        }
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Loads a state; graphs are captured anew at the next update, because the optimiser's tensors are others now."""
@@ -105,7 +115,9 @@ class DevicePPO(PPO):
 
     @property
     def _on_device(self) -> bool:
-        plain = not (self.rnd or self.symmetry or self.actor.is_recurrent or self.critic.is_recurrent)
+        plain = not (
+            self.rnd or self.symmetry or self.actor.is_recurrent or self.critic.is_recurrent
+        )
         return plain and torch.device(self.device).type == "cuda"
 
     def _batch_size(self) -> int:
@@ -120,7 +132,9 @@ class DevicePPO(PPO):
         self._sums = torch.zeros(len(FIGURES), device=self.device)
         parameters = list(chain(self.actor.parameters(), self.critic.parameters()))
         self._gathered = torch.zeros(sum(p.numel() for p in parameters) + 1, device=self.device)
-        for parameter, part in zip(parameters, self._gathered[:-1].split([p.numel() for p in parameters]), strict=True):
+        for parameter, part in zip(
+            parameters, self._gathered[:-1].split([p.numel() for p in parameters]), strict=True
+        ):
             parameter.grad = part.view_as(parameter)
         on_gpu = torch.device(self.device).type == "cuda"
         for group in self.optimizer.param_groups:
@@ -133,12 +147,25 @@ class DevicePPO(PPO):
         """Returns what a mini-batch consists of, on a GPU captured; the calls before the capture leave no trace."""
         device = torch.device(self.device)
         if device.type != "cuda":
-            return (self._differentiate, self._sum_up, self._descend) if self.is_multi_gpu else (self._differentiate_and_descend,)
+            return (
+                (self._differentiate, self._sum_up, self._descend)
+                if self.is_multi_gpu
+                else (self._differentiate_and_descend,)
+            )
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         kept = [(p, p.detach().clone()) for p in parameters] + [(self._rate, self._rate.clone())]
-        moments = [(value, value.clone()) for state in self.optimizer.state.values() for value in state.values()]
-        if self.is_multi_gpu:  # the sum stays outside: it is the one part whose length others decide
-            graphs = [capture(part, device, gradients=True) for part in (self._differentiate, self._descend)]
+        moments = [
+            (value, value.clone())
+            for state in self.optimizer.state.values()
+            for value in state.values()
+        ]
+        if (
+            self.is_multi_gpu
+        ):  # the sum stays outside: it is the one part whose length others decide
+            graphs = [
+                capture(part, device, gradients=True)
+                for part in (self._differentiate, self._descend)
+            ]
             captured = (graphs[0].replay, self._sum_up, graphs[1].replay)
         else:
             captured = (capture(self._differentiate_and_descend, device, gradients=True).replay,)
@@ -153,7 +180,11 @@ class DevicePPO(PPO):
 
     def _normalise(self, model: nn.Module) -> None:
         """Updates a model's normalisation in place: rsl-rl binds a new tensor, which the graph would not see."""
-        held = [(module, name, value) for module in model.modules() for name, value in module._buffers.items()]
+        held = [
+            (module, name, value)
+            for module in model.modules()
+            for name, value in module._buffers.items()
+        ]
         model.update_normalization(self.storage.observations.flatten(0, 1))  # type: ignore[operator]
         for module, name, value in held:
             if value is not None and module._buffers[name] is not value:
@@ -166,23 +197,41 @@ class DevicePPO(PPO):
     def _differentiate(self) -> None:
         """Differentiates the loss of the stored steps `_rows`; Schulman et al. 2017, equations 7 and 9, as rsl-rl weighs them."""
         storage, rows = self.storage, self._rows
-        observations = {name: value.flatten(0, 1)[rows] for name, value in storage.observations.items()}
+        observations = {
+            name: value.flatten(0, 1)[rows] for name, value in storage.observations.items()
+        }
         old_values, returns, advantages, old_log_prob, actions = (
             value.flatten(0, 1)[rows]
-            for value in (storage.values, storage.returns, self._advantages, storage.actions_log_prob, storage.actions)
+            for value in (
+                storage.values,
+                storage.returns,
+                self._advantages,
+                storage.actions_log_prob,
+                storage.actions,
+            )
         )
-        old_parameters = tuple(value.flatten(0, 1)[rows] for value in storage.distribution_params or ())
+        old_parameters = tuple(
+            value.flatten(0, 1)[rows] for value in storage.distribution_params or ()
+        )
         if self.normalize_advantage_per_mini_batch:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         kind = torch.device(self.device).type
-        with torch.autocast(device_type=kind, dtype=torch.bfloat16, enabled=self.use_mixed_precision):
-            # not by calling the actor: that would draw actions, and torch's check of their spread asks the host
+        with torch.autocast(
+            device_type=kind, dtype=torch.bfloat16, enabled=self.use_mixed_precision
+        ):
+            # not by calling the actor: that would draw actions, and torch's check of their spread
+            # asks the host
             self.actor.distribution.update(self.actor.mlp(self.actor.get_latent(observations)))  # type: ignore
-            log_prob, entropy = self.actor.get_output_log_prob(actions), self.actor.output_entropy.mean()
+            log_prob, entropy = (
+                self.actor.get_output_log_prob(actions),
+                self.actor.output_entropy.mean(),
+            )
             values = self.critic(observations)  # type: ignore[arg-type]
             if self._is_adaptive:
                 with torch.no_grad():
-                    divergence = self.actor.get_kl_divergence(old_parameters, self.actor.output_distribution_params).mean()
+                    divergence = self.actor.get_kl_divergence(
+                        old_parameters, self.actor.output_distribution_params
+                    ).mean()
             ratio = torch.exp(log_prob - old_log_prob.squeeze(1))
             gain = advantages.squeeze(1)
             clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
@@ -219,7 +268,12 @@ class DevicePPO(PPO):
 
     def _adapt_rate(self, divergence: torch.Tensor) -> None:
         """Raises the learning rate where the policy moves less than `desired_kl`, lowers it where it moves more."""
-        lower, higher = (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE), (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE)
+        lower, higher = (
+            (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE),
+            (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE),
+        )
         too_near = (divergence < self._wanted / 2.0) & (divergence > 0.0)
-        rate = torch.where(divergence > self._wanted * 2.0, lower, torch.where(too_near, higher, self._rate))
+        rate = torch.where(
+            divergence > self._wanted * 2.0, lower, torch.where(too_near, higher, self._rate)
+        )
         self._rate.copy_(rate)

@@ -13,7 +13,8 @@ from brokk_rl.rl.graph import capture
 class Rollout:
     """Does what `act` and `process_env_step` of `rsl_rl.algorithms.PPO` do, into the algorithm's own storage.
 
-    For feed-forward networks with a Gaussian policy; all tensors keep their addresses. On a CPU the same runs without graphs.
+    For feed-forward networks with a Gaussian policy; all tensors keep their addresses. On a CPU the
+    same runs without graphs.
 
     Args:
         algorithm: Gives networks, storage and discount.
@@ -21,11 +22,18 @@ class Rollout:
 
     def __init__(self, algorithm: PPO) -> None:
         self._algorithm, storage = algorithm, algorithm.storage
-        self._observations = {name: torch.zeros_like(value[0]) for name, value in storage.observations.items()}  # type: ignore[arg-type]
-        self._reward, self._done, self._timed_out = (torch.zeros_like(storage.rewards[0]) for _ in range(3))
+        self._observations = {
+            name: torch.zeros_like(value[0]) for name, value in storage.observations.items()
+        }  # type: ignore[arg-type]
+        self._reward, self._done, self._timed_out = (
+            torch.zeros_like(storage.rewards[0]) for _ in range(3)
+        )
         self._slot = torch.zeros(1, dtype=torch.int64, device=storage.rewards.device)
         self._actions = torch.zeros_like(storage.actions[0])
-        self._values, self._log_prob = torch.zeros_like(storage.values[0]), torch.zeros_like(storage.actions_log_prob[0])
+        self._values, self._log_prob = (
+            torch.zeros_like(storage.values[0]),
+            torch.zeros_like(storage.actions_log_prob[0]),
+        )
         self._parameters = tuple(torch.zeros_like(self._actions) for _ in range(2))
         if storage.distribution_params is None:
             storage.distribution_params = tuple(torch.zeros_like(storage.actions) for _ in range(2))
@@ -47,7 +55,11 @@ class Rollout:
         storage = self._algorithm.storage
         if storage.step >= storage.num_transitions_per_env:
             raise OverflowError("the storage is full: update before going on")
-        for target, value in ((self._reward, reward), (self._done, done), (self._timed_out, timed_out)):
+        for target, value in (
+            (self._reward, reward),
+            (self._done, done),
+            (self._timed_out, timed_out),
+        ):
             target[:, 0].copy_(value)
         self._slot.fill_(storage.step)
         self._store()
@@ -62,7 +74,8 @@ class Rollout:
         actor, seen = self._algorithm.actor, self._observations
         actor.distribution.update(actor.mlp(actor.get_latent(seen)))  # type: ignore[union-attr, arg-type]
         mean, std = actor.output_mean, actor.output_std
-        # as `Normal.sample`, which asks the host whether the spread is positive and cannot be captured
+        # as `Normal.sample`, which asks the host whether the spread is positive and cannot be
+        # captured
         self._actions.copy_(mean + std * torch.randn_like(mean))
         self._log_prob[:, 0].copy_(actor.get_output_log_prob(self._actions))
         self._values.copy_(self._algorithm.critic(seen))  # type: ignore[arg-type]
@@ -72,8 +85,14 @@ class Rollout:
     @torch.no_grad()
     def _keep(self) -> None:
         storage = self._algorithm.storage
-        reward = self._reward + self._algorithm.gamma * self._values * self._timed_out  # the end of time is not the end
-        rows = [(storage.actions, self._actions), (storage.rewards, reward), (storage.dones, self._done.to(storage.dones.dtype))]
+        reward = (
+            self._reward + self._algorithm.gamma * self._values * self._timed_out
+        )  # the end of time is not the end
+        rows = [
+            (storage.actions, self._actions),
+            (storage.rewards, reward),
+            (storage.dones, self._done.to(storage.dones.dtype)),
+        ]
         rows += [(storage.values, self._values), (storage.actions_log_prob, self._log_prob)]
         rows += [(storage.observations[name], value) for name, value in self._observations.items()]
         rows += zip(storage.distribution_params or (), self._parameters, strict=True)

@@ -23,7 +23,8 @@ from brokk_rl.spec import spec
 log = logging.getLogger(__name__)
 
 ROUND = 10
-"""Iterations between two changes of the desired divergence; processes that train together must agree on it."""
+"""Iterations between two changes of the desired divergence; processes that train together must
+agree on it."""
 
 
 @spec
@@ -40,11 +41,16 @@ class Budget:
 
     def check(self) -> None:
         if self.max_env_steps is None and self.max_seconds is None:
-            raise ConfigError("rl.budget: give max_env_steps, max_seconds or both; training without an end is not possible")
+            raise ConfigError(
+                "rl.budget: give max_env_steps, max_seconds or both; training without an end is not possible"
+            )
 
     def share_spent(self, env_steps: int, seconds: float) -> float:
         """Returns how much is spent, 1 or more when it is all."""
-        return max(env_steps / (self.max_env_steps or float("inf")), seconds / (self.max_seconds or float("inf")))
+        return max(
+            env_steps / (self.max_env_steps or float("inf")),
+            seconds / (self.max_seconds or float("inf")),
+        )
 
 
 @spec
@@ -52,18 +58,24 @@ class Training:
     """How a policy is trained with rsl-rl's PPO.
 
     Attributes:
-        num_envs: Environments, of each process where several train together; `null` for what the simulator's configuration says.
+        num_envs: Environments, of each process where several train together; `null` for what the
+            simulator's configuration says.
         num_starts: Number of valid starts from which resets draw.
         budget: When training ends.
-        save_interval: Iterations between checkpoints; a killed run loses no more. As often several processes prove that they agree.
+        save_interval: Iterations between checkpoints; a killed run loses no more. As often several
+            processes prove that they agree.
         keep_checkpoints: Newest checkpoints kept.
-        settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps learn fast, small ones keep it.
-        max_fault_rate: Share of control steps that may end in a diverged or overflowing world before the run stops with an error.
-        fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of compiling and a C++ compiler:
-            a fifth faster on a GPU; on a CPU, whose physics takes less than half of a control step of few worlds, far more.
-        random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at once.
-        runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`, `num_steps_per_env`, …), handed on as it
-            is.
+        settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
+            learn fast, small ones keep it.
+        max_fault_rate: Share of control steps that may end in a diverged or overflowing world
+            before the run stops with an error.
+        fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
+            compiling and a C++ compiler: a fifth faster on a GPU; on a CPU, whose physics takes
+            less than half of a control step of few worlds, far more.
+        random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at
+            once.
+        runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`,
+            `num_steps_per_env`, …), handed on as it is.
     """
 
     num_envs: int | None
@@ -79,7 +91,9 @@ class Training:
 
     def check(self) -> None:
         if not 0.0 <= self.settling <= 1.0:
-            raise ConfigError(f"rl.settling: expected a part of the budget, 0 to 1, got {self.settling}")
+            raise ConfigError(
+                f"rl.settling: expected a part of the budget, 0 to 1, got {self.settling}"
+            )
 
     def divergence(self, share_spent: float) -> float | None:
         """Returns the `desired_kl` of updates when this share of the budget is spent."""
@@ -90,15 +104,19 @@ class Training:
 
     def runner_config(self) -> dict[str, Any]:
         """Returns a copy for rsl-rl, which writes into it; keys without a value are dropped: its constructors know no `null`."""
-        return _without_nulls(copy.deepcopy(self.runner)) | {"save_interval": 10**9, "check_for_nan": False}
+        return _without_nulls(copy.deepcopy(self.runner)) | {
+            "save_interval": 10**9,
+            "check_for_nan": False,
+        }
 
 
 class Runner(OnPolicyRunner):
     """Trains; see `Training`.
 
-    rsl-rl's own checkpoint lacks the environment, the random generators and the step count; ours holds all of them, so that a
-    resumed run on a CPU goes on bit for bit. It is read with `weights_only=True`: a checkpoint from a stranger cannot run code.
-    Of several processes the first writes it, with what belongs to each of the others.
+    rsl-rl's own checkpoint lacks the environment, the random generators and the step count; ours
+    holds all of them, so that a resumed run on a CPU goes on bit for bit. It is read with
+    `weights_only=True`: a checkpoint from a stranger cannot run code. Of several processes the
+    first writes it, with what belongs to each of the others.
 
     Args:
         env: The control loop; a checkpoint of another machine than its own is refused.
@@ -112,7 +130,13 @@ class Runner(OnPolicyRunner):
     env: ControlLoop
 
     def __init__(
-        self, env: ControlLoop, training: Training, folder: Path, device: torch.device, logbook: Logbook, group: Group | None = None
+        self,
+        env: ControlLoop,
+        training: Training,
+        folder: Path,
+        device: torch.device,
+        logbook: Logbook,
+        group: Group | None = None,
     ) -> None:
         self.group = group or Group(device)
         printed = io.StringIO()
@@ -129,10 +153,14 @@ class Runner(OnPolicyRunner):
         first = self.current_learning_iteration == 0
         while rounds := self.group.from_first(self._rounds(book, steps)):
             if self.current_learning_iteration % ROUND == 0:
-                share = self.group.from_first(self.training.budget.share_spent(book.env_steps, book.seconds))
+                share = self.group.from_first(
+                    self.training.budget.share_spent(book.env_steps, book.seconds)
+                )
                 self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
             with contextlib.redirect_stdout(io.StringIO()):
-                self.learn(rounds, init_at_random_ep_len=first and self.training.random_episode_lengths)
+                self.learn(
+                    rounds, init_at_random_ep_len=first and self.training.random_episode_lengths
+                )
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
@@ -151,19 +179,31 @@ class Runner(OnPolicyRunner):
             rounds = min(rounds, max(1, -(-(budget.max_env_steps - book.env_steps) // steps)))
         if budget.max_seconds:
             # the first round is short and shows how long one takes
-            left = (budget.max_seconds - book.seconds) * book.env_steps / book.seconds / steps if book.env_steps else 1
+            left = (
+                (budget.max_seconds - book.seconds) * book.env_steps / book.seconds / steps
+                if book.env_steps
+                else 1
+            )
             rounds = min(rounds, max(1, round(left)))
         return rounds
 
     def _policy_state(self) -> dict[str, torch.Tensor]:
         """Returns parameters and normalisers of actor and critic by name."""
         models = {"actor": self.alg.actor, "critic": self.alg.critic}
-        return {f"{part}.{name}": value for part, model in models.items() for name, value in model.state_dict().items()}
+        return {
+            f"{part}.{name}": value
+            for part, model in models.items()
+            for name, value in model.state_dict().items()
+        }
 
     def _configure_multi_gpu(self) -> None:
         """Tells rsl-rl of the processes of `group`; its own way knows NCCL only and never ends the process group."""
         rank = self.group.rank
-        self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = rank.count, rank.index, rank.local
+        self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = (
+            rank.count,
+            rank.index,
+            rank.local,
+        )
         self.is_distributed = self.group.together
         numbers = {"global_rank": rank.index, "local_rank": rank.local, "world_size": rank.count}
         self.cfg["multi_gpu"] = numbers if self.is_distributed else None
@@ -177,7 +217,8 @@ class Runner(OnPolicyRunner):
         """Writes a checkpoint in one step, holding all that is needed to go on exactly; drops the oldest beyond `keep_checkpoints`.
 
         Raises:
-            StorageError: The disk is full or the folder cannot be written; older checkpoints are untouched.
+            StorageError: The disk is full or the folder cannot be written; older checkpoints are
+                untouched.
         """
         own = {"env": self.env.state_dict(), "random": random_state(self.device)}
         parts = self.group.gathered(own)
@@ -201,7 +242,10 @@ class Runner(OnPolicyRunner):
             with part.open("rb") as file:
                 os.fsync(file.fileno())
             part.replace(path)
-        except (OSError, RuntimeError) as error:  # torch's writer reports a full disk as a RuntimeError
+        except (
+            OSError,
+            RuntimeError,
+        ) as error:  # torch's writer reports a full disk as a RuntimeError
             part.unlink(missing_ok=True)
             raise StorageError(
                 f"cannot write the checkpoint {path}: {error}. The checkpoint before it is untouched; make room and resume."
@@ -212,18 +256,27 @@ class Runner(OnPolicyRunner):
     def save(self, path: str, infos: dict | None = None) -> None:
         """Does nothing: rsl-rl would save amid an iteration's bookkeeping; `checkpoint` follows every call of `learn`."""
 
-    def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
+    def load(
+        self,
+        path: str,
+        load_cfg: dict | None = None,
+        strict: bool = True,
+        map_location: str | None = None,
+    ) -> dict:
         """Restores a checkpoint so that training goes on exactly.
 
         Raises:
-            CheckpointError: The file is missing, corrupt, holds NaN or belongs to another machine or configuration.
+            CheckpointError: The file is missing, corrupt, holds NaN or belongs to another machine
+                or configuration.
         """
         content = read_checkpoint(Path(path), self.device)
         self.env.machine.check_fingerprint(content.get("fingerprint", {}), path)
         try:
             self.alg.load(content, None, strict=True)
             own = [content, *content.get("others", [])][self.group.rank.index :][:1]
-            for part in own:  # none where more processes go on than were stopped: the new ones start afresh
+            for part in (
+                own
+            ):  # none where more processes go on than were stopped: the new ones start afresh
                 self.env.load_state_dict(part["env"])
                 set_random_state(part["random"], self.device)
             self.alg.learning_rate = content["learning_rate"]
@@ -242,8 +295,8 @@ class Runner(OnPolicyRunner):
 def _tensor_cores(allowed: bool) -> Iterator[None]:
     """Lets matrix products use TF32 meanwhile.
 
-    Only where the control step is a captured graph, whose kernels were chosen before: ten bits of mantissa are enough for a
-    network, but would put the tool of a 5 m arm millimetres off.
+    Only where the control step is a captured graph, whose kernels were chosen before: ten bits of
+    mantissa are enough for a network, but would put the tool of a 5 m arm millimetres off.
     """
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if allowed else before)
@@ -273,9 +326,13 @@ def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
         raise CheckpointError(
             f"{path} is corrupt or not a checkpoint of ours ({type(error).__name__}); take an older one"
         ) from error
-    bad = [name for state in states for name, value in state.items() if not torch.isfinite(value).all()]
+    bad = [
+        name for state in states for name, value in state.items() if not torch.isfinite(value).all()
+    ]
     if bad:
-        raise CheckpointError(f"{path} holds NaN or infinite weights in {', '.join(bad[:3])}; take an older checkpoint")
+        raise CheckpointError(
+            f"{path} holds NaN or infinite weights in {', '.join(bad[:3])}; take an older checkpoint"
+        )
     return content
 
 

@@ -12,8 +12,9 @@ import torch
 def one_thread(device: torch.device | str) -> Iterator[None]:
     """Keeps torch to one thread meanwhile; nothing changes where `device` is a GPU.
 
-    The tensors of a control step are too small to share. Torch's other threads would only wait for the next one, and they wait
-    spinning, on the cores on which the physics runs; where the computer has other work too, all stand still for the slowest.
+    The tensors of a control step are too small to share. Torch's other threads would only wait for
+    the next one, and they wait spinning, on the cores on which the physics runs; where the computer
+    has other work too, all stand still for the slowest.
     """
     before = torch.get_num_threads()
     if torch.device(device).type != "cpu" or before == 1:

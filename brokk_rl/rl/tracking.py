@@ -95,7 +95,8 @@ class _Wandb:
         os.environ.setdefault("WANDB_SILENT", "true")
         import wandb
 
-        # reinit: a sweep with Hydra's basic launcher runs its jobs in one process, and each must get a run of its own
+        # reinit: a sweep with Hydra's basic launcher runs its jobs in one process, and each must
+        # get a run of its own
         self._run = wandb.init(
             project=config.project,
             group=config.group,

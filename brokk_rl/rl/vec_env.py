@@ -1,8 +1,8 @@
 """The control loop of many simulated machines at once, as rsl-rl wants to see it.
 
-One control step is command → follower → actuator model → drive and physics → judgement → resets → observation, all on the device,
-with fixed shapes and without a host synchronisation. Where the world allows it (Warp on a GPU) the whole step is captured once in a
-CUDA graph and replayed.
+One control step is command → follower → actuator model → drive and physics → judgement → resets →
+observation, all on the device, with fixed shapes and without a host synchronisation. Where the
+world allows it (Warp on a GPU) the whole step is captured once in a CUDA graph and replayed.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ class Plant:
     effects: dict[str, Effect]
     follower: Follower
 
-    def build(self, device: torch.device, num_envs: int | None, pool: int, seed: int) -> ControlLoop:
+    def build(
+        self, device: torch.device, num_envs: int | None, pool: int, seed: int
+    ) -> ControlLoop:
         """Returns the control loop on `device`.
 
         Args:
@@ -72,7 +74,8 @@ class Plant:
             model = effect.wrap(model, self.machine, num, device)
         follower = self.follower.build(self.machine, num, device)
         process = self.task.build(self.machine, num, device)
-        # with all threads, four processes on a computer of 64 cores had no starts after three minutes; with one each, after seconds
+        # with all threads, four processes on a computer of 64 cores had no starts after three
+        # minutes; with one each, after seconds
         with one_thread("cpu"):
             starts = {key: value.to(device) for key, value in process.starts(pool, seed).items()}
         return ControlLoop(self.machine, world, model, follower, process, starts)
@@ -91,9 +94,21 @@ class ControlLoop(VecEnv):
     """
 
     def __init__(
-        self, machine: Machine, world: World, actuator: ActuatorModel, follower: FollowerModel, task: TaskProcess, starts: Starts
+        self,
+        machine: Machine,
+        world: World,
+        actuator: ActuatorModel,
+        follower: FollowerModel,
+        task: TaskProcess,
+        starts: Starts,
     ) -> None:
-        self.machine, self.world, self.actuator, self.follower, self.task = machine, world, actuator, follower, task
+        self.machine, self.world, self.actuator, self.follower, self.task = (
+            machine,
+            world,
+            actuator,
+            follower,
+            task,
+        )
         self.num_envs = world.num_worlds
         self.device: torch.device = world.device
         self.num_actions = task.num_actions
@@ -101,12 +116,18 @@ class ControlLoop(VecEnv):
         self.cfg: dict[str, Any] = {}
         self.starts = starts
         shape = (self.num_envs, machine.num_history, machine.num_joints)
-        self.history = History(q=torch.zeros(shape, device=self.device), u=torch.zeros(shape, device=self.device))
+        self.history = History(
+            q=torch.zeros(shape, device=self.device), u=torch.zeros(shape, device=self.device)
+        )
         """What the controller sees."""
         sides = getattr(actuator, "sides", frozenset())
         self._sensing = cast(SensingModel, actuator) if "measurement" in sides else None
         self._misplacing = cast(SensingModel, actuator) if "kinematics" in sides else None
-        self.truth = History(q=self.history.q.clone(), u=self.history.u.clone()) if self._sensing else self.history
+        self.truth = (
+            History(q=self.history.q.clone(), u=self.history.u.clone())
+            if self._sensing
+            else self.history
+        )
         """What the machine does; the same object where sensors are true."""
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -116,7 +137,8 @@ class ControlLoop(VecEnv):
         self.finished = dict(zip(task.episode, self._finished, strict=True))
         """Figures of the episode that ended in the last step, valid where `done`."""
         self.end_q = torch.zeros_like(world.q)
-        """Joint positions at the end of the last step, before finished environments began anew, `(N, J)`."""
+        """Joint positions at the end of the last step, before finished environments began anew,
+        `(N, J)`."""
         self.end_u = torch.zeros_like(world.q)
         """Commands given in the last step, `(N, J)`; the policy's own where nobody follows it."""
         self.end_force_n = torch.zeros_like(world.contact_force_n)
@@ -127,7 +149,9 @@ class ControlLoop(VecEnv):
         self._steps = 0
         self._action = torch.zeros(self.num_envs, self.num_actions, device=self.device)
         # addresses that stay: a captured graph writes to them
-        self._groups = {name: torch.zeros_like(value) for name, value in task.observe(self.history).items()}
+        self._groups = {
+            name: torch.zeros_like(value) for name, value in task.observe(self.history).items()
+        }
         self._graph: torch.cuda.CUDAGraph | None = None
         self.begin()
 
@@ -158,7 +182,8 @@ class ControlLoop(VecEnv):
         """Captures the control step in a CUDA graph where device and world allow it; a few steps are simulated on the way.
 
         Args:
-            fuse: First have `torch.compile` fuse the small operations around the physics, on a GPU only for a graph.
+            fuse: First have `torch.compile` fuse the small operations around the physics, on a GPU
+                only for a graph.
 
         Raises:
             ConfigError: There is nothing here with which to compile.
@@ -166,7 +191,9 @@ class ControlLoop(VecEnv):
         graphs = self.device.type == "cuda" and self.world.supports_graphs
         if fuse := fuse and (graphs or self.device.type == "cpu"):
             for name in ("_command", "_judge", "_perceive"):
-                setattr(self, name, torch.compile(getattr(self, name), fullgraph=True, dynamic=False))
+                setattr(
+                    self, name, torch.compile(getattr(self, name), fullgraph=True, dynamic=False)
+                )
         with compiling():
             if graphs:
                 self._graph = capture(self._advance, self.device)
@@ -179,7 +206,10 @@ class ControlLoop(VecEnv):
 
     def get_observations(self) -> TensorDict:
         """Returns the current observation groups; asking twice gives the same."""
-        return TensorDict({name: value.clone() for name, value in self._groups.items()}, batch_size=[self.num_envs])
+        return TensorDict(
+            {name: value.clone() for name, value in self._groups.items()},
+            batch_size=[self.num_envs],
+        )
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """Advances one control period; see `rsl_rl.env.VecEnv.step`."""
@@ -210,13 +240,20 @@ class ControlLoop(VecEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """Returns copies of everything that must be stored to go on exactly; random generators are the session's."""
-        state: dict[str, torch.Tensor] = {"history.q": self.history.q, "history.u": self.history.u, "truth.q": self.truth.q}
+        state: dict[str, torch.Tensor] = {
+            "history.q": self.history.q,
+            "history.u": self.history.u,
+            "truth.q": self.truth.q,
+        }
         state |= {f"task.{name}": value for name, value in self.task.state.items()}
         state |= {f"episode.{name}": value for name, value in self.task.episode.items()}
         state |= {f"actuator.{name}": value for name, value in self.actuator.state.items()}
         state |= {f"follower.{name}": value for name, value in self.follower.state.items()}
         state |= {f"group.{name}": value for name, value in self._groups.items()}
-        return {"tensors": {name: value.clone() for name, value in state.items()}, "world": self.world.state_dict()}
+        return {
+            "tensors": {name: value.clone() for name, value in state.items()},
+            "world": self.world.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what `state_dict` returned."""
@@ -225,7 +262,11 @@ class ControlLoop(VecEnv):
         self.history.u.copy_(tensors["history.u"])
         self.truth.q.copy_(tensors["truth.q"])
         self.truth.u.copy_(tensors["history.u"])
-        parts = {"task": self.task.state, "episode": self.task.episode, "actuator": self.actuator.state}
+        parts = {
+            "task": self.task.state,
+            "episode": self.task.episode,
+            "actuator": self.actuator.state,
+        }
         parts |= {"follower": self.follower.state, "group": self._groups}
         for prefix, part in parts.items():
             for name, value in part.items():
@@ -247,7 +288,8 @@ class ControlLoop(VecEnv):
 
     def _command(self) -> torch.Tensor:
         """Puts what is given of the action into force; returns how far the drive shall move each joint, `(N, J)`."""
-        # histories hold what was given, as the machine's log does: it is all that policy and actuator model can know
+        # histories hold what was given, as the machine's log does: it is all that policy and
+        # actuator model can know
         self.end_u.copy_(self.follower.step(self.task.command(self._action)))
         self.truth.push_u(self.end_u)
         if self._sensing:
@@ -256,7 +298,8 @@ class ControlLoop(VecEnv):
 
     def _judge(self) -> Starts:
         """Judges what the world has done; returns where the finished environments start anew."""
-        # a world that became NaN is a fault and starts anew; its numbers must not poison the sums over all worlds
+        # a world that became NaN is a fault and starts anew; its numbers must not poison the sums
+        # over all worlds
         self.truth.push_q(self.world.q.nan_to_num())
         transition = self.task.step(self.truth, self.world)
         done = transition.terminated | transition.timed_out
@@ -268,7 +311,9 @@ class ControlLoop(VecEnv):
         self.end_force_n.copy_(self.world.contact_force_n)
         finished = torch.stack(tuple(self.task.episode.values()))
         self._finished.copy_(finished)
-        ending = torch.arange(len(self.task.reasons), device=self.device)[:, None] == transition.reason
+        ending = (
+            torch.arange(len(self.task.reasons), device=self.device)[:, None] == transition.reason
+        )
         self._totals.add_((torch.cat((finished, ending)) * done).sum(1))
         return self._draw()
 

@@ -23,7 +23,9 @@ class Auto:
     native: Native
     warp: Warp
 
-    def build(self, machine: Machine, device: torch.device | str, num_worlds: int | None = None) -> World:
+    def build(
+        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+    ) -> World:
         """Returns the worlds on `device`; `num_worlds` overrides the number in the config of the chosen backend."""
         chosen = self.native if torch.device(device).type == "cpu" else self.warp
         return chosen.build(machine, device, num_worlds)

@@ -1,13 +1,14 @@
 """The drive: makes the joints follow what the actuator model predicts, holds the arm, and yields where something blocks it.
 
-Each joint has a servo of its own inside MuJoCo, force = stiffness (act - q) - damping q', cut off at the yield force (the relief
-valve). Its reference is accumulated from the predicted increments. "Present position + increment" would be wrong: any sag under
-load becomes the next starting point, and the arm sinks. Within a control period the reference moves on at constant speed v (MuJoCo
+Each joint has a servo of its own inside MuJoCo, force = stiffness (act - q) - damping q', cut off
+at the yield force (the relief valve). Its reference is accumulated from the predicted increments.
+"Present position + increment" would be wrong: any sag under load becomes the next starting point,
+and the arm sinks. Within a control period the reference moves on at constant speed v (MuJoCo
 integrates ctrl = v into act), led by v damping / stiffness, so that damping does not cost a lag.
 
-The simulation has no gravity: the actuator model was learned on a machine that has its weight, so what gravity does to the motion
-is already in its increments and must not be counted twice. Nothing but the machine moves, so that this is the same as compensating
-it link by link, and cheaper.
+The simulation has no gravity: the actuator model was learned on a machine that has its weight, so
+what gravity does to the motion is already in its increments and must not be counted twice. Nothing
+but the machine moves, so that this is the same as compensating it link by link, and cheaper.
 """
 
 import mujoco
@@ -21,7 +22,8 @@ DAMPING_RATIO = 0.7
 
 
 MAX_SPEED = 20.0
-"""Joint speed (rad/s or m/s) beyond which a world counts as diverged; forty times what such a machine can do."""
+"""Joint speed (rad/s or m/s) beyond which a world counts as diverged; forty times what such a
+machine can do."""
 
 
 def add_drive(spec: mujoco.MjSpec, machine: Machine, inertia: np.ndarray) -> None:
@@ -35,7 +37,9 @@ def add_drive(spec: mujoco.MjSpec, machine: Machine, inertia: np.ndarray) -> Non
     for joint, body, seen in zip(machine.joints, machine.bodies, inertia, strict=True):
         stiffness = body.stiffness.value
         damping = 2.0 * DAMPING_RATIO * float(np.sqrt(stiffness * seen))
-        actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator = spec.add_actuator(
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
         actuator.set_to_intvelocity(kp=stiffness, kv=damping)
         actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
         actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -55,7 +59,12 @@ class Drive:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, machine: Machine, num_worlds: int, device: torch.device | str, dtype: torch.dtype
+        self,
+        model: mujoco.MjModel,
+        machine: Machine,
+        num_worlds: int,
+        device: torch.device | str,
+        dtype: torch.dtype,
     ) -> None:
         stiffness, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
 
@@ -65,12 +74,17 @@ class Drive:
         self.reference = torch.zeros(num_worlds, machine.num_joints, dtype=dtype, device=device)
         self._rate = 1.0 / machine.period_s
         self._lead = constant(damping / stiffness)
-        self._leash = constant(np.array([body.yield_force.value for body in machine.bodies]) / stiffness)
+        self._leash = constant(
+            np.array([body.yield_force.value for body in machine.bodies]) / stiffness
+        )
 
-    def step(self, q: torch.Tensor, increment: torch.Tensor, act: torch.Tensor, ctrl: torch.Tensor) -> None:
+    def step(
+        self, q: torch.Tensor, increment: torch.Tensor, act: torch.Tensor, ctrl: torch.Tensor
+    ) -> None:
         """Moves the references on by one control period.
 
-        The reference never leads the joint by more than what opens the relief valve, so a blocked joint does not wind up.
+        The reference never leads the joint by more than what opens the relief valve, so a blocked
+        joint does not wind up.
 
         Args:
             q: Present positions, `(N, J)`.
@@ -87,7 +101,8 @@ class Drive:
     def diverged(self, qvel: torch.Tensor) -> torch.Tensor:
         """Returns the worlds, `(N,)` bool, that are beyond use: absurd or NaN joint speeds, `(N, J)`, or references not finite.
 
-        The references count because the cut-off at the yield force turns NaN into a force that looks sound.
+        The references count because the cut-off at the yield force turns NaN into a force that
+        looks sound.
         """
         return (self.reference.mul(0.0).add_(qvel).abs_().amax(1) <= MAX_SPEED).logical_not_()
 

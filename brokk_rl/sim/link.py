@@ -36,7 +36,10 @@ class Simulated:
     @property
     def source(self) -> str:
         """The actuator and its effects."""
-        inner, effects = getattr(self.actuator, "actuator", self.actuator), getattr(self.actuator, "effects", {})
+        inner, effects = (
+            getattr(self.actuator, "actuator", self.actuator),
+            getattr(self.actuator, "effects", {}),
+        )
         return "simulator: " + " + ".join([type(inner).__name__, *effects])
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> "SimulatedLink":
@@ -49,20 +52,36 @@ class Simulated:
 class SimulatedLink:
     """The link at work; each `send` is one control period."""
 
-    def __init__(self, config: Simulated, machine: Machine, num_runs: int, session: Session, device: torch.device) -> None:
+    def __init__(
+        self,
+        config: Simulated,
+        machine: Machine,
+        num_runs: int,
+        session: Session,
+        device: torch.device,
+    ) -> None:
         self._config, self._machine, self._device = config, machine, device
         self._generator = session.generator("link")
         self._form = (num_runs, machine.num_joints) if num_runs > 1 else (machine.num_joints,)
         everywhere = torch.ones(num_runs, dtype=torch.bool, device=device)
         shape = (num_runs, machine.num_history, machine.num_joints)
-        self._history = History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
-        self._history.reset(everywhere, torch.as_tensor(machine.home, dtype=torch.float32, device=device).repeat(num_runs, 1))
+        self._history = History(
+            q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device)
+        )
+        self._history.reset(
+            everywhere,
+            torch.as_tensor(machine.home, dtype=torch.float32, device=device).repeat(num_runs, 1),
+        )
         devices = [device] if device.type == "cuda" else []
         with torch.random.fork_rng(devices):  # what differs from machine to machine is drawn here
             torch.manual_seed(session.stream("link"))
             self._model = config.actuator.build(machine, num_runs, device)
             self._model.reset(everywhere)
-        self._logged = {path.rpartition(".")[2]: path for path in self._model.state if path.rpartition(".")[2] in LOGGED}
+        self._logged = {
+            path.rpartition(".")[2]: path
+            for path in self._model.state
+            if path.rpartition(".")[2] in LOGGED
+        }
         self._steps = 0
         self._measure()
 
@@ -72,10 +91,14 @@ class SimulatedLink:
 
     def send(self, command: Command) -> Command:
         """Drives the machines for one control period; what is no number is a standstill."""
-        u = np.nan_to_num(np.asarray(command.u, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0).clip(-1.0, 1.0)
+        u = np.nan_to_num(
+            np.asarray(command.u, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0
+        ).clip(-1.0, 1.0)
         u = u.astype(np.float32)  # recorded as it was computed with
         with torch.inference_mode():
-            self._history.push_u(torch.as_tensor(u.reshape(self._measured.shape), device=self._device))
+            self._history.push_u(
+                torch.as_tensor(u.reshape(self._measured.shape), device=self._device)
+            )
             self._history.push_q(self._model.step(self._history))
         self._steps += 1
         self._measure()

@@ -1,7 +1,8 @@
 """From a machine and its MJCF to a compiled MuJoCo model.
 
-The MJCF says what the links look like and how their mass is distributed; every number about the machine is written into it from the
-machine's YAML, so that simulation, policy and the machine's own computer cannot disagree.
+The MJCF says what the links look like and how their mass is distributed; every number about the
+machine is written into it from the machine's YAML, so that simulation, policy and the machine's own
+computer cannot disagree.
 """
 
 from pathlib import Path
@@ -50,10 +51,14 @@ def contact_sensors(model: mujoco.MjModel) -> np.ndarray:
 
 def _read(machine: Machine) -> mujoco.MjSpec:
     if machine.mjcf is None:
-        raise ConfigError(f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose another machine=…")
+        raise ConfigError(
+            f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose another machine=…"
+        )
     path = ASSETS / machine.mjcf
     if not path.exists():
-        raise ConfigError(f"machine {machine.name}: no MJCF at {path}; set `mjcf` to a file under {ASSETS} or to an absolute path")
+        raise ConfigError(
+            f"machine {machine.name}: no MJCF at {path}; set `mjcf` to a file under {ASSETS} or to an absolute path"
+        )
     try:  # included rather than attached, so that names stay as the MJCF gives them
         includes = "".join(f'<include file="{file}"/>' for file in (ASSETS / "worksite.xml", path))
         spec = mujoco.MjSpec.from_string(f"<mujoco>{includes}</mujoco>")
@@ -69,7 +74,9 @@ def _read(machine: Machine) -> mujoco.MjSpec:
             f"({', '.join(machine.joint_names)}); missing: {', '.join(missing) or 'none'}, unknown: {', '.join(extra) or 'none'}"
         )
     if spec.site("tip") is None:
-        raise ConfigError(f"machine {machine.name}: {path.name} has no site 'tip' for the tool point")
+        raise ConfigError(
+            f"machine {machine.name}: {path.name} has no site 'tip' for the tool point"
+        )
     return spec
 
 
@@ -79,15 +86,25 @@ def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
     links = [spec.joint(name).parent for name in machine.joint_names]
     ends = [_values(body.origin_m) for body in machine.bodies[1:]] + [machine.tip_m]
     for joint, body, link, end, drawn_end in zip(
-        machine.joints, machine.bodies, links, ends, [*(b.pos for b in links[1:]), spec.site("tip").pos], strict=True
+        machine.joints,
+        machine.bodies,
+        links,
+        ends,
+        [*(b.pos for b in links[1:]), spec.site("tip").pos],
+        strict=True,
     ):
         _stretch(link, np.array(drawn_end), end)
         _write_inertia(link, drawn, body.mass_kg.value, body.com_m)
         link.pos = _values(body.origin_m)
         hinge = spec.joint(joint.name)
-        hinge.type = mujoco.mjtJoint.mjJNT_HINGE if joint.kind == "hinge" else mujoco.mjtJoint.mjJNT_SLIDE
+        hinge.type = (
+            mujoco.mjtJoint.mjJNT_HINGE if joint.kind == "hinge" else mujoco.mjtJoint.mjJNT_SLIDE
+        )
         hinge.axis, hinge.pos = body.axis, (0.0, 0.0, 0.0)
-        hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_TRUE, (joint.lower.value, joint.upper.value)
+        hinge.limited, hinge.range = (
+            mujoco.mjtLimited.mjLIMITED_TRUE,
+            (joint.lower.value, joint.upper.value),
+        )
     spec.site("tip").pos = machine.tip_m
 
 
@@ -116,11 +133,15 @@ def _stretch(link: mujoco.MjsBody, drawn_end: np.ndarray, end: np.ndarray) -> No
             geom.size = geom.size * (1.0 + (factor - 1.0) * np.abs(along @ axes.reshape(3, 3)) ** 2)
 
 
-def _write_inertia(link: mujoco.MjsBody, drawn: mujoco.MjModel, mass_kg: float, com_m: tuple[float, float, float]) -> None:
+def _write_inertia(
+    link: mujoco.MjsBody, drawn: mujoco.MjModel, mass_kg: float, com_m: tuple[float, float, float]
+) -> None:
     """Gives the link its mass and centre of mass; its inertia is that of the MJCF, scaled with the mass."""
     body = drawn.body(link.name)
     if body.mass[0] <= 0.0:
-        raise ConfigError(f"link '{link.name}' of the MJCF has no mass: give it an <inertial> or a geom with density")
+        raise ConfigError(
+            f"link '{link.name}' of the MJCF has no mass: give it an <inertial> or a geom with density"
+        )
     link.explicitinertial = True
     link.mass, link.ipos, link.iquat = mass_kg, com_m, body.iquat
     link.inertia = body.inertia * (mass_kg / body.mass[0])
@@ -130,7 +151,8 @@ def _write_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     option = spec.option
     option.timestep = timestep_s
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # a pyramid's friction depends on how its edges lie, which MuJoCo C and MuJoCo Warp choose differently
+    # a pyramid's friction depends on how its edges lie, which MuJoCo C and MuJoCo Warp choose
+    # differently
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     # what gravity does to the motion is in the actuator model, see `brokk_rl.sim.drive`

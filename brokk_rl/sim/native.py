@@ -34,14 +34,18 @@ class Native:
                 f"{self.substeps} and {self.num_threads}"
             )
 
-    def build(self, machine: Machine, device: torch.device | str, num_worlds: int | None = None) -> NativeWorld:
+    def build(
+        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+    ) -> NativeWorld:
         """Returns the worlds; `num_worlds` overrides the number in the config.
 
         Raises:
             DeviceError: `device` is not the CPU.
         """
         if torch.device(device).type != "cpu":
-            raise DeviceError(f"sim=native runs on the CPU, but device '{device}' was asked for; choose sim=warp, or the CPU")
+            raise DeviceError(
+                f"sim=native runs on the CPU, but device '{device}' was asked for; choose sim=warp, or the CPU"
+            )
         return NativeWorld(machine, num_worlds or self.num_worlds, self.substeps, self.num_threads)
 
 
@@ -62,15 +66,24 @@ class NativeWorld:
         self.model = compile_model(machine, machine.period_s / substeps)
         self._batch = Batch(self.model, num_worlds, num_threads)
         self._substeps = substeps
-        self._state, self._warning = torch.from_numpy(self._batch.state), torch.from_numpy(self._batch.warning)
+        self._state, self._warning = (
+            torch.from_numpy(self._batch.state),
+            torch.from_numpy(self._batch.warning),
+        )
         bound = {
-            name: torch.from_numpy(self._batch.bind(name)) for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
+            name: torch.from_numpy(self._batch.bind(name))
+            for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
         }
-        self._qpos, self._qvel, self._act, self._ctrl, self._mocap_pos, self._mocap_quat = bound.values()
-        self._geom_size, self._geom_pos = (torch.from_numpy(self._batch.expand(name)) for name in ("geom_size", "geom_pos"))
+        self._qpos, self._qvel, self._act, self._ctrl, self._mocap_pos, self._mocap_quat = (
+            bound.values()
+        )
+        self._geom_size, self._geom_pos = (
+            torch.from_numpy(self._batch.expand(name)) for name in ("geom_size", "geom_pos")
+        )
         self._placement = Placement(self.model, self.device, torch.float64)
         self._drive = Drive(self.model, machine, num_worlds, self.device, torch.float64)
-        # touch sensors measure in every substep; recording them all catches a peak between two control steps
+        # touch sensors measure in every substep; recording them all catches a peak between two
+        # control steps
         self._recorded = self._batch.rollout(substeps, record=("sensordata",))
         self._sensors = torch.from_numpy(self._recorded["sensordata"])
         self._is_touch = torch.from_numpy(contact_sensors(self.model))
@@ -89,7 +102,9 @@ class NativeWorld:
             self.faults[torch.from_numpy(error.ids)] = True
         self.contact_force_n.copy_((self._sensors @ self._is_touch).amax(1))
         self.q.copy_(self._qpos)
-        self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(self._warning.flatten(1).any(1))
+        self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(
+            self._warning.flatten(1).any(1)
+        )
 
     def bare_step(self) -> None:
         """Does nothing but `mujoco.batch`: as many substeps, no drive, nothing read out; what `step` is held against."""

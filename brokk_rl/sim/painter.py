@@ -18,7 +18,8 @@ _SHOWN_GROUPS = (0, 1, 2)
 class Painter:
     """Draws one world in any pose and scene; a context manager.
 
-    Needs a GL library: set `MUJOCO_GL` before MuJoCo is imported for the first time (`sim.probe.working_renderer` says to what).
+    Needs a GL library: set `MUJOCO_GL` before MuJoCo is imported for the first time
+    (`sim.probe.working_renderer` says to what).
 
     Args:
         machine: The machine.
@@ -39,7 +40,12 @@ class Painter:
     def __enter__(self) -> Painter:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         for renderer in self._renderers.values():
             renderer.close()
 

@@ -46,15 +46,25 @@ def capture_graph() -> str:
 def working_renderer() -> str | None:
     """Returns the first value of MUJOCO_GL with which a picture can be drawn here, `None` when there is none.
 
-    MuJoCo settles on one library at import and a broken driver may end the process, so each try has a process of its own.
+    MuJoCo settles on one library at import and a broken driver may end the process, so each try has
+    a process of its own.
     """
     chosen = os.environ.get("MUJOCO_GL")
     program = "from brokk_rl.sim.probe import render; render()"
     for name in (chosen,) if chosen else RENDERERS:
-        environment = os.environ | {"MUJOCO_GL": name, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+        environment = os.environ | {
+            "MUJOCO_GL": name,
+            "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+        }
         try:
             with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes its log where it runs
-                done = subprocess.run([sys.executable, "-c", program], env=environment, cwd=folder, capture_output=True, timeout=60)
+                done = subprocess.run(
+                    [sys.executable, "-c", program],
+                    env=environment,
+                    cwd=folder,
+                    capture_output=True,
+                    timeout=60,
+                )
         except subprocess.TimeoutExpired:
             continue
         if done.returncode == 0:
@@ -70,7 +80,9 @@ def render() -> None:
     """
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"
+    )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, 32, 32) as renderer:

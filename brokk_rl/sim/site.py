@@ -53,9 +53,13 @@ class Site:
             ConfigError: more than one machine is asked for, or the start does not fit the machine.
         """
         if num_runs != 1:
-            raise ConfigError(f"link=site has one machine, not {num_runs}; link=simulated has as many as you like")
+            raise ConfigError(
+                f"link=site has one machine, not {num_runs}; link=simulated has as many as you like"
+            )
         if self.start is not None and len(self.start) != machine.num_joints:
-            raise ConfigError(f"link.start: expected {machine.num_joints} joint positions, got {len(self.start)}")
+            raise ConfigError(
+                f"link.start: expected {machine.num_joints} joint positions, got {len(self.start)}"
+            )
         return SiteLink(self, machine, session)
 
 
@@ -72,9 +76,16 @@ class SiteLink:
             torch.manual_seed(session.stream("link"))
             self._model = site.actuator.build(machine, 1, cpu)
         self._history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-        self._logged = {path.rpartition(".")[2]: path for path in self._model.state if path.rpartition(".")[2] in LOGGED}
+        self._logged = {
+            path.rpartition(".")[2]: path
+            for path in self._model.state
+            if path.rpartition(".")[2] in LOGGED
+        }
         self._steps, self._measured = 0, np.zeros(machine.num_joints)
-        self.place(np.array(site.start if site.start is not None else machine.home), np.array(site.hole_in_base_m))
+        self.place(
+            np.array(site.start if site.start is not None else machine.home),
+            np.array(site.hole_in_base_m),
+        )
 
     def read(self) -> JointState:
         """Returns the state after the last control period; reading twice gives the same."""
@@ -82,7 +93,9 @@ class SiteLink:
 
     def send(self, command: Command) -> Command:
         """Drives the machine for one control period; what is no number is a standstill."""
-        u = np.nan_to_num(np.asarray(command.u, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0).clip(-1.0, 1.0)
+        u = np.nan_to_num(
+            np.asarray(command.u, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0
+        ).clip(-1.0, 1.0)
         with torch.inference_mode():
             self._history.push_u(torch.as_tensor(u[None], dtype=torch.float32))
             self._world.step(self._model.step(self._history) - self._history.q[:, -1])
@@ -106,7 +119,9 @@ class SiteLink:
 
     def extra(self) -> dict[str, np.ndarray]:
         """Returns the contact force, and the oil's temperature where the model knows one, each `(1,)`."""
-        found = {name: self._model.state[path].numpy().copy() for name, path in self._logged.items()}
+        found = {
+            name: self._model.state[path].numpy().copy() for name, path in self._logged.items()
+        }
         return found | {"force_n": self._world.contact_force_n.numpy().copy()}
 
     def __enter__(self) -> Self:

@@ -23,7 +23,12 @@ def frames(
 
     pose = Kinematics(machine).pose(torch.as_tensor(arrays["q"], dtype=torch.float32))
     chain = torch.cat(
-        (torch.zeros_like(pose.tip_in_base_m[:, None]), pose.joints_in_base_m, pose.tip_in_base_m[:, None]), 1
+        (
+            torch.zeros_like(pose.tip_in_base_m[:, None]),
+            pose.joints_in_base_m,
+            pose.tip_in_base_m[:, None],
+        ),
+        1,
     ).numpy()
     lines, scene = captions(machine, arrays), arrays["scene"]
 
@@ -55,15 +60,33 @@ def _view(axes, scene: np.ndarray, up: int):
         corners = np.stack([xs, zs], axis=1) + np.array([x, rim_z])
     else:
         turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-        corners = np.array([[-length, -width], [length, -width], [length, width], [-length, width]]) @ turn.T + np.array([x, y])
+        corners = np.array(
+            [[-length, -width], [length, -width], [length, width], [-length, width]]
+        ) @ turn.T + np.array([x, y])
     axes.fill(*corners.T, color="0.75", zorder=0)
     if up == 2:
         axes.axhline(0.0, color="0.4", linewidth=1)
     else:
         angles = np.linspace(0, 2 * np.pi, 60)
-        axes.plot(x + radius * np.cos(angles), y + radius * np.sin(angles), color="0.2", linewidth=1)
-    axes.set(xlim=(-1.0, 5.0), ylim=(-0.8, 3.6) if up == 2 else (-2.6, 2.6), xlabel="x / m", ylabel="z / m" if up == 2 else "y / m")
+        axes.plot(
+            x + radius * np.cos(angles), y + radius * np.sin(angles), color="0.2", linewidth=1
+        )
+    axes.set(
+        xlim=(-1.0, 5.0),
+        ylim=(-0.8, 3.6) if up == 2 else (-2.6, 2.6),
+        xlabel="x / m",
+        ylabel="z / m" if up == 2 else "y / m",
+    )
     axes.set_aspect("equal")
-    (links,) = axes.plot([], [], "-o", color="darkorange", linewidth=5, markersize=5, markerfacecolor="0.2", markeredgecolor="0.2")
+    (links,) = axes.plot(
+        [],
+        [],
+        "-o",
+        color="darkorange",
+        linewidth=5,
+        markersize=5,
+        markerfacecolor="0.2",
+        markeredgecolor="0.2",
+    )
     (chisel,) = axes.plot([], [], color="0.15", linewidth=3)
     return links, chisel

@@ -62,7 +62,8 @@ class Motion(Protocol):
 def render_video(machine: Machine, motion: Motion, path: Path) -> Path:
     """Writes an mp4 to `path` and stills beside it (`<stem>_0.png` is the start, the last one the end).
 
-    The renderer runs in a process of its own: GL drivers can end the process, and MuJoCo settles on one when it is imported.
+    The renderer runs in a process of its own: GL drivers can end the process, and MuJoCo settles on
+    one when it is imported.
 
     Returns:
         `path`.
@@ -89,11 +90,16 @@ def _painted(machine: Machine, arrays: dict[str, np.ndarray], draft: Path) -> bo
     """Tries MuJoCo's renderer in a process of its own; returns whether it drew everything."""
     library = working_renderer()
     if library is None:
-        log.warning("no GL library works here, so the video is a drawing; for pictures install libegl1 (see `brokk mode=doctor`)")
+        log.warning(
+            "no GL library works here, so the video is a drawing; for pictures install libegl1 (see `brokk mode=doctor`)"
+        )
         return False
     job = draft.with_suffix(".job")
     job.write_bytes(pickle.dumps((machine, arrays, draft)))
-    environment = os.environ | {"MUJOCO_GL": library, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
+    environment = os.environ | {
+        "MUJOCO_GL": library,
+        "PYTHONPATH": os.pathsep.join(part for part in sys.path if part),
+    }
     program = "import sys; from brokk_rl.sim.video import paint; paint(sys.argv[1])"
     try:
         done = subprocess.run(
@@ -109,7 +115,9 @@ def _painted(machine: Machine, arrays: dict[str, np.ndarray], draft: Path) -> bo
         return False
     if done.returncode:
         log.warning(
-            "MuJoCo's renderer failed with MUJOCO_GL=%s, so the video is a drawing: %s", library, done.stderr.strip()[-500:]
+            "MuJoCo's renderer failed with MUJOCO_GL=%s, so the video is a drawing: %s",
+            library,
+            done.stderr.strip()[-500:],
         )
     return done.returncode == 0
 
@@ -120,7 +128,9 @@ def paint(job: str) -> None:
     write(draft, _pictures(machine, arrays), len(arrays["q"]), machine.period_s)
 
 
-def _pictures(machine: Machine, arrays: dict[str, np.ndarray]) -> Callable[[Iterable[int]], Iterator[np.ndarray]]:
+def _pictures(
+    machine: Machine, arrays: dict[str, np.ndarray]
+) -> Callable[[Iterable[int]], Iterator[np.ndarray]]:
     """Returns what draws the given steps: the overview, the borehole close up, and the commands."""
     from PIL import Image, ImageDraw, ImageFont
 
@@ -133,11 +143,21 @@ def _pictures(machine: Machine, arrays: dict[str, np.ndarray]) -> Callable[[Iter
         with Painter(machine, width, height) as painter:
             for step in steps:
                 painter.pose(arrays["q"][step], arrays["scene"])
-                views = painter.picture("overview", split, height), painter.picture("close", CLOSE_WIDTH, height)
+                views = (
+                    painter.picture("overview", split, height),
+                    painter.picture("close", CLOSE_WIDTH, height),
+                )
                 picture = Image.fromarray(np.concatenate(views, axis=1))
                 pen = ImageDraw.Draw(picture)
                 pen.rectangle((split - 1, 0, split + 1, height), fill="white")
-                pen.text((16, 12), lines[step], fill="white", font=font, stroke_width=2, stroke_fill=(40, 40, 40))
+                pen.text(
+                    (16, 12),
+                    lines[step],
+                    fill="white",
+                    font=font,
+                    stroke_width=2,
+                    stroke_fill=(40, 40, 40),
+                )
                 _bars(pen, machine.joint_names, arrays["u"][step], font, height)
                 yield np.asarray(picture)
 
@@ -148,7 +168,9 @@ def _bars(pen, names: tuple[str, ...], u: np.ndarray, font, height: int) -> None
     """Draws one bar per joint in the lower left corner, from the middle to the command."""
     for row, (name, value) in enumerate(zip(names, u, strict=True)):
         y = height - 20 - 24 * (len(names) - row)
-        pen.text((16, y - 4), name, fill="white", font=font, stroke_width=2, stroke_fill=(40, 40, 40))
+        pen.text(
+            (16, y - 4), name, fill="white", font=font, stroke_width=2, stroke_fill=(40, 40, 40)
+        )
         pen.rectangle((60, y, 200, y + 14), fill=(60, 60, 60))
         ends = sorted((130.0, 130.0 + 70.0 * float(np.clip(value, -1.0, 1.0))))
         pen.rectangle((ends[0], y + 1, ends[1], y + 13), fill=(250, 170, 10))
@@ -156,17 +178,31 @@ def _bars(pen, names: tuple[str, ...], u: np.ndarray, font, height: int) -> None
 
 def captions(machine: Machine, arrays: dict[str, np.ndarray]) -> list[str]:
     """Returns a line for each step: time, where the tip is relative to the rim (unless the block is far away), and force."""
-    tip = Kinematics(machine).pose(torch.as_tensor(arrays["q"], dtype=torch.float32)).tip_in_base_m.numpy() - arrays["scene"][:3]
+    tip = (
+        Kinematics(machine)
+        .pose(torch.as_tensor(arrays["q"], dtype=torch.float32))
+        .tip_in_base_m.numpy()
+        - arrays["scene"][:3]
+    )
     concerned = float(np.hypot(*arrays["scene"][:2])) < FAR_M
     lines = []
     for step, ((x, y, z), force) in enumerate(zip(tip, arrays["force_n"], strict=True)):
         side = "above" if z > 0 else "below"
-        where = f"{100 * abs(z):4.0f} cm {side} the rim, {100 * math.hypot(x, y):5.1f} cm off axis    " if concerned else ""
+        where = (
+            f"{100 * abs(z):4.0f} cm {side} the rim, {100 * math.hypot(x, y):5.1f} cm off axis    "
+            if concerned
+            else ""
+        )
         lines.append(f"{step * machine.period_s:5.1f} s    {where}{force:6.0f} N")
     return lines
 
 
-def write(path: Path, draw: Callable[[Iterable[int]], Iterator[np.ndarray]], num_steps: int, period_s: float) -> None:
+def write(
+    path: Path,
+    draw: Callable[[Iterable[int]], Iterator[np.ndarray]],
+    num_steps: int,
+    period_s: float,
+) -> None:
     """Writes an mp4 and stills.
 
     Args:
@@ -182,7 +218,9 @@ def write(path: Path, draw: Callable[[Iterable[int]], Iterator[np.ndarray]], num
     steps = sorted({*range(0, num_steps, stride), num_steps - 1})
     chosen = {round(i * (len(steps) - 1) / (NUM_STILLS - 1)): i for i in range(NUM_STILLS)}
     rate_hz = 1.0 / (period_s * stride)
-    writer = imageio_ffmpeg.write_frames(str(path), SIZE, fps=rate_hz, quality=7, macro_block_size=4)  # pyright: ignore[reportArgumentType]
+    writer = imageio_ffmpeg.write_frames(
+        str(path), SIZE, fps=rate_hz, quality=7, macro_block_size=4
+    )  # pyright: ignore[reportArgumentType]
     writer.send(None)
     try:
         for count, picture in enumerate(draw(steps)):

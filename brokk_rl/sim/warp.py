@@ -21,13 +21,16 @@ class Warp:
     Attributes:
         num_worlds: Worlds, unless the caller of `build` asks for another number.
         substeps: Physics steps per control period.
-        num_contacts: Contacts for which there is room, in each world on average; more are a fault of the worlds that lose them.
-        num_constraints: Rows for contacts and joint limits for which there is room in each world; more are a fault.
+        num_contacts: Contacts for which there is room, in each world on average; more are a fault
+            of the worlds that lose them.
+        num_constraints: Rows for contacts and joint limits for which there is room in each world;
+            more are a fault.
         iterations: Bound on the solver's iterations in a substep.
         linesearch_iterations: Bound on the line search's iterations in each of them.
         tolerance: At which the solver stops.
-        fused: Dynamics, contacts' solver and integration by launches of our own (`warp_dynamics`, `warp_solver`): 18 a substep
-            instead of 60 and ten an iteration. The same physics; held against MuJoCo C on a CPU, not yet run on a GPU.
+        fused: Dynamics, contacts' solver and integration by launches of our own (`warp_dynamics`,
+            `warp_solver`): 18 a substep instead of 60 and ten an iteration. The same physics; held
+            against MuJoCo C on a CPU, not yet run on a GPU.
     """
 
     num_worlds: int
@@ -49,9 +52,13 @@ class Warp:
             self.linesearch_iterations,
         )
         if min(counts) < 1 or self.tolerance <= 0.0:
-            raise ConfigError(f"sim: expected counts of 1 or more and a positive tolerance, got {counts} and {self.tolerance}")
+            raise ConfigError(
+                f"sim: expected counts of 1 or more and a positive tolerance, got {counts} and {self.tolerance}"
+            )
 
-    def build(self, machine: Machine, device: torch.device | str, num_worlds: int | None = None) -> WarpWorld:
+    def build(
+        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+    ) -> WarpWorld:
         """Returns the worlds; `num_worlds` overrides the number in the config. On a CPU this is slow and meant for tests.
 
         Raises:
@@ -64,6 +71,8 @@ class Warp:
             )
         if device.type == "cuda" and device.index is None:
             device = torch.device("cuda", torch.cuda.current_device())
-        from brokk_rl.sim.warp_world import WarpWorld  # takes seconds to import, so only where it is needed
+        from brokk_rl.sim.warp_world import (
+            WarpWorld,
+        )  # takes seconds to import, so only where it is needed
 
         return WarpWorld(self, machine, num_worlds or self.num_worlds, device)

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import warp as wp
 
 MAX_DOFS = 16
-"""Up to here Warp unrolls the loops over degrees of freedom; beyond, a solver for any size is the better one."""
+"""Up to here Warp unrolls the loops over degrees of freedom; beyond, a solver for any size is the
+better one."""
 
 
 class Algebra(NamedTuple):
@@ -17,8 +18,10 @@ class Algebra(NamedTuple):
     Attributes:
         Vector: A number a degree of freedom.
         Matrix: A square matrix.
-        inertia_at: `(elements, element, world)` -> the mass matrix of a world, from the lower half that `mujoco_warp` keeps.
-        solved: `(A, b)` -> the solution of A x = b for a positive definite A, which needs no pivots.
+        inertia_at: `(elements, element, world)` -> the mass matrix of a world, from the lower half
+            that `mujoco_warp` keeps.
+        solved: `(A, b)` -> the solution of A x = b for a positive definite A, which needs no
+            pivots.
     """
 
     Vector: Any

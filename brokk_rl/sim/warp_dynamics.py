@@ -2,16 +2,19 @@
 # (sizes of vectors and matrices are known only at run time, so that their types are values)
 """Forces on an arm before contacts, and its step in time after them: a launch each for all Warp worlds.
 
-Before: the mass matrix M, the forces of the servos (`brokk_rl.sim.drive`) and the inertial forces of the present motion, from
-Newton's and Euler's laws of every body projected onto the joints (Kane and Levinson, "Dynamics: Theory and Applications", 1985):
+Before: the mass matrix M, the forces of the servos (`brokk_rl.sim.drive`) and the inertial forces
+of the present motion, from Newton's and Euler's laws of every body projected onto the joints (Kane
+and Levinson, "Dynamics: Theory and Applications", 1985):
 
     M = Σ m Jᵀ J + Wᵀ I W        bias = Σ Jᵀ (m a) + Wᵀ (I α + ω × I ω)
 
-with the Jacobians J and W of a body's centre of mass and turn, and its accelerations a and α where no joint accelerates. After:
-MuJoCo's implicit integrator (documentation, Computation, "implicitfast"), (M + h D) x' = M x with the damping D of the servos that
-are not cut off at their yield force.
+with the Jacobians J and W of a body's centre of mass and turn, and its accelerations a and α where
+no joint accelerates. After: MuJoCo's implicit integrator (documentation, Computation,
+"implicitfast"), (M + h D) x' = M x with the damping D of the servos that are not cut off at their
+yield force.
 
-For five joints this is less arithmetic than the recursions of `mujoco_warp`, made for any tree, take in launches.
+For five joints this is less arithmetic than the recursions of `mujoco_warp`, made for any tree,
+take in launches.
 """
 
 import functools
@@ -79,7 +82,10 @@ def _kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
     ):
         world = wp.tid()
         inertia, bias = Matrix(), Vector()
-        turns, moves = Columns(), Columns()  # of each joint at unit speed: its turn, and the velocity of a point at `origin`
+        turns, moves = (
+            Columns(),
+            Columns(),
+        )  # of each joint at unit speed: its turn, and the velocity of a point at `origin`
         origin = pose.anchor[world, 0]
         omega, alpha, acceleration, point = wp.vec3(), wp.vec3(), wp.vec3(), wp.vec3(origin)
         for k in range(n):
@@ -103,17 +109,27 @@ def _kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
                 body = arm.bodies[at]
                 mass = arm.mass[world % arm.mass.shape[0], body]
                 frame = pose.frame[world, body]
-                tensor = frame * wp.diag(arm.inertia[world % arm.inertia.shape[0], body]) * wp.transpose(frame)
+                tensor = (
+                    frame
+                    * wp.diag(arm.inertia[world % arm.inertia.shape[0], body])
+                    * wp.transpose(frame)
+                )
                 center = pose.center[world, body]
                 to = center - point
-                force = mass * (acceleration + wp.cross(alpha, to) + wp.cross(omega, wp.cross(omega, to)))
+                force = mass * (
+                    acceleration + wp.cross(alpha, to) + wp.cross(omega, wp.cross(omega, to))
+                )
                 torque = tensor * alpha + wp.cross(omega, tensor * omega)
                 for i in range(k + 1):
                     move = moves[i] + wp.cross(turns[i], center - origin)
                     bias[i] = bias[i] + wp.dot(move, force) + wp.dot(turns[i], torque)
                     for j in range(i + 1):
                         other = moves[j] + wp.cross(turns[j], center - origin)
-                        inertia[i, j] = inertia[i, j] + mass * wp.dot(move, other) + wp.dot(turns[i], tensor * turns[j])
+                        inertia[i, j] = (
+                            inertia[i, j]
+                            + mass * wp.dot(move, other)
+                            + wp.dot(turns[i], tensor * turns[j])
+                        )
         reference[world, root] = origin
         for i in range(n):
             for j in range(i + 1):
@@ -121,7 +137,10 @@ def _kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
                     own = wp.where(i == j, arm.armature[world % arm.armature.shape[0], i], 0.0)
                     elements[world, element[i, j]] = inertia[i, j] + own
             bound = arm.yield_force[i]
-            pull = arm.stiffness[i] * (act[world, i] - qpos[world, i]) - arm.damping[i] * qvel[world, i]
+            pull = (
+                arm.stiffness[i] * (act[world, i] - qpos[world, i])
+                - arm.damping[i] * qvel[world, i]
+            )
             servo[world, i] = wp.clamp(pull, bound[0], bound[1])
             smooth[world, i] = servo[world, i] - bias[i]
 
@@ -179,7 +198,8 @@ class Dynamics:
     """Stands in for all of `mujoco_warp` but kinematics, collisions, constraints and their solution, for an arm driven by servos.
 
     Args:
-        mujoco_model: The arm: joints in one chain, each driven by the servo of its number (`brokk_rl.sim.drive`).
+        mujoco_model: The arm: joints in one chain, each driven by the servo of its number
+            (`brokk_rl.sim.drive`).
         model: The same on the device.
         data: Worlds of the model.
     """
@@ -202,7 +222,12 @@ class Dynamics:
         arm.bodies = wp.array(bodies, dtype=int, device=device)
         first = np.searchsorted(last_dof[bodies], np.arange(mujoco_model.nv + 1))
         arm.first_body = wp.array(first, dtype=int, device=device)
-        pose.axis, pose.anchor, pose.center, pose.frame = data.xaxis, data.xanchor, data.xipos, data.ximat
+        pose.axis, pose.anchor, pose.center, pose.frame = (
+            data.xaxis,
+            data.xanchor,
+            data.xipos,
+            data.ximat,
+        )
         root = int(mujoco_model.body_rootid[bodies[0]])
         state = [data.qpos, data.qvel, data.act]
         servo, inertia = data.actuator_force, data.M
@@ -210,7 +235,17 @@ class Dynamics:
         self._before = [arm, pose, model.M_elemid, root, *state]
         # contact Jacobians measure `cdof` from `subtree_com` of the root: any point near will do
         self._before += [data.subtree_com, data.cdof, inertia, servo, data.qfrc_smooth]
-        self._after = [arm, model.M_elemid, model.opt.timestep, inertia, servo, data.qacc, data.efc.Ma, data.ctrl, *counts]
+        self._after = [
+            arm,
+            model.M_elemid,
+            model.opt.timestep,
+            inertia,
+            servo,
+            data.qacc,
+            data.efc.Ma,
+            data.ctrl,
+            *counts,
+        ]
         self._after += [*state, data.time, data.qacc_warmstart, data.overflow]
         self._kernels, self._num_worlds = _kernels(model.nv), data.nworld
 
@@ -226,4 +261,8 @@ class Dynamics:
 def _last_dof(model: mujoco.MjModel, body: int) -> int:
     """Returns the last degree of freedom that moves `body`, -1 for none."""
     welded = model.body_weldid[body]
-    return int(model.body_dofadr[welded] + model.body_dofnum[welded] - 1) if model.body_dofnum[welded] else -1
+    return (
+        int(model.body_dofadr[welded] + model.body_dofnum[welded] - 1)
+        if model.body_dofnum[welded]
+        else -1
+    )

@@ -1,16 +1,20 @@
 """The contact solver of the Warp worlds: a world's whole problem in one launch.
 
-MuJoCo finds the acceleration x that minimises a convex cost (MuJoCo documentation, Computation, "Constraint solver" and "Primal
-problem"; Todorov, "Convex and analytically-invertible dynamics with contacts and constraints", ICRA 2014):
+MuJoCo finds the acceleration x that minimises a convex cost (MuJoCo documentation, Computation,
+"Constraint solver" and "Primal problem"; Todorov, "Convex and analytically-invertible dynamics with
+contacts and constraints", ICRA 2014):
 
     ½ (x - x₀)ᵀ M (x - x₀) + Σ s(J x - a)        x₀ = M⁻¹ f, the acceleration without constraints
 
-One term of the sum is a joint limit or a contact: a limit costs ½ D r² while its residual r = J x - a is negative; a contact has a
-residual along its normal and two along its surface, and an elliptic cone divides their space into three zones (`_cone`). Newton's
-method with a line search along each step finds the minimum in a few iterations.
+One term of the sum is a joint limit or a contact: a limit costs ½ D r² while its residual r = J x -
+a is negative; a contact has a residual along its normal and two along its surface, and an elliptic
+cone divides their space into three zones (`_cone`). Newton's method with a line search along each
+step finds the minimum in a few iterations.
 
-An arm has a handful of joints and contacts, so that the solver of `mujoco_warp`, made for any size, spends its time on launching a
-dozen kernels an iteration. Here a warp of 32 threads solves a world: each thread takes a constraint and all share the sums.
+An arm has a handful of joints and contacts, so that the solver of `mujoco_warp`, made for any size,
+spends its time on launching a
+dozen kernels an iteration. Here a warp of 32 threads solves a world: each thread takes a constraint
+and all share the sums.
 """
 
 # pyright: reportInvalidTypeForm=false
@@ -25,14 +29,17 @@ import warp as wp
 from brokk_rl.sim.warp_algebra import algebra
 
 NUM_LANES = 32
-"""Threads a world. A block that is one warp sums without waiting; an arm has fewer constraints than that."""
+"""Threads a world. A block that is one warp sums without waiting; an arm has fewer constraints than
+that."""
 
 _SLOPE_LEFT = wp.constant(0.01)
 """The line search ends where the slope is this part of the slope at its start."""
 
 _FRICTIONLESS = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
 _ELLIPTIC = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC))
-_FRICTION = wp.types.vector(5, wp.float32)  # what MuJoCo keeps of a contact: tangential (2), torsional, rolling (2)
+_FRICTION = wp.types.vector(
+    5, wp.float32
+)  # what MuJoCo keeps of a contact: tangential (2), torsional, rolling (2)
 
 
 @wp.struct
@@ -73,12 +80,15 @@ def _span(constraints: Constraints, world: int, row: int, num_rows: int) -> int:
 
 
 @wp.func
-def _cone(residual: wp.vec3, stiffness: wp.vec3, mu: float, friction: wp.vec2) -> tuple[wp.vec3, wp.mat33]:
+def _cone(
+    residual: wp.vec3, stiffness: wp.vec3, mu: float, friction: wp.vec2
+) -> tuple[wp.vec3, wp.mat33]:
     """Returns the force -∂s/∂r of a constraint and the curvature ∂²s/∂r² of its cost.
 
-    With t the length of the tangential residual, each part times its friction, and n the normal one, a contact that separates
-    (n ≥ t) costs nothing; one that sticks (μ² n + t ≤ 0) costs ½ Σ D r²; one that slides, between them, ½ c (n - t)² with
-    c = D / (1 + μ²), whose curvature is that of (n - t) and that of the length t, which bends across the direction of sliding.
+    With t the length of the tangential residual, each part times its friction, and n the normal
+    one, a contact that separates (n ≥ t) costs nothing; one that sticks (μ² n + t ≤ 0) costs ½ Σ D
+    r²; one that slides, between them, ½ c (n - t)² with c = D / (1 + μ²), whose curvature is that
+    of (n - t) and that of the length t, which bends across the direction of sliding.
     A single row has neither friction nor tangents: t = μ = 0.
     """
     u, v = friction[0] * residual[1], friction[1] * residual[2]
@@ -115,7 +125,9 @@ def _kernel(num_dofs: int) -> wp.Kernel:
         return joined
 
     @wp.func
-    def rows_at(constraints: Constraints, world: int, row: int, span: int) -> tuple[Rows, wp.vec3, wp.vec3]:
+    def rows_at(
+        constraints: Constraints, world: int, row: int, span: int
+    ) -> tuple[Rows, wp.vec3, wp.vec3]:
         """Returns Jacobian, target and stiffness of a constraint, zeros below a single row."""
         jacobian, target, stiffness = Rows(), wp.vec3(), wp.vec3()
         for i in range(3):
@@ -134,7 +146,9 @@ def _kernel(num_dofs: int) -> wp.Kernel:
         return wp.vec2(friction[0], friction[1])
 
     @wp.func
-    def expansion(constraints: Constraints, world: int, lane: int, num_rows: int, cone_width: float, x: Vector) -> System:
+    def expansion(
+        constraints: Constraints, world: int, lane: int, num_rows: int, cone_width: float, x: Vector
+    ) -> System:
         """Writes the forces at x and returns this thread's part of `[Hessian | gradient]` of the sum of constraints."""
         total = System()
         for row in range(lane, num_rows, wp.block_dim()):
@@ -142,7 +156,9 @@ def _kernel(num_dofs: int) -> wp.Kernel:
             if span > 0:
                 jacobian, target, stiffness = rows_at(constraints, world, row, span)
                 friction = friction_at(constraints, world, row, span)
-                force, curvature = _cone(jacobian * x - target, stiffness, cone_width * friction[0], friction)
+                force, curvature = _cone(
+                    jacobian * x - target, stiffness, cone_width * friction[0], friction
+                )
                 for i in range(3):
                     if i < span:
                         constraints.force[world, row + i] = force[i]
@@ -152,7 +168,14 @@ def _kernel(num_dofs: int) -> wp.Kernel:
 
     @wp.func
     def slope(
-        constraints: Constraints, world: int, lane: int, num_rows: int, cone_width: float, x: Vector, step: Vector, alpha: float
+        constraints: Constraints,
+        world: int,
+        lane: int,
+        num_rows: int,
+        cone_width: float,
+        x: Vector,
+        step: Vector,
+        alpha: float,
     ) -> wp.vec2:
         """Returns this thread's part of the first and second derivative along `step` of the sum of constraints."""
         total = wp.vec2()
@@ -185,7 +208,11 @@ def _kernel(num_dofs: int) -> wp.Kernel:
 
         Without constraints the slope is `start` + length `bend`; with them it begins at -`descent`.
         """
-        low, high, alpha = wp.float32(0.0), wp.float32(wp.inf), wp.float32(1.0)  # plain literals would be constants to Warp
+        low, high, alpha = (
+            wp.float32(0.0),
+            wp.float32(wp.inf),
+            wp.float32(1.0),
+        )  # plain literals would be constants to Warp
         for _ in range(num_searches):
             part = slope(constraints, world, lane, num_rows, cone_width, x, step, alpha)
             sums = wp.tile_reduce(wp.add, wp.tile(part, preserve_type=True))[0]
@@ -245,12 +272,27 @@ def _kernel(num_dofs: int) -> wp.Kernel:
                 if wp.length(gradient) < bound or 0.5 * descent < bound or taken == num_iterations:
                     break
                 start, bend = wp.dot(residual, step), wp.dot(step, inertia * step)
-                alpha = searched(constraints, world, lane, num_rows, width, x, step, start, bend, descent, num_searches)
+                alpha = searched(
+                    constraints,
+                    world,
+                    lane,
+                    num_rows,
+                    width,
+                    x,
+                    step,
+                    start,
+                    bend,
+                    descent,
+                    num_searches,
+                )
                 x += alpha * step
                 taken += 1
             normal = wp.float32(0.0)
             for row in range(lane, num_rows, wp.block_dim()):
-                if constraints.kind[world, row] >= _FRICTIONLESS and _span(constraints, world, row, num_rows) > 0:
+                if (
+                    constraints.kind[world, row] >= _FRICTIONLESS
+                    and _span(constraints, world, row, num_rows) > 0
+                ):
                     normal += constraints.force[world, row]
             pressure = wp.tile_reduce(wp.add, wp.tile(normal))[0]
             if lane == 0:
@@ -270,9 +312,11 @@ class Solver:
     """Stands in for `mujoco_warp.solve` where all constraints are joint limits and contacts without torsional friction.
 
     Args:
-        model: Gives the degrees of freedom and the options `iterations`, `ls_iterations` and `tolerance`.
+        model: Gives the degrees of freedom and the options `iterations`, `ls_iterations` and
+            `tolerance`.
         data: Worlds of the model.
-        peak: Raised to the sum of the normal forces of each world's contacts, `(N,)`, in newtons; MuJoCo C's touch sensors agree.
+        peak: Raised to the sum of the normal forces of each world's contacts, `(N,)`, in newtons;
+            MuJoCo C's touch sensors agree.
     """
 
     def __init__(self, model: mjw.Model, data: mjw.Data, peak: wp.array) -> None:
@@ -284,10 +328,23 @@ class Solver:
         constraints.force = rows.force
         option = model.opt
         self._kernel, self._num_worlds = _kernel(model.nv), data.nworld
-        self._inputs = [data.M, model.M_elemid, data.qfrc_smooth, data.qacc_warmstart, constraints, option.impratio_invsqrt]
+        self._inputs = [
+            data.M,
+            model.M_elemid,
+            data.qfrc_smooth,
+            data.qacc_warmstart,
+            constraints,
+            option.impratio_invsqrt,
+        ]
         self._inputs += [option.tolerance, option.iterations, option.ls_iterations]
         self._outputs = [data.qacc, rows.Ma, data.qfrc_constraint, data.solver_niter, peak]
 
     def __call__(self) -> None:
         """Finds the accelerations and forces of all worlds."""
-        wp.launch_tiled(self._kernel, dim=self._num_worlds, inputs=self._inputs, outputs=self._outputs, block_dim=NUM_LANES)
+        wp.launch_tiled(
+            self._kernel,
+            dim=self._num_worlds,
+            inputs=self._inputs,
+            outputs=self._outputs,
+            block_dim=NUM_LANES,
+        )

@@ -30,7 +30,8 @@ def _keep_peak(
 ):
     """Raises each world's peak to the sum of the normal forces of its contacts, the first row of each in an elliptic cone.
 
-    The same as the sum of the touch sensors (`sim.native` reads those), for one launch instead of eight.
+    The same as the sum of the touch sensors (`sim.native` reads those), for one launch instead of
+    eight.
     """
     world = wp.tid()
     total = wp.float32(0.0)  # a plain literal would be a constant to Warp
@@ -49,15 +50,25 @@ def check(compiled: mujoco.MjModel, machine: Machine, is_fused: bool) -> None:
         "plugins": compiled.nplugin,
         "friction in joints": compiled.dof_frictionloss.any(),
     }
-    passive = (compiled.jnt_stiffness, compiled.dof_damping, compiled.body_gravcomp, compiled.opt.density, compiled.opt.viscosity)
+    passive = (
+        compiled.jnt_stiffness,
+        compiled.dof_damping,
+        compiled.body_gravcomp,
+        compiled.opt.density,
+        compiled.opt.viscosity,
+    )
     too_much = {
         "actuators": compiled.nu != machine.num_joints,
         "branches": (compiled.dof_parentid != np.arange(-1, compiled.nv - 1)).any(),
         "springs, dampers or fluids": any(np.any(values) for values in passive),
-        "torsional friction (condim above 3)": (np.concatenate([compiled.geom_condim, compiled.pair_dim]) > 3).any(),
+        "torsional friction (condim above 3)": (
+            np.concatenate([compiled.geom_condim, compiled.pair_dim]) > 3
+        ).any(),
         f"more than {MAX_DOFS} joints": compiled.nv > MAX_DOFS,
     }
-    if found := [name for name, count in (left_out | (too_much if is_fused else {})).items() if count]:
+    if found := [
+        name for name, count in (left_out | (too_much if is_fused else {})).items() if count
+    ]:
         instead = "sim.fused=false or sim=native" if is_fused else "sim=native"
         raise ConfigError(
             f"machine {machine.name}: sim=warp simulates arms that are one chain of links, but its MJCF has {', '.join(found)}; "
@@ -68,8 +79,8 @@ def check(compiled: mujoco.MjModel, machine: Machine, is_fused: bool) -> None:
 def staged(model: mjw.Model, data: mjw.Data, peak: wp.array) -> Callable[[], None]:
     """Returns `mjw.step` for a chain of bodies, without its stages for cameras, deformable bodies, tendons and sensors.
 
-    Some 60 launches, and ten an iteration of the solver. The GPU waits for launches, not for arithmetic: every stage that a model
-    does not need costs time.
+    Some 60 launches, and ten an iteration of the solver. The GPU waits for launches, not for
+    arithmetic: every stage that a model does not need costs time.
 
     Args:
         model: The model.
@@ -96,7 +107,9 @@ def staged(model: mjw.Model, data: mjw.Data, peak: wp.array) -> Callable[[], Non
     return step
 
 
-def fused(compiled: mujoco.MjModel, model: mjw.Model, data: mjw.Data, peak: wp.array) -> Callable[[], None]:
+def fused(
+    compiled: mujoco.MjModel, model: mjw.Model, data: mjw.Data, peak: wp.array
+) -> Callable[[], None]:
     """Returns the same for an arm of a few joints driven by servos, in 18 launches.
 
     Args:

@@ -20,16 +20,18 @@ if TYPE_CHECKING:
     from brokk_rl.sim.warp import Warp
 
 
-# Too few iterations leave a slightly soft contact; what is lost to a full buffer is lost, and that is a fault.
+# Too few iterations leave a slightly soft contact; what is lost to a full buffer is lost, and that
+# is a fault.
 _LOST = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
 
 
 class WarpWorld:
     """Fulfils `brokk_rl.contracts.World` on a GPU (or, for tests, on the CPU).
 
-    All tensors are views of Warp's arrays. `step` and `reset` use torch's current stream and keep every address, so that the caller
-    may capture them together with its own torch operations inside `torch.cuda.graph`. Outside a
-    capture the solver's loop (`fused: false`) asks the host after each iteration, which is slow.
+    All tensors are views of Warp's arrays. `step` and `reset` use torch's current stream and keep
+    every address, so that the caller may capture them together with its own torch operations inside
+    `torch.cuda.graph`. Outside a capture the solver's loop (`fused: false`) asks the host after
+    each iteration, which is slow.
 
     Args:
         spec: Sizes and solver settings.
@@ -48,20 +50,38 @@ class WarpWorld:
         wp.init()
         self._warp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._warp_device):
-            self._model = mjw.put_model(self.model, batch_sizes={"geom_size": num_worlds, "geom_pos": num_worlds})
-            self._data = mjw.make_data(self.model, num_worlds, nconmax=spec.num_contacts, njmax=spec.num_constraints)
+            self._model = mjw.put_model(
+                self.model, batch_sizes={"geom_size": num_worlds, "geom_pos": num_worlds}
+            )
+            self._data = mjw.make_data(
+                self.model, num_worlds, nconmax=spec.num_contacts, njmax=spec.num_constraints
+            )
         self._write_options(spec)
         data, model = self._data, self._model
-        names = ("qpos", "qvel", "act", "ctrl", "time", "qacc_warmstart", "mocap_pos", "mocap_quat", "overflow")
+        names = (
+            "qpos",
+            "qvel",
+            "act",
+            "ctrl",
+            "time",
+            "qacc_warmstart",
+            "mocap_pos",
+            "mocap_quat",
+            "overflow",
+        )
         self._views = {name: wp.to_torch(getattr(data, name)) for name in names}
-        self._views |= {name: wp.to_torch(getattr(model, name)) for name in ("geom_size", "geom_pos")}
+        self._views |= {
+            name: wp.to_torch(getattr(model, name)) for name in ("geom_size", "geom_pos")
+        }
         self._placement = Placement(self.model, device, torch.float32)
         self._drive = Drive(self.model, machine, num_worlds, device, torch.float32)
         self.q = torch.zeros(num_worlds, machine.num_joints, device=device)
         self.contact_force_n = torch.zeros(num_worlds, device=device)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         peak = wp.from_torch(self.contact_force_n)
-        self._substep = fused(self.model, model, data, peak) if spec.fused else staged(model, data, peak)
+        self._substep = (
+            fused(self.model, model, data, peak) if spec.fused else staged(model, data, peak)
+        )
         home = torch.tensor(machine.home, dtype=torch.float32, device=device).expand(num_worlds, -1)
         self.reset(torch.ones_like(self.faults), home, nominal(num_worlds, device))
 
@@ -74,7 +94,9 @@ class WarpWorld:
             for _ in range(self._substeps):
                 self._substep()
         self.q.copy_(view["qpos"])
-        self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_((view["overflow"] & _LOST) != 0)
+        self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_(
+            (view["overflow"] & _LOST) != 0
+        )
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.World`."""

@@ -1,9 +1,11 @@
 """The bus description: one DBC that says what is sent, how, how often and by whom.
 
-Signals are found by their names, whatever message they travel in, so that a DBC of another gateway takes the place of the example
-as long as it names them alike: `Command_<joint>`, `CommandMode`, `Position_<joint>`, `Valid_<joint>`, `Flow_<joint>`, `FlowSource`,
-`Lever_<left|right>_<theta|psi>`, `ButtonRight`, `DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`; optional are `Stamp`,
-`OilTemperature` and all others, which are recorded. Protected messages have a `Counter`, a `Crc` of one whole byte and the
+Signals are found by their names, whatever message they travel in, so that a DBC of another gateway
+takes the place of the example
+as long as it names them alike: `Command_<joint>`, `CommandMode`, `Position_<joint>`,
+`Valid_<joint>`, `Flow_<joint>`, `FlowSource`, `Lever_<left|right>_<theta|psi>`, `ButtonRight`,
+`DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`; optional are `Stamp`, `OilTemperature` and all
+others, which are recorded. Protected messages have a `Counter`, a `Crc` of one whole byte and the
 attribute `E2EDataId`. Cycle times are the DBC's (`GenMsgCycleTime`): no rate is written down twice.
 """
 
@@ -72,16 +74,36 @@ class Description:
     def __init__(self, name: str, machine: Machine) -> None:
         self.name = name
         self._database = _load(name)
-        self._messages: dict[str, Message] = {message.name: message for message in self._database.messages}
+        self._messages: dict[str, Message] = {
+            message.name: message for message in self._database.messages
+        }
         self.layouts = {message.name: _layout(message, name) for message in self._database.messages}
         self.by_id = {layout.frame_id: layout for layout in self.layouts.values()}
-        self._home = {signal.name: message.name for message in self._database.messages for signal in message.signals}
-        required = [f"{what}_{joint}" for what in ("Command", "Position", "Valid", "Flow") for joint in machine.joint_names]
+        self._home = {
+            signal.name: message.name
+            for message in self._database.messages
+            for signal in message.signals
+        }
+        required = [
+            f"{what}_{joint}"
+            for what in ("Command", "Position", "Valid", "Flow")
+            for joint in machine.joint_names
+        ]
         required += [f"Lever_{axis}" for axis in LEVER_AXES]
-        required += ["CommandMode", "FlowSource", "ButtonRight", "DeadMan", "RemoteOn", "EStop", "ExclusiveSelected"]
+        required += [
+            "CommandMode",
+            "FlowSource",
+            "ButtonRight",
+            "DeadMan",
+            "RemoteOn",
+            "EStop",
+            "ExclusiveSelected",
+        ]
         for signal in required:
             if signal not in self._home:
-                raise ConfigError(f"bus: {name} has no signal '{signal}', which machine '{machine.name}' needs")
+                raise ConfigError(
+                    f"bus: {name} has no signal '{signal}', which machine '{machine.name}' needs"
+                )
         self.command = self.layouts[self.message_of(f"Command_{machine.joint_names[0]}")]
         """The message with the valve commands."""
 
@@ -92,12 +114,18 @@ class Description:
             ConfigError: there is none.
         """
         if signal not in self._home:
-            raise ConfigError(f"bus: {self.name} has no signal '{signal}'; {choices(signal, self._home)}")
+            raise ConfigError(
+                f"bus: {self.name} has no signal '{signal}'; {choices(signal, self._home)}"
+            )
         return self._home[signal]
 
     def signals(self, message: str) -> list[str]:
         """Returns the names of the signals of `message`, without counter and CRC."""
-        return [signal.name for signal in self._messages[message].signals if signal.name not in (COUNTER, CRC)]
+        return [
+            signal.name
+            for signal in self._messages[message].signals
+            if signal.name not in (COUNTER, CRC)
+        ]
 
     def unit(self, message: str, signal: str) -> str:
         """Returns the unit of a signal, '' for none."""
@@ -139,7 +167,9 @@ def located(name: str) -> Path:
     try:
         return Path(str(resources.files(package))) / inside
     except (ModuleNotFoundError, ValueError, TypeError) as error:
-        raise ConfigError(f"{name}: there is no package '{package}' ({error}); give a path, or package:path") from error
+        raise ConfigError(
+            f"{name}: there is no package '{package}' ({error}); give a path, or package:path"
+        ) from error
 
 
 def _load(name: str) -> Database:
@@ -161,7 +191,13 @@ def _layout(message: Message, dbc: str) -> Layout:
     data_id, crc_byte, modulus = None, 0, 1
     if attribute is not None:
         counter, crc = signals.get(COUNTER), signals.get(CRC)
-        if counter is None or crc is None or crc.length != 8 or crc.start % 8 or crc.byte_order != "little_endian":
+        if (
+            counter is None
+            or crc is None
+            or crc.length != 8
+            or crc.start % 8
+            or crc.byte_order != "little_endian"
+        ):
             raise ConfigError(
                 f"bus: message {message.name} of {dbc} has E2EDataId; it needs {COUNTER}, and {CRC} of one whole byte"
             )

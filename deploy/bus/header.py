@@ -1,7 +1,8 @@
 """A C header for the gateway's side: identifiers, periods, data ids, packing of every signal, and the CRC, all from the DBC.
 
-cantools generates the C source that packs and unpacks (`cantools generate_c_source <dbc>`); this header adds what it leaves out,
-the end-to-end protection and the times, so that gateway and PC go by one file.
+cantools generates the C source that packs and unpacks (`cantools generate_c_source <dbc>`); this
+header adds what it leaves out, the end-to-end protection and the times, so that gateway and PC go
+by one file.
 """
 
 from __future__ import annotations

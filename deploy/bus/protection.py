@@ -1,10 +1,11 @@
 """End-to-end protection of messages in the manner of AUTOSAR's profiles: CRC-8 with a data id, counter, and a small state machine.
 
-It finds repetition, loss, delay, insertion, masquerade, wrong sequence, corruption and a blocked channel. It detects errors; it is
+It finds repetition, loss, delay, insertion, masquerade, wrong sequence, corruption and a blocked
+channel. It detects errors; it is
 no security: whoever knows the bus description can write valid messages.
 
-    CRC wrong, or counter repeated, or counter further on than `MAX_STEP`: an error, the message is not used
-    INIT     --two good in a row--> VALID
+    CRC wrong, or counter repeated, or counter further on than `MAX_STEP`: an error, the message is
+    not used INIT     --two good in a row--> VALID
     VALID    --two errors in a row, or a score of five (error +1, good -1)--> INVALID
     INVALID  --RECOVERY good in a row--> VALID
 """
@@ -16,7 +17,8 @@ from enum import Enum
 POLYNOMIAL, START, FINAL = 0x1D, 0xFF, 0xFF
 """CRC-8 SAE J1850."""
 MAX_STEP = 4
-"""Largest step of a counter: up to three messages lost in a row are let pass; age says whether that is too long."""
+"""Largest step of a counter: up to three messages lost in a row are let pass; age says whether that
+is too long."""
 IN_A_ROW, SCORE, RECOVERY = 2, 5, 10
 
 

@@ -1,7 +1,8 @@
 """Wires: how frames get onto a bus and off it, through python-can.
 
-Only `recv` and `send` of python-can are used. Its `Notifier` dies silently of the first exception, and its cyclic senders either
-die too or, in the kernel, go on repeating the last command while the program hangs; nothing here uses them.
+Only `recv` and `send` of python-can are used. Its `Notifier` dies silently of the first exception,
+and its cyclic senders either die too or, in the kernel, go on repeating the last command while the
+program hangs; nothing here uses them.
 """
 
 from __future__ import annotations
@@ -44,9 +45,11 @@ class Wire:
     """A bus that python-can reaches.
 
     Attributes:
-        interface: `socketcan` for a machine, `udp_multicast` between processes, `virtual` within one.
+        interface: `socketcan` for a machine, `udp_multicast` between processes, `virtual` within
+            one.
         channel: Name of the interface (`can0`), or multicast group.
-        bitrate: Bits per second, for adapters that are set by the program; `null` where the system sets it (socketcan).
+        bitrate: Bits per second, for adapters that are set by the program; `null` where the system
+            sets it (socketcan).
         port: Port of `udp_multicast`; `null` elsewhere.
     """
 
@@ -59,7 +62,8 @@ class Wire:
         """Opens the bus.
 
         Args:
-            frame_ids: Only these are received; the kernel leaves out others where it can. `None`: all.
+            frame_ids: Only these are received; the kernel leaves out others where it can. `None`:
+                all.
 
         Raises:
             LinkError: there is no such bus.
@@ -74,7 +78,12 @@ class Wire:
         try:
             bus = can.Bus(interface=self.interface, channel=self.channel, **options)  # type: ignore[arg-type]
             if frame_ids is not None:
-                bus.set_filters([{"can_id": one, "can_mask": 0x1FFFFFFF, "extended": one > 0x7FF} for one in frame_ids])
+                bus.set_filters(
+                    [
+                        {"can_id": one, "can_mask": 0x1FFFFFFF, "extended": one > 0x7FF}
+                        for one in frame_ids
+                    ]
+                )
         except (can.CanError, OSError, ValueError, ImportError) as error:
             raise LinkError(
                 f"bus.interface={self.interface} bus.channel={self.channel}: cannot be opened ({error}). `ip link` shows the CAN "
@@ -111,7 +120,12 @@ class OpenWire:
         Raises:
             LinkError: it could not be sent; it is not sent later either.
         """
-        message = can.Message(arbitration_id=frame.frame_id, data=frame.data, is_extended_id=frame.extended, check=False)
+        message = can.Message(
+            arbitration_id=frame.frame_id,
+            data=frame.data,
+            is_extended_id=frame.extended,
+            check=False,
+        )
         try:
             self._bus.send(message, timeout=0.0)
         except (can.CanError, OSError) as error:
@@ -161,7 +175,11 @@ class Replay:
             LinkError: the file cannot be read.
         """
         try:
-            return OpenReplay(BLFReader(self.path), self.speed, None if frame_ids is None else frozenset(frame_ids))
+            return OpenReplay(
+                BLFReader(self.path),
+                self.speed,
+                None if frame_ids is None else frozenset(frame_ids),
+            )
         except (OSError, ValueError, BLFParseError) as error:
             raise LinkError(f"bus.path={self.path}: nothing can be replayed ({error})") from error
 
@@ -208,6 +226,11 @@ class OpenReplay:
     def _following(self) -> can.Message:
         for message in self._messages:
             wanted = self._frame_ids is None or message.arbitration_id in self._frame_ids
-            if wanted and message.is_rx and not message.is_error_frame and not message.is_remote_frame:
+            if (
+                wanted
+                and message.is_rx
+                and not message.is_error_frame
+                and not message.is_remote_frame
+            ):
                 return message
         raise LinkError("bus: the replay is over")

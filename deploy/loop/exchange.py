@@ -1,7 +1,8 @@
 """What the processes of the loop share: slots that hold the newest value, and pipes to the log.
 
-Nobody ever waits for anybody: a writer overwrites, a reader takes what is there, and a full pipe counts what it had to drop. All of
-it is anonymous memory (memfd) that lives as long as a process has it, so nothing is left behind by a killed one.
+Nobody ever waits for anybody: a writer overwrites, a reader takes what is there, and a full pipe
+counts what it had to drop. All of it is anonymous memory (memfd) that lives as long as a process
+has it, so nothing is left behind by a killed one.
 """
 
 from __future__ import annotations
@@ -46,15 +47,17 @@ class Memory:
 
 
 def _mapped(fd: int, size: int) -> mmap.mmap:
-    # with all of its pages: what is there from the beginning costs no cycle later, and does not look like growth
+    # with all of its pages: what is there from the beginning costs no cycle later, and does not
+    # look like growth
     return mmap.mmap(fd, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
 
 
 class Slot:
     """The newest record of one writer, for any number of readers.
 
-    Two records are written in turn and the number of the newest is put in front last. A reader that was overtaken, or that met a
-    writer killed in the middle (the checksum tells), reads again; the older record always is whole.
+    Two records are written in turn and the number of the newest is put in front last. A reader that
+    was overtaken, or that met a writer killed in the middle (the checksum tells), reads again; the
+    older record always is whole.
 
     Args:
         name: Of the slot.
@@ -73,7 +76,9 @@ class Slot:
         number = self._number + 1
         at = HEAD.size + (number % 2) * self._stride
         self.memory.bytes[at : at + len(data)] = data
-        self.memory.bytes[at + len(data) : at + len(data) + 4] = zlib.crc32(data).to_bytes(4, "little")
+        self.memory.bytes[at + len(data) : at + len(data) + 4] = zlib.crc32(data).to_bytes(
+            4, "little"
+        )
         self.memory.bytes[: HEAD.size] = HEAD.pack(number)
         self._number = number
 
@@ -97,7 +102,8 @@ class Slot:
     def peek(self, field: str) -> Any | None:
         """Returns one number of the newest record, `None` before the first: for a look at the time of what takes long to read.
 
-        Unlike `read` it does not notice a writer that overtakes it: take nothing from here that has to fit the rest.
+        Unlike `read` it does not notice a writer that overtakes it: take nothing from here that has
+        to fit the rest.
         """
         if (number := self.number) == 0:
             return None
@@ -168,4 +174,7 @@ class Pipe:
     def _copy_out(self, at: int, length: int) -> bytes:
         start, base = at % self._size, self._HEADER.size
         first = min(length, self._size - start)
-        return self.memory.bytes[base + start : base + start + first] + self.memory.bytes[base : base + length - first]
+        return (
+            self.memory.bytes[base + start : base + start + first]
+            + self.memory.bytes[base : base + length - first]
+        )

@@ -1,6 +1,7 @@
 """The perception process: the camera's newest frame for page and log, and the boreholes that are seen in it.
 
-It waits for the camera and for nobody else, and nobody waits for it: if it dies, the last frame grows old where it is shown.
+It waits for the camera and for nobody else, and nobody waits for it: if it dies, the last frame
+grows old where it is shown.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from deploy.picture import shrunk
 log = logging.getLogger(__name__)
 
 MEMORY = 10
-"""Sightings, at most, that count against a new one: a base that was moved is noticed within seconds."""
+"""Sightings, at most, that count against a new one: a base that was moved is noticed within
+seconds."""
 QUIET_S = 10.0
 """Between two messages about frames that cannot be used."""
 
@@ -40,9 +42,11 @@ class Camera:
 
     Attributes:
         source: Where frames come from.
-        finder: Finds boreholes in them; `null`: nobody looks, a person at the page can still point at one.
+        finder: Finds boreholes in them; `null`: nobody looks, a person at the page can still point
+            at one.
         rate_hz: Frames a second at most.
-        num_px: Pixels of a frame that are handed on; larger ones are shrunk, perception has them whole.
+        num_px: Pixels of a frame that are handed on; larger ones are shrunk, perception has them
+            whole.
         forget_s: Time after which a borehole that is not seen any more is forgotten.
         stale_s: Age from which the picture is shown as old.
         record_hz: Pictures a second that are recorded; 0: none.
@@ -57,7 +61,11 @@ class Camera:
     record_hz: float
 
     def check(self) -> None:
-        if min(self.rate_hz, self.forget_s, self.stale_s) <= 0 or self.record_hz < 0 or self.num_px < 256:
+        if (
+            min(self.rate_hz, self.forget_s, self.stale_s) <= 0
+            or self.record_hz < 0
+            or self.num_px < 256
+        ):
             raise ConfigError(
                 "camera: expected rate_hz, forget_s and stale_s above 0, record_hz of 0 or more, num_px of 256 or more"
             )
@@ -106,7 +114,10 @@ def _look(finder: Any, frame: Frame) -> list[HolePose]:
         log.debug("%s", error)
         return []
     assert frame.base_from_camera is not None
-    return [hole if hole.frame == "base" else hole.moved(frame.base_from_camera, frame.camera_cov) for hole in found]
+    return [
+        hole if hole.frame == "base" else hole.moved(frame.base_from_camera, frame.camera_cov)
+        for hole in found
+    ]
 
 
 def _publish(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:
@@ -114,13 +125,22 @@ def _publish(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:
     height, width = frame.color.shape[:2]
     part = min(1.0, math.sqrt(num_px / (width * height)))
     size = int(part * width), int(part * height)
-    color, depth_m = (frame.color, frame.depth_m) if part == 1.0 else (shrunk(frame.color, *size), shrunk(frame.depth_m, *size))
+    color, depth_m = (
+        (frame.color, frame.depth_m)
+        if part == 1.0
+        else (shrunk(frame.color, *size), shrunk(frame.depth_m, *size))
+    )
     count = size[0] * size[1]
     record = slot.new()
     record["t_s"], record["width"], record["height"] = t_s, *size
-    record["color"][:count], record["depth_m"][:count] = color.reshape(count, 3), depth_m.reshape(count)
+    record["color"][:count], record["depth_m"][:count] = (
+        color.reshape(count, 3),
+        depth_m.reshape(count),
+    )
     record["camera_matrix"] = frame.camera_matrix * np.array([[part], [part], [1.0]])
-    record["base_from_camera"] = math.nan if frame.base_from_camera is None else frame.base_from_camera
+    record["base_from_camera"] = (
+        math.nan if frame.base_from_camera is None else frame.base_from_camera
+    )
     slot.write(record)
 
 
@@ -140,8 +160,9 @@ def frame_of(record: Any) -> Frame:
 class KnownHoles:
     """Boreholes over many frames, each under the name that it got when it was first seen.
 
-    What a new frame says counts by its variance against what was known, of which no more than `MEMORY` sightings count. What the
-    camera's pose is wrong by is the same in all of them: it is no reason to trust one frame more than another, and it stays.
+    What a new frame says counts by its variance against what was known, of which no more than
+    `MEMORY` sightings count. What the camera's pose is wrong by is the same in all of them: it is
+    no reason to trust one frame more than another, and it stays.
 
     Args:
         forget_s: Time after which one that is not seen any more is forgotten.
@@ -163,17 +184,25 @@ class KnownHoles:
             else:
                 old = self._holes[name]
                 before = min(old["weight"], MEMORY * weight)
-                center_m = (before * old["center_in_base_m"] + weight * pose.center_m) / (before + weight)
+                center_m = (before * old["center_in_base_m"] + weight * pose.center_m) / (
+                    before + weight
+                )
             self._holes[name] = {
                 "center_in_base_m": center_m, "axis_in_base": pose.axis, "radius_m": pose.radius_m, "score": pose.score,
                 "weight": before + weight, "shared_m2": shared, "t_s": now_s,
             }  # fmt: skip
-        self._holes = {name: hole for name, hole in self._holes.items() if now_s - hole["t_s"] <= self._forget_s}
+        self._holes = {
+            name: hole
+            for name, hole in self._holes.items()
+            if now_s - hole["t_s"] <= self._forget_s
+        }
 
     def write(self, slot: Slot, now_s: float) -> None:
         """Makes what is known the newest; the surest where there are too many."""
         record = slot.new()
-        surest = sorted(sorted(self._holes, key=lambda name: -self._holes[name]["score"])[:MOST_HOLES])
+        surest = sorted(
+            sorted(self._holes, key=lambda name: -self._holes[name]["score"])[:MOST_HOLES]
+        )
         record["t_s"], record["count"] = now_s, len(surest)
         for row, name in enumerate(surest):
             for field, value in self._holes[name].items():

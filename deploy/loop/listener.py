@@ -27,7 +27,8 @@ BUS_PRIORITY, POLICY_PRIORITY = 55, 50
 OPTIONAL = {"page": "nothing is shown any more", "camera": "nothing new is seen any more"}
 """Processes without which the loop goes on, and what is lost with them."""
 ENDED = {"policy": 0, "bus": 1, "log": 3}
-"""In which order they are asked to: the policy before the bus, so that it can say goodbye, and the log when all has been said."""
+"""In which order they are asked to: the policy before the bus, so that it can say goodbye, and the
+log when all has been said."""
 
 
 @dataclass
@@ -48,10 +49,14 @@ class Children:
         """Process ids by name."""
         return {child.name: child.pid for child in self._running}
 
-    def start(self, name: str, target: str, arguments: tuple[Any, ...], priority: int | None = None) -> None:
+    def start(
+        self, name: str, target: str, arguments: tuple[Any, ...], priority: int | None = None
+    ) -> None:
         """Starts `target` (`module:function`), called as `function(stop, *arguments, exchange)`."""
         realtime = priority if self.realtime else None
-        self._running.append(Child(name, target, (*arguments, self.exchange), self.exchange.files, realtime))
+        self._running.append(
+            Child(name, target, (*arguments, self.exchange), self.exchange.files, realtime)
+        )
 
     def check(self) -> None:
         """Says once which of the optional ones have ended.
@@ -64,9 +69,16 @@ class Children:
                 continue
             self._running.remove(child)
             if child.name in OPTIONAL:
-                log.error("ALARM: the %s has ended (exit code %s); %s", child.name, child.code, OPTIONAL[child.name])
+                log.error(
+                    "ALARM: the %s has ended (exit code %s); %s",
+                    child.name,
+                    child.code,
+                    OPTIONAL[child.name],
+                )
             else:
-                raise LinkError(f"the {child.name} process has died (exit code {child.code}); what it said stands above")
+                raise LinkError(
+                    f"the {child.name} process has died (exit code {child.code}); what it said stands above"
+                )
 
     def end(self) -> None:
         """Ends them all, one after the other."""
@@ -107,7 +119,9 @@ class Listener:
         LeverMap(self.guidance.levers or machine.levers, machine)
         Bundle(self.policy, machine)
 
-    def listen(self, children: Children, machine: Machine, target_s: float, pitch_rad: float | None) -> None:
+    def listen(
+        self, children: Children, machine: Machine, target_s: float, pitch_rad: float | None
+    ) -> None:
         """Starts bus and policy.
 
         Args:
@@ -117,6 +131,8 @@ class Listener:
             pitch_rad: Wanted pitch of the tool, for policies that ask for one.
         """
         setting = Setting(self.wire, self.dbc, machine, self.limits)
-        counsel = Counsel(machine, self.policy, self.guidance, self.limits.joints_s, target_s, pitch_rad)
+        counsel = Counsel(
+            machine, self.policy, self.guidance, self.limits.joints_s, target_s, pitch_rad
+        )
         children.start("bus", "deploy.loop.station:run", (setting,), BUS_PRIORITY)
         children.start("policy", "deploy.policy.adviser:run", (counsel,), POLICY_PRIORITY)

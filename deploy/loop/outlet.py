@@ -1,6 +1,7 @@
 """The outlet: all that is shown to an operator, taken from the slots at one moment; terminal and page read only this.
 
-Plain data in SI units. What is stale is said to be so by its age, never left out; whoever draws it greys it by that.
+Plain data in SI units. What is stale is said to be so by its age, never left out; whoever draws it
+greys it by that.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ class Advice:
     """What the policy proposes.
 
     Attributes:
-        valid: Whether there is an advice; if not, `levers` are on their way to neutral and `reason` says why.
+        valid: Whether there is an advice; if not, `levers` are on their way to neutral and `reason`
+            says why.
         reason: Why there is none.
         age_s: Since it was made.
         number: Counts up; tells a new advice from an old one.
@@ -135,7 +137,9 @@ def view(exchange: Exchange) -> View:
             reason=REASONS[int(advice["reason"])].value,
             age_s=now_s - float(advice["t_s"]),
             number=int(advice["number"]),
-            levers=LeverAngles(*advice["lever_rad"].tolist(), button_right=bool(advice["button_right"])),
+            levers=LeverAngles(
+                *advice["lever_rad"].tolist(), button_right=bool(advice["button_right"])
+            ),
             command=tuple(advice["u"].tolist()),
             target_in_base_m=tuple(advice["target_in_base_m"].tolist()),
         )

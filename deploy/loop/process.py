@@ -24,7 +24,11 @@ from typing import Any, Literal
 log = logging.getLogger(__name__)
 
 _ENTRY = "from deploy.loop.process import enter; enter()"
-_DIE_WITH_PARENT, _LOCK_ALL, _ON_USE = 1, 3, 4  # PR_SET_PDEATHSIG; MCL_CURRENT | MCL_FUTURE; MCL_ONFAULT
+_DIE_WITH_PARENT, _LOCK_ALL, _ON_USE = (
+    1,
+    3,
+    4,
+)  # PR_SET_PDEATHSIG; MCL_CURRENT | MCL_FUTURE; MCL_ONFAULT
 _LARGE_BYTES = 1 << 30
 
 Stop = Callable[[], bool]
@@ -42,12 +46,21 @@ class Child:
         realtime: Priority of SCHED_FIFO to ask for, 1 to 99; `None` for an ordinary process.
     """
 
-    def __init__(self, name: str, target: str, arguments: Sequence[Any], files: Sequence[int], realtime: int | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        target: str,
+        arguments: Sequence[Any],
+        files: Sequence[int],
+        realtime: int | None = None,
+    ) -> None:
         self.name = name
         command = [sys.executable, "-P", "-c", _ENTRY]
         # libraries of numbers would start threads that compete with the loop
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=tuple(files), env=environment)
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, pass_fds=tuple(files), env=environment
+        )
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it died already; `code` says so
             self._process.stdin.write(pickle.dumps((name, target, realtime, os.getpid())))
@@ -86,12 +99,16 @@ def enter() -> None:
     _libc().prctl(_DIE_WITH_PARENT, signal.SIGTERM)
     if os.getppid() != parent:
         raise SystemExit(1)  # it died meanwhile
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent asks each in turn
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches the whole group; the parent asks each in turn
     asked: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
     logging.basicConfig(level=logging.INFO, format=f"{name}: %(message)s")
     if realtime is not None:
-        ask_for_priority(realtime)  # before all that has to be imported: a busy computer would take ten times as long
+        ask_for_priority(
+            realtime
+        )  # before all that has to be imported: a busy computer would take ten times as long
     arguments, function = pickle.load(sys.stdin.buffer), resolve_name(target)
     if realtime is not None:
         keep_in_memory()
@@ -101,7 +118,8 @@ def enter() -> None:
 def keep_in_memory() -> None:
     """Asks for locked memory, and keeps the garbage collector out.
 
-    What maps gigabytes, as the simulator of a twin does, keeps what it has used; all else is there from the beginning.
+    What maps gigabytes, as the simulator of a twin does, keeps what it has used; all else is there
+    from the beginning.
     """
     gc.collect()
     gc.freeze()
@@ -148,7 +166,9 @@ class Pace:
     def __init__(self, period_s: float) -> None:
         self.period_s, self.next_s = period_s, time.monotonic() + period_s
         self.cycles, self.missed = 0, 0
-        self.lateness_s = array("d", bytes(8 * self.KEPT))  # all at once: memory that grows for an hour looks like a leak
+        self.lateness_s = array(
+            "d", bytes(8 * self.KEPT)
+        )  # all at once: memory that grows for an hour looks like a leak
 
     def begin(self) -> int:
         """Marks that the cycle of `next_s` begins now, and moves on; returns the number of deadlines missed before it."""

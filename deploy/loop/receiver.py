@@ -43,24 +43,44 @@ class Receiver:
     def __post_init__(self) -> None:
         machine, described = self.machine, self.description
         heard = [layout for node in (GATEWAY, REMOTE) for layout in described.sent_by(node)]
-        self.channels = {layout.name: Channel(layout.modulus) for layout in heard if layout.data_id is not None}
+        self.channels = {
+            layout.name: Channel(layout.modulus) for layout in heard if layout.data_id is not None
+        }
         self._wanted = {layout.frame_id: layout for layout in heard}
         needed = {
-            described.message_of(name) for name in ("DeadMan", "EStop", "ExclusiveSelected", f"Flow_{machine.joint_names[0]}")
+            described.message_of(name)
+            for name in ("DeadMan", "EStop", "ExclusiveSelected", f"Flow_{machine.joint_names[0]}")
         }
         needed |= {described.message_of(f"Position_{joint}") for joint in machine.joint_names}
         self._needed = needed & set(self.channels)
         self.body = body_of(
-            machine.lower.tolist(), machine.upper.tolist(), machine.max_speed.tolist(), machine.is_exclusive.tolist()
+            machine.lower.tolist(),
+            machine.upper.tolist(),
+            machine.max_speed.tolist(),
+            machine.is_exclusive.tolist(),
         )
         self.plausibility = Plausibility(self.limits, self.body)
         count = machine.num_joints
-        self.q, self.q_t_s, self.q_valid = np.zeros(count), np.full(count, -math.inf), np.zeros(count, dtype=bool)
-        self.flow, self.flow_sum, self.flow_number, self.flow_t_s = np.zeros(count), np.zeros(count), 0, -math.inf
+        self.q, self.q_t_s, self.q_valid = (
+            np.zeros(count),
+            np.full(count, -math.inf),
+            np.zeros(count, dtype=bool),
+        )
+        self.flow, self.flow_sum, self.flow_number, self.flow_t_s = (
+            np.zeros(count),
+            np.zeros(count),
+            0,
+            -math.inf,
+        )
         self.followed = False
         self.lever, self.levers_t_s = np.zeros(4), -math.inf
         self.button_right = self.deadman = self.remote_on = False
-        self.estop, self.exclusive_selected, self.oil_c, self.status_t_s = False, False, math.nan, -math.inf
+        self.estop, self.exclusive_selected, self.oil_c, self.status_t_s = (
+            False,
+            False,
+            math.nan,
+            -math.inf,
+        )
         self.frames = self.refused = 0
         self.held_up_s, self._transit = 0.0, _Transit()
         self._own: deque[bytes] = deque(maxlen=OWN)
@@ -135,13 +155,20 @@ class Receiver:
         if f"Flow_{machine.joint_names[0]}" in values:
             self.followed = values["FlowSource"] == FROM_PC
             self.flow = np.array([values[f"Flow_{joint}"] for joint in machine.joint_names])
-            self.flow_sum, self.flow_number, self.flow_t_s = self.flow_sum + self.flow, self.flow_number + 1, now_s
+            self.flow_sum, self.flow_number, self.flow_t_s = (
+                self.flow_sum + self.flow,
+                self.flow_number + 1,
+                now_s,
+            )
         if "DeadMan" in values:
             self.lever = np.array([values[f"Lever_{axis}"] for axis in LEVER_AXES])
             self.button_right, self.deadman = values["ButtonRight"] == 1.0, values["DeadMan"] == 1.0
             self.remote_on, self.levers_t_s = values["RemoteOn"] == 1.0, now_s
         if "EStop" in values:
-            self.estop, self.exclusive_selected = values["EStop"] == 1.0, values["ExclusiveSelected"] == 1.0
+            self.estop, self.exclusive_selected = (
+                values["EStop"] == 1.0,
+                values["ExclusiveSelected"] == 1.0,
+            )
             self.oil_c, self.status_t_s = values.get("OilTemperature", math.nan), now_s
 
 
@@ -157,9 +184,15 @@ class _Transit:
         if self._offset_s is None:
             self._offset_s = raw_s
         # clocks differ by a constant and whole turns of the stamp
-        transit_s = (raw_s - self._offset_s + STAMP_MODULUS_S / 2) % STAMP_MODULUS_S - STAMP_MODULUS_S / 2
+        transit_s = (
+            raw_s - self._offset_s + STAMP_MODULUS_S / 2
+        ) % STAMP_MODULUS_S - STAMP_MODULUS_S / 2
         if now_s - self._since_s > FORGET_S:
-            self._best_s, self._recent_s, self._since_s = min(self._recent_s, transit_s), transit_s, now_s
+            self._best_s, self._recent_s, self._since_s = (
+                min(self._recent_s, transit_s),
+                transit_s,
+                now_s,
+            )
         self._recent_s = min(self._recent_s, transit_s)
         self._best_s = min(self._best_s, transit_s)
         return transit_s - self._best_s

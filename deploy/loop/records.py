@@ -2,8 +2,9 @@
 
 `J` joints; times are monotonic, in s; 0 where nothing has come.
 
-`STATE` is written by the bus process, `ADVICE` by the policy, `REQUEST` by whoever commands valves on purpose, `TARGET` by what
-knows the borehole, `CONTROLS` by the operator's side, `FRAME` and `HOLES` by perception.
+`STATE` is written by the bus process, `ADVICE` by the policy, `REQUEST` by whoever commands valves
+on purpose, `TARGET` by what knows the borehole, `CONTROLS` by the operator's side, `FRAME` and
+`HOLES` by perception.
 """
 
 from __future__ import annotations
@@ -32,7 +33,11 @@ def state_fields(num_joints: int) -> np.dtype:
             ("flow_sum", *each),  # over all messages so far, for means over any period
             ("flow_number", np.uint64),
             ("flow_t_s", float),
-            ("lever", float, (4,)),  # the operator's own, of full: left theta, psi, right theta, psi
+            (
+                "lever",
+                float,
+                (4,),
+            ),  # the operator's own, of full: left theta, psi, right theta, psi
             ("button_right", bool),
             ("deadman", bool),
             ("remote_on", bool),
@@ -41,7 +46,10 @@ def state_fields(num_joints: int) -> np.dtype:
             ("exclusive_selected", bool),
             ("status_t_s", float),
             ("oil_c", float),
-            ("held_up_s", float),  # how much later than at best the last positions came, by the gateway's clock
+            (
+                "held_up_s",
+                float,
+            ),  # how much later than at best the last positions came, by the gateway's clock
             ("bus_up", bool),
             ("trusted", bool),
             ("alone", bool),
@@ -113,8 +121,11 @@ HOLES = np.dtype([("t_s", float), ("count", np.uint8), ("holes", HOLE, (MOST_HOL
 TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,)), ("std_m", float)])
 """The borehole: when it was found, the centre of its rim, and the standard deviation of that."""
 
-CONTROLS = np.dtype([("t_s", float), ("armed", bool), ("recording", bool), ("recording_t_s", float)])
-"""What the operator's side wants: commands to be sent at all; and whether all this is recorded, since when."""
+CONTROLS = np.dtype(
+    [("t_s", float), ("armed", bool), ("recording", bool), ("recording_t_s", float)]
+)
+"""What the operator's side wants: commands to be sent at all; and whether all this is recorded,
+since when."""
 
 
 @dataclass

@@ -1,9 +1,10 @@
 """The bus process: reads the bus, watches over it, and sends what the guard lets pass. It waits for nobody.
 
-One cycle of 10 ms: receive until the deadline, hand what is known to the guard, send, publish. A message that ends a motion
-(dead-man, emergency stop, a channel that cannot be trusted) ends the cycle too: it is acted on when it arrives. A command that
-stops motion is sent at once, others with the cycle time of the DBC. Where nothing is ever commanded there is no request slot, and
-nothing is ever sent.
+One cycle of 10 ms: receive until the deadline, hand what is known to the guard, send, publish. A
+message that ends a motion (dead-man, emergency stop, a channel that cannot be trusted) ends the
+cycle too: it is acted on when it arrives. A command that stops motion is sent at once, others with
+the cycle time of the DBC. Where nothing is ever commanded there is no request slot, and nothing is
+ever sent.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ REOPEN_S = 0.2
 """Between attempts to open a bus that went down."""
 TRIPS = tuple(Trip)
 FRAME = struct.Struct("<dIBB")
-"""Of a frame in the log's pipe: time, identifier, 1 where it was sent from here, and number of data bytes that follow."""
+"""Of a frame in the log's pipe: time, identifier, 1 where it was sent from here, and number of data
+bytes that follow."""
 FRAMES, TEXT = b"F", b"J"
 """First byte of what goes through the log's pipe: frames, or a JSON text with topic and time."""
 IDLE, COMMAND = 0, 1
@@ -88,7 +90,10 @@ class Station:
 
     def _receive(self) -> None:
         """Takes frames until the deadline."""
-        if self._bus is not None and (stood_s := time.monotonic() - self._pace.next_s) > self._gap_s:
+        if (
+            self._bus is not None
+            and (stood_s := time.monotonic() - self._pace.next_s) > self._gap_s
+        ):
             log.warning("time stood still for %.1f s; what was said meanwhile is dropped", stood_s)
             self._bus.close()
             self._bus = None
@@ -121,10 +126,23 @@ class Station:
     def _cycle(self) -> None:
         """Decides, sends, publishes."""
         now_s = time.monotonic()
-        decision = self._guard.decide(now_s, self._armed(), self._receiver.seen(now_s, self._bus is not None), self._request(now_s))
+        decision = self._guard.decide(
+            now_s,
+            self._armed(),
+            self._receiver.seen(now_s, self._bus is not None),
+            self._request(now_s),
+        )
         before, self._decision = self._decision, decision
         if before is None or (decision.state, decision.trip) != (before.state, before.trip):
-            self._say("guard", now_s, {"state": decision.state.name, "trip": decision.trip.value, "cause": decision.cause.value})
+            self._say(
+                "guard",
+                now_s,
+                {
+                    "state": decision.state.name,
+                    "trip": decision.trip.value,
+                    "cause": decision.cause.value,
+                },
+            )
         if decision.sends and self._exchange.request is not None:
             stops = before is not None and any(before.u) and not any(decision.u)
             self._command(decision, now_s, at_once=stops)
@@ -135,15 +153,24 @@ class Station:
 
     def _armed(self) -> bool:
         controls = self._exchange.controls.read()
-        return self._exchange.request is not None and controls is not None and bool(controls["armed"])
+        return (
+            self._exchange.request is not None and controls is not None and bool(controls["armed"])
+        )
 
     def _request(self, now_s: float) -> Request | None:
         record = self._exchange.request.read() if self._exchange.request else None
-        return None if record is None else Request(tuple(record["u"].tolist()), now_s - float(record["t_s"]))
+        return (
+            None
+            if record is None
+            else Request(tuple(record["u"].tolist()), now_s - float(record["t_s"]))
+        )
 
     def _command(self, decision: Decision, now_s: float, at_once: bool) -> None:
         """Sends the guard's decision, and the heartbeat when it is due; the one place from which valves are commanded."""
-        values: dict[str, float] = {f"Command_{joint}": u for joint, u in zip(self._machine.joint_names, decision.u, strict=True)}
+        values: dict[str, float] = {
+            f"Command_{joint}": u
+            for joint, u in zip(self._machine.joint_names, decision.u, strict=True)
+        }
         values["CommandMode"] = COMMAND if decision.state is State.ACTIVE else IDLE
         self._send(self._description.command.name, values, now_s, at_once)
         if "PcHeartbeat" in self._description.layouts:
@@ -157,7 +184,9 @@ class Station:
         self._due_s[name] = max(due_s, now_s - period_s) + period_s
         counter = self._counters[name] = self._counters.get(name, -1) + 1
         layout = self._description.layouts[name]
-        frame = Wired(layout.frame_id, self._description.encode(name, values, counter), layout.extended)
+        frame = Wired(
+            layout.frame_id, self._description.encode(name, values, counter), layout.extended
+        )
         if name == self._description.command.name:
             self._receiver.sent(frame.data)
         try:
@@ -169,17 +198,48 @@ class Station:
     def _publish(self, now_s: float, decision: Decision) -> None:
         receiver, record = self._receiver, self._exchange.state.new()
         seen = receiver.seen(now_s, self._bus is not None)
-        record["t_s"], record["q"], record["q_t_s"] = now_s, receiver.q, max(0.0, receiver.q_t_s.min() - receiver.held_up_s)
-        record["q_plausible"], record["trusted"], record["alone"] = seen.joints_plausible, seen.trusted, seen.alone
-        record["flow"], record["flow_sum"], record["flow_number"] = receiver.flow, receiver.flow_sum, receiver.flow_number
-        record["flow_t_s"], record["levers_t_s"] = max(0.0, receiver.flow_t_s), max(0.0, receiver.levers_t_s)
-        record["status_t_s"], record["held_up_s"], record["bus_up"] = max(0.0, receiver.status_t_s), receiver.held_up_s, seen.bus_up
-        record["lever"], record["button_right"], record["deadman"] = receiver.lever, receiver.button_right, receiver.deadman
-        record["remote_on"], record["estop"], record["oil_c"] = receiver.remote_on, receiver.estop, receiver.oil_c
+        record["t_s"], record["q"], record["q_t_s"] = (
+            now_s,
+            receiver.q,
+            max(0.0, receiver.q_t_s.min() - receiver.held_up_s),
+        )
+        record["q_plausible"], record["trusted"], record["alone"] = (
+            seen.joints_plausible,
+            seen.trusted,
+            seen.alone,
+        )
+        record["flow"], record["flow_sum"], record["flow_number"] = (
+            receiver.flow,
+            receiver.flow_sum,
+            receiver.flow_number,
+        )
+        record["flow_t_s"], record["levers_t_s"] = (
+            max(0.0, receiver.flow_t_s),
+            max(0.0, receiver.levers_t_s),
+        )
+        record["status_t_s"], record["held_up_s"], record["bus_up"] = (
+            max(0.0, receiver.status_t_s),
+            receiver.held_up_s,
+            seen.bus_up,
+        )
+        record["lever"], record["button_right"], record["deadman"] = (
+            receiver.lever,
+            receiver.button_right,
+            receiver.deadman,
+        )
+        record["remote_on"], record["estop"], record["oil_c"] = (
+            receiver.remote_on,
+            receiver.estop,
+            receiver.oil_c,
+        )
         record["exclusive_selected"] = receiver.exclusive_selected
         record["guard"], record["sent"] = decision.state.value, decision.u
         record["trip"], record["cause"] = TRIPS.index(decision.trip), TRIPS.index(decision.cause)
-        record["frames"], record["refused"], record["lost"] = receiver.frames, receiver.refused, receiver.lost
+        record["frames"], record["refused"], record["lost"] = (
+            receiver.frames,
+            receiver.refused,
+            receiver.lost,
+        )
         record["missed"] = self._pace.missed
         self._exchange.state.write(record)
 
@@ -202,7 +262,9 @@ class Station:
     def _farewell(self) -> None:
         now_s = time.monotonic()
         if self._bus is not None and self._decision is not None and self._decision.sends:
-            last = self._guard.decide(now_s, True, self._receiver.seen(now_s, False), None)  # a bus that is going down: zero
+            last = self._guard.decide(
+                now_s, True, self._receiver.seen(now_s, False), None
+            )  # a bus that is going down: zero
             self._command(last, now_s, at_once=True)
         self._exchange.reports.put(json.dumps({"process": "bus"} | self._pace.report()).encode())
         if self._log:
@@ -214,4 +276,6 @@ class Station:
         self._log.append(FRAME.pack(now_s, frame.frame_id, sent, len(frame.data)) + frame.data)
 
     def _say(self, topic: str, now_s: float, values: dict[str, object]) -> None:
-        self._exchange.bus_log.put(TEXT + json.dumps({"topic": topic, "t_s": now_s, **values}).encode())
+        self._exchange.bus_log.put(
+            TEXT + json.dumps({"topic": topic, "t_s": now_s, **values}).encode()
+        )

@@ -1,7 +1,8 @@
 """The parent of the loop: starts bus, policy and log, watches over them, shows what the outlet says, reports on timing.
 
-A child that dies is not started again in secret: bus or policy end the run with an error, a dead log is an alarm beside which
-guidance goes on. Whoever dies, the gateway goes to zero flow by itself.
+A child that dies is not started again in secret: bus or policy end the run with an error, a dead
+log is an alarm beside which guidance goes on. Whoever dies, the gateway goes to zero flow by
+itself.
 """
 
 from __future__ import annotations
@@ -69,11 +70,15 @@ class Loop(Listener):
 
     def check(self) -> None:
         if self.armed and not self.commands:
-            raise ConfigError("deploy.armed: nothing is ever sent in this mode; deploy=auto sends the policy's commands")
+            raise ConfigError(
+                "deploy.armed: nothing is ever sent in this mode; deploy=auto sends the policy's commands"
+            )
         if self.seconds is not None and self.seconds <= 0:
             raise ConfigError(f"deploy.seconds: expected more than 0, or null, got {self.seconds}")
         if isinstance(self.target, Seen) and (self.camera is None or self.camera.finder is None):
-            raise ConfigError("target=seen: there is no camera that looks for boreholes; choose camera=… as well")
+            raise ConfigError(
+                "target=seen: there is no camera that looks for boreholes; choose camera=… as well"
+            )
 
     def run(self, machine: Machine, session: Session, companions: Sequence[Companion]) -> None:
         """Runs until the time is over or a person stops it; leaves `processes.json` and `timing.json`.
@@ -89,17 +94,29 @@ class Loop(Listener):
             LinkError: bus or policy process died.
         """
         self.refuse(machine)
-        exchange = Exchange.new(machine.num_joints, self.commands, self.camera.num_px if self.camera else 0)
-        children, recorder = Children(exchange, self.realtime), self._recorder(exchange, machine, session.folder)
+        exchange = Exchange.new(
+            machine.num_joints, self.commands, self.camera.num_px if self.camera else 0
+        )
+        children, recorder = (
+            Children(exchange, self.realtime),
+            self._recorder(exchange, machine, session.folder),
+        )
         try:
             for companion in companions:
-                children.start(companion.name, companion.target, companion.arguments, companion.realtime)
+                children.start(
+                    companion.name, companion.target, companion.arguments, companion.realtime
+                )
             self._start(children, machine, session)
             recorder.refresh()
             write_json(session.folder / PROCESSES, children.pids | recorder.pids)
             aim = Aim(self.target.build(), exchange.target, exchange.holes)
             full_rad = full_angles_rad(self.guidance.levers or machine.levers)
-            self._watch(children, exchange, full_rad, Wanted(exchange, recorder, aim, self.armed, self.commands))
+            self._watch(
+                children,
+                exchange,
+                full_rad,
+                Wanted(exchange, recorder, aim, self.armed, self.commands),
+            )
         except KeyboardInterrupt:
             log.info("stopping")
         finally:
@@ -113,7 +130,14 @@ class Loop(Listener):
         if self.page is not None:
             camera_s = self.camera.stale_s if self.camera else None
             beside = Beside(
-                self.page, machine, self.guidance, session, self.limits.joints_s, self.limits.levers_s, self.target_s, camera_s
+                self.page,
+                machine,
+                self.guidance,
+                session,
+                self.limits.joints_s,
+                self.limits.levers_s,
+                self.target_s,
+                camera_s,
             )
             children.start("page", "deploy.page.from_loop:run", (beside,))
         if self.camera is not None:
@@ -123,18 +147,26 @@ class Loop(Listener):
         facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
 
         def start(folder: Path) -> Child:
-            capture = Capture(folder, self.dbc, machine, facts, self.camera.record_hz if self.camera else 0.0)
+            capture = Capture(
+                folder, self.dbc, machine, facts, self.camera.record_hz if self.camera else 0.0
+            )
             return Child("log", "deploy.recorder.capture:run", (capture, exchange), exchange.files)
 
         recorder = Recorder(exchange, folder, start)
         recorder.wanted = self.record
         return recorder
 
-    def _watch(self, children: Children, exchange: Exchange, full_rad: tuple[float, ...], wanted: Wanted) -> None:
+    def _watch(
+        self, children: Children, exchange: Exchange, full_rad: tuple[float, ...], wanted: Wanted
+    ) -> None:
         """Shows, does what is wanted and looks after the children until it is time to stop."""
         end_s = None if self.seconds is None else time.monotonic() + self.seconds
         with contextlib.ExitStack() as stack:
-            live = stack.enter_context(Live(console=Console(stderr=True), refresh_per_second=10)) if self.show else None
+            live = (
+                stack.enter_context(Live(console=Console(stderr=True), refresh_per_second=10))
+                if self.show
+                else None
+            )
             while end_s is None or time.monotonic() < end_s:
                 wanted.refresh()
                 children.check()
@@ -151,7 +183,8 @@ class Companion:
         name: What it is.
         target: `module:function`, called as `function(stop, *arguments, exchange)`.
         arguments: Its arguments.
-        realtime: Real-time priority, where the loop asks for one: a machine is never late; `None`: an ordinary process.
+        realtime: Real-time priority, where the loop asks for one: a machine is never late; `None`:
+            an ordinary process.
     """
 
     name: str
@@ -169,4 +202,7 @@ def _report(exchange: Exchange, session: Session) -> None:
             one["process"], one["cycles"], 1e3 * one["period_s"], one["missed"], 1e3 * one["late_p99_s"], 1e3 * one["late_max_s"],
         )  # fmt: skip
     dropped = sum(pipe.dropped for pipe in exchange.logs)
-    write_json(session.folder / TIMING, {"processes": reports, "log_dropped": dropped, "last": view(exchange).plain()})
+    write_json(
+        session.folder / TIMING,
+        {"processes": reports, "log_dropped": dropped, "last": view(exchange).plain()},
+    )

@@ -159,8 +159,16 @@ def holes_of(slot: Slot) -> list[Any]:
 
 def nearest(holes: list[Any], center_m: np.ndarray) -> Any | None:
     """Returns that of `holes` which is the borehole at `center_m`, if any."""
-    one = min(holes, key=lambda hole: float(np.linalg.norm(hole["center_in_base_m"] - center_m)), default=None)
-    return one if one is not None and np.linalg.norm(one["center_in_base_m"] - center_m) <= NEAR_M else None
+    one = min(
+        holes,
+        key=lambda hole: float(np.linalg.norm(hole["center_in_base_m"] - center_m)),
+        default=None,
+    )
+    return (
+        one
+        if one is not None and np.linalg.norm(one["center_in_base_m"] - center_m) <= NEAR_M
+        else None
+    )
 
 
 def place_of(hole: Any) -> Place:
@@ -185,7 +193,9 @@ class _Surest:
         sure = max(holes, key=lambda hole: float(hole["score"]), default=None)
         if self._said or sure is None or float(sure["score"]) < self._score:
             return None
-        self._said = True  # from now on it is followed; a surer one next to it is the operator's choice
+        self._said = (
+            True  # from now on it is followed; a surer one next to it is the operator's choice
+        )
         return place_of(sure)
 
 
@@ -206,9 +216,13 @@ class _Watched:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ConfigError(f"target.path={self._path}: expected JSON with center_in_base_m: [x, y, z] ({error})") from error
+            raise ConfigError(
+                f"target.path={self._path}: expected JSON with center_in_base_m: [x, y, z] ({error})"
+            ) from error
         if center_m.shape != (3,) or not np.isfinite(center_m).all():
-            raise ConfigError(f"target.path={self._path}: center_in_base_m is {center_m.tolist()}, expected three numbers")
+            raise ConfigError(
+                f"target.path={self._path}: center_in_base_m is {center_m.tolist()}, expected three numbers"
+            )
         # only a file that lay there before goes by the wall clock, which may be set at any time
         age_s = max(0.0, time.time() - changed / 1e9) if before is None else 0.0
         return Place(center_m, std_m, time.monotonic() - age_s)

@@ -21,7 +21,8 @@ log = logging.getLogger(__name__)
 class Recorder:
     """The log process, there or not as it is wanted; one at a time, each recording in a folder of its own.
 
-    While there is none the pipes are emptied, so that nothing old is written later and nothing counts as lost.
+    While there is none the pipes are emptied, so that nothing old is written later and nothing
+    counts as lost.
 
     Args:
         exchange: With the pipes.
@@ -54,12 +55,17 @@ class Recorder:
         child = self._child
         if child is not None and child.code is not None:
             if not self._asked:
-                log.error("ALARM: the log has died (exit code %s); nothing is recorded any more", child.code)
+                log.error(
+                    "ALARM: the log has died (exit code %s); nothing is recorded any more",
+                    child.code,
+                )
                 self.wanted = False
             self._child = child = None
         if child is None and self.wanted:
             self._number += 1
-            folder = self.into or (self._folder if self._number == 1 else self._folder / f"recording_{self._number}")
+            folder = self.into or (
+                self._folder if self._number == 1 else self._folder / f"recording_{self._number}"
+            )
             self.into = None
             self._child, self._asked, self.since_s = self._start(folder), False, time.monotonic()
         elif child is not None and not self.wanted and not self._asked:
@@ -87,7 +93,9 @@ class Wanted:
         commands: Whether anything is ever sent.
     """
 
-    def __init__(self, exchange: Exchange, recorder: Recorder, aim: Aim, armed: bool, commands: bool) -> None:
+    def __init__(
+        self, exchange: Exchange, recorder: Recorder, aim: Aim, armed: bool, commands: bool
+    ) -> None:
         self._exchange, self._recorder, self._aim = exchange, recorder, aim
         self._armed, self._commands = armed, commands
 
@@ -99,7 +107,9 @@ class Wanted:
                 self._recorder.wanted = wish["value"] == "on"
                 self._recorder.into = Path(wish["into"]) if "into" in wish else self._recorder.into
             elif "center_in_base_m" in wish:
-                self._aim.choose(Place(np.array(wish["center_in_base_m"]), wish["std_m"], wish["t_s"]))
+                self._aim.choose(
+                    Place(np.array(wish["center_in_base_m"]), wish["std_m"], wish["t_s"])
+                )
             else:
                 self._armed = self._commands and wish["kind"] == "start"
             log.info("wished: %s %s", wish["kind"], wish["value"])
@@ -110,5 +120,8 @@ class Wanted:
         self._recorder.refresh()
         controls = self._exchange.controls.new()
         controls["t_s"], controls["armed"] = time.monotonic(), self._armed
-        controls["recording"], controls["recording_t_s"] = self._recorder.recording, self._recorder.since_s
+        controls["recording"], controls["recording_t_s"] = (
+            self._recorder.recording,
+            self._recorder.since_s,
+        )
         self._exchange.controls.write(controls)

@@ -1,8 +1,10 @@
 """Who may ask the page's server for what: pure rules, no I/O.
 
-Watching is free for browsers of this page. Whoever wants something done shows the token first, and is refused without the dead-man,
-except for `stop`: it can only end what a dead-man is there for. A page of another origin cannot connect (a stranger's site in the
-same browser), nor can a name that is not this server's (DNS rebinding).
+Watching is free for browsers of this page. Whoever wants something done shows the token first, and
+is refused without the dead-man,
+except for `stop`: it can only end what a dead-man is there for. A page of another origin cannot
+connect (a stranger's site in the same browser), nor can a name that is not this server's (DNS
+rebinding).
 """
 
 from __future__ import annotations
@@ -15,8 +17,8 @@ from typing import Literal
 from deploy.page.shown import KINDS, Shown, Wish
 
 Refusal = Literal["token", "malformed", "deadman", "target", "nowhere", "busy"]
-"""Why a wish was refused: wrong token; no such wish; the dead-man is not held; no such target; nothing is measured where the person
-points; the loop does not take it."""
+"""Why a wish was refused: wrong token; no such wish; the dead-man is not held; no such target;
+nothing is measured where the person points; the loop does not take it."""
 LOCAL = ("localhost", "127.0.0.1", "[::1]")
 POINT = re.compile(r"0?\.\d{1,6},0?\.\d{1,6}")
 """A place in the picture: parts of its width and height, at neither edge."""
@@ -51,7 +53,11 @@ def read_wish(text: str | bytes) -> Wish | None:
     kind, value = found["kind"], found["value"]
     if kind not in KINDS or not isinstance(value, str):
         return None
-    fits = {"record": value in ("on", "off"), "target": bool(value), "point": bool(POINT.fullmatch(value))}.get(kind, value == "")
+    fits = {
+        "record": value in ("on", "off"),
+        "target": bool(value),
+        "point": bool(POINT.fullmatch(value)),
+    }.get(kind, value == "")
     return Wish(kind, value) if fits else None
 
 

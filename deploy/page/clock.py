@@ -7,7 +7,8 @@ import math
 from dataclasses import dataclass
 
 KEPT = 64
-"""Messages of which the sending time is remembered; a page has at most a few that it has not answered."""
+"""Messages of which the sending time is remembered; a page has at most a few that it has not
+answered."""
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,8 @@ class Said:
 
     Attributes:
         number: Of the message.
-        advice: Number of the advice that became visible with it; `None` where that had been visible before.
+        advice: Number of the advice that became visible with it; `None` where that had been visible
+            before.
         drawn_s: When, by this computer's monotonic clock.
     """
 
@@ -28,8 +30,8 @@ class Said:
 class PageClock:
     """Translates times of a page into those of this computer.
 
-    The difference of the clocks is that of the exchange with the shortest round trip so far (as in NTP): waiting in a queue on one
-    way only makes the round trip longer.
+    The difference of the clocks is that of the exchange with the shortest round trip so far (as in
+    NTP): waiting in a queue on one way only makes the round trip longer.
 
     Attributes:
         round_trip_s: The shortest one.
@@ -51,7 +53,9 @@ class PageClock:
         """Returns what the page says in `text`: `[number, came_ms, drawn_ms, said_ms]` by its own clock; `None` for nonsense."""
         try:
             number, came_ms, drawn_ms, said_ms = json.loads(text)
-            came_s, drawn_s, said_s = (float(value) / 1000.0 for value in (came_ms, drawn_ms, said_ms))
+            came_s, drawn_s, said_s = (
+                float(value) / 1000.0 for value in (came_ms, drawn_ms, said_ms)
+            )
             sent_s, advice = self._sent.pop(number)
         except (ValueError, TypeError, KeyError):
             return None

@@ -1,9 +1,9 @@
 """A frame on its way to the page: depth in whole millimetres, coded by differences along each row and zstd, and colour as JPEG.
 
-Small differences are small numbers (zigzag), and low and high bytes stand apart: 206 KiB for 640 x 360 px, where plain differences
-take 262, 32-bit points and colours 3.2 MB, and Draco 702 KiB and a second. The page makes points of it on the graphics card. A
-message is the length of a JSON header, 4 bytes little-endian, the header, the depth, and the JPEG, which also is the camera's
-picture.
+Small differences are small numbers (zigzag), and low and high bytes stand apart: 206 KiB for 640 x
+360 px, where plain differences take 262, 32-bit points and colours 3.2 MB, and Draco 702 KiB and a
+second. The page makes points of it on the graphics card. A message is the length of a JSON header,
+4 bytes little-endian, the header, the depth, and the JPEG, which also is the camera's picture.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ def encode(frame: Frame, width: int, quality: int) -> bytes:
         FrameError: depth and colour differ in size.
     """
     if frame.depth_m.shape != frame.color.shape[:2]:
-        raise FrameError(f"depth is {frame.depth_m.shape}, colour {frame.color.shape}: expected one size")
+        raise FrameError(
+            f"depth is {frame.depth_m.shape}, colour {frame.color.shape}: expected one size"
+        )
     full_height, full_width = frame.depth_m.shape
     part = min(1.0, width / full_width)
     size = round(part * full_width), round(part * full_height)
@@ -62,7 +64,8 @@ def encode(frame: Frame, width: int, quality: int) -> bytes:
 def planes(depth_m: np.ndarray) -> np.ndarray:
     """Returns the low and the high bytes, `(2, h, w)`, of depths, `(h, w)` in m, as 16-bit millimetres (0: unknown).
 
-    Each stands as its difference to its left neighbour, modulo 2^16, from 0 outwards: 0, -1, 1, -2, ….
+    Each stands as its difference to its left neighbour, modulo 2^16, from 0 outwards: 0, -1, 1, -2,
+    ….
     """
     units = np.nan_to_num(depth_m / M_PER_UNIT, nan=0.0, posinf=0.0, neginf=0.0).round()
     units = np.where((units > 0) & (units < FAR), units, 0).astype("<u2")
@@ -74,7 +77,11 @@ def planes(depth_m: np.ndarray) -> np.ndarray:
 
 def depth_m(data: bytes, width: int, height: int) -> np.ndarray:
     """Returns the depths, `(h, w)` float32 in m and NaN where unknown, that `data` holds: as the page has them."""
-    low, high = np.frombuffer(zstandard.ZstdDecompressor().decompress(data), np.uint8).reshape(2, height, width).astype(np.uint16)
+    low, high = (
+        np.frombuffer(zstandard.ZstdDecompressor().decompress(data), np.uint8)
+        .reshape(2, height, width)
+        .astype(np.uint16)
+    )
     outwards = low | high << 8
     units = ((outwards >> 1) ^ -(outwards & 1)).cumsum(1, dtype=np.uint16).astype(np.float32)
     return np.where(units > 0, units * np.float32(M_PER_UNIT), np.float32(np.nan))

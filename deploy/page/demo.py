@@ -1,7 +1,8 @@
 """A feed without a machine: a simulated state and camera, so that the page can be seen, tried and tested at a desk.
 
-What it shows is made up from the clock alone: the joint that is never moved with others goes its way with the button held, then the
-rest; the operator's levers follow the advice a little late. It claims nothing about a machine or a policy.
+What it shows is made up from the clock alone: the joint that is never moved with others goes its
+way with the button held, then the rest; the operator's levers follow the advice a little late. It
+claims nothing about a machine or a policy.
 """
 
 from __future__ import annotations
@@ -57,8 +58,15 @@ class Demo:
     rate_hz: float
 
     def check(self) -> None:
-        if self.lag_s < 0 or not 0 < self.amplitude <= 1 or self.rate_hz <= 0 or min(self.width_px, self.height_px) < 16:
-            raise ConfigError("feed: expected lag_s of 0 or more, amplitude in (0, 1], rate_hz of more than 0, 16 px or more")
+        if (
+            self.lag_s < 0
+            or not 0 < self.amplitude <= 1
+            or self.rate_hz <= 0
+            or min(self.width_px, self.height_px) < 16
+        ):
+            raise ConfigError(
+                "feed: expected lag_s of 0 or more, amplitude in (0, 1], rate_hz of more than 0, 16 px or more"
+            )
 
     def build(self, machine: Machine) -> DemoFeed:
         """Returns it at work."""
@@ -79,7 +87,9 @@ class DemoFeed:
         self._began_s = clock()
         self._guiding, self._recorded_s = True, self._began_s
         self._recording, self._chosen = False, TARGETS[0].name
-        self._camera = Camera(demo.width_px, demo.height_px, BLOCK_M, TARGETS) if demo.frames else None
+        self._camera = (
+            Camera(demo.width_px, demo.height_px, BLOCK_M, TARGETS) if demo.frames else None
+        )
         self._exclusive = machine.is_exclusive
 
     def news(self) -> int:
@@ -98,7 +108,11 @@ class DemoFeed:
         chosen = next(target for target in targets if target.chosen)
         path = ()
         if machine.has_bodies and self._guiding:
-            path = approach(tool(machine, q).tip_in_base_m, np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base))
+            path = approach(
+                tool(machine, q).tip_in_base_m,
+                np.array(chosen.center_in_base_m),
+                np.array(chosen.axis_in_base),
+            )
         age_s: dict[str, float | None] = {
             "positions": t_s % 0.01,
             "levers": t_s % 0.02,
@@ -138,7 +152,10 @@ class DemoFeed:
         found = frame and borehole_at(frame, x, y, TARGETS[0].radius_m)
         if not found:
             return False
-        apart_m = {one.name: float(np.linalg.norm(np.array(one.center_in_base_m) - found[0])) for one in TARGETS}
+        apart_m = {
+            one.name: float(np.linalg.norm(np.array(one.center_in_base_m) - found[0]))
+            for one in TARGETS
+        }
         nearest = min(apart_m, key=lambda name: apart_m[name])
         self._chosen = nearest if apart_m[nearest] <= NEAR_M else self._chosen
         return apart_m[nearest] <= NEAR_M
@@ -152,12 +169,20 @@ class DemoFeed:
         at_s, number = t_s % cycle, int(t_s // cycle)
         alone = at_s < EXCLUSIVE_S and bool(self._exclusive.any())
         if alone:
-            u[self._exclusive] = self._demo.amplitude * np.sin(np.pi * at_s / EXCLUSIVE_S) * (1 if number % 2 == 0 else -1)
+            u[self._exclusive] = (
+                self._demo.amplitude
+                * np.sin(np.pi * at_s / EXCLUSIVE_S)
+                * (1 if number % 2 == 0 else -1)
+            )
         else:
             phase = 2 * np.pi * (at_s - EXCLUSIVE_S) / OTHERS_S
             joints = np.arange(self._machine.num_joints)
             u = np.where(
-                self._exclusive, 0.0, self._demo.amplitude * np.sin(phase * (1 + joints % 2)) * (1 - 2 * (joints // 2 % 2))
+                self._exclusive,
+                0.0,
+                self._demo.amplitude
+                * np.sin(phase * (1 + joints % 2))
+                * (1 - 2 * (joints // 2 % 2)),
             )
         left_s = cycle - at_s
         due_s = 0.0 if alone else left_s if left_s <= LEAD_IN_S and self._exclusive.any() else None
@@ -174,8 +199,17 @@ class DemoFeed:
         phase = 2 * np.pi * max(0.0, at_s - EXCLUSIVE_S) / OTHERS_S
         joints = np.arange(machine.num_joints)
         times = 1 + joints % 2
-        others = speed * (1 - np.cos(phase * times)) / times * OTHERS_S / (2 * np.pi) * (1 - 2 * (joints // 2 % 2))
-        return np.clip(machine.home + np.where(self._exclusive, alone, others), machine.lower, machine.upper)
+        others = (
+            speed
+            * (1 - np.cos(phase * times))
+            / times
+            * OTHERS_S
+            / (2 * np.pi)
+            * (1 - 2 * (joints // 2 % 2))
+        )
+        return np.clip(
+            machine.home + np.where(self._exclusive, alone, others), machine.lower, machine.upper
+        )
 
 
 def levers_of(machine: Machine, u: np.ndarray, button: bool) -> Levers:

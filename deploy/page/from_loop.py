@@ -1,7 +1,8 @@
 """The page beside the loop: a process of its own that reads the outlet and hands wishes to the supervisor.
 
-The slots it reads are overwritten by their writers, who wait for nobody; what it writes are two pipes that count what they must
-drop. However slow a browser is, or if this process dies, the loop feels nothing of it.
+The slots it reads are overwritten by their writers, who wait for nobody; what it writes are two
+pipes that count what they must drop. However slow a browser is, or if this process dies, the loop
+feels nothing of it.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ ADVICE_PERIODS = 3
 """Control periods without a new advice from which the last one is stale."""
 UP: Vector = (0.0, 0.0, 1.0)
 GIVEN = "+"
-"""Name of a borehole that perception does not know: one from a file, from the configuration, or pointed at."""
+"""Name of a borehole that perception does not know: one from a file, from the configuration, or
+pointed at."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,11 @@ def run(stop: Stop, beside: Beside, exchange: Exchange) -> None:
     link = beside.session.folder / LINK
 
     def tell(address: str) -> None:
-        log.info("%s; the link that may also have things done stands in %s", address.partition("#")[0], link)
+        log.info(
+            "%s; the link that may also have things done stands in %s",
+            address.partition("#")[0],
+            link,
+        )
 
     beside.page.serve(stop, beside.machine, LoopFeed(beside, exchange), beside.session, tell)
 
@@ -88,7 +94,9 @@ class LoopFeed:
         clock: Monotonic time in s.
     """
 
-    def __init__(self, beside: Beside, exchange: Exchange, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, beside: Beside, exchange: Exchange, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._beside, self._exchange, self._clock = beside, exchange, clock
         self._guiding, self._began_s = True, clock()
         machine = beside.machine
@@ -111,7 +119,10 @@ class LoopFeed:
             "positions": (machine and machine.q_age_s, beside.positions_s),
             "levers": (machine and machine.levers_age_s, beside.levers_s),
             "advice": (proposed and proposed.age_s, ADVICE_PERIODS * beside.machine.period_s),
-            "borehole": (None if target is None else seen.t_s - float(target["t_s"]), beside.borehole_s),
+            "borehole": (
+                None if target is None else seen.t_s - float(target["t_s"]),
+                beside.borehole_s,
+            ),
         }
         if beside.camera_s is not None:
             taken_s = self._frame_t_s()
@@ -124,10 +135,20 @@ class LoopFeed:
             own=machine and machine.levers,
             q=machine and machine.q,
             streams=tuple(Stream(name, *age) for name, age in ages_s.items()),
-            safety=safety and Safety(safety.commands, safety.state, safety.trip, safety.deadman, safety.estop, safety.bus_up),
+            safety=safety
+            and Safety(
+                safety.commands,
+                safety.state,
+                safety.trip,
+                safety.deadman,
+                safety.estop,
+                safety.bus_up,
+            ),
             recording=Recording(
                 recording,
-                seen.t_s - float(controls["recording_t_s"]) if recording and controls is not None else 0.0,
+                seen.t_s - float(controls["recording_t_s"])
+                if recording and controls is not None
+                else 0.0,
                 safety.log_dropped if safety else 0,
             ),
             targets=found,
@@ -151,8 +172,14 @@ class LoopFeed:
             place = self._named(wish.value) if wish.kind == "target" else self._pointed(wish.value)
             if place is None:
                 return False
-            facts = {"center_in_base_m": place.center_in_base_m.tolist(), "std_m": place.std_m, "t_s": place.t_s}
-        taken = self._exchange.wishes.put(json.dumps({"kind": wish.kind, "value": wish.value, **facts}).encode())
+            facts = {
+                "center_in_base_m": place.center_in_base_m.tolist(),
+                "std_m": place.std_m,
+                "t_s": place.t_s,
+            }
+        taken = self._exchange.wishes.put(
+            json.dumps({"kind": wish.kind, "value": wish.value, **facts}).encode()
+        )
         self._say("wish", {"kind": wish.kind, "value": wish.value, "taken": taken, **facts})
         if wish.kind in ("start", "stop"):
             self._guiding = wish.kind == "start"
@@ -161,18 +188,35 @@ class LoopFeed:
 
     def drawn(self, drawn: Drawn) -> None:
         """See `Feed`; goes into the recording as topic `drawn`."""
-        self._say("drawn", {"advice": drawn.number, "at_s": drawn.t_s, "round_trip_s": drawn.round_trip_s, "page": drawn.page})
+        self._say(
+            "drawn",
+            {
+                "advice": drawn.number,
+                "at_s": drawn.t_s,
+                "round_trip_s": drawn.round_trip_s,
+                "page": drawn.page,
+            },
+        )
 
     def _say(self, topic: str, values: dict[str, Any]) -> None:
-        self._exchange.page_log.put(TEXT + json.dumps({"topic": topic, "t_s": self._clock(), **values}).encode())
+        self._exchange.page_log.put(
+            TEXT + json.dumps({"topic": topic, "t_s": self._clock(), **values}).encode()
+        )
 
     def _advice(self, proposed: outlet.Advice) -> Advice:
         levers = proposed.levers.parts(self._full_rad)
         due_s = 0.0 if levers.button_right else None
-        if not levers.button_right and proposed.valid and np.asarray(proposed.command)[self._exclusive].any():
-            # the policy wants it already; what is shown goes through neutral first, as fast as a hand can
+        if (
+            not levers.button_right
+            and proposed.valid
+            and np.asarray(proposed.command)[self._exclusive].any()
+        ):
+            # the policy wants it already; what is shown goes through neutral first, as fast as a
+            # hand can
             most_rad = max(map(abs, proposed.levers.angles_rad))
-            due_s = max(self._beside.machine.period_s, most_rad / self._beside.guidance.max_rate_rad_s)
+            due_s = max(
+                self._beside.machine.period_s, most_rad / self._beside.guidance.max_rate_rad_s
+            )
         return Advice(proposed.valid, proposed.reason, proposed.number, levers, due_s)
 
     def _frame_t_s(self) -> float | None:
@@ -191,12 +235,25 @@ class LoopFeed:
         ]  # fmt: skip
         if aim is not None and chosen is None:
             radius_m = self._beside.page.borehole_radius_m
-            found.append(Target(GIVEN, _vector(aim["center_in_base_m"]), UP, radius_m, float(aim["std_m"]) or None, None, True))
+            found.append(
+                Target(
+                    GIVEN,
+                    _vector(aim["center_in_base_m"]),
+                    UP,
+                    radius_m,
+                    float(aim["std_m"]) or None,
+                    None,
+                    True,
+                )
+            )
         return tuple(found)
 
     def _named(self, name: str) -> Place | None:
         """Returns where the borehole of that name is."""
-        one = next((hole for hole in holes_of(self._exchange.holes) if str(int(hole["name"])) == name), None)
+        one = next(
+            (hole for hole in holes_of(self._exchange.holes) if str(int(hole["name"])) == name),
+            None,
+        )
         return None if one is None else place_of(one)
 
     def _pointed(self, value: str) -> Place | None:

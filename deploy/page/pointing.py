@@ -1,7 +1,7 @@
 """Where a person points: the borehole under a click into the camera's picture. Pure.
 
-The mouth of a borehole is dark and has no depth of its own, so the face around it is measured: a plane through the points beside
-the mouth, and on it the ray through the click.
+The mouth of a borehole is dark and has no depth of its own, so the face around it is measured: a
+plane through the points beside the mouth, and on it the ray through the click.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ NEAREST_PX, REACH_PX = 6, 24
 """Half the size of the window that tells how far away the face is, and how large it may become."""
 
 
-def borehole_at(frame: Frame, x: float, y: float, radius_m: float) -> tuple[np.ndarray, float] | None:
+def borehole_at(
+    frame: Frame, x: float, y: float, radius_m: float
+) -> tuple[np.ndarray, float] | None:
     """Returns the centre of the borehole that a person points at, `(3,)` in the base frame, and its standard deviation in m.
 
     Args:
@@ -46,7 +48,9 @@ def borehole_at(frame: Frame, x: float, y: float, radius_m: float) -> tuple[np.n
     from_pixel, focal_px = np.linalg.inv(frame.camera_matrix), float(frame.camera_matrix[0, 0])
     ray = from_pixel @ np.array([u, v, 1.0])
     reach = int(OUTER * focal_px * radius_m / about_m) + NEAREST_PX
-    rows, columns = np.mgrid[max(0, int(v) - reach) : int(v) + reach + 1, max(0, int(u) - reach) : int(u) + reach + 1]
+    rows, columns = np.mgrid[
+        max(0, int(v) - reach) : int(v) + reach + 1, max(0, int(u) - reach) : int(u) + reach + 1
+    ]
     rows, columns = rows[rows < height], columns[rows < height]
     rows, columns = rows[columns < width], columns[columns < width]
     depth_m = frame.depth_m[rows, columns]
@@ -71,7 +75,9 @@ def borehole_at(frame: Frame, x: float, y: float, radius_m: float) -> tuple[np.n
 def _distance_m(depth_m: np.ndarray, u: float, v: float) -> float | None:
     """Returns how far away what is clicked at is, from the smallest window that knows."""
     for half in range(NEAREST_PX, REACH_PX + 1, 6):
-        window = depth_m[max(0, int(v) - half) : int(v) + half + 1, max(0, int(u) - half) : int(u) + half + 1]
+        window = depth_m[
+            max(0, int(v) - half) : int(v) + half + 1, max(0, int(u) - half) : int(u) + half + 1
+        ]
         known = window[np.isfinite(window)]
         if len(known) >= LEAST_POINTS:
             return float(np.median(known))

@@ -1,8 +1,9 @@
 """The page's server: one process, one port; files, and three WebSockets.
 
-`/state` sends the newest `Shown` as JSON, `/frames` the newest frame, `/control` takes wishes. A page says of every message when it
-has drawn it, and has at most a few that it has not drawn: whoever is slow, asleep or not reading gets fewer and always the newest,
-and costs neither memory nor the loop anything.
+`/state` sends the newest `Shown` as JSON, `/frames` the newest frame, `/control` takes wishes. A
+page says of every message when it
+has drawn it, and has at most a few that it has not drawn: whoever is slow, asleep or not reading
+gets fewer and always the newest, and costs neither memory nor the loop anything.
 """
 
 from __future__ import annotations
@@ -76,7 +77,14 @@ class Server:
         annex: What else is served; `None`: nothing.
     """
 
-    def __init__(self, page: OperatorPage, machine: Machine, feed: Feed, token: str, annex: Annex | None = None) -> None:
+    def __init__(
+        self,
+        page: OperatorPage,
+        machine: Machine,
+        feed: Feed,
+        token: str,
+        annex: Annex | None = None,
+    ) -> None:
         self._page, self._feed, self._token, self._annex = page, feed, token, annex
         self._files = load(json.dumps(page.setup(machine)).encode())
         self._talks = {STATE: self._states, FRAMES: self._frames, CONTROL: self._control}
@@ -103,7 +111,9 @@ class Server:
                 close_timeout=1, open_timeout=5, logger=logging.getLogger("deploy.page.websockets"),
             )  # fmt: skip
         except OSError as error:
-            raise LinkError(f"page: cannot listen on {page.host}:{page.port} ({error.strerror}); choose page.port=…") from error
+            raise LinkError(
+                f"page: cannot listen on {page.host}:{page.port} ({error.strerror}); choose page.port=…"
+            ) from error
         port = next(iter(server.sockets)).getsockname()[1]
         self._names = access.names(page.host, port, page.names)
         logging.getLogger("deploy.page.websockets").setLevel(logging.WARNING)
@@ -119,7 +129,8 @@ class Server:
     async def _watch(self) -> None:
         """Looks at the feed. A new advice goes out at once, what else is new no faster than the rate.
 
-        A browser draws one frame in `FRAME_S`: what would take the frame of an advice that is expected waits and goes with it.
+        A browser draws one frame in `FRAME_S`: what would take the frame of an advice that is
+        expected waits and goes with it.
         """
         sent_s = looked_s = advised_s = apart_s = 0.0
         before = advised = None
@@ -128,7 +139,11 @@ class Server:
             until_s = advised_s + apart_s - now_s
             expected = -POLL_S < until_s < FRAME_S
             silent = now_s - sent_s >= HEARTBEAT_S
-            if number != advised or silent or (now_s - looked_s >= 1.0 / self._page.rate_hz and not expected):
+            if (
+                number != advised
+                or silent
+                or (now_s - looked_s >= 1.0 / self._page.rate_hz and not expected)
+            ):
                 looked_s, shown = now_s, self._feed.shown()
                 safe = (shown.safety, shown.alive, shown.guiding)
                 facts = (shown.advice, shown.own, shown.q, *safe, shown.recording.on, shown.targets)
@@ -137,7 +152,10 @@ class Server:
                     apart_s, advised_s = now_s - advised_s, now_s
                 if silent or facts != before:
                     sent_s, before, advised = now_s, facts, number
-                    text = json.dumps({"number": self._state.number + 1, "shown": shown.plain()}, separators=(",", ":"))
+                    text = json.dumps(
+                        {"number": self._state.number + 1, "shown": shown.plain()},
+                        separators=(",", ":"),
+                    )
                     await self._state.put((shown, text))
             await asyncio.sleep(CLOSE_S if abs(until_s) < POLL_S else POLL_S)
 
@@ -148,8 +166,15 @@ class Server:
             await asyncio.sleep(FRAME_POLL_S)
             frame = self._feed.frame(taken_s) if self._open and time.monotonic() >= due_s else None
             if frame is not None:
-                taken_s, due_s = frame.t_s, time.monotonic() + 0.9 / self._page.frames_hz  # a camera's period is not exact
-                await self._frame.put(await asyncio.to_thread(cloud.encode, frame, self._page.picture_px, self._page.jpeg_quality))
+                taken_s, due_s = (
+                    frame.t_s,
+                    time.monotonic() + 0.9 / self._page.frames_hz,
+                )  # a camera's period is not exact
+                await self._frame.put(
+                    await asyncio.to_thread(
+                        cloud.encode, frame, self._page.picture_px, self._page.jpeg_quality
+                    )
+                )
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answers requests for files; `None` lets a WebSocket in."""
@@ -158,9 +183,15 @@ class Server:
             return _refused(HTTPStatus.MISDIRECTED_REQUEST, "unknown host name; see page.names")
         if path not in self._talks:
             found = self._files.get(path)
-            return _refused(HTTPStatus.NOT_FOUND, "no such page") if found is None else _response(HTTPStatus.OK, *found)
+            return (
+                _refused(HTTPStatus.NOT_FOUND, "no such page")
+                if found is None
+                else _response(HTTPStatus.OK, *found)
+            )
         origin = request.headers.get("Origin")
-        if not access.same_origin(origin, host, self._names) or (path not in (STATE, FRAMES) and origin is None):
+        if not access.same_origin(origin, host, self._names) or (
+            path not in (STATE, FRAMES) and origin is None
+        ):
             log.warning("refused a connection from another origin")
             return _refused(HTTPStatus.FORBIDDEN, "another origin")
         if self._open >= 3 * self._page.clients:
@@ -239,7 +270,9 @@ class Server:
             given = json.loads(await asyncio.wait_for(connection.recv(), 5.0))
         except (ValueError, TimeoutError):
             given = None
-        if not access.token_fits(given.get("token") if isinstance(given, dict) else None, self._token):
+        if not access.token_fits(
+            given.get("token") if isinstance(given, dict) else None, self._token
+        ):
             async with self._guess:  # one guess at a time, whoever guesses
                 await asyncio.sleep(WRONG_TOKEN_S)
             log.warning("refused a page with a wrong token")
@@ -257,7 +290,11 @@ class Server:
         if reason is None and not self._feed.wish(wish):
             reason = "nowhere" if wish.kind == "point" else "busy"
         log.info("%s %s: %s", wish.kind, wish.value, reason or "done")
-        return {"refused": reason, "kind": wish.kind} if reason else {"done": wish.kind, "kind": wish.kind}
+        return (
+            {"refused": reason, "kind": wish.kind}
+            if reason
+            else {"done": wish.kind, "kind": wish.kind}
+        )
 
 
 async def _both(listen: Coroutine[None, None, None], speak: Coroutine[None, None, None]) -> None:
@@ -274,7 +311,9 @@ async def _both(listen: Coroutine[None, None, None], speak: Coroutine[None, None
 
 
 def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
-    headers = Headers({**SECURITY, "Content-Type": kind, "Content-Length": str(len(body)), "Connection": "close"})
+    headers = Headers(
+        {**SECURITY, "Content-Type": kind, "Content-Length": str(len(body)), "Connection": "close"}
+    )
     return Response(status.value, status.phrase, headers, body)
 
 

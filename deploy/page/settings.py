@@ -27,10 +27,13 @@ class OperatorPage:
     """The operator's page.
 
     Attributes:
-        host: Address to listen on. 127.0.0.1: this computer only; anything else opens it to a network, unencrypted.
+        host: Address to listen on. 127.0.0.1: this computer only; anything else opens it to a
+            network, unencrypted.
         port: TCP port; 0: any free one.
-        names: Further names that browsers may use for this computer, where `host` is not this computer's alone.
-        token: What a browser must show to have something done; `null`: a new one each time, in the link that is shown at the start.
+        names: Further names that browsers may use for this computer, where `host` is not this
+            computer's alone.
+        token: What a browser must show to have something done; `null`: a new one each time, in the
+            link that is shown at the start.
         language: `auto`: the browser's.
         rate_hz: Fastest rate of levers and state; what changes is sent at once up to that.
         frames_hz: Fastest rate of camera pictures and point clouds.
@@ -62,8 +65,13 @@ class OperatorPage:
         if not 0 <= self.port < 65536:
             raise ConfigError(f"page.port: expected 0 to 65535, got {self.port}")
         if self.token is not None and len(self.token) < 16:
-            raise ConfigError("page.token: expected at least 16 characters, or null for a new one each time")
-        if min(self.rate_hz, self.frames_hz, self.stale_s, self.tolerance) <= 0 or min(self.points, self.clients) < 1:
+            raise ConfigError(
+                "page.token: expected at least 16 characters, or null for a new one each time"
+            )
+        if (
+            min(self.rate_hz, self.frames_hz, self.stale_s, self.tolerance) <= 0
+            or min(self.points, self.clients) < 1
+        ):
             raise ConfigError("page: rates, stale_s, tolerance, points and clients are more than 0")
         if not 1 <= self.jpeg_quality <= 100 or not 16 <= self.picture_px <= 4096:
             raise ConfigError("page: expected jpeg_quality in 1 … 100 and picture_px in 16 … 4096")
@@ -110,7 +118,11 @@ class OperatorPage:
 
 def link(page: OperatorPage, port: int, token: str) -> str:
     """Returns the address to open; the token stands behind `#`, which browsers keep to themselves."""
-    host = "localhost" if page.host in ("127.0.0.1", "::1") else (page.names[0] if page.names else page.host)
+    host = (
+        "localhost"
+        if page.host in ("127.0.0.1", "::1")
+        else (page.names[0] if page.names else page.host)
+    )
     return f"http://{host}:{port}/#token={token}"
 
 

@@ -1,7 +1,7 @@
 """What the page and whoever feeds it promise each other: `Shown` goes out, `Wish` and `Drawn` come back.
 
-Plain data in SI units, made anew at every moment and never queued: a reader takes the newest and misses the rest. Nothing is left
-out because it is old; its age says so, and the page greys it.
+Plain data in SI units, made anew at every moment and never queued: a reader takes the newest and
+misses the rest. Nothing is left out because it is old; its age says so, and the page greys it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class Advice:
         reason: Why there is none, as `deploy.policy.adviser.Advised` has it.
         number: Counts up; draw times refer to it.
         levers: Where to.
-        button_due_s: Time until the right button is to be held, 0 where that is now; `None` where it is not coming.
+        button_due_s: Time until the right button is to be held, 0 where that is now; `None` where
+            it is not coming.
     """
 
     valid: bool
@@ -43,7 +44,8 @@ class Stream:
     """How fresh one source is.
 
     Attributes:
-        name: `positions`, `levers`, `advice`, `camera`, `borehole`; the page has a word for each in both languages.
+        name: `positions`, `levers`, `advice`, `camera`, `borehole`; the page has a word for each in
+            both languages.
         age_s: Age of the newest; `None` where nothing has come yet.
         limit_s: Age from which it is stale.
     """
@@ -133,7 +135,8 @@ class Shown:
         recording: Whether it is written down.
         targets: Boreholes to choose from.
         path_in_base_m: Where the tool is going, from its tip; empty where nothing is planned.
-        block_in_base_m: Two opposite corners of a block to draw; `None` where the point cloud is all that is known.
+        block_in_base_m: Two opposite corners of a block to draw; `None` where the point cloud is
+            all that is known.
     """
 
     t_s: float
@@ -153,7 +156,13 @@ class Shown:
     def deadman(self) -> bool:
         """Whether the dead-man is known to be held now."""
         fresh = not any(stream.stale for stream in self.streams if stream.name == "levers")
-        return self.alive and fresh and self.safety is not None and self.safety.deadman and not self.safety.estop
+        return (
+            self.alive
+            and fresh
+            and self.safety is not None
+            and self.safety.deadman
+            and not self.safety.estop
+        )
 
     def plain(self) -> dict[str, Any]:
         """Returns it as plain JSON data; what is not finite is null."""
@@ -165,9 +174,10 @@ class Wish:
     """What a person wants done, checked already: token, origin, dead-man.
 
     Attributes:
-        kind: `start` and `stop` guiding, `record` on or off, choose a `target`, `point` at a borehole in the picture.
-        value: `on` or `off` for `record`, the name of the `target`, `x,y` of the point as parts of the picture from its upper left
-            corner, else empty.
+        kind: `start` and `stop` guiding, `record` on or off, choose a `target`, `point` at a
+            borehole in the picture.
+        value: `on` or `off` for `record`, the name of the `target`, `x,y` of the point as parts of
+            the picture from its upper left corner, else empty.
     """
 
     kind: Kind
@@ -180,8 +190,10 @@ class Drawn:
 
     Attributes:
         number: Of the advice.
-        t_s: Monotonic time of this computer at which its frame was drawn, by the browser's clock and half the round trip.
-        round_trip_s: Of the shortest exchange with that page so far; half of it is how wrong `t_s` may be.
+        t_s: Monotonic time of this computer at which its frame was drawn, by the browser's clock
+            and half the round trip.
+        round_trip_s: Of the shortest exchange with that page so far; half of it is how wrong `t_s`
+            may be.
         page: Counts the pages that were opened.
     """
 

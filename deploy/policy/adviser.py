@@ -1,7 +1,7 @@
 """The policy process: at each control period from what is known to what the operator is shown.
 
-It never touches the bus. Where commands are sent at all (`deploy=auto`) it also writes them into the request slot, which the guard
-reads; otherwise there is no such slot.
+It never touches the bus. Where commands are sent at all (`deploy=auto`) it also writes them into
+the request slot, which the guard reads; otherwise there is no such slot.
 """
 
 from __future__ import annotations
@@ -118,7 +118,10 @@ class Adviser:
     def _sample(self, state: np.ndarray | None, missed: int, now_s: float) -> Advised:
         if state is None:
             return Advised.NO_STATE
-        if now_s - float(state["q_t_s"]) > self._counsel.stale_s or now_s - float(state["t_s"]) > self._counsel.stale_s:
+        if (
+            now_s - float(state["q_t_s"]) > self._counsel.stale_s
+            or now_s - float(state["t_s"]) > self._counsel.stale_s
+        ):
             self._ring.empty()
             return Advised.STALE
         if not state["q_plausible"] or not state["trusted"]:
@@ -140,12 +143,22 @@ class Adviser:
         together = moved[self._exclusive].any() and moved.sum() > 1
         return None if not np.isfinite(u).all() or np.abs(u).max() > 1.0 + 1e-6 or together else u
 
-    def _publish(self, reason: Advised, u: np.ndarray, target_m: np.ndarray, infer_s: float, now_s: float) -> None:
+    def _publish(
+        self, reason: Advised, u: np.ndarray, target_m: np.ndarray, infer_s: float, now_s: float
+    ) -> None:
         self._number += 1
         shown = self._display.show(u, self._machine.period_s)
         record = self._exchange.advice.new()
-        record["t_s"], record["number"], record["reason"] = now_s, self._number, REASONS.index(reason)
-        record["u"], record["lever_rad"], record["button_right"] = u, shown.angles_rad, shown.button_right
+        record["t_s"], record["number"], record["reason"] = (
+            now_s,
+            self._number,
+            REASONS.index(reason),
+        )
+        record["u"], record["lever_rad"], record["button_right"] = (
+            u,
+            shown.angles_rad,
+            shown.button_right,
+        )
         record["target_in_base_m"], record["infer_s"] = target_m, infer_s
         self._exchange.advice.write(record)
         if self._exchange.request is not None and reason is Advised.VALID:

@@ -1,8 +1,8 @@
 """A policy bundle, as a trainer leaves it: `policy.onnx`, `policy.json` (the contract) and `golden.json` (what it must answer).
 
-The file holds everything from the observation vector to the masked command. It is refused when it was made for another machine,
-joint order, history or rate, when contract and file do not belong together, or when it answers otherwise here than where it was
-made.
+The file holds everything from the observation vector to the masked command. It is refused when it
+was made for another machine, joint order, history or rate, when contract and file do not belong
+together, or when it answers otherwise here than where it was made.
 """
 
 from __future__ import annotations
@@ -51,7 +51,11 @@ class Bundle:
             target_std_m=observation["target"]["std_m"],
             pitch_rad=(pitch["mean_rad"], pitch["std_rad"]) if pitch else None,
         )
-        self.encoder = Encoder(machine, scaling, with_proposals=any("proposals" in part for part in observation["order"]))
+        self.encoder = Encoder(
+            machine,
+            scaling,
+            with_proposals=any("proposals" in part for part in observation["order"]),
+        )
         expected = self.encoder.describe()
         for key, value in expected.items():
             if key != "size" and _differs(value, observation.get(key)):
@@ -70,10 +74,15 @@ class Bundle:
 
     def command(self, observation: np.ndarray) -> np.ndarray:
         """Returns masked commands, `(B, J)`, for observation vectors, `(B, O)`."""
-        return np.asarray(self._session.run(None, {"observation": observation.astype(np.float32)})[0])
+        return np.asarray(
+            self._session.run(None, {"observation": observation.astype(np.float32)})[0]
+        )
 
     def _check_golden(self, golden: dict[str, Any], folder: str) -> None:
-        observations, expected = np.array(golden["observation"], np.float32), np.array(golden["command"], np.float32)
+        observations, expected = (
+            np.array(golden["observation"], np.float32),
+            np.array(golden["command"], np.float32),
+        )
         for one, answer in zip(observations, expected, strict=True):
             found = self.command(one[None])[0]
             if found.shape != answer.shape or not np.abs(found - answer).max() <= TOLERANCE:
@@ -85,7 +94,9 @@ class Bundle:
 
 def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> None:
     if contract.get("schema") != SCHEMA:
-        raise CheckpointError(f"{folder}: the contract has schema {contract.get('schema')}, expected {SCHEMA}")
+        raise CheckpointError(
+            f"{folder}: the contract has schema {contract.get('schema')}, expected {SCHEMA}"
+        )
     machine.check_fingerprint(contract.get("fingerprint", {}), f"the policy in {folder}")
     facts = {
         "joints": list(machine.joint_names), "exclusive": list(machine.exclusive), "rate_hz": 1 / machine.period_s,
@@ -93,17 +104,31 @@ def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> 
     }  # fmt: skip
     for name, here in facts.items():
         if _differs(here, contract.get(name)):
-            raise CheckpointError(f"{folder}: the policy's {name} is {contract.get(name)}, that of machine '{machine.name}' {here}")
-    if contract.get("command", {}).get("order") != list(machine.joint_names) or not contract["command"].get("masked"):
-        raise CheckpointError(f"{folder}: expected masked commands in the order {', '.join(machine.joint_names)}")
+            raise CheckpointError(
+                f"{folder}: the policy's {name} is {contract.get(name)}, that of machine '{machine.name}' {here}"
+            )
+    if contract.get("command", {}).get("order") != list(machine.joint_names) or not contract[
+        "command"
+    ].get("masked"):
+        raise CheckpointError(
+            f"{folder}: expected masked commands in the order {', '.join(machine.joint_names)}"
+        )
 
 
 def _differs(mine: Any, other: Any) -> bool:
     """Says whether two pieces of plain data differ by more than rounding."""
     if isinstance(mine, dict):
-        return not isinstance(other, dict) or mine.keys() != other.keys() or any(_differs(mine[k], other[k]) for k in mine)
+        return (
+            not isinstance(other, dict)
+            or mine.keys() != other.keys()
+            or any(_differs(mine[k], other[k]) for k in mine)
+        )
     if isinstance(mine, (list, tuple)):
-        return not isinstance(other, list) or len(mine) != len(other) or any(map(_differs, mine, other))
+        return (
+            not isinstance(other, list)
+            or len(mine) != len(other)
+            or any(map(_differs, mine, other))
+        )
     if isinstance(mine, (int, float)) and isinstance(other, (int, float)):
         return abs(mine - other) > 1e-6
     return mine != other
@@ -113,23 +138,39 @@ def _read(path: Path, folder: str) -> dict[str, Any]:
     try:
         return json.loads(path.read_text())
     except FileNotFoundError:
-        hint = "export it again (mode=export)" if path.parent.is_dir() else "give the folder of a trained policy"
+        hint = (
+            "export it again (mode=export)"
+            if path.parent.is_dir()
+            else "give the folder of a trained policy"
+        )
         raise CheckpointError(f"policy {folder}: {path.name} is missing; {hint}") from None
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"policy {folder}: {path.name} cannot be read ({error}); export it again (mode=export)") from error
+        raise CheckpointError(
+            f"policy {folder}: {path.name} cannot be read ({error}); export it again (mode=export)"
+        ) from error
 
 
 def _session(path: Path, folder: str, contract: dict[str, Any]) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1  # a pool of threads would only wake up late
+    options.intra_op_num_threads = options.inter_op_num_threads = (
+        1  # a pool of threads would only wake up late
+    )
     options.log_severity_level = 3
     try:
-        session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(
+            path.read_bytes(), options, providers=["CPUExecutionProvider"]
+        )
     except FileNotFoundError:
-        raise CheckpointError(f"policy {folder}: {ONNX} is missing; export it (mode=export)") from None
+        raise CheckpointError(
+            f"policy {folder}: {ONNX} is missing; export it (mode=export)"
+        ) from None
     except Exception as error:  # onnxruntime's errors have no base of their own
-        raise CheckpointError(f"policy {folder}: {ONNX} is damaged or truncated ({str(error).splitlines()[0]})") from error
+        raise CheckpointError(
+            f"policy {folder}: {ONNX} is damaged or truncated ({str(error).splitlines()[0]})"
+        ) from error
     said = session.get_modelmeta().custom_metadata_map.get("brokk.fingerprint")
     if said is None or json.loads(said) != contract["fingerprint"]:
-        raise CheckpointError(f"policy {folder}: {CONTRACT} and {ONNX} do not belong together; export it again (mode=export)")
+        raise CheckpointError(
+            f"policy {folder}: {CONTRACT} and {ONNX} do not belong together; export it again (mode=export)"
+        )
     return session

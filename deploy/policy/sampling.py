@@ -1,9 +1,10 @@
 """What the policy remembers, sampled from a faster bus at its own rate.
 
-One sample a control period: the newest measured position, and the mean of what the valves really got over the period, as a
-recording holds it. A single missed period is filled in halfway between its neighbours, and valves of which nothing was heard in
-one period still get what they got. After more, or after anything stale, the ring is filled anew before the policy speaks again: a
-history with a hole is one that it has never seen in training.
+One sample a control period: the newest measured position, and the mean of what the valves really
+got over the period, as a recording holds it. A single missed period is filled in halfway between
+its neighbours, and valves of which nothing was heard in
+one period still get what they got. After more, or after anything stale, the ring is filled anew
+before the policy speaks again: a history with a hole is one that it has never seen in training.
 """
 
 from __future__ import annotations
@@ -46,7 +47,11 @@ class Ring:
     def sample(self, state: Any, missed: int) -> None:
         """Takes a sample of a fresh record of `STATE`; `missed` periods went by without one."""
         number, before = int(state["flow_number"]), self._flow_number
-        u = (state["flow_sum"] - self._flow_sum) / (number - before) if 0 <= before < number else np.array(state["flow"])
+        u = (
+            (state["flow_sum"] - self._flow_sum) / (number - before)
+            if 0 <= before < number
+            else np.array(state["flow"])
+        )
         self._silent = self._silent + 1 if number == before else 0
         if self._silent > 1:  # the valves' messages have stopped
             self.filled = 0
@@ -64,5 +69,8 @@ class Ring:
     def _push(self, q: np.ndarray, u: np.ndarray) -> None:
         if not self.filled:
             self.proposed = np.zeros_like(self.proposed)
-        self.q, self.u = np.concatenate([self.q[1:], q[None]]), np.concatenate([self.u[1:], u[None]])
+        self.q, self.u = (
+            np.concatenate([self.q[1:], q[None]]),
+            np.concatenate([self.u[1:], u[None]]),
+        )
         self.filled += 1

@@ -1,8 +1,9 @@
 """The log process: writes what bus and policy hand over, and puts it safely on the disk twice a second.
 
-MCAP holds every decoded message as a JSON topic of its name, `advice`, `guard`, `fault`, `bus`, `holes`, and pictures of the camera
-as topic `camera` (`foxglove.CompressedImage`); BLF holds the frames as they were, for any tool that reads it. Times are monotonic
-ones plus one constant, so that a step of the wall clock shows nowhere.
+MCAP holds every decoded message as a JSON topic of its name, `advice`, `guard`, `fault`, `bus`,
+`holes`, and pictures of the camera as topic `camera` (`foxglove.CompressedImage`); BLF holds the
+frames as they were, for any tool that reads it. Times are monotonic ones plus one constant, so that
+a step of the wall clock shows nowhere.
 """
 
 from __future__ import annotations
@@ -40,7 +41,11 @@ FLUSH_S = 0.5
 """What even a power failure costs at most."""
 MCAP, BLF = "capture.mcap", "frames.blf"
 PICTURES, JPEG_QUALITY = "camera", 80
-TIME = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
+TIME = {
+    "type": "object",
+    "title": "time",
+    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+}
 BINARY = {"type": "string", "contentEncoding": "base64"}
 """Of Foxglove's schema of a picture: its viewer shows them."""
 FACTS = "brokk"
@@ -70,7 +75,8 @@ def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
     """Runs until it is asked to stop, then takes what is there: those who write may go on without being recorded.
 
     Raises:
-        StorageError: the disk is full, or the files cannot be written; what was written stays readable.
+        StorageError: the disk is full, or the files cannot be written; what was written stays
+            readable.
     """
     try:
         with Log(capture) as target:
@@ -85,7 +91,9 @@ def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
                     target.add_picture(*picture)
                 target.flush_when_due()
     except OSError as error:
-        raise StorageError(f"log: {error.strerror or error} ({capture.folder}); nothing more is recorded") from error
+        raise StorageError(
+            f"log: {error.strerror or error} ({capture.folder}); nothing more is recorded"
+        ) from error
 
 
 class DurableBlf(BLFWriter):
@@ -118,7 +126,9 @@ class Log:
         }  # fmt: skip
         self._mcap.add_metadata(FACTS, facts | capture.facts)
         now_ns = time.time_ns()
-        self._mcap.add_attachment(now_ns, now_ns, Path(capture.dbc).name, "text/plain", located(capture.dbc).read_bytes())
+        self._mcap.add_attachment(
+            now_ns, now_ns, Path(capture.dbc).name, "text/plain", located(capture.dbc).read_bytes()
+        )
         self._blf = DurableBlf(capture.folder / BLF)
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
@@ -137,7 +147,12 @@ class Log:
         """Takes a JPEG of the camera."""
         wall_ns = int(t_s * 1e9) + self._offset_ns
         stamp = {"sec": wall_ns // 10**9, "nsec": wall_ns % 10**9}
-        values = {"timestamp": stamp, "frame_id": "camera", "format": "jpeg", "data": base64.b64encode(data).decode()}
+        values = {
+            "timestamp": stamp,
+            "frame_id": "camera",
+            "format": "jpeg",
+            "data": base64.b64encode(data).decode(),
+        }
         self._write(PICTURES, t_s, values)
 
     def flush_when_due(self) -> None:
@@ -170,20 +185,33 @@ class Log:
         extended = layout.extended if layout else frame_id > 0x7FF
         self._blf.on_message_received(
             can.Message(
-                timestamp=wall_s, arbitration_id=frame_id, data=payload, is_extended_id=extended, is_rx=not sent, check=False
+                timestamp=wall_s,
+                arbitration_id=frame_id,
+                data=payload,
+                is_extended_id=extended,
+                is_rx=not sent,
+                check=False,
             )
         )
         if layout is None:
             return
         values = self._description.decode(layout, payload)
         if isinstance(values, Fault):
-            self._write("refused", t_s, {"message": layout.name, "fault": values.value, "data": payload.hex()})
+            self._write(
+                "refused",
+                t_s,
+                {"message": layout.name, "fault": values.value, "data": payload.hex()},
+            )
         else:
             self._write(layout.name, t_s, values | {"sent": sent}, layout)
 
-    def _write(self, topic: str, t_s: float, values: dict[str, Any], layout: Layout | None = None) -> None:
+    def _write(
+        self, topic: str, t_s: float, values: dict[str, Any], layout: Layout | None = None
+    ) -> None:
         if topic not in self._channels:
-            self._channels[topic] = self._mcap.register_channel(topic, "json", self._schema(topic, layout))
+            self._channels[topic] = self._mcap.register_channel(
+                topic, "json", self._schema(topic, layout)
+            )
             self._sequence[topic] = 0
         self._sequence[topic] += 1
         wall_ns = int(t_s * 1e9) + self._offset_ns
@@ -191,13 +219,20 @@ class Log:
         self._mcap.add_message(self._channels[topic], wall_ns, text, wall_ns, self._sequence[topic])
 
     def _schema(self, topic: str, layout: Layout | None) -> int:
-        properties: dict[str, Any] = {"t_s": {"type": "number", "description": "monotonic time in s"}}
+        properties: dict[str, Any] = {
+            "t_s": {"type": "number", "description": "monotonic time in s"}
+        }
         for signal in self._description.signals(layout.name) if layout else ():
-            properties[signal] = {"type": "number", "description": self._description.unit(layout.name, signal) if layout else ""}
+            properties[signal] = {
+                "type": "number",
+                "description": self._description.unit(layout.name, signal) if layout else "",
+            }
         title = topic
         if topic == PICTURES:
             title = "foxglove.CompressedImage"
-            properties |= {"timestamp": TIME, "data": BINARY} | {key: {"type": "string"} for key in ("frame_id", "format")}
+            properties |= {"timestamp": TIME, "data": BINARY} | {
+                key: {"type": "string"} for key in ("frame_id", "format")
+            }
         schema = {"title": title, "type": "object", "properties": properties}
         return self._mcap.register_schema(title, "jsonschema", json.dumps(schema).encode())
 
@@ -219,7 +254,10 @@ class Pictures:
         now_s = time.monotonic()
         if self._slot is None or now_s < self._next_s or self._slot.number == self._taken:
             return None
-        self._taken, self._next_s = self._slot.number, now_s + 0.9 * self._apart_s  # a camera's period is not exact
+        self._taken, self._next_s = (
+            self._slot.number,
+            now_s + 0.9 * self._apart_s,
+        )  # a camera's period is not exact
         record = self._slot.read()
         if record is None:
             return None

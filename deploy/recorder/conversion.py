@@ -1,7 +1,8 @@
 """From a capture to the recordings that identification and diagnosis read (`mode=convert import=capture`).
 
-At the machine's control rate: positions linearly between messages; commands as what the valves really got, averaged over the period
-that begins at each row, as the policy's history has it. A gap in either splits the log; pieces of one log share the metadata `run`.
+At the machine's control rate: positions linearly between messages; commands as what the valves
+really got, averaged over the period that begins at each row, as the policy's history has it. A gap
+in either splits the log; pieces of one log share the metadata `run`.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ class CaptureLog:
         """Returns the pieces of the capture at `path`; see `brokk_rl.modes.convert.LogReader`.
 
         Raises:
-            RecordingError: it cannot be read, was made on another machine, or holds no piece that is long enough.
+            RecordingError: it cannot be read, was made on another machine, or holds no piece that
+                is long enough.
         """
         (contents, q, flow), found = self._series(path, machine), []
         for begin_s, end_s in _pieces([*q.values(), *flow.values()], self.longest_gap_s):
@@ -63,12 +65,16 @@ class CaptureLog:
         contents, q, flow = self._series(path, machine)
         for first_s, last_s in _pieces([*q.values(), *flow.values()], self.longest_gap_s):
             if first_s <= begin_s + self.longest_gap_s and last_s >= end_s - self.longest_gap_s:
-                return self._piece(contents, q, flow, max(first_s, begin_s), min(last_s, end_s), path, machine)
+                return self._piece(
+                    contents, q, flow, max(first_s, begin_s), min(last_s, end_s), path, machine
+                )
         raise RecordingError(
             f"{path}: a gap of more than {self.longest_gap_s:g} s in the {end_s - begin_s:.1f} s that are asked for"
         )
 
-    def _series(self, path: Path, machine: Machine) -> tuple[Contents, dict[str, Series], dict[str, Series]]:
+    def _series(
+        self, path: Path, machine: Machine
+    ) -> tuple[Contents, dict[str, Series], dict[str, Series]]:
         """Returns the capture, positions, and what the valves got, by joint."""
         contents = reading.read(path)
         try:
@@ -89,7 +95,9 @@ class CaptureLog:
         path: Path,
         machine: Machine,
     ) -> Recording:
-        grid_s = begin_s + np.arange(int((end_s - begin_s) / machine.period_s + 1e-6)) * machine.period_s
+        grid_s = (
+            begin_s + np.arange(int((end_s - begin_s) / machine.period_s + 1e-6)) * machine.period_s
+        )
         first_s = next(iter(contents.messages.values()))[0][0]
         created = datetime.fromtimestamp((contents.wall_ns / 1e9) + (begin_s - first_s), UTC)
         return Recording(
@@ -121,14 +129,18 @@ def _series(contents: Contents, signal: str, path: Path) -> Series:
             if len(t_s) > 1:
                 forward = np.concatenate([[True], np.diff(t_s) > 0])
                 return t_s[forward], values[forward]
-    raise RecordingError(f"{path}: signal '{signal}' was never heard (topics: {', '.join(sorted(contents.messages)) or 'none'})")
+    raise RecordingError(
+        f"{path}: signal '{signal}' was never heard (topics: {', '.join(sorted(contents.messages)) or 'none'})"
+    )
 
 
 def _pieces(series: Sequence[Series], longest_gap_s: float) -> list[tuple[float, float]]:
     """Returns the times, begin and end, in which none of the series has a gap."""
     begin_s, end_s = max(t_s[0] for t_s, _ in series), min(t_s[-1] for t_s, _ in series)
     gaps = sorted(
-        (float(t_s[row]), float(t_s[row + 1])) for t_s, _ in series for row in np.flatnonzero(np.diff(t_s) > longest_gap_s)
+        (float(t_s[row]), float(t_s[row + 1]))
+        for t_s, _ in series
+        for row in np.flatnonzero(np.diff(t_s) > longest_gap_s)
     )
     pieces, at_s = [], begin_s
     for before_s, after_s in gaps:
@@ -157,8 +169,15 @@ def _extra(contents: Contents, grid_s: np.ndarray, machine: Machine) -> dict[str
             extra["oil_c"] = oil_c.astype(np.float32)
     if advised := contents.messages.get("advice"):
         t_s = advised.series("t_s")
-        shown = np.array([values["u"] if values["reason"] == "valid" else [np.nan] * machine.num_joints for _, values in advised])
+        shown = np.array(
+            [
+                values["u"] if values["reason"] == "valid" else [np.nan] * machine.num_joints
+                for _, values in advised
+            ]
+        )
         rows = np.searchsorted(t_s, grid_s, side="right") - 1
         for j, name in enumerate(machine.joint_names):
-            extra[f"advice_{name}"] = np.where(rows >= 0, shown[rows.clip(0), j], np.nan).astype(np.float32)
+            extra[f"advice_{name}"] = np.where(rows >= 0, shown[rows.clip(0), j], np.nan).astype(
+                np.float32
+            )
     return extra

@@ -28,8 +28,8 @@ log = logging.getLogger(__name__)
 class Messages(Sequence[tuple[float, dict[str, Any]]]):
     """The messages of a topic, in order: (t_s, values); `t_s` is monotonic time.
 
-    Topics of numbers alone, which is what a bus says, are kept by column: an hour of them takes a tenth of the memory of as many
-    dictionaries.
+    Topics of numbers alone, which is what a bus says, are kept by column: an hour of them takes a
+    tenth of the memory of as many dictionaries.
     """
 
     def __init__(self) -> None:
@@ -59,7 +59,9 @@ class Messages(Sequence[tuple[float, dict[str, Any]]]):
         """Returns a signal's values, `(T,)`, or those of `t_s`."""
         if name == "t_s":
             return np.array(self._t_s)
-        return np.array(self._columns[name] if self._columns else [row[name] for row in self._rows], dtype=float)
+        return np.array(
+            self._columns[name] if self._columns else [row[name] for row in self._rows], dtype=float
+        )
 
     def __len__(self) -> int:
         return len(self._t_s)
@@ -68,7 +70,9 @@ class Messages(Sequence[tuple[float, dict[str, Any]]]):
     def __getitem__(self, index: int) -> tuple[float, dict[str, Any]]: ...
     @overload
     def __getitem__(self, index: slice) -> list[tuple[float, dict[str, Any]]]: ...
-    def __getitem__(self, index: int | slice) -> tuple[float, dict[str, Any]] | list[tuple[float, dict[str, Any]]]:
+    def __getitem__(
+        self, index: int | slice
+    ) -> tuple[float, dict[str, Any]] | list[tuple[float, dict[str, Any]]]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         if not self._columns:
@@ -108,9 +112,13 @@ def read(path: Path) -> Contents:
         elif isinstance(record, Message):
             values = json.loads(record.data)
             contents.wall_ns = contents.wall_ns or record.log_time
-            contents.messages.setdefault(topics[record.channel_id], Messages()).add(values.pop("t_s"), values)
+            contents.messages.setdefault(topics[record.channel_id], Messages()).add(
+                values.pop("t_s"), values
+            )
     if not contents.facts:
-        raise RecordingError(f"{path}: no capture of this framework, or cut off within its first second")
+        raise RecordingError(
+            f"{path}: no capture of this framework, or cut off within its first second"
+        )
     return contents
 
 
@@ -138,16 +146,28 @@ def recover_mcap(path: Path, out: Path) -> int:
         writer.start(profile="brokk", library="brokk-rl")
         for record in _records(path):
             if isinstance(record, Schema):
-                schemas.setdefault(record.id, writer.register_schema(record.name, record.encoding, record.data))
+                schemas.setdefault(
+                    record.id, writer.register_schema(record.name, record.encoding, record.data)
+                )
             elif isinstance(record, Channel) and record.id not in channels:
-                channels[record.id] = writer.register_channel(record.topic, record.message_encoding, schemas[record.schema_id])
+                channels[record.id] = writer.register_channel(
+                    record.topic, record.message_encoding, schemas[record.schema_id]
+                )
             elif isinstance(record, Message):
-                writer.add_message(channels[record.channel_id], record.log_time, record.data, record.publish_time, record.sequence)
+                writer.add_message(
+                    channels[record.channel_id],
+                    record.log_time,
+                    record.data,
+                    record.publish_time,
+                    record.sequence,
+                )
                 count += 1
             elif isinstance(record, Metadata):
                 writer.add_metadata(record.name, dict(record.metadata))
             elif isinstance(record, Attachment):
-                writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+                writer.add_attachment(
+                    record.create_time, record.log_time, record.name, record.media_type, record.data
+                )
         writer.finish()
     if not count:
         part.unlink()
@@ -192,7 +212,11 @@ def _records(path: Path) -> Iterator[Any]:
         while True:
             try:
                 record = next(reader)
-                inner = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+                inner = (
+                    breakup_chunk(record, validate_crc=True)
+                    if isinstance(record, Chunk)
+                    else [record]
+                )
             except StopIteration:
                 return
             except Exception as error:  # a cut-off file fails wherever it was cut

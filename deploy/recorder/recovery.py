@@ -22,7 +22,8 @@ class Recovery:
     """Captures to recover.
 
     Attributes:
-        input: Glob, or list of globs, of `.mcap` and `.blf` files; what else lies beside them is left out.
+        input: Glob, or list of globs, of `.mcap` and `.blf` files; what else lies beside them is
+            left out.
     """
 
     input: str | tuple[str, ...]
@@ -31,15 +32,20 @@ class Recovery:
         """Writes each recovered file under its own name, led by that of its folder, into `folder`.
 
         Raises:
-            RecordingError: nothing matches, two would have the same name, or nothing can be read of one.
+            RecordingError: nothing matches, two would have the same name, or nothing can be read of
+                one.
         """
         matching = record.matching(self.input, "capture")
         paths = [path for path in matching if path.suffix in KINDS]
         if not paths:
-            raise RecordingError(f"recover.input: {matching[0]} is neither .mcap nor .blf, nor is anything else that matches")
+            raise RecordingError(
+                f"recover.input: {matching[0]} is neither .mcap nor .blf, nor is anything else that matches"
+            )
         names = [f"{path.resolve().parent.name}_{path.name}" for path in paths]
         if len(set(names)) < len(names):
-            raise RecordingError("recover.input: two captures lie in folders of the same name; recover one after the other")
+            raise RecordingError(
+                "recover.input: two captures lie in folders of the same name; recover one after the other"
+            )
         for path, name in track(list(zip(paths, names, strict=True)), "recovering", transient=True):
             count = KINDS[path.suffix](path, folder / name)
             log.info("%s: %d messages recovered into %s", path, count, folder / name)

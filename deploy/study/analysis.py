@@ -35,7 +35,8 @@ class MeasuredTrial:
     Attributes:
         facts: What stands in its file.
         values: By measure, NaN where the recording does not tell.
-        tip_in_base_m: Path of the tool until the trial ended, `(T, 3)`; empty where there is no recording.
+        tip_in_base_m: Path of the tool until the trial ended, `(T, 3)`; empty where there is no
+            recording.
         counts: Whether it enters the means; practice and spare trials do not.
     """
 
@@ -56,7 +57,8 @@ class Analysis:
         means: By measure and condition, one mean a participant, `(P,)`, NaN where there is none.
         loads: NASA-TLX by scale (and `raw`, `weighted`) and condition, `(P,)`.
         effects: By measure; those of `loads` as `tlx_<scale>`.
-        holm: p adjusted within its family by the same names: secondary measures, and the six scales.
+        holm: p adjusted within its family by the same names: secondary measures, and the six
+            scales.
         primary: Name of the measure that decides.
         alpha: Level.
         remarks: What a reader must know.
@@ -95,23 +97,45 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
         alpha=design["alpha"],
         remarks=list(data.remarks),
     )
-    everything = [(trial, bool(trial["period"])) for trial in data.trials.values()] + [(trial, False) for trial in data.spare]
+    everything = [(trial, bool(trial["period"])) for trial in data.trials.values()] + [
+        (trial, False) for trial in data.spare
+    ]
     if at_twin := sum(bool(trial.get("twin")) for trial, counts in everything if counts):
-        found.remarks.append(Remark("study", f"{at_twin} trials that count were done at a simulated machine, the twin"))
+        found.remarks.append(
+            Remark(
+                "study", f"{at_twin} trials that count were done at a simulated machine, the twin"
+            )
+        )
     success = Success(**design["success"])
     for trial, counts in progress(everything):
         found.trials.append(_measured(data.folder, trial, counts, machine, success, found.remarks))
-    found.means = {each.name: {which: _means(found, each.name, which) for which in CONDITIONS} for each in MEASURES}
+    found.means = {
+        each.name: {which: _means(found, each.name, which) for which in CONDITIONS}
+        for each in MEASURES
+    }
     _note_few(found)
     _loads(found, data)
-    for name, by_condition in (*found.means.items(), *((f"tlx_{scale}", value) for scale, value in found.loads.items())):
+    for name, by_condition in (
+        *found.means.items(),
+        *((f"tlx_{scale}", value) for scale, value in found.loads.items()),
+    ):
         if name not in GUIDED_ONLY:
-            found.effects[name] = effect(by_condition["guided"], by_condition["unguided"], found.guided_first)
-    secondary = [each.name for each in MEASURES if each.name in found.effects and each.name != found.primary]
+            found.effects[name] = effect(
+                by_condition["guided"], by_condition["unguided"], found.guided_first
+            )
+    secondary = [
+        each.name for each in MEASURES if each.name in found.effects and each.name != found.primary
+    ]
     for family in (secondary, [f"tlx_{scale}" for scale in tlx.SCALES]):
         p = [deciding_p(found.effects[name]) for name in family]
         found.holm |= dict(
-            zip(family, exact.holm(np.array([math.nan if value is None else value for value in p])).tolist(), strict=True)
+            zip(
+                family,
+                exact.holm(
+                    np.array([math.nan if value is None else value for value in p])
+                ).tolist(),
+                strict=True,
+            )
         )
     return found
 
@@ -122,10 +146,17 @@ def deciding_p(found: Effect) -> float | None:
 
 
 def _measured(
-    folder: Path, trial: dict[str, Any], counts: bool, machine: Machine, success: Success, remarks: list[Remark]
+    folder: Path,
+    trial: dict[str, Any],
+    counts: bool,
+    machine: Machine,
+    success: Success,
+    remarks: list[Remark],
 ) -> MeasuredTrial:
     name = f"{trial.get('participant')} {trial.get('period')}.{trial.get('number')}"
-    empty = MeasuredTrial(trial, dict.fromkeys((each.name for each in MEASURES), math.nan), np.zeros((0, 3)), counts)
+    empty = MeasuredTrial(
+        trial, dict.fromkeys((each.name for each in MEASURES), math.nan), np.zeros((0, 3)), counts
+    )
     where = trial.get("hole")
     if not trial.get("recording") or not isinstance(where, dict):
         why = f" ({trial['recording_problem']})" if trial.get("recording_problem") else ""
@@ -135,15 +166,24 @@ def _measured(
         remarks.append(Remark(name, f"{trial['recording_problem']}; it counts"))
     try:
         recording: Recording = record.read(folder / trial["recording"], machine)
-        hole = Hole(center_in_base_m=tuple(where["center_in_base_m"]), radius_m=float(where["radius_m"]))
+        hole = Hole(
+            center_in_base_m=tuple(where["center_in_base_m"]), radius_m=float(where["radius_m"])
+        )
     except (RecordingError, KeyError, TypeError, ValueError) as error:
-        remarks.append(Remark(name, f"its recording cannot be used ({error}); only its outcome is known"))
+        remarks.append(
+            Remark(name, f"its recording cannot be used ({error}); only its outcome is known")
+        )
         return _outcome_only(empty)
     values = measure(recording, machine, hole, success, float(trial["limit_s"]))
     said = trial.get("outcome")
     if said in ("inserted", "time limit") and (said == "inserted") != bool(values["success"]):
         seen = "an insertion" if values["success"] else "none"
-        remarks.append(Remark(name, f"written down as '{said}', but the recording shows {seen}; the recording counts"))
+        remarks.append(
+            Remark(
+                name,
+                f"written down as '{said}', but the recording shows {seen}; the recording counts",
+            )
+        )
     num = int(np.searchsorted(recording.t_s - recording.t_s[0], values["time_s"], side="right"))
     return MeasuredTrial(trial, values, tool(machine, recording.q[:num]).tip_in_base_m, counts)
 
@@ -163,14 +203,20 @@ def _means(found: Analysis, measure_name: str, condition: str) -> np.ndarray:
     """Returns each participant's mean over the trials that tell, `(P,)`."""
     means = np.full(len(found.participants), np.nan)
     for index, name in enumerate(found.participants):
-        values = np.array([t.values[measure_name] for t in found.trials if _is_of(t, name, condition)])
+        values = np.array(
+            [t.values[measure_name] for t in found.trials if _is_of(t, name, condition)]
+        )
         values = values[~np.isnan(values)]
         means[index] = values.mean() if len(values) else math.nan
     return means
 
 
 def _is_of(trial: MeasuredTrial, participant: str, condition: str) -> bool:
-    return trial.counts and trial.facts["participant"] == participant and trial.facts["condition"] == condition
+    return (
+        trial.counts
+        and trial.facts["participant"] == participant
+        and trial.facts["condition"] == condition
+    )
 
 
 def _note_few(found: Analysis) -> None:
@@ -184,7 +230,10 @@ def _note_few(found: Analysis) -> None:
 
 def _loads(found: Analysis, data: StudyData) -> None:
     keys = (*tlx.SCALES, "raw", "weighted")
-    found.loads = {key: {which: np.full(len(found.participants), np.nan) for which in CONDITIONS} for key in keys}
+    found.loads = {
+        key: {which: np.full(len(found.participants), np.nan) for which in CONDITIONS}
+        for key in keys
+    }
     for (name, period), answers in data.questionnaires.items():
         if name not in found.participants:
             continue
@@ -192,4 +241,7 @@ def _loads(found: Analysis, data: StudyData) -> None:
         values = tlx.ratings(answers) | {"raw": tlx.raw(answers), "weighted": tlx.weighted(answers)}
         for key, value in values.items():
             found.loads[key][condition][found.participants.index(name)] = value
-        found.remarks += [Remark(f"{name} period {period}", f"questionnaire: {text}") for text in tlx.check(answers)]
+        found.remarks += [
+            Remark(f"{name} period {period}", f"questionnaire: {text}")
+            for text in tlx.check(answers)
+        ]

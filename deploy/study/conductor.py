@@ -1,7 +1,8 @@
 """Leads a participant through a sitting: takes what is said on the page, watches the machine, writes everything down at once.
 
-What was done stands in the study's folder (`deploy.study.folder`) before the next thing begins, so that an interruption at any time
-costs at most the trial that was under way; that one is kept as aborted, and done again.
+What was done stands in the study's folder (`deploy.study.folder`) before the next thing begins, so
+that an interruption at any time costs at most the trial that was under way; that one is kept as
+aborted, and done again.
 """
 
 from __future__ import annotations
@@ -69,9 +70,17 @@ class Conductor:
         operators: dict[str, str] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._folder, self._machine, self._stage, self._words, self._times = folder, machine, stage, words, times
+        self._folder, self._machine, self._stage, self._words, self._times = (
+            folder,
+            machine,
+            stage,
+            words,
+            times,
+        )
         self._facts, self._seed, self._operators, self._clock = facts, seed, operators or {}, clock
-        for path in sorted((folder / folders.TRIALS).glob("*.json")):  # what an interruption left half saved
+        for path in sorted(
+            (folder / folders.TRIALS).glob("*.json")
+        ):  # what an interruption left half saved
             with suppress(ValueError):  # a file that cannot be read is said in the report
                 keep(folder, path, machine, stage)
         self._data: StudyData = folders.read(folder)
@@ -85,7 +94,11 @@ class Conductor:
     @property
     def shows_advice(self) -> bool:
         """Whether a guided trial is under way."""
-        return self._attempt is not None and self._attempt.running and self._attempt.trial.condition == "guided"
+        return (
+            self._attempt is not None
+            and self._attempt.running
+            and self._attempt.trial.condition == "guided"
+        )
 
     @property
     def running(self) -> bool:
@@ -100,7 +113,9 @@ class Conductor:
         """
         plan = self._data.plan
         if who is not None and (who not in plan["participants"] or who in plan.get("erased", {})):
-            raise ConfigError(f"study.participant={who}: no participant of the plan; {choices(who, plan['participants'])}")
+            raise ConfigError(
+                f"study.participant={who}: no participant of the plan; {choices(who, plan['participants'])}"
+            )
         if self._attempt is not None:
             self._attempt.abort("the sitting was left")
             self._attempt.close()
@@ -131,7 +146,12 @@ class Conductor:
                 self._note({"stopped": False, "went_on": _now()})
             elif do == "consent" and step.kind == "consent":
                 self._consent(said)
-            elif do == "end_practice" and step.kind == "trial" and not step.period and not self.running:
+            elif (
+                do == "end_practice"
+                and step.kind == "trial"
+                and not step.period
+                and not self.running
+            ):
                 self._close_attempt()
                 self._note({"practice_ended": True})
             elif step.kind == "trial" and self._attempt is not None:
@@ -150,11 +170,22 @@ class Conductor:
 
     def view(self) -> dict[str, Any]:
         """Returns what pages show, as plain data."""
-        found: dict[str, Any] = {"kind": "choose", "who": self._who, "problem": self.problem, "simulated": self._facts["simulated"]}
+        found: dict[str, Any] = {
+            "kind": "choose",
+            "who": self._who,
+            "problem": self.problem,
+            "simulated": self._facts["simulated"],
+        }
         if self._who is None or self._step is None:
             return found | {"participants": progress(self._data)}
         step = self._step
-        found |= {"kind": step.kind, "period": step.period, "condition": step.condition, "done": step.done, "of": step.of}
+        found |= {
+            "kind": step.kind,
+            "period": step.period,
+            "condition": step.condition,
+            "done": step.done,
+            "of": step.of,
+        }
         if step.kind == "consent":
             return found | {"text": self._words.consent, "version": self._words.version}
         if self._attempt is not None:
@@ -170,7 +201,13 @@ class Conductor:
         """Goes back to the list of participants, and says what went wrong there; what stands on the disk is gone on with later."""
         log.error("%s", error)
         self._stage.record(None)
-        self._who, self._step, self._attempt, self._form, self.problem = None, None, None, None, str(error)
+        self._who, self._step, self._attempt, self._form, self.problem = (
+            None,
+            None,
+            None,
+            None,
+            str(error),
+        )
 
     def _in_trial(self, do: str, attempt: Attempt) -> str:
         if do == "begin":
@@ -190,18 +227,24 @@ class Conductor:
         if self._who is None:
             return
         step = self._step = next_step(self._data, self._who)
-        log.info("%s: %s %s", self._who, step.kind, step.trial.name if step.trial else step.period or "")
+        log.info(
+            "%s: %s %s", self._who, step.kind, step.trial.name if step.trial else step.period or ""
+        )
         if step.trial is not None:
             hole = self._data.plan["design"]["holes"][step.trial.hole]
             start = np.array(self._data.plan["design"]["starts"][step.trial.start])
-            facts = self._facts | ({"operator": self._operators[step.condition]} if self._operators else {})
+            facts = self._facts | (
+                {"operator": self._operators[step.condition]} if self._operators else {}
+            )
             self._attempt = Attempt(
                 self._folder, self._data.plan["design"], step.trial, hole, start, self._machine, self._stage, self._times,
                 facts, self._clock,
             )  # fmt: skip
         elif step.kind == "questionnaire":
             seed = self._seed(f"pairs {self._who} {step.period}")
-            self._form = Form(self._folder, self._who, step.period, seed, {"simulated": self._facts["simulated"]})
+            self._form = Form(
+                self._folder, self._who, step.period, seed, {"simulated": self._facts["simulated"]}
+            )
 
     def _close_attempt(self) -> None:
         if self._attempt is not None:
@@ -210,8 +253,17 @@ class Conductor:
 
     def _consent(self, said: dict[str, Any]) -> None:
         agreed = said.get("agreed") is True
-        consent = {"agreed": agreed, "version": self._words.version, "language": str(said.get("language", ""))[:5], "at": _now()}
-        self._note({"consent": consent} if agreed else {"consent": consent, "stopped": True, "reason": "no consent"})
+        consent = {
+            "agreed": agreed,
+            "version": self._words.version,
+            "language": str(said.get("language", ""))[:5],
+            "at": _now(),
+        }
+        self._note(
+            {"consent": consent}
+            if agreed
+            else {"consent": consent, "stopped": True, "reason": "no consent"}
+        )
 
     def _stop(self, reason: str) -> None:
         if self._attempt is not None:
@@ -221,8 +273,14 @@ class Conductor:
 
     def _note(self, facts: dict[str, Any]) -> None:
         assert self._who is not None
-        known = {key: value for key, value in self._data.participants.get(self._who, {}).items() if key != "participant"}
-        folders.write_participant(self._folder, self._who, known | facts | {"simulated": self._facts["simulated"]})
+        known = {
+            key: value
+            for key, value in self._data.participants.get(self._who, {}).items()
+            if key != "participant"
+        }
+        folders.write_participant(
+            self._folder, self._who, known | facts | {"simulated": self._facts["simulated"]}
+        )
         self._go_on()
 
 

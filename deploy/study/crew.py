@@ -1,6 +1,7 @@
 """Twins spread over processes, period by period; what comes of them does not depend on how many there are.
 
-The operators stay in one process, since their chance is drawn for all of them at once; here only the machines are divided.
+The operators stay in one process, since their chance is drawn for all of them at once; here only
+the machines are divided.
 """
 
 from __future__ import annotations
@@ -23,20 +24,28 @@ class Crew:
     """Desks (see `deploy.study.twins`) in child processes; a context manager.
 
     Args:
-        build: `module:function` that returns the desks of a process, called with each of `parts` as arguments.
+        build: `module:function` that returns the desks of a process, called with each of `parts` as
+            arguments.
         parts: Arguments of `build`, one tuple a process.
         rows: Which trials each process has, in order.
         count: Trials in all.
     """
 
-    def __init__(self, build: str, parts: Sequence[tuple[Any, ...]], rows: Sequence[np.ndarray], count: int) -> None:
+    def __init__(
+        self, build: str, parts: Sequence[tuple[Any, ...]], rows: Sequence[np.ndarray], count: int
+    ) -> None:
         self._build, self._parts, self._rows, self._count = build, parts, rows, count
         self._children: list[tuple[Child, Channel]] = []
 
     def __enter__(self) -> Self:
         for number, part in enumerate(self._parts):
             mine, theirs = socket.socketpair()
-            child = Child(f"twins {number + 1}", "deploy.study.crew:work", (theirs.fileno(), self._build, part), [theirs.fileno()])
+            child = Child(
+                f"twins {number + 1}",
+                "deploy.study.crew:work",
+                (theirs.fileno(), self._build, part),
+                [theirs.fileno()],
+            )
             theirs.close()
             self._children.append((child, Channel(mine.detach())))
         return self
@@ -46,7 +55,9 @@ class Crew:
             channel.close()
             child.end(PATIENCE_S)
 
-    def ask(self, method: str, running: np.ndarray, values: np.ndarray | None = None) -> dict[int, Any]:
+    def ask(
+        self, method: str, running: np.ndarray, values: np.ndarray | None = None
+    ) -> dict[int, Any]:
         """Calls a method of the desks of all running trials, `(N,)` bool, each with its row of `values`; returns answers by trial.
 
         Raises:
@@ -73,7 +84,12 @@ def work(stop: Stop, file: int, build: str, part: tuple[Any, ...]) -> None:
     while True:
         try:
             method, places, arguments = channel.recv()
-            channel.send([getattr(desks[place], method)(*given) for place, given in zip(places, arguments, strict=True)])
+            channel.send(
+                [
+                    getattr(desks[place], method)(*given)
+                    for place, given in zip(places, arguments, strict=True)
+                ]
+            )
         except (EOFError, BrokenPipeError, ConnectionResetError):
             return
 

@@ -1,8 +1,9 @@
 """What a study of two periods says about guidance: effect, interval, tests, and what practice did beside it.
 
-Each person has one figure in each period. `first - second` holds plus or minus the effect of guidance (by who was guided first) and
-the same effect of the period in both sequences, so that half the difference of the sequences' means is guidance and half their sum
-the period (Hills and Armitage, Br. J. Clin. Pharmacol. 8 (1979) 7-20).
+Each person has one figure in each period. `first - second` holds plus or minus the effect of
+guidance (by who was guided first) and the same effect of the period in both sequences, so that half
+the difference of the sequences' means is guidance and half their sum the period (Hills and
+Armitage, Br. J. Clin. Pharmacol. 8 (1979) 7-20).
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ class Effect:
         paired_dz: Mean difference over its standard deviation.
         paired_dz_ci95: Interval from the noncentral t distribution.
         hodges_lehmann: Median of the means of all pairs of differences.
-        hodges_lehmann_ci95: Exact interval that belongs to the signed-rank test; `None` where there is none of 95 %.
+        hodges_lehmann_ci95: Exact interval that belongs to the signed-rank test; `None` where there
+            is none of 95 %.
         paired_p: Exact paired permutation test.
         wilcoxon_p: Exact signed-rank test.
         adjusted: Difference with the period in the model.
@@ -45,8 +47,9 @@ class Effect:
         p: Exact test over sequences: the one that counts. `None` where all had the same sequence.
         period: What the second period is above the first, by practice or fatigue.
         period_p: Student's test of it.
-        carry_over_p: Student's test of unequal sums of the sequences: what the first period left behind differs. It sees little at
-            such sizes and decides nothing here (Freeman, Stat. Med. 8 (1989) 1421-1432).
+        carry_over_p: Student's test of unequal sums of the sequences: what the first period left
+            behind differs. It sees little at such sizes and decides nothing here (Freeman, Stat.
+            Med. 8 (1989) 1421-1432).
     """
 
     num_persons: int
@@ -88,7 +91,9 @@ def effect(guided: np.ndarray, unguided: np.ndarray, guided_first: np.ndarray) -
     if num >= 2:
         facts |= _paired(guided - unguided)
     if min(num_first, num - num_first) >= 2:
-        facts |= _adjusted(np.where(first, guided - unguided, unguided - guided), guided + unguided, first)
+        facts |= _adjusted(
+            np.where(first, guided - unguided, unguided - guided), guided + unguided, first
+        )
     return Effect(num_persons=num, num_guided_first=num_first, **facts)
 
 
@@ -104,7 +109,10 @@ def _paired(difference: np.ndarray) -> dict:
         "hodges_lehmann_ci95": hodges_lehmann(difference)[1],
     }
     if std > ROUNDING * float(np.abs(difference).max()):
-        facts |= {"paired_dz": mean / std, "paired_dz_ci95": dz_interval(mean / std, math.sqrt(num), num - 1)}
+        facts |= {
+            "paired_dz": mean / std,
+            "paired_dz_ci95": dz_interval(mean / std, math.sqrt(num), num - 1),
+        }
     return facts
 
 
@@ -135,7 +143,9 @@ def _adjusted(period_difference: np.ndarray, total: np.ndarray, first: np.ndarra
 
 def _within(values: np.ndarray, first: np.ndarray) -> float:
     """Returns the standard deviation within sequences, 0 where it is rounding only."""
-    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in (values[first], values[~first]))
+    squares = sum(
+        float(((part - part.mean()) ** 2).sum()) for part in (values[first], values[~first])
+    )
     std = math.sqrt(squares / (len(values) - 2))
     return std if std > ROUNDING * float(np.abs(values).max()) else 0.0
 
@@ -143,7 +153,8 @@ def _within(values: np.ndarray, first: np.ndarray) -> float:
 def dz_interval(dz: float, scale: float, free: int) -> Interval:
     """Returns the 95 % interval of a standardised mean difference.
 
-    The noncentralities under which t is just as far out as it may be (Cumming and Finch, Educ. Psychol. Meas. 61 (2001) 532-574).
+    The noncentralities under which t is just as far out as it may be (Cumming and Finch, Educ.
+    Psychol. Meas. 61 (2001) 532-574).
 
     Args:
         dz: Mean over standard deviation.
@@ -157,7 +168,10 @@ def dz_interval(dz: float, scale: float, free: int) -> Interval:
         return share if math.isfinite(share) else float(shift < t)  # far out scipy gives NaN
 
     def bound(level: float) -> float:
-        low, high = t - 10.0 - 4.0 * abs(t), t + 10.0 + 4.0 * abs(t)  # with 1 degree of freedom it reaches to 2.24 t
+        low, high = (
+            t - 10.0 - 4.0 * abs(t),
+            t + 10.0 + 4.0 * abs(t),
+        )  # with 1 degree of freedom it reaches to 2.24 t
         return float(optimize.brentq(lambda shift: below(shift) - level, low, high)) / scale  # type: ignore[arg-type]
 
     return bound(0.5 + CONFIDENCE / 2), bound(0.5 - CONFIDENCE / 2)
@@ -166,7 +180,8 @@ def dz_interval(dz: float, scale: float, free: int) -> Interval:
 def hodges_lehmann(difference: np.ndarray) -> tuple[float, Interval | None]:
     """Returns the median of the means of all pairs, and its exact 95 % interval, `None` where so few persons allow none.
 
-    Source: Hollander, Wolfe and Chicken, Nonparametric Statistical Methods, 2014, sections 3.2 and 3.3.
+    Source: Hollander, Wolfe and Chicken, Nonparametric Statistical Methods, 2014, sections 3.2 and
+    3.3.
     """
     num = len(difference)
     rows, columns = np.triu_indices(num)
@@ -175,6 +190,8 @@ def hodges_lehmann(difference: np.ndarray) -> tuple[float, Interval | None]:
     for rank in range(1, num + 1):
         ways = np.concatenate((ways, np.zeros(rank))) + np.concatenate((np.zeros(rank), ways))
     below = np.cumsum(ways) / 2.0**num
-    cut = int(np.searchsorted(below, (1 - CONFIDENCE) / 2 + 1e-12, side="right"))  # sums so small occur in less than 2.5 %
+    cut = int(
+        np.searchsorted(below, (1 - CONFIDENCE) / 2 + 1e-12, side="right")
+    )  # sums so small occur in less than 2.5 %
     interval = (float(means[cut - 1]), float(means[len(means) - cut])) if cut else None
     return float(np.median(means)), interval

@@ -1,8 +1,10 @@
 """Who does what when: sequences drawn by lot, holes and starts in Latin squares, practice before.
 
-A participant does a few trials in each of two periods, one with guidance and one without. Which comes first is drawn, in pairs
-of participants, so that at no time one sequence is two ahead. Within a period every hole and every start occurs once, and over
-participants each stands at every place of the period equally often: neither a hard hole nor practice favours a condition.
+A participant does a few trials in each of two periods, one with guidance and one without. Which
+comes first is drawn, in pairs of participants, so that at no time one sequence is two ahead. Within
+a period every hole and every start occurs once, and over
+participants each stands at every place of the period equally often: neither a hard hole nor
+practice favours a condition.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ class Success:
 
     Attributes:
         depth_m: Depth of the tip below the rim.
-        clearance_m: Distance from the hole's axis within which the tip is inside: radius of the hole less that of the chisel.
+        clearance_m: Distance from the hole's axis within which the tip is inside: radius of the
+            hole less that of the chisel.
     """
 
     depth_m: float
@@ -53,11 +56,12 @@ class Design:
 
     Attributes:
         num_participants: Participants to invite.
-        order: `counterbalanced`, or `fixed` with guidance first for all, as in the paper; then order and guidance cannot
-            be told apart.
+        order: `counterbalanced`, or `fixed` with guidance first for all, as in the paper; then
+            order and guidance cannot be told apart.
         holes: Boreholes by name, one trial each in each period.
         starts: Joint positions from which trials begin, by name, as many as holes; rad or m.
-        practice_trials: Trials before the first period that do not count, half of them with guidance, until two in a row succeed.
+        practice_trials: Trials before the first period that do not count, half of them with
+            guidance, until two in a row succeed.
         practice_minutes: Time for it.
         limit_s: Time after which a trial ends; a trial without insertion counts with this time.
         success: When the tool is in.
@@ -78,20 +82,26 @@ class Design:
 
     def check(self) -> None:
         if self.num_participants < 2:
-            raise ConfigError(f"study.design.num_participants: expected 2 or more, got {self.num_participants}")
+            raise ConfigError(
+                f"study.design.num_participants: expected 2 or more, got {self.num_participants}"
+            )
         if len(self.holes) != len(self.starts) or len(self.holes) < 2:
             raise ConfigError(
                 "study.design: expected as many starts as holes, 2 or more, "
                 f"got {len(self.holes)} holes and {len(self.starts)} starts"
             )
         if not 0 < self.alpha < 1:
-            raise ConfigError(f"study.design.alpha: expected a level between 0 and 1, got {self.alpha}")
+            raise ConfigError(
+                f"study.design.alpha: expected a level between 0 and 1, got {self.alpha}"
+            )
 
     def check_machine(self, machine: Machine) -> None:
         """Raises a `ConfigError` that names the start which the machine cannot take."""
         for name, q in self.starts.items():
             if len(q) != machine.num_joints:
-                raise ConfigError(f"study.design.starts.{name}: expected {machine.num_joints} positions, got {len(q)}")
+                raise ConfigError(
+                    f"study.design.starts.{name}: expected {machine.num_joints} positions, got {len(q)}"
+                )
             for joint, value in zip(machine.joints, q, strict=True):
                 if not joint.lower.value <= value <= joint.upper.value:
                     raise ConfigError(
@@ -138,18 +148,24 @@ def sequences(design: Design, generator: np.random.Generator) -> dict[str, tuple
     for _ in range(math.ceil(design.num_participants / 2)):
         guided_first = bool(generator.integers(2)) or design.order == "fixed"
         second_first = guided_first if design.order == "fixed" else not guided_first
-        drawn += [CONDITIONS if first else (CONDITIONS[1], CONDITIONS[0]) for first in (guided_first, second_first)]
+        drawn += [
+            CONDITIONS if first else (CONDITIONS[1], CONDITIONS[0])
+            for first in (guided_first, second_first)
+        ]
     return dict(zip(pseudonyms(design.num_participants), drawn, strict=False))
 
 
 def squares(size: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns two Latin squares, `(K, K)` each: row `i` is an order of holes and one of starts.
 
-    In each, every entry stands once in every row and column. For odd `K` without divisor 3, and 3 itself, they are orthogonal
-    (every pair of hole and start occurs once over the rows); for even `K` they cannot be made so by shifts, and pairs repeat.
+    In each, every entry stands once in every row and column. For odd `K` without divisor 3, and 3
+    itself, they are orthogonal (every pair of hole and start occurs once over the rows); for even
+    `K` they cannot be made so by shifts, and pairs repeat.
     """
     row, place = np.mgrid[:size, :size]
-    factor = next((m for m in range(2, size) if math.gcd(m, size) == math.gcd(m - 1, size) == 1), size - 1)
+    factor = next(
+        (m for m in range(2, size) if math.gcd(m, size) == math.gcd(m - 1, size) == 1), size - 1
+    )
     return (row + place) % size, (row + factor * place) % size
 
 
@@ -157,19 +173,36 @@ def trials(design: Design, generator: np.random.Generator) -> list[Trial]:
     """Returns every trial in the order in which it is to be done, practice first."""
     holes, starts = list(design.holes), list(design.starts)
     hole_square, start_square = squares(len(holes))
-    shuffle = [generator.permutation(len(holes)) for _ in range(2)]  # which name stands for which letter of the squares
+    shuffle = [
+        generator.permutation(len(holes)) for _ in range(2)
+    ]  # which name stands for which letter of the squares
     found = []
     for index, (participant, conditions) in enumerate(sequences(design, generator).items()):
         for number in range(design.practice_trials):
             condition = CONDITIONS[number % 2]
             place = (index + number) % len(holes)
-            found.append(Trial(participant, 0, condition, number + 1, holes[place], starts[(place + 1) % len(starts)]))
+            found.append(
+                Trial(
+                    participant,
+                    0,
+                    condition,
+                    number + 1,
+                    holes[place],
+                    starts[(place + 1) % len(starts)],
+                )
+            )
         for period, condition in zip(PERIODS, conditions, strict=True):
-            # both of a pair have the same rows, one with each sequence; the second period has another row than the first
+            # both of a pair have the same rows, one with each sequence; the second period has
+            # another row than the first
             row = (index // 2 + (period - 1) * (len(holes) // 2)) % len(holes)
             for place in range(len(holes)):
-                hole, start = shuffle[0][hole_square[row, place]], shuffle[1][start_square[row, place]]
-                found.append(Trial(participant, period, condition, place + 1, holes[hole], starts[start]))
+                hole, start = (
+                    shuffle[0][hole_square[row, place]],
+                    shuffle[1][start_square[row, place]],
+                )
+                found.append(
+                    Trial(participant, period, condition, place + 1, holes[hole], starts[start])
+                )
     return found
 
 
@@ -185,6 +218,8 @@ def as_json(design: Design, machine: Machine, seed: int, planned: list[Trial]) -
         "fingerprint": machine.fingerprint(),
         "seed": seed,
         "design": asdict(design),
-        "participants": {name: [found[period] for period in PERIODS] for name, found in conditions.items()},
+        "participants": {
+            name: [found[period] for period in PERIODS] for name, found in conditions.items()
+        },
         "trials": [asdict(trial) for trial in planned],
     }

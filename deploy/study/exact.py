@@ -1,8 +1,9 @@
 """Exact tests by counting: what would have come out had the design's coin fallen otherwise, over all the ways it could have fallen.
 
-No distribution is assumed. Two coins are possible: which of a person's two conditions is called guided (`flips`, the paired test),
-and which persons had the guided condition first (`sequences`, the draw that was really made; it keeps what practice does, because
-that stays with the period). Axes: `S` studies at once, `P` persons, `M` ways.
+No distribution is assumed. Two coins are possible: which of a person's two conditions is called
+guided (`flips`, the paired test), and which persons had the guided condition first (`sequences`,
+the draw that was really made; it keeps what practice does, because that stays with the period).
+Axes: `S` studies at once, `P` persons, `M` ways.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy as np
 from scipy import stats
 
 MOST_WAYS = 300_000
-"""Ways that are all counted; of more so many are drawn, and the p-value is that of a Monte-Carlo test."""
+"""Ways that are all counted; of more so many are drawn, and the p-value is that of a Monte-Carlo
+test."""
 MANY_WAYS = 20_000
 """Ways drawn where there are more."""
 ROUNDING = 1e-9
@@ -69,13 +71,16 @@ def wilcoxon_p(difference: np.ndarray) -> float:
 def sequence_p(period_difference: np.ndarray, guided_first: np.ndarray) -> np.ndarray:
     """Returns the two-sided p of guidance with the period in the model, for `(…, P)` differences first period minus second.
 
-    The difference of the two sequences' means over all draws of the same size; practice shifts both sequences alike and drops out.
-    The permutation counterpart of Hills and Armitage, Br. J. Clin. Pharmacol. 8 (1979) 7-20, equation for the treatment effect.
+    The difference of the two sequences' means over all draws of the same size; practice shifts both
+    sequences alike and drops out. The permutation counterpart of Hills and Armitage, Br. J. Clin.
+    Pharmacol. 8 (1979) 7-20, equation for the treatment effect.
     """
     first = np.asarray(guided_first, bool)
     num, num_first = len(first), int(first.sum())
     if not 0 < num_first < num:
-        raise ValueError("both sequences must occur: with one alone guidance and order cannot be told apart")
+        raise ValueError(
+            "both sequences must occur: with one alone guidance and order cannot be told apart"
+        )
     weights = np.where(_draws(num, num_first), 1.0 / num_first, -1.0 / (num - num_first))
     own = np.where(first, 1.0 / num_first, -1.0 / (num - num_first))
     return _two_sided(np.asarray(period_difference, float), weights, own)
@@ -92,7 +97,9 @@ def holm(p: np.ndarray) -> np.ndarray:
     return adjusted
 
 
-def _two_sided(values: np.ndarray, weights: np.ndarray, own: np.ndarray | None = None) -> np.ndarray:
+def _two_sided(
+    values: np.ndarray, weights: np.ndarray, own: np.ndarray | None = None
+) -> np.ndarray:
     """Returns the share of ways, `(M, P)` weights, whose statistic is as far from 0 as that of `own` (all ones where not given)."""
     num = values.shape[-1]
     rows = values.reshape(-1, num)

@@ -1,14 +1,15 @@
 """A study on disk: plan, trials, questionnaires, who stopped; and everything of it that is not as it should be, in words.
 
     plan.json                          what was planned
-    trials/<P>_<period>_<nn>.json      one trial: who, when, where, how it ended, and the name of its recording
-    recordings/<P>_<period>_<nn>.parquet
+    trials/<P>_<period>_<nn>.json      one trial: who, when, where, how it ended, and the name of
+    its recording recordings/<P>_<period>_<nn>.parquet
     captures/<P>_<period>_<nn>/        what the loop recorded, whole: messages and frames of the bus
     questionnaires/<P>_<period>.json   NASA-TLX after a period
     participants/<P>.json              what is known of a participant: whether they stopped, and why
     reports.json                       where reports were written, for who wants to be forgotten
 
-Nothing that is there is passed over in silence: what cannot be used, is there twice or is missing becomes a remark.
+Nothing that is there is passed over in silence: what cannot be used, is there twice or is missing
+becomes a remark.
 """
 
 from __future__ import annotations
@@ -26,11 +27,23 @@ from brokk_rl.session import write_json
 from deploy.study.design import CONDITIONS, PERIODS
 
 PLAN, REPORTS = "plan.json", "reports.json"
-TRIALS, RECORDINGS, QUESTIONNAIRES, PARTICIPANTS = "trials", "recordings", "questionnaires", "participants"
+TRIALS, RECORDINGS, QUESTIONNAIRES, PARTICIPANTS = (
+    "trials",
+    "recordings",
+    "questionnaires",
+    "participants",
+)
 CAPTURES = "captures"
 OUTCOMES = ("inserted", "time limit", "stopped", "aborted")
 """How a trial can end: by the task, by time, by the participant, by the experimenter or a fault."""
-TRIAL_FIELDS = {"participant": str, "period": int, "condition": str, "number": int, "hole": dict, "limit_s": (int, float)}
+TRIAL_FIELDS = {
+    "participant": str,
+    "period": int,
+    "condition": str,
+    "number": int,
+    "hole": dict,
+    "limit_s": (int, float),
+}
 """What a trial must say."""
 
 
@@ -57,8 +70,8 @@ class StudyData:
         trials: Trials that count, by participant, period and number.
         questionnaires: By participant and period.
         participants: What is known of participants, by pseudonym.
-        spare: Trials that are kept but do not count: doubled ones, those of the unknown, those whose condition was
-            not the planned one.
+        spare: Trials that are kept but do not count: doubled ones, those of the unknown, those
+            whose condition was not the planned one.
         remarks: What is not as it should be.
     """
 
@@ -89,7 +102,9 @@ def read_plan(folder: Path) -> dict[str, Any]:
         )
     plan = _read(folder / PLAN)
     if not isinstance(plan, dict) or plan.get("schema") != 1 or "participants" not in plan:
-        raise ConfigError(f"{folder / PLAN}: expected a plan of schema 1 as study.do=plan writes it")
+        raise ConfigError(
+            f"{folder / PLAN}: expected a plan of schema 1 as study.do=plan writes it"
+        )
     return plan
 
 
@@ -119,7 +134,9 @@ def rewrite(path: Path, changes: dict[str, Any]) -> None:
     _write(path, _read(path) | changes)
 
 
-def write_questionnaire(folder: Path, participant: str, period: int, answers: dict[str, Any]) -> Path:
+def write_questionnaire(
+    folder: Path, participant: str, period: int, answers: dict[str, Any]
+) -> Path:
     """Writes a questionnaire; answers given again take the place of those before, which are kept within the file."""
     path = folder / QUESTIONNAIRES / f"{participant}_{period}.json"
     entry: dict[str, Any] = {"schema": 1, "participant": participant, "period": period}
@@ -131,7 +148,10 @@ def write_questionnaire(folder: Path, participant: str, period: int, answers: di
 
 def write_participant(folder: Path, participant: str, facts: dict[str, Any]) -> Path:
     """Writes what is known of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
-    return _write(folder / PARTICIPANTS / f"{participant}.json", {"schema": 1, "participant": participant, **facts})
+    return _write(
+        folder / PARTICIPANTS / f"{participant}.json",
+        {"schema": 1, "participant": participant, **facts},
+    )
 
 
 def note_report(folder: Path, report: Path) -> None:
@@ -146,7 +166,8 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     """Deletes every file about a participant; the plan keeps an empty place that says so.
 
     Returns:
-        What was deleted, and folders with reports that were made with the participant's data, to be deleted and made again.
+        What was deleted, and folders with reports that were made with the participant's data, to be
+        deleted and made again.
 
     Raises:
         ConfigError: the study has no such participant.
@@ -159,7 +180,11 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     gone = []
     for part in (TRIALS, RECORDINGS, CAPTURES, QUESTIONNAIRES, PARTICIPANTS):
         for path in sorted((folder / part).glob("*")):
-            if path.stem == participant or path.stem.startswith(f"{participant}_") or _belongs(path, participant):
+            if (
+                path.stem == participant
+                or path.stem.startswith(f"{participant}_")
+                or _belongs(path, participant)
+            ):
                 try:
                     if path.is_dir():
                         shutil.rmtree(path)
@@ -170,9 +195,13 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
                         f"cannot delete {path}: {error.strerror}; {len(gone)} files are gone, run it again"
                     ) from error
                 gone.append(path)
-    plan.setdefault("erased", {})[participant] = datetime.now().astimezone().isoformat(timespec="seconds")
+    plan.setdefault("erased", {})[participant] = (
+        datetime.now().astimezone().isoformat(timespec="seconds")
+    )
     _write(folder / PLAN, plan)
-    reports = [Path(name) for name in (_read(folder / REPORTS) if (folder / REPORTS).exists() else [])]
+    reports = [
+        Path(name) for name in (_read(folder / REPORTS) if (folder / REPORTS).exists() else [])
+    ]
     return gone, [report for report in reports if report.exists()]
 
 
@@ -188,11 +217,17 @@ def _belongs(path: Path, participant: str) -> bool:
 
 
 def _read_trials(data: StudyData) -> None:
-    found = sorted(_entries(data.folder / TRIALS, data), key=lambda item: str(item[1].get("created", "")))
+    found = sorted(
+        _entries(data.folder / TRIALS, data), key=lambda item: str(item[1].get("created", ""))
+    )
     for name, trial in found:
-        lacking = [key for key, kind in TRIAL_FIELDS.items() if not isinstance(trial.get(key), kind)]
+        lacking = [
+            key for key, kind in TRIAL_FIELDS.items() if not isinstance(trial.get(key), kind)
+        ]
         if lacking:
-            data.remarks.append(Remark(name, f"the trial lacks {', '.join(lacking)}; it does not count"))
+            data.remarks.append(
+                Remark(name, f"the trial lacks {', '.join(lacking)}; it does not count")
+            )
             data.spare.append(trial)
             continue
         who, period, condition = trial["participant"], trial["period"], trial["condition"]
@@ -200,15 +235,15 @@ def _read_trials(data: StudyData) -> None:
         if who not in data.plan["participants"]:
             problem = f"'{who}' is no participant of the plan; kept, but it does not count"
         elif period not in (0, *PERIODS) or condition not in CONDITIONS:
-            problem = (
-                f"period {period}, condition '{condition}': expected 0, 1 or 2 and {' or '.join(CONDITIONS)}; it does not count"
-            )
+            problem = f"period {period}, condition '{condition}': expected 0, 1 or 2 and {' or '.join(CONDITIONS)}; it does not count"
         elif period and data.plan["participants"][who][period - 1] != condition:
             problem = f"done {condition}, but planned {data.plan['participants'][who][period - 1]}; kept, but it does not count"
         elif key in data.trials:
             problem = "done twice: the first counts, since the second had more practice; the other is kept"
         elif trial.get("outcome") == "aborted":
-            problem = f"aborted ({trial.get('reason', 'no reason given')}); kept, but it does not count"
+            problem = (
+                f"aborted ({trial.get('reason', 'no reason given')}); kept, but it does not count"
+            )
         else:
             data.trials[key] = trial
             continue
@@ -221,16 +256,27 @@ def _read_questionnaires(data: StudyData) -> None:
         who, period = str(entry.get("participant")), entry.get("period")
         if who not in data.plan["participants"] or period not in PERIODS:
             data.remarks.append(
-                Remark(name, f"a questionnaire of '{who}', period {period}, whom the plan does not know; not counted")
+                Remark(
+                    name,
+                    f"a questionnaire of '{who}', period {period}, whom the plan does not know; not counted",
+                )
             )
         elif (who, period) in data.questionnaires:
             data.remarks.append(
-                Remark(name, "a second questionnaire for the same period: the one that is named as it should be counts")
+                Remark(
+                    name,
+                    "a second questionnaire for the same period: the one that is named as it should be counts",
+                )
             )
         else:
             data.questionnaires[who, period] = entry
             if "before" in entry:
-                data.remarks.append(Remark(name, "was filled in twice: the later answers count, the earlier are kept in the file"))
+                data.remarks.append(
+                    Remark(
+                        name,
+                        "was filled in twice: the later answers count, the earlier are kept in the file",
+                    )
+                )
 
 
 def _note_missing(data: StudyData) -> None:
@@ -246,7 +292,10 @@ def _note_missing(data: StudyData) -> None:
             continue
         if known.get("stopped"):
             data.remarks.append(
-                Remark(who, f"stopped after {len(done)} trials ({known.get('reason', 'no reason given')}); what was done is kept")
+                Remark(
+                    who,
+                    f"stopped after {len(done)} trials ({known.get('reason', 'no reason given')}); what was done is kept",
+                )
             )
         lost = sorted(planned.get(who, set()) - done)
         if not done:
@@ -255,7 +304,8 @@ def _note_missing(data: StudyData) -> None:
             names = ", ".join(f"{period}.{number}" for period, number in lost)
             data.remarks.append(
                 Remark(
-                    who, f"{len(lost)} of {len(planned[who])} trials are missing (period.trial {names}); means are over the others"
+                    who,
+                    f"{len(lost)} of {len(planned[who])} trials are missing (period.trial {names}); means are over the others",
                 )
             )
         for period in PERIODS:
@@ -288,5 +338,7 @@ def _write(path: Path, value: Any) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, value)
     except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror or error}; nothing was left behind") from error
+        raise StorageError(
+            f"cannot write {path}: {error.strerror or error}; nothing was left behind"
+        ) from error
     return path

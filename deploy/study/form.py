@@ -27,7 +27,9 @@ class Form:
         facts: What it says of itself besides.
     """
 
-    def __init__(self, folder: Path, who: str, period: int, seed: int, facts: dict[str, Any]) -> None:
+    def __init__(
+        self, folder: Path, who: str, period: int, seed: int, facts: dict[str, Any]
+    ) -> None:
         path = folder / folders.QUESTIONNAIRES / f"{who}_{period}.json"
         if not path.exists():
             shown = [list(pair) for pair in tlx.pairs(np.random.default_rng(seed))]
@@ -36,8 +38,12 @@ class Form:
         entry = json.loads(path.read_text())
         self._path = path
         self._ratings: dict[str, int] = dict(entry.get("ratings") or {})
-        self._shown: list[list[str]] = entry.get("shown_pairs") or [list(pair) for pair in tlx.PAIRS]
-        self._chosen = {frozenset(answer["pair"]): answer["chosen"] for answer in entry.get("pairs") or []}
+        self._shown: list[list[str]] = entry.get("shown_pairs") or [
+            list(pair) for pair in tlx.PAIRS
+        ]
+        self._chosen = {
+            frozenset(answer["pair"]): answer["chosen"] for answer in entry.get("pairs") or []
+        }
         self.finished = bool(entry.get("finished"))
         self._at = min([*self._missing(), LAST])
 
@@ -46,7 +52,11 @@ class Form:
         do, at = said.get("do"), said.get("to")
         if do == "rate" and self._fits(said):
             self._ratings[said["scale"]] = said["value"]
-        elif do == "pair" and said.get("pair") in range(NUM_PAIRS) and said.get("chosen") in self._shown[said["pair"]]:
+        elif (
+            do == "pair"
+            and said.get("pair") in range(NUM_PAIRS)
+            and said.get("chosen") in self._shown[said["pair"]]
+        ):
             self._chosen[frozenset(self._shown[said["pair"]])] = said["chosen"]
             self._at = NUM_RATINGS + said["pair"] + 1
         elif do == "to" and isinstance(at, int) and 0 <= at <= LAST:
@@ -69,15 +79,30 @@ class Form:
 
     def _fits(self, said: dict[str, Any]) -> bool:
         value = said.get("value")
-        return said.get("scale") in tlx.SCALES and type(value) is int and 0 <= value <= 100 and value % tlx.STEP == 0
+        return (
+            said.get("scale") in tlx.SCALES
+            and type(value) is int
+            and 0 <= value <= 100
+            and value % tlx.STEP == 0
+        )
 
     def _missing(self) -> list[int]:
         """Returns the screens that have no answer."""
-        scales = [index for index, scale in enumerate(tlx.SCALES) if self._ratings.get(scale) is None]
-        return scales + [NUM_RATINGS + i for i, pair in enumerate(self._shown) if frozenset(pair) not in self._chosen]
+        scales = [
+            index for index, scale in enumerate(tlx.SCALES) if self._ratings.get(scale) is None
+        ]
+        return scales + [
+            NUM_RATINGS + i
+            for i, pair in enumerate(self._shown)
+            if frozenset(pair) not in self._chosen
+        ]
 
     def _write(self) -> None:
         answers = [
-            {"pair": pair, "chosen": self._chosen[frozenset(pair)]} for pair in self._shown if frozenset(pair) in self._chosen
+            {"pair": pair, "chosen": self._chosen[frozenset(pair)]}
+            for pair in self._shown
+            if frozenset(pair) in self._chosen
         ]
-        folders.rewrite(self._path, {"ratings": self._ratings, "pairs": answers, "finished": self.finished})
+        folders.rewrite(
+            self._path, {"ratings": self._ratings, "pairs": answers, "finished": self.finished}
+        )

@@ -1,6 +1,7 @@
 """What a trial's recording says about how a person worked; one number each, NaN where the recording does not tell.
 
-Everything is counted from the start of the recording to the insertion, or to the limit where there was none.
+Everything is counted from the start of the recording to the insertion, or to the limit where there
+was none.
 Axes: `T` time, `J` joints.
 """
 
@@ -18,15 +19,18 @@ from deploy.study.design import Hole, Success
 from deploy.study.smoothness import sparc
 
 PIECE_S = 0.5
-"""A path is measured between means over so long: shorter pieces would add up the encoders' noise, longer ones cut corners."""
+"""A path is measured between means over so long: shorter pieces would add up the encoders' noise,
+longer ones cut corners."""
 MOVING = 0.05
 """Share of a joint's top speed above which it moves."""
 LEVER_ON, LEVER_OFF = 0.10, 0.05
-"""Deflection from which a lever is being moved, and below which it is let go; two, so that tremor does not count."""
+"""Deflection from which a lever is being moved, and below which it is let go; two, so that tremor
+does not count."""
 MOST_LAG_S = 2.0
 """Longest lag behind the advice that is looked for."""
 CONTACT_N = 50.0
-"""Force from which the tool touches something; the recordings' own column, not measured on every machine."""
+"""Force from which the tool touches something; the recordings' own column, not measured on every
+machine."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,9 @@ GUIDED_ONLY = ("advice_error", "advice_lag_s")
 """Measures that say something only where advice was shown, and so cannot be compared."""
 
 
-def measure(recording: Recording, machine: Machine, hole: Hole, success: Success, limit_s: float) -> dict[str, float]:
+def measure(
+    recording: Recording, machine: Machine, hole: Hole, success: Success, limit_s: float
+) -> dict[str, float]:
     """Returns every measure of `MEASURES` of one trial.
 
     Args:
@@ -83,7 +89,12 @@ def measure(recording: Recording, machine: Machine, hole: Hole, success: Success
     inserted = last is not None and bool(within[last])
     num = last + 1 if inserted and last is not None else int(within.sum())
     period_s = 1.0 / recording.rate_hz
-    q, u, tip, t_s = recording.q[:num].astype(float), recording.u[:num].astype(float), tip[:num], t_s[:num]
+    q, u, tip, t_s = (
+        recording.q[:num].astype(float),
+        recording.u[:num].astype(float),
+        tip[:num],
+        t_s[:num],
+    )
     path_m = length(tip, period_s)
     goal = np.array(hole.center_in_base_m) - [0.0, 0.0, success.depth_m]
     onsets = movements(u)
@@ -91,12 +102,18 @@ def measure(recording: Recording, machine: Machine, hole: Hole, success: Success
         "time_s": float(t_s[-1]) if inserted else limit_s,
         "success": float(inserted),
         "path_m": path_m,
-        "efficiency": min(1.0, float(np.linalg.norm(goal - tip[0])) / path_m) if inserted and path_m else math.nan,
+        "efficiency": min(1.0, float(np.linalg.norm(goal - tip[0])) / path_m)
+        if inserted and path_m
+        else math.nan,
         "several_joints": float((moving(q, machine, period_s).sum(1) >= 2).mean()),
         "lever_movements": float(len(onsets)),
         "joint_switches": float(np.count_nonzero(np.diff(onsets[:, 1]))),
-        "exclusive_share": float((np.abs(u[:, machine.is_exclusive]) > LEVER_OFF).any(1).mean()) if machine.exclusive else math.nan,
-        "smoothness": sparc(np.linalg.norm(np.diff(averaged(tip, 5), axis=0), axis=1), recording.rate_hz),
+        "exclusive_share": float((np.abs(u[:, machine.is_exclusive]) > LEVER_OFF).any(1).mean())
+        if machine.exclusive
+        else math.nan,
+        "smoothness": sparc(
+            np.linalg.norm(np.diff(averaged(tip, 5), axis=0), axis=1), recording.rate_hz
+        ),
         "control_effort": float(np.abs(np.diff(u, axis=0)).sum() / (period_s * max(1, num - 1))),
         "advice_error": math.nan,
         "advice_lag_s": math.nan,
@@ -117,7 +134,9 @@ def measure(recording: Recording, machine: Machine, hole: Hole, success: Success
 def insertion(tip_in_base_m: np.ndarray, hole: Hole, success: Success) -> int | None:
     """Returns the first sample at which the tip, `(T, 3)`, is in the hole, `None` where it never is."""
     away = tip_in_base_m - np.array(hole.center_in_base_m)
-    inside = (np.hypot(away[:, 0], away[:, 1]) <= success.clearance_m) & (away[:, 2] <= -success.depth_m)
+    inside = (np.hypot(away[:, 0], away[:, 1]) <= success.clearance_m) & (
+        away[:, 2] <= -success.depth_m
+    )
     return int(inside.argmax()) if inside.any() else None
 
 
@@ -162,7 +181,10 @@ def tracking(u: np.ndarray, advice: np.ndarray, period_s: float) -> dict[str, fl
     asked = np.nan_to_num(advice)
     most = min(round(MOST_LAG_S / period_s), len(u) - 1)
     agreement = [float((u[lag:] * asked[: len(u) - lag]).sum()) for lag in range(most + 1)]
-    return {"advice_error": error, "advice_lag_s": int(np.argmax(agreement)) * period_s if max(agreement) > 0 else math.nan}
+    return {
+        "advice_error": error,
+        "advice_lag_s": int(np.argmax(agreement)) * period_s if max(agreement) > 0 else math.nan,
+    }
 
 
 def averaged(values: np.ndarray, size: int) -> np.ndarray:

@@ -1,7 +1,8 @@
 """A simulated participant at the twin, in real time: a browser's connections, a remote on the bus, a person's hands between them.
 
-The participant sees what the page is sent and nothing else, presses what a person would press, and moves the remote's levers as the
-simulated operators of `conf/operator` do. Everything that comes of it is marked as simulated.
+The participant sees what the page is sent and nothing else, presses what a person would press, and
+moves the remote's levers as the simulated operators of `conf/operator` do. Everything that comes of
+it is marked as simulated.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ class Participant:
         guidance: How the levers are shown.
         guided: Whose hands and eyes these are in trials with advice.
         unguided: In trials without.
-        sittings: How many participants of the plan come one after the other; `null`: all that have not finished.
+        sittings: How many participants of the plan come one after the other; `null`: all that have
+            not finished.
     """
 
     twin: Twin
@@ -67,14 +69,26 @@ class Participant:
     @property
     def operators(self) -> dict[str, str]:
         """Who is at the levers, by condition."""
-        return {"guided": type(self.guided).__name__.lower(), "unguided": type(self.unguided).__name__.lower()}
+        return {
+            "guided": type(self.guided).__name__.lower(),
+            "unguided": type(self.unguided).__name__.lower(),
+        }
 
     def companions(self, machine: Machine, session: Session) -> list[Companion]:
         """Returns the processes to run beside the loop."""
-        person = Person(self, machine, session.folder.resolve() / LINK, session.stream("study operators"))
+        person = Person(
+            self, machine, session.folder.resolve() / LINK, session.stream("study operators")
+        )
         return [
-            Companion("twin", "deploy.twin.twin:run", (self.twin, machine, self.plant, session), TWIN_PRIORITY),
-            Companion("participant", "deploy.study.participant:take_part", (person,), TWIN_PRIORITY),
+            Companion(
+                "twin",
+                "deploy.twin.twin:run",
+                (self.twin, machine, self.plant, session),
+                TWIN_PRIORITY,
+            ),
+            Companion(
+                "participant", "deploy.study.participant:take_part", (person,), TWIN_PRIORITY
+            ),
         ]
 
 
@@ -107,7 +121,8 @@ class _Taking:
         levers = bench.guidance.levers or machine.levers
         self._shown_map, self._own = LeverMap(levers, machine), LeverMap(machine.levers, machine)
         self._shown_full = [
-            max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0) for axis in AXES
+            max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0)
+            for axis in AXES
         ]
         self._shown: dict[str, Any] = {}
         self._study: dict[str, Any] = {}
@@ -120,10 +135,15 @@ class _Taking:
         host, token = await self._address(stop)
         async with (
             connect(f"ws://{host}/state", proxy=None, close_timeout=0.5) as state,
-            connect(f"ws://{host}/study", origin=f"http://{host}", proxy=None, close_timeout=0.5) as study,  # type: ignore[arg-type]
+            connect(
+                f"ws://{host}/study", origin=f"http://{host}", proxy=None, close_timeout=0.5
+            ) as study,  # type: ignore[arg-type]
         ):
             await study.send(json.dumps({"token": token}))
-            tasks = [asyncio.create_task(self._look(state)), asyncio.create_task(self._press(study))]
+            tasks = [
+                asyncio.create_task(self._look(state)),
+                asyncio.create_task(self._press(study)),
+            ]
             try:
                 await self._hold(stop, self._bench.twin.wire, tasks)
             finally:
@@ -136,7 +156,9 @@ class _Taking:
             if time.monotonic() > end_s:
                 raise TimeoutError(f"no page after {STARTING_S:g} s ({self._person.link})")
             await asyncio.sleep(0.2)
-        host, _, token = self._person.link.read_text().strip().removeprefix("http://").partition("/#token=")
+        host, _, token = (
+            self._person.link.read_text().strip().removeprefix("http://").partition("/#token=")
+        )
         return host, token
 
     async def _look(self, state: ClientConnection) -> None:
@@ -156,8 +178,12 @@ class _Taking:
             shown = self._study = said["study"]
             if shown.get("phase") == "ready" and not self._ready(shown):
                 continue
-            screen = [shown.get(key) for key in ("kind", "who", "period", "phase", "number", "done")]
-            if screen != pressed or time.monotonic() - pressed_s > AGAIN_S:  # each screen is answered once, or once more if need be
+            screen = [
+                shown.get(key) for key in ("kind", "who", "period", "phase", "number", "done")
+            ]
+            if (
+                screen != pressed or time.monotonic() - pressed_s > AGAIN_S
+            ):  # each screen is answered once, or once more if need be
                 pressed, pressed_s = screen, time.monotonic()
                 for one in self._presses(shown):
                     await study.send(json.dumps(one))
@@ -165,7 +191,9 @@ class _Taking:
     def _presses(self, study: dict[str, Any]) -> list[dict[str, Any]]:
         kind, phase = study["kind"], study.get("phase")
         if kind == "choose":
-            waiting = [one["name"] for one in study["participants"] if one["state"] in ("new", "begun")]
+            waiting = [
+                one["name"] for one in study["participants"] if one["state"] in ("new", "begun")
+            ]
             if waiting and self._left > 0:
                 return [{"do": "choose", "who": waiting[0]}]
             self._end()
@@ -193,8 +221,14 @@ class _Taking:
         made = answered(float(np.mean(self._took_s or [0.0])) / 100.0, 0.0, generator)
         chosen = {frozenset(answer["pair"]): answer["chosen"] for answer in made["pairs"]}
         self._took_s.clear()
-        found = [{"do": "rate", "scale": scale, "value": value} for scale, value in made["ratings"].items()]
-        found += [{"do": "pair", "pair": i, "chosen": chosen[frozenset(pair)]} for i, pair in enumerate(study["pairs"])]
+        found = [
+            {"do": "rate", "scale": scale, "value": value}
+            for scale, value in made["ratings"].items()
+        ]
+        found += [
+            {"do": "pair", "pair": i, "chosen": chosen[frozenset(pair)]}
+            for i, pair in enumerate(study["pairs"])
+        ]
         return [*found, {"do": "to", "to": study["last"]}, {"do": "finish"}]
 
     @property
@@ -229,10 +263,16 @@ class _Taking:
             self._model = None
             return np.zeros(num)
         if self._model is None:
-            operator = self._bench.guided if study["condition"] == "guided" else self._bench.unguided
-            self._model = operator.build(self._machine, np.array([self._number - 1]), self._person.seed)
+            operator = (
+                self._bench.guided if study["condition"] == "guided" else self._bench.unguided
+            )
+            self._model = operator.build(
+                self._machine, np.array([self._number - 1]), self._person.seed
+            )
         rim = np.array(shown["targets"][0]["center_in_base_m"])
-        view = OperatorView(q=np.array(shown["q"])[None], rim_in_base_m=rim[None], advice=self._advice(shown)[None])
+        view = OperatorView(
+            q=np.array(shown["q"])[None], rim_in_base_m=rim[None], advice=self._advice(shown)[None]
+        )
         return self._model.step(view)[0]
 
     def _advice(self, shown: dict[str, Any]) -> np.ndarray:
@@ -240,7 +280,9 @@ class _Taking:
         if advice is None:
             return np.full(self._machine.num_joints, np.nan)
         parts = np.array([advice["levers"][f"{side}_{axis}"] for side, axis in AXES])
-        return self._shown_map.command(parts * np.array(self._shown_full), advice["levers"]["button_right"])
+        return self._shown_map.command(
+            parts * np.array(self._shown_full), advice["levers"]["button_right"]
+        )
 
     def _end(self) -> None:
         if not self._finished:

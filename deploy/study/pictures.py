@@ -31,7 +31,9 @@ def paths(found: Analysis) -> Figure:
     figure = Figure(figsize=(3.6 * max(1, len(holes)), 6.8), layout="constrained")
     for column, name in enumerate(holes):
         here = [trial for trial in drawn if _hole(trial) == name]
-        for row, (title, horizontal, vertical) in enumerate((("from above", 0, 1), ("from the side", None, 2))):
+        for row, (title, horizontal, vertical) in enumerate(
+            (("from above", 0, 1), ("from the side", None, 2))
+        ):
             axis = figure.add_subplot(2, len(holes), row * len(holes) + column + 1)
             _paths(axis, here, horizontal, vertical)
             axis.set_title(f"hole {name}, {title}", fontsize=9)
@@ -50,13 +52,21 @@ def radar(found: Analysis) -> Figure:
     angles = np.linspace(0, 2 * math.pi, len(tlx.SCALES), endpoint=False)
     for shift, condition in ((-0.02, "guided"), (0.02, "unguided")):
         values = [found.loads[scale][condition] for scale in tlx.SCALES]
-        means = np.array([np.nanmean(value) if not np.isnan(value).all() else math.nan for value in values])
+        means = np.array(
+            [np.nanmean(value) if not np.isnan(value).all() else math.nan for value in values]
+        )
         halves = np.array([_half(value) for value in values])
         colour, line = LOOK[condition]
         closed = np.append(angles, angles[0]) + shift
-        axis.plot(closed, np.append(means, means[0]), line, color=colour, label=condition, linewidth=2)
-        axis.errorbar(angles + shift, means, halves, fmt="o", color=colour, markersize=4, elinewidth=1)
-    axis.set_xticks(angles, [title.replace(" (", "\n(") for title in tlx.SCALES.values()], fontsize=9)
+        axis.plot(
+            closed, np.append(means, means[0]), line, color=colour, label=condition, linewidth=2
+        )
+        axis.errorbar(
+            angles + shift, means, halves, fmt="o", color=colour, markersize=4, elinewidth=1
+        )
+    axis.set_xticks(
+        angles, [title.replace(" (", "\n(") for title in tlx.SCALES.values()], fontsize=9
+    )
     axis.tick_params(axis="x", pad=16)
     axis.set_ylim(0, 100)
     axis.set_yticks([20, 40, 60, 80], ["20", "40", "60", "80"], fontsize=7, color=GREY)
@@ -70,7 +80,9 @@ def pairs(found: Analysis, names: Sequence[str]) -> Figure:
     figure = Figure(figsize=(3.6 * COLUMNS, 2.9 * rows + 0.5), layout="constrained")
     for number, name in enumerate(names):
         axis = figure.add_subplot(rows, COLUMNS, number + 1)
-        values = found.loads[name.removeprefix("tlx_")] if name.startswith("tlx_") else found.means[name]
+        values = (
+            found.loads[name.removeprefix("tlx_")] if name.startswith("tlx_") else found.means[name]
+        )
         both = np.stack((values["unguided"], values["guided"]))
         for first, colour, label in ((True, GREEN, "guided first"), (False, RED, "unguided first")):
             mine = both[:, found.guided_first == first]
@@ -79,7 +91,13 @@ def pairs(found: Analysis, names: Sequence[str]) -> Figure:
         for place, value in ((-0.15, both[0]), (1.15, both[1])):
             if not np.isnan(value).all():
                 axis.errorbar(
-                    [place], [np.nanmean(value)], [[_half(value)], [_half(value)]], fmt="s", color="black", markersize=5, capsize=3
+                    [place],
+                    [np.nanmean(value)],
+                    [[_half(value)], [_half(value)]],
+                    fmt="s",
+                    color="black",
+                    markersize=5,
+                    capsize=3,
                 )
         axis.set_xticks([0, 1], ["unguided", "guided"])
         axis.set_xlim(-0.35, 1.35)
@@ -125,10 +143,16 @@ def title_of(name: str) -> str:
 
 def standardised(effect: Effect) -> tuple[float | None, tuple[float, float] | None]:
     """Returns dz and its interval with the period in the model, without where sequences do not allow it."""
-    return (effect.dz, effect.dz_ci95) if effect.dz is not None else (effect.paired_dz, effect.paired_dz_ci95)
+    return (
+        (effect.dz, effect.dz_ci95)
+        if effect.dz is not None
+        else (effect.paired_dz, effect.paired_dz_ci95)
+    )
 
 
-def _paths(axis: Axes, trials: Sequence[MeasuredTrial], horizontal: int | None, vertical: int) -> None:
+def _paths(
+    axis: Axes, trials: Sequence[MeasuredTrial], horizontal: int | None, vertical: int
+) -> None:
     labelled = set()
     for trial in trials:
         tip = trial.tip_in_base_m

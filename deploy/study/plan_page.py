@@ -19,7 +19,14 @@ RULES = (
 )
 
 
-def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: dict[str, Any], notice: str = "") -> Page:
+def page(
+    design: Design,
+    machine: str,
+    seed: int,
+    planned: list[Trial],
+    errors: dict[str, Any],
+    notice: str = "",
+) -> Page:
     """Returns the page.
 
     Args:
@@ -35,7 +42,10 @@ def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: 
     paired_least, sequence_least = sample_size.least(design.alpha)
     wanted = sample_size.enough(design.alpha)
     if design.order == "fixed":
-        summary, tone = "With guidance first for all, order and guidance cannot be told apart, whatever the numbers say.", "bad"
+        summary, tone = (
+            "With guidance first for all, order and guidance cannot be told apart, whatever the numbers say.",
+            "bad",
+        )
     elif can.smallest_p > design.alpha:
         summary, tone = (
             f"{num} participants cannot reach p < {design.alpha:g}: the smallest possible p is {can.smallest_p:.3f}. It takes "
@@ -65,14 +75,17 @@ def page(design: Design, machine: str, seed: int, planned: list[Trial], errors: 
     found.items(RULES)
     found.heading("Places")
     found.table(
-        ["hole", "x, m", "y, m", "rim z, m", "radius, m"], [[n, *h.center_in_base_m, h.radius_m] for n, h in design.holes.items()]
+        ["hole", "x, m", "y, m", "rim z, m", "radius, m"],
+        [[n, *h.center_in_base_m, h.radius_m] for n, h in design.holes.items()],
     )
     found.table(
         ["start", *(f"joint {i + 1}" for i in range(len(next(iter(design.starts.values())))))],
         [[n, *q] for n, q in design.starts.items()],
     )
     found.heading("Order of trials")
-    found.text("A hole and a start a trial, in this order; tick what is done, write down what went otherwise.")
+    found.text(
+        "A hole and a start a trial, in this order; tick what is done, write down what went otherwise."
+    )
     _sheets(found, planned)
     return found
 
@@ -96,8 +109,17 @@ def _numbers(found: Page, design: Design, paired_least: int, sequence_least: int
     for size in (sample_size.size(num, design.alpha) for num in sizes):
         here = size.num_participants == design.num_participants
         name = Cell(str(size.num_participants), note="this plan" if here else "")
-        rows.append([name, f"{size.smallest_paired_p:.2g}", f"{size.smallest_p:.2g}", *(f"{power:.2f}" for power in size.power)])
-    found.table(columns, rows, "smallest possible p of both tests, and power with the period in the model")
+        rows.append(
+            [
+                name,
+                f"{size.smallest_paired_p:.2g}",
+                f"{size.smallest_p:.2g}",
+                *(f"{power:.2f}" for power in size.power),
+            ]
+        )
+    found.table(
+        columns, rows, "smallest possible p of both tests, and power with the period in the model"
+    )
 
 
 def _errors(found: Page, errors: dict[str, Any]) -> None:
@@ -128,14 +150,19 @@ def _sheets(found: Page, planned: list[Trial]) -> None:
     for participant in dict.fromkeys(trial.participant for trial in planned):
         mine = [trial for trial in planned if trial.participant == participant]
         found.heading(participant, 3)
-        columns = ["", *(str(number) for number in range(1, max(trial.number for trial in mine) + 1))]
+        columns = [
+            "",
+            *(str(number) for number in range(1, max(trial.number for trial in mine) + 1)),
+        ]
         rows = []
         for period in sorted({trial.period for trial in mine}):
             here = [trial for trial in mine if trial.period == period]
             title = "practice" if not period else f"period {period}: {here[0].condition}"
             cells: list[str | Cell] = [f"{trial.hole} from {trial.start}" for trial in here]
             if not period:
-                cells = [Cell(f"{trial.hole} from {trial.start}", trial.condition) for trial in here]
+                cells = [
+                    Cell(f"{trial.hole} from {trial.start}", trial.condition) for trial in here
+                ]
             rows.append([title, *cells, *[""] * (len(columns) - 1 - len(here))])
             rows.append(["notes", *[""] * (len(columns) - 1)])
         found.table(columns, rows)

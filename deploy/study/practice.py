@@ -2,8 +2,9 @@
 
     log T = log base + skill + hole - learning * log(trial number) + guidance + chance
 
-Practice follows the power law (Newell and Rosenbloom 1981); a trial longer than the limit counts with the limit. Thousands of
-studies can be drawn in a second, so that a plan can say how often it would find what is not there, and miss what is.
+Practice follows the power law (Newell and Rosenbloom 1981); a trial longer than the limit counts
+with the limit. Thousands of studies can be drawn in a second, so that a plan can say how often it
+would find what is not there, and miss what is.
 Axes: `S` studies, `P` persons, `K` trials in a period.
 """
 
@@ -47,10 +48,19 @@ class Practice:
 
     def check(self) -> None:
         if self.base_s <= 0 or self.chance_sd <= 0:
-            raise ConfigError(f"study.practice: expected base_s and chance_sd above 0, got {self.base_s} and {self.chance_sd}")
+            raise ConfigError(
+                f"study.practice: expected base_s and chance_sd above 0, got {self.base_s} and {self.chance_sd}"
+            )
 
     def draw(
-        self, guided_first: np.ndarray, num_trials: int, practised: int, limit_s: float, effect: float, seed: int, studies: int = 1
+        self,
+        guided_first: np.ndarray,
+        num_trials: int,
+        practised: int,
+        limit_s: float,
+        effect: float,
+        seed: int,
+        studies: int = 1,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns mean times with and without guidance, `(S, P)` each, s.
 
@@ -68,11 +78,15 @@ class Practice:
         skill = self.skill_sd * generator.standard_normal(persons)
         learning = self.learning + self.learning_sd * generator.standard_normal(persons)
         gain = effect + self.guidance_sd * generator.standard_normal(persons)
-        hole = self.hole_sd * generator.standard_normal((studies, 1, 1, num_trials))  # each occurs once in each period
+        hole = self.hole_sd * generator.standard_normal(
+            (studies, 1, 1, num_trials)
+        )  # each occurs once in each period
         chance = self.chance_sd * generator.standard_normal((*persons[:2], 2, num_trials))
         number = practised + 1 + np.arange(2 * num_trials).reshape(2, num_trials)
         guided = np.stack((guided_first, ~guided_first), 1)[None, :, :, None]
-        time_s = self.base_s * np.exp(skill + hole + chance - learning * np.log(number) + gain * guided)
+        time_s = self.base_s * np.exp(
+            skill + hole + chance - learning * np.log(number) + gain * guided
+        )
         period = np.minimum(time_s, limit_s).mean(3)
         first = np.where(guided_first, period[..., 0], period[..., 1])
         return first, np.where(guided_first, period[..., 1], period[..., 0])
@@ -91,7 +105,11 @@ class Practice:
             guided, unguided = self.draw(first, num_trials, practised, limit_s, effect, seed=1)
             saved = (unguided - guided)[0]
             spread = float(np.sqrt((saved[first].var() + saved[~first].var()) / 2))
-            return float(saved[first].mean() + saved[~first].mean()) / 2 / spread - dz if spread > 0 else -dz
+            return (
+                float(saved[first].mean() + saved[~first].mean()) / 2 / spread - dz
+                if spread > 0
+                else -dz
+            )
 
         if found(STRONGEST) < 0:
             raise ConfigError(
@@ -125,7 +143,8 @@ def share_significant(
         alpha: Level of the test.
         studies: Number of studies.
         seed: Of the draws.
-        fixed: Guidance first for all, and the paired test, as there is no other; else counterbalanced, period in the model.
+        fixed: Guidance first for all, and the paired test, as there is no other; else
+            counterbalanced, period in the model.
     """
     first = np.ones(num_persons, bool) if fixed else np.arange(num_persons) < (num_persons + 1) // 2
     effect = practice.effect_of(dz, num_trials, practised, limit_s) if dz else 0.0

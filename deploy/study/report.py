@@ -40,9 +40,17 @@ def write(folder: Path, data: StudyData, found: Analysis) -> Path:
         write_text(folder / "effects.csv", _effects(found, data.is_simulated))
         effects = {name: asdict(effect) for name, effect in found.effects.items()}
         remarks = [asdict(remark) for remark in found.remarks]
-        facts = {"primary": found.primary, "alpha": found.alpha, "simulated": data.is_simulated, "participants": found.participants}
+        facts = {
+            "primary": found.primary,
+            "alpha": found.alpha,
+            "simulated": data.is_simulated,
+            "participants": found.participants,
+        }
         write_json(
-            folder / "report.json", _plain({"schema": 1, **facts, "effects": effects, "holm": found.holm, "remarks": remarks})
+            folder / "report.json",
+            _plain(
+                {"schema": 1, **facts, "effects": effects, "holm": found.holm, "remarks": remarks}
+            ),
         )
         drawn = {
             "paths": pictures.paths(found),
@@ -52,10 +60,14 @@ def write(folder: Path, data: StudyData, found: Analysis) -> Path:
         }
         for name, figure in drawn.items():
             if data.is_simulated:
-                figure.suptitle("SIMULATED OPERATORS", fontsize=9, color="#b3261e", x=0.02, ha="left")
+                figure.suptitle(
+                    "SIMULATED OPERATORS", fontsize=9, color="#b3261e", x=0.02, ha="left"
+                )
             figure.savefig(folder / f"{name}.png", dpi=150)
     except OSError as error:
-        raise StorageError(f"cannot write the report into {folder}: {error.strerror or error}") from error
+        raise StorageError(
+            f"cannot write the report into {folder}: {error.strerror or error}"
+        ) from error
     path = folder / "report.html"
     _page(folder, data, found).write(path)
     return path
@@ -75,10 +87,16 @@ def verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str]:
     low, high = effect.adjusted_ci95
     size = f"{title}: {effect.adjusted:+.3g} with guidance (95 % {low:+.3g} to {high:+.3g}), exact p = {effect.p:.3g}"
     if effect.p > found.alpha:
-        return f"No effect of guidance is shown on the primary measure. {size}; {effect.num_persons} participants.", "warn"
+        return (
+            f"No effect of guidance is shown on the primary measure. {size}; {effect.num_persons} participants.",
+            "warn",
+        )
     helps = effect.adjusted * better > 0
     who = "In this simulation guidance" if is_simulated else "Guidance"
-    return f"{who} {'helps' if helps else 'harms'}. {size}; {effect.num_persons} participants.", "good" if helps else "bad"
+    return (
+        f"{who} {'helps' if helps else 'harms'}. {size}; {effect.num_persons} participants.",
+        "good" if helps else "bad",
+    )
 
 
 def _page(folder: Path, data: StudyData, found: Analysis) -> Page:
@@ -88,10 +106,13 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Page:
     if data.is_simulated:
         page.text(f"{NOTICE[0].upper()}{NOTICE[1:]}.", "warn")
     num, num_first = len(found.participants), int(found.guided_first.sum())
-    least = max(smallest_paired_p(num), smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0)
+    least = max(
+        smallest_paired_p(num), smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0
+    )
     if least > found.alpha:
         page.text(
-            f"With {num} participants no test here can reach p = {found.alpha:g}: the smallest possible is {least:.3g}.", "bad"
+            f"With {num} participants no test here can reach p = {found.alpha:g}: the smallest possible is {least:.3g}.",
+            "bad",
         )
     counted = [trial for trial in found.trials if trial.counts]
     page.facts(
@@ -115,18 +136,29 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Page:
     page.picture(folder / "effects.png", "Effect of guidance on every measure, with 95 % intervals")
     page.picture(folder / "pairs.png", "Every participant, and means with 95 % intervals")
     page.heading("Tool paths")
-    page.picture(folder / "paths.png", "Paths of the tool, guided solid and unguided dotted; stars: starts, spheres: holes")
+    page.picture(
+        folder / "paths.png",
+        "Paths of the tool, guided solid and unguided dotted; stars: starts, spheres: holes",
+    )
     page.heading("Workload (NASA-TLX)")
-    page.table(*_table(found, LOADS), "0 to 100, more is more load; below each figure its 95 % interval")
+    page.table(
+        *_table(found, LOADS), "0 to 100, more is more load; below each figure its 95 % interval"
+    )
     page.picture(folder / "tlx.png", "Means of the six scales with 95 % intervals")
     page.heading("Without the period in the model")
     page.text(
         "The usual paired tests, for comparison; practice is part of the differences here, though not of their mean where as many "
         "had one order as the other."
     )
-    page.table(*_paired_table(found), "guided minus unguided; period: second minus first, with guidance in the model")
+    page.table(
+        *_paired_table(found),
+        "guided minus unguided; period: second minus first, with guidance in the model",
+    )
     page.heading("How the advice was followed")
-    page.table(["measure", "mean, guided"], [[pictures.title_of(name), _mean(found, name)] for name in GUIDED_ONLY])
+    page.table(
+        ["measure", "mean, guided"],
+        [[pictures.title_of(name), _mean(found, name)] for name in GUIDED_ONLY],
+    )
     page.heading("What to beware of")
     if found.remarks:
         page.table(["where", "what"], [[remark.where, remark.text] for remark in found.remarks])
@@ -142,20 +174,42 @@ def _table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list[list[
         e, is_primary = found.effects[name], name == found.primary
         note = f"{e.num_persons} people" + ", the primary measure" * is_primary
         means = [Cell(pictures.title_of(name), note), _number(e.guided), _number(e.unguided)]
-        size = [Cell(_number(e.adjusted), _interval(e.adjusted_ci95)), Cell(_number(e.dz), _interval(e.dz_ci95))]
+        size = [
+            Cell(_number(e.adjusted), _interval(e.adjusted_ci95)),
+            Cell(_number(e.dz), _interval(e.dz_ci95)),
+        ]
         rows.append([*means, *size, _p(e.p), "decides" if is_primary else _p(found.holm.get(name))])
     return columns, rows
 
 
 def _paired_table(found: Analysis) -> tuple[list[str], list[list[str | Cell]]]:
-    columns = ["measure", "difference", "Hodges-Lehmann", "dz", "p, permuted", "p, Wilcoxon", "period", "p, carry-over"]
+    columns = [
+        "measure",
+        "difference",
+        "Hodges-Lehmann",
+        "dz",
+        "p, permuted",
+        "p, Wilcoxon",
+        "period",
+        "p, carry-over",
+    ]
     rows: list[list[str | Cell]] = []
     for name in (*COMPARED, *LOADS):
         e = found.effects[name]
-        mean, middle = Cell(_number(e.difference), _interval(e.paired_ci95)), _interval(e.hodges_lehmann_ci95)
+        mean, middle = (
+            Cell(_number(e.difference), _interval(e.paired_ci95)),
+            _interval(e.hodges_lehmann_ci95),
+        )
         dz = Cell(_number(e.paired_dz), _interval(e.paired_dz_ci95))
-        tests = [_p(e.paired_p), _p(e.wilcoxon_p), Cell(_number(e.period), f"p {_p(e.period_p)}"), _p(e.carry_over_p)]
-        rows.append([pictures.title_of(name), mean, Cell(_number(e.hodges_lehmann), middle), dz, *tests])
+        tests = [
+            _p(e.paired_p),
+            _p(e.wilcoxon_p),
+            Cell(_number(e.period), f"p {_p(e.period_p)}"),
+            _p(e.carry_over_p),
+        ]
+        rows.append(
+            [pictures.title_of(name), mean, Cell(_number(e.hodges_lehmann), middle), dz, *tests]
+        )
     return columns, rows
 
 
@@ -165,11 +219,23 @@ def _mean(found: Analysis, name: str) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return (
+        "–"
+        if value is None or math.isnan(value)
+        else f"{value:.0f}"
+        if abs(value) >= 1000
+        else f"{value:.3g}"
+    )
 
 
 def _p(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.4f}" if value >= 0.0001 else f"{value:.1e}"
+    return (
+        "–"
+        if value is None or math.isnan(value)
+        else f"{value:.4f}"
+        if value >= 0.0001
+        else f"{value:.1e}"
+    )
 
 
 def _interval(value: tuple[float, float] | None) -> str:
@@ -214,7 +280,10 @@ def _effects(found: Analysis, is_simulated: bool) -> str:
         head += [f"{key}_low", f"{key}_high"] if key.endswith("_ci95") else [key]
     rows = []
     for name, effect in found.effects.items():
-        values = [(None, None) if value is None and key.endswith("_ci95") else value for key, value in asdict(effect).items()]
+        values = [
+            (None, None) if value is None and key.endswith("_ci95") else value
+            for key, value in asdict(effect).items()
+        ]
         rows.append([name, is_simulated, *_flat(values), _blank(found.holm.get(name, math.nan))])
     return _csv(["measure", "simulated", *head, "p_holm"], rows)
 

@@ -1,7 +1,7 @@
 """The process that leads a sitting: the operator's page beside the loop, with the study's pages over it.
 
-Advice is shown in guided trials alone, and left out here, not in the browser. While a sitting goes on nothing but `stop` is taken
-from the operator's page: recording and borehole are the study's.
+Advice is shown in guided trials alone, and left out here, not in the browser. While a sitting goes
+on nothing but `stop` is taken from the operator's page: recording and borehole are the study's.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ log = logging.getLogger(__name__)
 TICK_S = 0.05
 SHOW_S = 0.1
 """Between looks at what to show; pages get what has changed."""
-HEAD = b'<link rel="stylesheet" href="study.css"><script type="module" src="study.js"></script></head>'
+HEAD = (
+    b'<link rel="stylesheet" href="study.css"><script type="module" src="study.js"></script></head>'
+)
 
 
 @dataclass(frozen=True)
@@ -72,14 +74,23 @@ def run(stop: Stop, sitters: Sitters, exchange: Exchange) -> None:
     stage = LoopStage(exchange, beside.machine, sitters.target, sitters.port)
     seed = beside.session.stream
     conductor = Conductor(
-        sitters.folder, beside.machine, stage, sitters.words, sitters.times, sitters.facts, seed, sitters.operators
+        sitters.folder,
+        beside.machine,
+        stage,
+        sitters.words,
+        sitters.times,
+        sitters.facts,
+        seed,
+        sitters.operators,
     )
     if sitters.participant:
         conductor.choose(sitters.participant)
     link = beside.session.folder / LINK
 
     def tell(address: str) -> None:
-        log.info("%s; the link that leads the sitting stands in %s", address.partition("#")[0], link)
+        log.info(
+            "%s; the link that leads the sitting stands in %s", address.partition("#")[0], link
+        )
 
     try:
         feed = StudyFeed(LoopFeed(beside, exchange), conductor)
@@ -129,7 +140,8 @@ class StudyFeed:
 class StudyPages:
     """The study's pages and their WebSocket; see `deploy.page.server.Annex`.
 
-    What is asked of the participant lies over the operator's page; in a trial it is a bar at its upper edge.
+    What is asked of the participant lies over the operator's page; in a trial it is a bar at its
+    upper edge.
 
     Args:
         conductor: Of the sitting.
@@ -140,7 +152,9 @@ class StudyPages:
     def __init__(self, conductor: Conductor) -> None:
         self._conductor = conductor
         kind, index = static("deploy.page")["/index.html"]
-        self.files: Mapping[str, tuple[str, bytes]] = static("deploy.study") | {"/": (kind, index.replace(b"</head>", HEAD, 1))}
+        self.files: Mapping[str, tuple[str, bytes]] = static("deploy.study") | {
+            "/": (kind, index.replace(b"</head>", HEAD, 1))
+        }
 
     async def run(self) -> None:
         """See `Annex`."""
@@ -156,7 +170,9 @@ class StudyPages:
                 refused = self._take(text)
                 if refused:
                     log.info("refused: %s", refused)
-                await connection.send(json.dumps({"refused": refused} | {"study": self._conductor.view()}))
+                await connection.send(
+                    json.dumps({"refused": refused} | {"study": self._conductor.view()})
+                )
         finally:
             speaking.cancel()
 

@@ -25,7 +25,8 @@ class Size:
         num_participants: The number.
         smallest_paired_p: Least two-sided p of an exact paired test.
         smallest_p: Least two-sided p of the test over sequences.
-        power: Share of studies that find an effect of each of `EFFECTS_DZ` with the test over sequences.
+        power: Share of studies that find an effect of each of `EFFECTS_DZ` with the test over
+            sequences.
     """
 
     num_participants: int
@@ -50,7 +51,9 @@ def size(num: int, alpha: float) -> Size:
     studies = min(STUDIES, MOST_COUNTED // ways) if ways <= exact.MOST_WAYS else STUDIES
     chance = np.random.default_rng(num).standard_normal((studies, num))
     power = [
-        float((exact.sequence_p(chance + np.where(first, dz, -dz), first) <= alpha).mean()) if smallest <= alpha else 0.0
+        float((exact.sequence_p(chance + np.where(first, dz, -dz), first) <= alpha).mean())
+        if smallest <= alpha
+        else 0.0
         for dz in EFFECTS_DZ
     ]
     return Size(num, exact.smallest_paired_p(num), smallest, tuple(power))
@@ -58,10 +61,14 @@ def size(num: int, alpha: float) -> Size:
 
 def enough(alpha: float, power: float = 0.8, effect: int = 1, most: int = 40) -> int | None:
     """Returns the least even number of participants that finds an effect of `EFFECTS_DZ[effect]` with `power`."""
-    return next((num for num in range(6, most + 1, 2) if size(num, alpha).power[effect] >= power), None)
+    return next(
+        (num for num in range(6, most + 1, 2) if size(num, alpha).power[effect] >= power), None
+    )
 
 
 def least(alpha: float) -> tuple[int, int]:
     """Returns the least numbers with which a paired test, and the test over sequences, can reach `alpha` at all."""
     paired = next(num for num in range(1, 100) if exact.smallest_paired_p(num) <= alpha)
-    return paired, next(num for num in range(2, 100) if exact.smallest_sequence_p((num + 1) // 2, num) <= alpha)
+    return paired, next(
+        num for num in range(2, 100) if exact.smallest_sequence_p((num + 1) // 2, num) <= alpha
+    )

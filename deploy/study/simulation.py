@@ -26,7 +26,9 @@ NOTICE = "simulated operators: no person took part, and nothing here is evidence
 class Nowhere:
     """No simulator: studies are planned, done by people and reported, as on the machine's own computer."""
 
-    def run(self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel) -> list[Recording]:
+    def run(
+        self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
+    ) -> list[Recording]:
         """Is never asked: the study refuses before it begins; see `brokk_rl.contracts.TrialGround`."""
         raise NotImplementedError
 
@@ -66,16 +68,30 @@ def simulate(
         depth_m=design.success.depth_m,
         clearance_m=design.success.clearance_m,
     )
-    operators = Divided(machine, persons, is_guided, guided, unguided, session.stream("study operators"))
+    operators = Divided(
+        machine, persons, is_guided, guided, unguided, session.stream("study operators")
+    )
     loads: dict[tuple[str, int], list[float]] = {}
     for trial, recording in zip(todo, ground.run(machine, session, batch, operators), strict=True):
         path = folder / folders.RECORDINGS / f"{trial.name}.parquet"
         record.write(recording, path)
-        found = measure(recording, machine, design.holes[trial.hole], design.success, design.limit_s)
+        found = measure(
+            recording, machine, design.holes[trial.hole], design.success, design.limit_s
+        )
         kind = type(guided if trial.condition == "guided" else unguided).__name__.lower()
-        facts: dict[str, Any] = {**asdict(trial), "hole": {"name": trial.hole, **asdict(design.holes[trial.hole])}}
-        facts |= {"limit_s": design.limit_s, "outcome": "inserted" if found["success"] else "time limit"}
-        facts |= {"recording": f"{folders.RECORDINGS}/{path.name}", "simulated": True, "operator": kind}
+        facts: dict[str, Any] = {
+            **asdict(trial),
+            "hole": {"name": trial.hole, **asdict(design.holes[trial.hole])},
+        }
+        facts |= {
+            "limit_s": design.limit_s,
+            "outcome": "inserted" if found["success"] else "time limit",
+        }
+        facts |= {
+            "recording": f"{folders.RECORDINGS}/{path.name}",
+            "simulated": True,
+            "operator": kind,
+        }
         folders.write_trial(folder, trial.name, facts)
         loads.setdefault((trial.participant, trial.period), []).append(
             found["time_s"] / design.limit_s + 0.1 * found["control_effort"]
@@ -91,9 +107,15 @@ def answered(load: float, habit: float, generator: np.random.Generator) -> dict[
     """Returns a questionnaire as made up from how long and busy the trials were; it has the form of answers, no more."""
     middle = 25.0 + 60.0 * load + habit
     ratings = {
-        scale: int(np.clip(tlx.STEP * round((middle + generator.normal(0.0, 8.0)) / tlx.STEP), 0, 100)) for scale in tlx.SCALES
+        scale: int(
+            np.clip(tlx.STEP * round((middle + generator.normal(0.0, 8.0)) / tlx.STEP), 0, 100)
+        )
+        for scale in tlx.SCALES
     }
-    chosen = [{"pair": list(pair), "chosen": pair[int(generator.integers(2))]} for pair in tlx.pairs(generator)]
+    chosen = [
+        {"pair": list(pair), "chosen": pair[int(generator.integers(2))]}
+        for pair in tlx.pairs(generator)
+    ]
     return {"ratings": ratings, "pairs": chosen, "note": NOTICE}
 
 
@@ -110,12 +132,21 @@ class Divided:
     """
 
     def __init__(
-        self, machine: Machine, persons: np.ndarray, is_guided: np.ndarray, guided: Operator, unguided: Operator, seed: int
+        self,
+        machine: Machine,
+        persons: np.ndarray,
+        is_guided: np.ndarray,
+        guided: Operator,
+        unguided: Operator,
+        seed: int,
     ) -> None:
         self._shape = (len(persons), machine.num_joints)
         self._parts: list[tuple[np.ndarray, OperatorModel]] = [
             (rows, operator.build(machine, persons[rows], seed))
-            for rows, operator in ((np.flatnonzero(is_guided), guided), (np.flatnonzero(~is_guided), unguided))
+            for rows, operator in (
+                (np.flatnonzero(is_guided), guided),
+                (np.flatnonzero(~is_guided), unguided),
+            )
             if len(rows)
         ]
 
@@ -123,5 +154,7 @@ class Divided:
         """See `brokk_rl.contracts.OperatorModel`."""
         given = np.zeros(self._shape)
         for rows, model in self._parts:
-            given[rows] = model.step(OperatorView(view.q[rows], view.rim_in_base_m[rows], view.advice[rows]))
+            given[rows] = model.step(
+                OperatorView(view.q[rows], view.rim_in_base_m[rows], view.advice[rows])
+            )
         return given

@@ -24,7 +24,8 @@ from deploy.study.trial import Times
 from deploy.twin.bench import Bench
 
 LOCK, TARGET = ".sitting", "target.json"
-"""File in the study's folder that one program at a time holds; file in the run folder that says to the loop where the hole is."""
+"""File in the study's folder that one program at a time holds; file in the run folder that says to
+the loop where the hole is."""
 
 
 @spec
@@ -41,7 +42,9 @@ class Consent:
 
     def check(self) -> None:
         if missing := {"en", "de"} - set(self.text):
-            raise ConfigError(f"study.sitting.consent.text: no text in {', '.join(sorted(missing))}")
+            raise ConfigError(
+                f"study.sitting.consent.text: no text in {', '.join(sorted(missing))}"
+            )
 
 
 @spec
@@ -50,7 +53,8 @@ class Sitting:
 
     Attributes:
         loop: The loop on the machine's computer; listens, shows, records.
-        bench: The twin, and a simulated participant, in place of machine and person; `null` on a machine.
+        bench: The twin, and a simulated participant, in place of machine and person; `null` on a
+            machine.
         page: The operator's page.
         consent: What is agreed to.
         times: How a trial begins and ends.
@@ -64,25 +68,38 @@ class Sitting:
 
     def check(self) -> None:
         if self.loop.commands:
-            raise ConfigError("study.do=run: in a study people move the machine; deploy=listen, not deploy=auto")
+            raise ConfigError(
+                "study.do=run: in a study people move the machine; deploy=listen, not deploy=auto"
+            )
         if isinstance(self.bench, Bench) and self.bench.operator is not None:
-            raise ConfigError("study.do=run: that operator follows advice that is not shown; bench=participant, or bench=twin")
+            raise ConfigError(
+                "study.do=run: that operator follows advice that is not shown; bench=participant, or bench=twin"
+            )
 
-    def run(self, machine: Machine, session: Session, folder: Path, participant: str | None) -> None:
+    def run(
+        self, machine: Machine, session: Session, folder: Path, participant: str | None
+    ) -> None:
         """Leads sittings until a person stops the program.
 
         Raises:
-            ConfigError: the folder holds no study of this machine, the plan has no such participant, or another program leads
-                sittings of this study.
+            ConfigError: the folder holds no study of this machine, the plan has no such
+                participant, or another program leads sittings of this study.
         """
         data = folders.read(folder)
         machine.check_fingerprint(data.plan["fingerprint"], f"the study in {folder}")
         there = [who for who in data.plan["participants"] if who not in data.plan.get("erased", {})]
         if participant is not None and participant not in there:
-            raise ConfigError(f"study.participant={participant}: nobody of the plan; {choices(participant, there)}")
+            raise ConfigError(
+                f"study.participant={participant}: nobody of the plan; {choices(participant, there)}"
+            )
         target = session.folder / TARGET
-        loop = replace(self.loop, page=None, record=False, show=False, target=File(path=str(target)))
-        limits, operators = loop.limits, self.bench.operators if isinstance(self.bench, Participant) else {}
+        loop = replace(
+            self.loop, page=None, record=False, show=False, target=File(path=str(target))
+        )
+        limits, operators = (
+            loop.limits,
+            self.bench.operators if isinstance(self.bench, Participant) else {},
+        )
         room = Sitters(
             beside=Beside(
                 self.page, machine, loop.guidance, session, limits.joints_s, limits.levers_s, loop.target_s,
@@ -99,7 +116,11 @@ class Sitting:
         )  # fmt: skip
         beside = self.bench.companions(machine, session) if self.bench else []
         with alone(folder):
-            loop.run(machine, session, [*beside, Companion("study", "deploy.study.room:run", (room,), None)])
+            loop.run(
+                machine,
+                session,
+                [*beside, Companion("study", "deploy.study.room:run", (room,), None)],
+            )
 
 
 @contextmanager
@@ -109,5 +130,7 @@ def alone(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise ConfigError(f"{folder}: sittings of this study go on already, in another program; end that one first") from error
+            raise ConfigError(
+                f"{folder}: sittings of this study go on already, in another program; end that one first"
+            ) from error
         yield

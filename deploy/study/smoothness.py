@@ -1,7 +1,7 @@
 """Smoothness of a movement: spectral arc length of its speed.
 
-Source: Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet, J. NeuroEng. Rehabil. 12 (2015) 112 (SPARC), with their
-parameters (cut-off 10 Hz, threshold 0.05, padding by 2**4).
+Source: Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet, J. NeuroEng. Rehabil. 12 (2015)
+112 (SPARC), with their parameters (cut-off 10 Hz, threshold 0.05, padding by 2**4).
 """
 
 from __future__ import annotations

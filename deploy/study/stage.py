@@ -27,7 +27,8 @@ FRESH_S = 0.3
 CLOSING_S = 15.0
 """How long a capture may take to be closed before what is there is read."""
 GAP_S, LONGEST_GAP_S = 0.2, 1.0
-"""Silence of the bus in a trial from which it is said, and the longest that is filled in between its ends."""
+"""Silence of the bus in a trial from which it is said, and the longest that is filled in between
+its ends."""
 FILLED = "filled"
 """Metadata of a recording that says so."""
 
@@ -65,7 +66,8 @@ class Stage(Protocol):
     def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
         """Returns what was recorded in `folder` between two times, once the recording has been closed.
 
-        Where the bus was silent for a moment, positions go straight from one end of it to the other; the metadata `filled` says so.
+        Where the bus was silent for a moment, positions go straight from one end of it to the
+        other; the metadata `filled` says so.
 
         Raises:
             RecordingError: it cannot be used.
@@ -83,19 +85,31 @@ class LoopStage:
         port: Where the twin can be told to be put elsewhere; `None` on a machine.
     """
 
-    def __init__(self, exchange: Exchange, machine: Machine, target: Path, port: int | None) -> None:
+    def __init__(
+        self, exchange: Exchange, machine: Machine, target: Path, port: int | None
+    ) -> None:
         self._exchange, self._machine, self._target, self._port = exchange, machine, target, port
 
     def sight(self) -> Sight:
         """See `Stage`."""
-        state, advice, controls = self._exchange.state.read(), self._exchange.advice.read(), self._exchange.controls.read()
+        state, advice, controls = (
+            self._exchange.state.read(),
+            self._exchange.advice.read(),
+            self._exchange.controls.read(),
+        )
         now_s = time.monotonic()
-        fresh = state is not None and now_s - float(state["q_t_s"]) < FRESH_S and bool(state["q_plausible"])
+        fresh = (
+            state is not None
+            and now_s - float(state["q_t_s"]) < FRESH_S
+            and bool(state["q_plausible"])
+        )
         advised = Advised.NO_STATE
         if advice is not None and now_s - float(advice["t_s"]) < FRESH_S:
             advised = REASONS[int(advice["reason"])]
         recording = controls is not None and bool(controls["recording"])
-        return Sight(np.array(state["q"]) if fresh and state is not None else None, advised.value, recording)
+        return Sight(
+            np.array(state["q"]) if fresh and state is not None else None, advised.value, recording
+        )
 
     def prepare(self, hole: Hole, start: np.ndarray) -> None:
         """See `Stage`."""
@@ -105,11 +119,17 @@ class LoopStage:
             try:
                 ask(self._port, {"place": place}, timeout_s=2.0)
             except OSError as error:
-                raise RecordingError(f"the twin does not answer on port {self._port} ({error}); is it running?") from error
+                raise RecordingError(
+                    f"the twin does not answer on port {self._port} ({error}); is it running?"
+                ) from error
 
     def record(self, folder: Path | None) -> None:
         """See `Stage`."""
-        wish = {"kind": "record", "value": "off"} if folder is None else {"kind": "record", "value": "on", "into": str(folder)}
+        wish = (
+            {"kind": "record", "value": "off"}
+            if folder is None
+            else {"kind": "record", "value": "on", "into": str(folder)}
+        )
         self._exchange.wishes.put(json.dumps(wish).encode())
 
     def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
@@ -118,7 +138,17 @@ class LoopStage:
         while not (path.exists() and reading.is_whole(path)) and time.monotonic() < patience_s:
             time.sleep(0.2)
         try:
-            return CaptureLog(longest_gap_s=GAP_S, shortest_s=0.0).between(path, self._machine, begin_s, end_s)
+            return CaptureLog(longest_gap_s=GAP_S, shortest_s=0.0).between(
+                path, self._machine, begin_s, end_s
+            )
         except RecordingError:
-            found = CaptureLog(longest_gap_s=LONGEST_GAP_S, shortest_s=0.0).between(path, self._machine, begin_s, end_s)
-        return replace(found, metadata={**found.metadata, FILLED: f"silences of up to {LONGEST_GAP_S:g} s are filled in"})
+            found = CaptureLog(longest_gap_s=LONGEST_GAP_S, shortest_s=0.0).between(
+                path, self._machine, begin_s, end_s
+            )
+        return replace(
+            found,
+            metadata={
+                **found.metadata,
+                FILLED: f"silences of up to {LONGEST_GAP_S:g} s are filled in",
+            },
+        )

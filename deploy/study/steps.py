@@ -1,6 +1,7 @@
 """Where a participant's sitting stands, read from the study's folder alone: what comes next after any interruption stands there.
 
-Consent, practice, the trials of the first period, its questionnaire, the trials of the second, its questionnaire.
+Consent, practice, the trials of the first period, its questionnaire, the trials of the second, its
+questionnaire.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ class Step:
     """What comes next.
 
     Attributes:
-        kind: Consent, a trial, a questionnaire, nothing more, or nothing because the participant has stopped.
+        kind: Consent, a trial, a questionnaire, nothing more, or nothing because the participant
+            has stopped.
         trial: The trial, where it is one.
         period: Of the trial or questionnaire; 0 for practice.
         condition: Of the trial, or of the period that the questionnaire is about.
@@ -44,18 +46,35 @@ def next_step(data: StudyData, who: str) -> Step:
     if not (known.get("consent") or {}).get("agreed"):
         return Step("consent")
     for period in (0, *PERIODS):
-        planned = [Trial(**trial) for trial in data.plan["trials"] if trial["participant"] == who and trial["period"] == period]
+        planned = [
+            Trial(**trial)
+            for trial in data.plan["trials"]
+            if trial["participant"] == who and trial["period"] == period
+        ]
         lacking = [trial for trial in planned if (who, period, trial.number) not in data.trials]
         if lacking and not (period == 0 and practised(data, who)):
-            return Step("trial", lacking[0], period, lacking[0].condition, len(planned) - len(lacking), len(planned))
-        if period and not data.questionnaires.get((who, period), {"finished": False}).get("finished", True):
+            return Step(
+                "trial",
+                lacking[0],
+                period,
+                lacking[0].condition,
+                len(planned) - len(lacking),
+                len(planned),
+            )
+        if period and not data.questionnaires.get((who, period), {"finished": False}).get(
+            "finished", True
+        ):
             return Step("questionnaire", None, period, data.plan["participants"][who][period - 1])
     return Step("done")
 
 
 def practised(data: StudyData, who: str) -> bool:
     """Says whether practice is over before all of it was done: by success, by time, or because the experimenter said so."""
-    done = [trial for (name, period, _), trial in sorted(data.trials.items()) if name == who and not period]
+    done = [
+        trial
+        for (name, period, _), trial in sorted(data.trials.items())
+        if name == who and not period
+    ]
     row = [trial.get("outcome") == "inserted" for trial in done[-ENOUGH:]]
     minutes = sum(float(trial.get("seconds", 0.0)) for trial in done) / 60.0
     ended = bool(data.participants.get(who, {}).get("practice_ended"))
@@ -67,9 +86,19 @@ def progress(data: StudyData) -> list[dict[str, Any]]:
     found = []
     for who in data.plan["participants"]:
         done = sum(name == who and period > 0 for name, period, _ in data.trials)
-        of = sum(trial["participant"] == who and trial["period"] > 0 for trial in data.plan["trials"])
+        of = sum(
+            trial["participant"] == who and trial["period"] > 0 for trial in data.plan["trials"]
+        )
         step = next_step(data, who).kind
-        state = "erased" if who in data.plan.get("erased", {}) else step if step in ("done", "stopped") else ""
+        state = (
+            "erased"
+            if who in data.plan.get("erased", {})
+            else step
+            if step in ("done", "stopped")
+            else ""
+        )
         begun = who in data.participants
-        found.append({"name": who, "done": done, "of": of, "state": state or ("begun" if begun else "new")})
+        found.append(
+            {"name": who, "done": done, "of": of, "state": state or ("begun" if begun else "new")}
+        )
     return found

@@ -51,7 +51,14 @@ class Steps:
     num_studies: int
     sitting: Sitting
 
-    def run(self, machine: Machine, session: Session, ground: TrialGround, guided: Operator, unguided: Operator) -> None:
+    def run(
+        self,
+        machine: Machine,
+        session: Session,
+        ground: TrialGround,
+        guided: Operator,
+        unguided: Operator,
+    ) -> None:
         """Does the step `do`; see `brokk_rl.modes.study.Steps`."""
         if self.do == "plan":
             self._plan(machine, session)
@@ -59,25 +66,47 @@ class Steps:
             self._erase(session)
         elif self.do == "run":
             if self.folder is None:
-                raise ConfigError("study.do=run needs study.folder=<folder>: the study that study.do=plan has planned")
+                raise ConfigError(
+                    "study.do=run needs study.folder=<folder>: the study that study.do=plan has planned"
+                )
             self.sitting.run(machine, session, Path(self.folder), self.participant)
         elif self.do == "simulate":
             if isinstance(ground, Nowhere):
-                raise ConfigError("study.do=simulate needs a simulator: ground=twin or ground=simulated")
+                raise ConfigError(
+                    "study.do=simulate needs a simulator: ground=twin or ground=simulated"
+                )
             planned = self._plan(machine, session, is_simulated=True)
-            simulate(self._home(session), self.design, planned, machine, session, ground, guided, unguided)
+            simulate(
+                self._home(session),
+                self.design,
+                planned,
+                machine,
+                session,
+                ground,
+                guided,
+                unguided,
+            )
             self._report(machine, session)
         else:
             self._report(machine, session)
 
-    def _plan(self, machine: Machine, session: Session, is_simulated: bool = False) -> list[designs.Trial]:
+    def _plan(
+        self, machine: Machine, session: Session, is_simulated: bool = False
+    ) -> list[designs.Trial]:
         plan = plan_study(self.design, machine, session)
         folder = self._home(session)
         if (folder / folders.PLAN).exists():
-            raise ConfigError(f"{folder} already holds a study; plan another one with study.folder=<folder>")
-        errors = study_errors(self.design, self.practice, self.num_studies, session.stream("study errors"))
+            raise ConfigError(
+                f"{folder} already holds a study; plan another one with study.folder=<folder>"
+            )
+        errors = study_errors(
+            self.design, self.practice, self.num_studies, session.stream("study errors")
+        )
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / folders.PLAN, designs.as_json(self.design, machine, session.seed, plan) | {"simulated": is_simulated})
+        write_json(
+            folder / folders.PLAN,
+            designs.as_json(self.design, machine, session.seed, plan) | {"simulated": is_simulated},
+        )
         write_json(folder / "plan_errors.json", errors)
         notice = f"The trials of this study are done by {NOTICE}." if is_simulated else ""
         page = plan_page.page(self.design, machine.name, session.seed, plan, errors, notice)
@@ -96,7 +125,9 @@ class Steps:
     def _report(self, machine: Machine, session: Session) -> None:
         data = folders.read(self._home(session))
         machine.check_fingerprint(data.plan["fingerprint"], f"the study in {data.folder}")
-        found = analyse(data, machine, lambda trials: track(trials, "measuring trials", transient=True))
+        found = analyse(
+            data, machine, lambda trials: track(trials, "measuring trials", transient=True)
+        )
         path = report.write(session.folder, data, found)
         folders.note_report(data.folder, session.folder)
         for remark in found.remarks:
@@ -106,13 +137,18 @@ class Steps:
 
     def _erase(self, session: Session) -> None:
         if not self.participant:
-            raise ConfigError("study.do=erase needs study.participant=<pseudonym> and study.folder=<folder>")
+            raise ConfigError(
+                "study.do=erase needs study.participant=<pseudonym> and study.folder=<folder>"
+            )
         folders.read_plan(self._home(session))
         with alone(self._home(session)):
             gone, reports = folders.erase(self._home(session), self.participant)
         log.info("%s erased: %d files deleted", self.participant, len(gone))
         for place in reports:
-            log.warning("%s was made with this participant's data: delete it, and make it again with study.do=report", place)
+            log.warning(
+                "%s was made with this participant's data: delete it, and make it again with study.do=report",
+                place,
+            )
 
     def _home(self, session: Session) -> Path:
         return Path(self.folder) if self.folder else session.folder
@@ -131,12 +167,34 @@ def study_errors(design: Design, practice: Practice, num_studies: int, seed: int
         ("no effect, counterbalanced, period in the model", num, 0.0, False),
         ("large effect, counterbalanced, period in the model", num, PLANTED_DZ, False),
         ("no effect, guidance first for all, paired test", num, 0.0, True),
-        ("no effect, guidance first for all, paired test: the paper's number", PAPER_PERSONS, 0.0, True),
+        (
+            "no effect, guidance first for all, paired test: the paper's number",
+            PAPER_PERSONS,
+            0.0,
+            True,
+        ),
     ]
     found = []
     for what, persons, dz, fixed in cases:
         share = share_significant(
-            practice, persons, trials, design.practice_trials, design.limit_s, dz, design.alpha, num_studies, seed, fixed
+            practice,
+            persons,
+            trials,
+            design.practice_trials,
+            design.limit_s,
+            dz,
+            design.alpha,
+            num_studies,
+            seed,
+            fixed,
         )
-        found.append({"what": what, "num_participants": persons, "planted_dz": dz, "fixed_order": fixed, **share})
+        found.append(
+            {
+                "what": what,
+                "num_participants": persons,
+                "planted_dz": dz,
+                "fixed_order": fixed,
+                **share,
+            }
+        )
     return {"schema": 1, "alpha": design.alpha, "seed": seed, "studies": found}

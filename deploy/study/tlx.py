@@ -1,8 +1,9 @@
 """NASA-TLX: six scales of workload, raw and weighted.
 
-Each scale goes from 0 to 100 in steps of 5; that of performance from good (0) to poor (100), so that more is more load on all six.
-The raw score is their mean; the weighted one weighs each by how often it was chosen in the 15 pairs (Hart and Staveland 1988; Hart
-2006). An answer that is missing makes the score missing: a mean over the rest would be another questionnaire.
+Each scale goes from 0 to 100 in steps of 5; that of performance from good (0) to poor (100), so
+that more is more load on all six. The raw score is their mean; the weighted one weighs each by how
+often it was chosen in the 15 pairs (Hart and Staveland 1988; Hart 2006). An answer that is missing
+makes the score missing: a mean over the rest would be another questionnaire.
 """
 
 from __future__ import annotations

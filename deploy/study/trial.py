@@ -38,7 +38,8 @@ class Times:
     Attributes:
         countdown_s: From the press on the page to the beginning.
         settle_s: For which a recording goes on after the end.
-        start_tolerance: How far each joint may be from the start, rad or m, so that the page calls it there.
+        start_tolerance: How far each joint may be from the start, rad or m, so that the page calls
+            it there.
     """
 
     countdown_s: float
@@ -76,8 +77,16 @@ class Attempt:
         clock: Callable[[], float],
     ) -> None:
         self.trial = trial
-        self._folder, self._start, self._machine, self._stage, self._times = folder, start, machine, stage, times
-        self._hole = Hole(center_in_base_m=tuple(hole["center_in_base_m"]), radius_m=float(hole["radius_m"]))
+        self._folder, self._start, self._machine, self._stage, self._times = (
+            folder,
+            start,
+            machine,
+            stage,
+            times,
+        )
+        self._hole = Hole(
+            center_in_base_m=tuple(hole["center_in_base_m"]), radius_m=float(hole["radius_m"])
+        )
         self._success, self._limit_s = Success(**design["success"]), float(design["limit_s"])
         self._facts, self._clock = facts, clock
         self._phase: Phase = "ready"
@@ -105,9 +114,17 @@ class Attempt:
         if self._stage.sight().q is None:
             return "no positions"
         hole = {"name": self.trial.hole, **asdict(self._hole)}
-        facts: dict[str, Any] = {**asdict(self.trial), "hole": hole, "limit_s": self._limit_s, **self._facts}
+        facts: dict[str, Any] = {
+            **asdict(self.trial),
+            "hole": hole,
+            "limit_s": self._limit_s,
+            **self._facts,
+        }
         # until it is over it stands there as what it would be if everything ended now
-        unfinished = {"outcome": "aborted", "reason": "interrupted: the sitting ended during the trial"}
+        unfinished = {
+            "outcome": "aborted",
+            "reason": "interrupted: the sitting ended during the trial",
+        }
         self._path = folders.write_trial(self._folder, self.trial.name, facts | unfinished)
         self._stage.record(self._captured)
         self._enter("starting")
@@ -115,7 +132,11 @@ class Attempt:
 
     def stop(self) -> str:
         """Ends it for the participant; one that has not begun is left as it is."""
-        return self._end("stopped", "") if self._phase == "running" else self.abort("stopped before it began")
+        return (
+            self._end("stopped", "")
+            if self._phase == "running"
+            else self.abort("stopped before it began")
+        )
 
     def abort(self, reason: str) -> str:
         """Ends it for a fault: it is kept, does not count, and is done again."""
@@ -137,10 +158,17 @@ class Attempt:
         elif self._phase == "countdown" and in_phase_s >= self._times.countdown_s:
             self._began_s = now_s
             if self._path is not None and sight.q is not None:
-                folders.rewrite(self._path, {"start_error": np.round(sight.q - self._start, 4).tolist()})
+                folders.rewrite(
+                    self._path, {"start_error": np.round(sight.q - self._start, 4).tolist()}
+                )
             self._enter("running")
         elif self._phase == "running" and sight.q is not None:
-            inside = insertion(tool(self._machine, sight.q).tip_in_base_m[None], self._hole, self._success) is not None
+            inside = (
+                insertion(
+                    tool(self._machine, sight.q).tip_in_base_m[None], self._hole, self._success
+                )
+                is not None
+            )
             if inside or in_phase_s >= self._limit_s:
                 self._end("inserted" if inside else "time limit", "")
         elif self._phase == "settling" and in_phase_s >= self._times.settle_s:
@@ -156,7 +184,9 @@ class Attempt:
             {"joint": name, "away": round(float(value), 3), "there": bool(abs(value) <= self._times.start_tolerance)}
             for name, value in zip(self._machine.joint_names, away, strict=True)
         ]  # fmt: skip
-        left_s = {"countdown": self._times.countdown_s, "running": self._limit_s}.get(self._phase, 0.0) - (now_s - self._since_s)
+        left_s = {"countdown": self._times.countdown_s, "running": self._limit_s}.get(
+            self._phase, 0.0
+        ) - (now_s - self._since_s)
         return {
             "phase": self._phase, "number": self.trial.number, "hole": self.trial.hole, "start": self.trial.start, "joints": joints,
             "advised": sight.advised, "left_s": round(max(0.0, left_s), 1), "outcome": self._outcome, "reason": self._reason,
@@ -187,7 +217,9 @@ class Attempt:
         self._seconds = self._clock() - self._began_s if ran else 0.0
         self._outcome, self._reason = outcome, reason
         assert self._path is not None
-        folders.rewrite(self._path, {"outcome": outcome, "reason": reason, "seconds": round(self._seconds, 2)})
+        folders.rewrite(
+            self._path, {"outcome": outcome, "reason": reason, "seconds": round(self._seconds, 2)}
+        )
         self._enter("settling")
         if not ran:
             self._save()
@@ -199,15 +231,21 @@ class Attempt:
         assert self._path is not None
         if self._seconds:
             window_s = [self._began_s, end_s]
-            folders.rewrite(self._path, {"capture": f"{folders.CAPTURES}/{self._path.stem}", "window_s": window_s})
-        self._saving = self._worker.submit(keep, self._folder, self._path, self._machine, self._stage)
+            folders.rewrite(
+                self._path,
+                {"capture": f"{folders.CAPTURES}/{self._path.stem}", "window_s": window_s},
+            )
+        self._saving = self._worker.submit(
+            keep, self._folder, self._path, self._machine, self._stage
+        )
         self._enter("saving")
 
 
 def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
     """Makes a recording of what was captured of the trial in the file `path`; what cannot be used is said in that file.
 
-    A trial that began has a `window_s`, so that this can be done again where it was interrupted: the clock is that of the capture.
+    A trial that began has a `window_s`, so that this can be done again where it was interrupted:
+    the clock is that of the capture.
     """
     trial = json.loads(path.read_text())
     if "window_s" not in trial or "recording" in trial or "recording_problem" in trial:
@@ -229,7 +267,11 @@ def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
 def _told(found: record.Recording, trial: dict[str, Any]) -> record.Recording:
     """Returns the recording with the hole, and without advice that was not shown."""
     guided = trial["condition"] == "guided"
-    extra = {name: values for name, values in found.extra.items() if guided or not name.startswith("advice_")}
+    extra = {
+        name: values
+        for name, values in found.extra.items()
+        if guided or not name.startswith("advice_")
+    }
     at = zip("xyz", trial["hole"]["center_in_base_m"], strict=True)
     extra |= {f"target_{axis}_m": np.full(len(found.t_s), value, np.float32) for axis, value in at}
     return replace(found, extra=extra)

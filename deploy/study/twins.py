@@ -1,9 +1,11 @@
 """Where simulated operators do trials on the twin: the real time's own parts, one process, and a clock that runs as fast as it can.
 
-Each trial has a twin (`deploy.twin`: plant, gateway, its messages), a remote, and of the loop the receiver and the adviser with
-policy and lever display. Frames go through the bus description both ways: coded, counted, checked. What is not there: a bus with
-latencies, processes and their scheduling, guard and page. A simulated person sees an advice in the control period in which it is
-made, a real one some tens of milliseconds later.
+Each trial has a twin (`deploy.twin`: plant, gateway, its messages), a remote, and of the loop the
+receiver and the adviser with
+policy and lever display. Frames go through the bus description both ways: coded, counted, checked.
+What is not there: a bus with latencies, processes and their scheduling, guard and page. A simulated
+person sees an advice in the control period in which it is made, a real one some tens of
+milliseconds later.
 Axes: `N` trials, `J` joints.
 """
 
@@ -71,21 +73,36 @@ class Twins:
         if self.num_processes < 0:
             raise ConfigError(f"ground.num_processes: expected 0 or more, got {self.num_processes}")
 
-    def run(self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel) -> list[Recording]:
+    def run(
+        self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
+    ) -> list[Recording]:
         """See `brokk_rl.contracts.TrialGround`."""
         num, nothing = len(trials.q), np.full(machine.num_joints, np.nan)
-        places = [(session.stream(f"twin {n}"), trials.q[n], trials.rim_in_base_m[n], bool(trials.guided[n])) for n in range(num)]
+        places = [
+            (
+                session.stream(f"twin {n}"),
+                trials.q[n],
+                trials.rim_in_base_m[n],
+                bool(trials.guided[n]),
+            )
+            for n in range(num)
+        ]
         processes = min(self.num_processes or cores(), num)
         rows = [np.arange(first, num, processes) for first in range(processes)]
         parts = [(self, machine, session, [places[n] for n in mine]) for mine in rows]
-        steps, left = round(trials.limit_s / machine.period_s), np.full(num, round(self.settle_s / machine.period_s))
+        steps, left = (
+            round(trials.limit_s / machine.period_s),
+            np.full(num, round(self.settle_s / machine.period_s)),
+        )
         running = np.ones(num, bool)
         with Crew("deploy.study.twins:desks", parts, rows, num) as crew:
             now, found = crew.ask("seen", running), dict[int, Recording]()
             for _ in track(range(steps), "simulated operators at the twin", transient=True):
                 q = np.stack([now[n][0] for n in range(num)])
                 advice = np.stack([now[n][1] if trials.guided[n] else nothing for n in range(num)])
-                given = operators.step(OperatorView(q=q, rim_in_base_m=trials.rim_in_base_m, advice=advice))
+                given = operators.step(
+                    OperatorView(q=q, rim_in_base_m=trials.rim_in_base_m, advice=advice)
+                )
                 now |= crew.ask("period", running, given)
                 left -= _inserted(machine, q, trials) & running
                 found |= crew.ask("end", running & (left <= 0))
@@ -96,11 +113,17 @@ class Twins:
         return [found[n] for n in range(num)]
 
 
-def desks(ground: Twins, machine: Machine, session: Session, places: list[tuple[int, np.ndarray, np.ndarray, bool]]) -> list[_Desk]:
+def desks(
+    ground: Twins,
+    machine: Machine,
+    session: Session,
+    places: list[tuple[int, np.ndarray, np.ndarray, bool]],
+) -> list[_Desk]:
     """Returns a desk for each of `places`: seed, start, rim, and whether advice is shown there."""
     bundle, description = Bundle(ground.policy, machine), Description(ground.dbc, machine)
     made = [
-        _Desk(ground, machine, description, bundle, replace(session, seed=seed), q, rim, guided) for seed, q, rim, guided in places
+        _Desk(ground, machine, description, bundle, replace(session, seed=seed), q, rim, guided)
+        for seed, q, rim, guided in places
     ]
     for desk in made:
         desk.wait(BEFORE_S)
@@ -109,7 +132,9 @@ def desks(ground: Twins, machine: Machine, session: Session, places: list[tuple[
 
 def _inserted(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray:
     away = tool(machine, q).tip_in_base_m - trials.rim_in_base_m
-    return (np.hypot(away[:, 0], away[:, 1]) <= trials.clearance_m) & (away[:, 2] <= -trials.depth_m)
+    return (np.hypot(away[:, 0], away[:, 1]) <= trials.clearance_m) & (
+        away[:, 2] <= -trials.depth_m
+    )
 
 
 class _Newest:
@@ -170,18 +195,35 @@ class _Desk:
         placed = replace(ground.plant, start=start, hole_in_base_m=hole)  # type: ignore[type-var]
         self._link, self._air = placed.build(machine, 1, session), _Air()
         twin = Twin(
-            wire=NO_BUS, dbc=ground.dbc, remote=False, deadman=False, again_s=None, fault_port=None, seconds=None, realtime=False
+            wire=NO_BUS,
+            dbc=ground.dbc,
+            remote=False,
+            deadman=False,
+            again_s=None,
+            fault_port=None,
+            seconds=None,
+            realtime=False,
         )
         self._twin = Running(twin, machine, self._link, self._air, FaultPort(None))
-        self._remote, self._receiver = Remote(description), Receiver(description, machine, ground.limits)
+        self._remote, self._receiver = (
+            Remote(description),
+            Receiver(description, machine, ground.limits),
+        )
         self._remote.deadman = True
         target = np.zeros((), TARGET)
         target["t_s"], target["center_in_base_m"] = BEGIN_S, rim_m
         fields = state_fields(machine.num_joints), advice_fields(machine.num_joints)
-        self._shared = _Shared(_Newest(fields[0]), _Newest(fields[1]), _Newest(TARGET, target), None, _NoLog())
-        counsel = Counsel(machine, ground.policy, ground.guidance, ground.limits.joints_s, 1e9, None)
+        self._shared = _Shared(
+            _Newest(fields[0]), _Newest(fields[1]), _Newest(TARGET, target), None, _NoLog()
+        )
+        counsel = Counsel(
+            machine, ground.policy, ground.guidance, ground.limits.joints_s, 1e9, None
+        )
         self._adviser = Adviser(counsel, bundle, self._shared)  # type: ignore[arg-type]
-        self._own, self._display = LeverMap(machine.levers, machine), LeverMap(ground.guidance.levers or machine.levers, machine)
+        self._own, self._display = (
+            LeverMap(machine.levers, machine),
+            LeverMap(ground.guidance.levers or machine.levers, machine),
+        )
         self._full_rad, self._cycles = axis_full_rad(machine), 0
         self._rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
         self._shown = np.zeros(machine.num_joints)
@@ -204,7 +246,11 @@ class _Desk:
         angles_rad, self._remote.button_right = self._own.levers(given)
         self._remote.levers = (angles_rad / self._full_rad).clip(-1.0, 1.0).tolist()
         advised = self._shared.advice.read()
-        advice = np.full(len(given), np.nan) if advised is None or int(advised["reason"]) != VALID else np.array(advised["u"])
+        advice = (
+            np.full(len(given), np.nan)
+            if advised is None or int(advised["reason"]) != VALID
+            else np.array(advised["u"])
+        )
         for _ in range(round(self._machine.period_s / CYCLE_S)):
             self._cycle()
         u = (receiver.flow_sum - before[0]) / max(1, receiver.flow_number - before[1])
@@ -228,13 +274,23 @@ class _Desk:
         """Publishes what is known, as the bus process does, and lets the policy speak."""
         receiver, record, now_s = self._receiver, self._shared.state.new(), self._now_s
         seen = receiver.seen(now_s, bus_up=True)
-        record["t_s"], record["q"], record["q_t_s"] = now_s, receiver.q, max(0.0, receiver.q_t_s.min())
+        record["t_s"], record["q"], record["q_t_s"] = (
+            now_s,
+            receiver.q,
+            max(0.0, receiver.q_t_s.min()),
+        )
         record["q_plausible"], record["trusted"] = seen.joints_plausible, seen.trusted
-        record["flow"], record["flow_sum"], record["flow_number"] = receiver.flow, receiver.flow_sum, receiver.flow_number
+        record["flow"], record["flow_sum"], record["flow_number"] = (
+            receiver.flow,
+            receiver.flow_sum,
+            receiver.flow_number,
+        )
         self._shared.state.write(record)
         self._adviser.cycle(0, now_s)
         advice = self._shared.advice.read()
-        self._shown = self._display.command(np.array(advice["lever_rad"]), bool(advice["button_right"]))
+        self._shown = self._display.command(
+            np.array(advice["lever_rad"]), bool(advice["button_right"])
+        )
 
     def end(self) -> Recording:
         """Returns the recording, and lets go of the twin: its memory is wanted for nothing any more."""
@@ -245,9 +301,14 @@ class _Desk:
     def recording(self) -> Recording:
         """Returns the trial at the control rate, commands as the valves got them."""
         machine = self._machine
-        q, u, advice = (np.stack([row[i] for row in self._rows]).astype(np.float32) for i in range(3))
+        q, u, advice = (
+            np.stack([row[i] for row in self._rows]).astype(np.float32) for i in range(3)
+        )
         extra = {"force_n": np.array([row[3] for row in self._rows], np.float32)}
-        extra |= {f"target_{axis}_m": np.full(len(q), self._rim_m[i], np.float32) for i, axis in enumerate("xyz")}
+        extra |= {
+            f"target_{axis}_m": np.full(len(q), self._rim_m[i], np.float32)
+            for i, axis in enumerate("xyz")
+        }
         if self._guided:
             extra |= {f"advice_{name}": advice[:, j] for j, name in enumerate(machine.joint_names)}
         return Recording(

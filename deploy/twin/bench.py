@@ -21,9 +21,11 @@ class Bench:
     Attributes:
         twin: The twin.
         plant: The simulated machine behind it.
-        operator: Who moves the levers as they are shown; `null`: nobody, the levers stay in neutral.
+        operator: Who moves the levers as they are shown; `null`: nobody, the levers stay in
+            neutral.
         guidance: How the levers are shown.
-        assumed: What policies for such an operator assume of them (`advice=person`), for the record; `null` without one.
+        assumed: What policies for such an operator assume of them (`advice=person`), for the
+            record; `null` without one.
     """
 
     twin: Twin
@@ -40,13 +42,23 @@ class Bench:
 
     def companions(self, machine: Machine, session: Session) -> list[Companion]:
         """Returns the processes to run beside the loop."""
-        found = [Companion("twin", "deploy.twin.twin:run", (self.twin, machine, self.plant, session), TWIN_PRIORITY)]
+        found = [
+            Companion(
+                "twin",
+                "deploy.twin.twin:run",
+                (self.twin, machine, self.plant, session),
+                TWIN_PRIORITY,
+            )
+        ]
         if self.operator is not None:
             levers = LeverMap(self.guidance.levers or machine.levers, machine)
             wire, dbc, seed = self.twin.wire, self.twin.dbc, session.stream("operator")
             found.append(
                 Companion(
-                    "operator", "deploy.twin.remote:operate", (wire, dbc, machine, self.operator, levers, seed), TWIN_PRIORITY
+                    "operator",
+                    "deploy.twin.remote:operate",
+                    (wire, dbc, machine, self.operator, levers, seed),
+                    TWIN_PRIORITY,
                 )
             )
         return found

@@ -1,8 +1,9 @@
 """Faults on request: what can go wrong with messages and machine, switched on over a local port. Off unless a port is configured.
 
-A request is one JSON datagram: `{"fault": "drop", "message": "JointPos1", "seconds": 0.2}`. `message` names one message, or is left
-out for all; without `seconds` a fault stays until `{"fault": "none"}`. The same port takes
-`{"place": {"q": [...], "hole_in_base_m": [x, y, z]}}`: machine and block are put elsewhere, as somebody does between two trials.
+A request is one JSON datagram: `{"fault": "drop", "message": "JointPos1", "seconds": 0.2}`.
+`message` names one message, or is left out for all; without `seconds` a fault stays until
+`{"fault": "none"}`. The same port takes `{"place": {"q": [...], "hole_in_base_m": [x, y, z]}}`:
+machine and block are put elsewhere, as somebody does between two trials.
 """
 
 from __future__ import annotations
@@ -29,14 +30,23 @@ FRAME_FAULTS = (
     "freeze_counter",
     "masquerade",
 )
-"""Faults of messages on their way: not sent, one in ten not sent, sent twice, swapped with the next, sent 0.2 s late, one bit
-wrong, cut short, under another identifier, with a counter that stands still, with the CRC of another message."""
+"""Faults of messages on their way: not sent, one in ten not sent, sent twice, swapped with the
+next, sent 0.2 s late, one bit wrong, cut short, under another identifier, with a counter that
+stands still, with the CRC of another message."""
 SIGNAL_FAULTS = ("stuck", "jump", "drift", "out_of_range", "sign", "invalid")
-"""Faults of the measured position of the first joint: stands still, one jump, drifts, beyond its limits, wrong sign, called
-invalid."""
-MACHINE_FAULTS = ("estop", "deadman_released", "remote_off", "lever", "second_sender", "flood", "silent")
-"""Faults of the machine: emergency stop, dead-man or remote let go, a lever moved, another node that sends commands, a babbling
-node, nothing sent at all."""
+"""Faults of the measured position of the first joint: stands still, one jump, drifts, beyond its
+limits, wrong sign, called invalid."""
+MACHINE_FAULTS = (
+    "estop",
+    "deadman_released",
+    "remote_off",
+    "lever",
+    "second_sender",
+    "flood",
+    "silent",
+)
+"""Faults of the machine: emergency stop, dead-man or remote let go, a lever moved, another node
+that sends commands, a babbling node, nothing sent at all."""
 KNOWN = ("none", *FRAME_FAULTS, *SIGNAL_FAULTS, *MACHINE_FAULTS)
 
 
@@ -64,11 +74,20 @@ class Faults:
         try:
             asked = json.loads(text)
             if "place" in asked:
-                self._place = [float(q) for q in asked["place"]["q"]], [float(x) for x in asked["place"]["hole_in_base_m"]]
+                self._place = (
+                    [float(q) for q in asked["place"]["q"]],
+                    [float(x) for x in asked["place"]["hole_in_base_m"]],
+                )
                 return
-            fault, message, seconds = asked["fault"], asked.get("message", ""), float(asked.get("seconds", 1e9))
+            fault, message, seconds = (
+                asked["fault"],
+                asked.get("message", ""),
+                float(asked.get("seconds", 1e9)),
+            )
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ConfigError(f"fault: expected JSON with 'fault', got {text[:80]!r} ({error})") from error
+            raise ConfigError(
+                f"fault: expected JSON with 'fault', got {text[:80]!r} ({error})"
+            ) from error
         if fault not in KNOWN:
             raise ConfigError(f"fault: there is no '{fault}'; {choices(str(fault), KNOWN)}")
         if fault == "none":

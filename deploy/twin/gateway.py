@@ -4,8 +4,9 @@
     valid commands, dead-man held         the PC has them, after three frames with mode idle
     otherwise                             zero flow
 
-Commands that stay away for `TIMEOUT_S`, whose counter stands still or whose CRC is wrong count as missing; the PC then begins again
-with idle frames. Zero flow at an emergency stop, and when the remote is lost.
+Commands that stay away for `TIMEOUT_S`, whose counter stands still or whose CRC is wrong count as
+missing; the PC then begins again with idle frames. Zero flow at an emergency stop, and when the
+remote is lost.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from deploy.bus.wire import Wired
 from deploy.guidance import AXES, LeverMap, full_angles_rad
 
 TIMEOUT_S = 0.07
-"""Age of the last valid command from which there is none; three cycles and a half, within the 100 ms that are promised."""
+"""Age of the last valid command from which there is none; three cycles and a half, within the 100
+ms that are promised."""
 REMOTE_S, FORGET_S = 0.13, 1.0
 IDLE_FRAMES = 3
 NEUTRAL = 0.03
@@ -97,7 +99,11 @@ class Gateway:
             return nothing, NOBODY, GatewayState.STOPPED
         if np.abs(self._lever).max() > NEUTRAL:
             self._idle = 0
-            return self._map.command(self._lever * self._axis_full_rad, self._button), LEVERS, GatewayState.LEVERS
+            return (
+                self._map.command(self._lever * self._axis_full_rad, self._button),
+                LEVERS,
+                GatewayState.LEVERS,
+            )
         if now_s - self._u_s > TIMEOUT_S or not self._trusts(self._command.name):
             self._idle = 0
             return nothing, NOBODY, GatewayState.TIMEOUT

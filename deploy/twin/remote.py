@@ -42,16 +42,27 @@ class Remote:
 
     def frame(self, frozen: int | None = None) -> Wired:
         """Returns the next message; `frozen` is a counter that stands still, a fault."""
-        values: dict[str, float] = {f"Lever_{axis}": value for axis, value in zip(LEVER_AXES, self.levers, strict=True)}
+        values: dict[str, float] = {
+            f"Lever_{axis}": value for axis, value in zip(LEVER_AXES, self.levers, strict=True)
+        }
         values |= {"ButtonRight": self.button_right, "DeadMan": self.deadman, "RemoteOn": self.on}
         self._counter = self._counter + 1 if frozen is None else frozen
         return Wired(
-            self._layout.frame_id, self._description.encode(self._layout.name, values, self._counter), self._layout.extended
+            self._layout.frame_id,
+            self._description.encode(self._layout.name, values, self._counter),
+            self._layout.extended,
         )
 
 
 def operate(
-    stop: Stop, wire: Wire, dbc: str, machine: Machine, follower: Follower, levers: LeverMap, seed: int, exchange: Exchange
+    stop: Stop,
+    wire: Wire,
+    dbc: str,
+    machine: Machine,
+    follower: Follower,
+    levers: LeverMap,
+    seed: int,
+    exchange: Exchange,
 ) -> None:
     """Runs a simulated operator: reads the outlet as a person reads the page, and moves the levers as `follower` says.
 
@@ -65,14 +76,18 @@ def operate(
     per_period = round(machine.period_s / remote.period_s)
     full_rad, pace, cycle = axis_full_rad(machine), Pace(remote.period_s), 0
     remote.deadman = True
-    own = LeverMap(machine.levers, machine)  # what he moves is the machine's remote, whatever pattern is shown
+    own = LeverMap(
+        machine.levers, machine
+    )  # what he moves is the machine's remote, whatever pattern is shown
     with wire.open([]) as bus:
         while not stop():
             pace.wait()
             pace.begin()
             if cycle % per_period == 0:
                 with torch.inference_mode():
-                    proposed = torch.as_tensor(_proposed(exchange, levers), dtype=torch.float32)[None]
+                    proposed = torch.as_tensor(_proposed(exchange, levers), dtype=torch.float32)[
+                        None
+                    ]
                     given = hands.step(proposed)[0].numpy().astype(float)
                 angles_rad, remote.button_right = own.levers(given)
                 remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()

@@ -1,8 +1,8 @@
 """The twin at work: gateway, remote and a simulated machine, in real time, on a bus.
 
-The machine is simulated at the control rate: what the valves get at the beginning of a period moves it through that period, and its
-positions are sent in between as a faster sensor would see them. Without an operator of its own the twin also plays the remote,
-levers in neutral.
+The machine is simulated at the control rate: what the valves get at the beginning of a period moves
+it through that period, and its positions are sent in between as a faster sensor would see them.
+Without an operator of its own the twin also plays the remote, levers in neutral.
 """
 
 from __future__ import annotations
@@ -47,9 +47,12 @@ class Twin:
     Attributes:
         wire: The bus.
         dbc: Its description.
-        remote: Whether the twin plays the remote too; `false` where an operator is a node of its own.
-        deadman: Whether an operator at that remote presses the dead-man, one second after the PC is first heard, and holds it.
-        again_s: When that operator, if the valves do not follow the PC, lets go and presses again; `null`: holds it all the same.
+        remote: Whether the twin plays the remote too; `false` where an operator is a node of its
+            own.
+        deadman: Whether an operator at that remote presses the dead-man, one second after the PC is
+            first heard, and holds it.
+        again_s: When that operator, if the valves do not follow the PC, lets go and presses again;
+            `null`: holds it all the same.
         fault_port: Local port for faults on request; `null`: none.
         seconds: When to stop; `null`: when told to.
         realtime: Whether to ask for real-time priority: a machine is never late.
@@ -66,7 +69,9 @@ class Twin:
 
     def check(self) -> None:
         if self.fault_port is not None and not 0 < self.fault_port < 65536:
-            raise ConfigError(f"twin.fault_port: expected 1 to 65535, or null, got {self.fault_port}")
+            raise ConfigError(
+                f"twin.fault_port: expected 1 to 65535, or null, got {self.fault_port}"
+            )
         if self.again_s is not None and self.again_s <= 0:
             raise ConfigError(f"twin.again_s: expected more than 0, or null, got {self.again_s}")
 
@@ -80,11 +85,22 @@ class Twin:
             ask_for_priority(TWIN_PRIORITY)
         session.folder.mkdir(parents=True, exist_ok=True)
         write_text(session.folder / HEADER, c_header(Description(self.dbc, machine)))
-        with plant.build(machine, 1, session) as link, self.wire.open() as bus, FaultPort(self.fault_port) as port:
+        with (
+            plant.build(machine, 1, session) as link,
+            self.wire.open() as bus,
+            FaultPort(self.fault_port) as port,
+        ):
             Running(self, machine, link, bus, port).run(stop)
 
 
-def run(stop: Stop, twin: Twin, machine: Machine, plant: Connection, session: Session, exchange: Any = None) -> None:
+def run(
+    stop: Stop,
+    twin: Twin,
+    machine: Machine,
+    plant: Connection,
+    session: Session,
+    exchange: Any = None,
+) -> None:
     """Runs a twin as a child process."""
     twin.run(stop, machine, plant, session)
 
@@ -113,7 +129,13 @@ class Running:
     """
 
     def __init__(self, twin: Twin, machine: Machine, link: Link, bus: Bus, port: FaultPort) -> None:
-        self._twin, self._machine, self._link, self._bus, self._port = twin, machine, link, bus, port
+        self._twin, self._machine, self._link, self._bus, self._port = (
+            twin,
+            machine,
+            link,
+            bus,
+            port,
+        )
         self._description = Description(twin.dbc, machine)
         self._gateway, self._remote = Gateway(self._description, machine), Remote(self._description)
         self._faults, self._pace = Faults(), Pace(CYCLE_S)
@@ -173,7 +195,12 @@ class Running:
             self._bus.send(frame)
         if faults.on("second_sender", "", now_s):
             command = self._description.command
-            self._bus.send(Wired(command.frame_id, self._description.encode(command.name, {}, self._counters.get("JointPos1", 0))))
+            self._bus.send(
+                Wired(
+                    command.frame_id,
+                    self._description.encode(command.name, {}, self._counters.get("JointPos1", 0)),
+                )
+            )
         if faults.on("flood", "", now_s):
             for _ in range(FLOOD):
                 self._bus.send(Wired(0x1FFF0000, bytes(8)))
@@ -190,8 +217,15 @@ class Running:
         """Returns what the valves get, `(J,)`, and what is said of it; that they get nothing any more is said at once."""
         gateway, before = self._gateway, self._flow
         self._flow, self._source, state = gateway.flow(now_s)
-        said = {f"Flow_{name}": float(u) for name, u in zip(self._machine.joint_names, self._flow, strict=True)}
-        said |= {"FlowSource": self._source, "EStop": gateway.estop, "ExclusiveSelected": gateway.exclusive_selected}
+        said = {
+            f"Flow_{name}": float(u)
+            for name, u in zip(self._machine.joint_names, self._flow, strict=True)
+        }
+        said |= {
+            "FlowSource": self._source,
+            "EStop": gateway.estop,
+            "ExclusiveSelected": gateway.exclusive_selected,
+        }
         said |= {"GatewayState": state.value, "OilTemperature": self._oil_c}
         if before.any() and not self._flow.any():
             for signal in ("FlowSource", "EStop"):
@@ -205,7 +239,9 @@ class Running:
         released = remote.deadman and not held  # which does not wait for its turn either
         if now_s < self._due_s.get(layout.name, now_s) and not released:
             return
-        self._due_s[layout.name] = max(self._due_s.get(layout.name, now_s), now_s - layout.period_s) + layout.period_s
+        self._due_s[layout.name] = (
+            max(self._due_s.get(layout.name, now_s), now_s - layout.period_s) + layout.period_s
+        )
         remote.deadman = held
         remote.on = not faults.on("remote_off", "", now_s)
         remote.levers = (0.5 if faults.on("lever", "", now_s) else 0.0, 0.0, 0.0, 0.0)
@@ -217,7 +253,9 @@ class Running:
     def _held(self, now_s: float) -> bool:
         """Says whether the operator holds the dead-man; a PC that was not ready when it was pressed waits for it to be let go."""
         heard = now_s - self._gateway.heard_s > PRESS_S
-        pressed = self._twin.deadman and heard and not self._faults.on("deadman_released", "", now_s)
+        pressed = (
+            self._twin.deadman and heard and not self._faults.on("deadman_released", "", now_s)
+        )
         again_s = self._twin.again_s
         if not pressed or self._source == PC:
             self._grip_s = now_s
@@ -225,15 +263,21 @@ class Running:
             self._grip_s = now_s + LET_GO_S
         return pressed and now_s >= self._grip_s
 
-    def _send(self, name: str, values: dict[str, float], now_s: float, at_once: bool = False) -> None:
+    def _send(
+        self, name: str, values: dict[str, float], now_s: float, at_once: bool = False
+    ) -> None:
         layout = self._description.layouts[name]
         due_s = self._due_s.get(name, now_s)
         if now_s < due_s - CYCLE_S / 2 and not at_once:
             return
         self._due_s[name] = max(due_s, now_s - layout.period_s) + layout.period_s
         counter = self._counters[name] = self._counters.get(name, -1) + 1
-        data = self._description.encode(name, values, FROZEN if self._faults.on("freeze_counter", name, now_s) else counter)
-        for one in self._faults.pass_on(layout, Wired(layout.frame_id, data, layout.extended), now_s):
+        data = self._description.encode(
+            name, values, FROZEN if self._faults.on("freeze_counter", name, now_s) else counter
+        )
+        for one in self._faults.pass_on(
+            layout, Wired(layout.frame_id, data, layout.extended), now_s
+        ):
             self._bus.send(one)
 
     def _positions(self, now_s: float) -> dict[str, float]:
@@ -257,11 +301,18 @@ class Running:
             q[:] = -q
         valid = 0.0 if faults.on("invalid", "", now_s) else 1.0
         names = machine.joint_names
-        values = {f"Position_{name}": float(np.clip(value, -3.2, 3.2)) for name, value in zip(names, q, strict=True)}
+        values = {
+            f"Position_{name}": float(np.clip(value, -3.2, 3.2))
+            for name, value in zip(names, q, strict=True)
+        }
         return values | {f"Valid_{name}": valid for name in names}
 
 
 def _oil_c(link: Link) -> float:
     """Returns the oil's temperature as the bus can say it, in degrees Celsius."""
     extra = getattr(link, "extra", dict)()
-    return float(np.clip(np.round(np.asarray(extra["oil_c"]).mean()), -40, 215)) if "oil_c" in extra else 20.0
+    return (
+        float(np.clip(np.round(np.asarray(extra["oil_c"]).mean()), -40, 215))
+        if "oil_c" in extra
+        else 20.0
+    )

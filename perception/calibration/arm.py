@@ -21,7 +21,8 @@ class Links:
 
     Attributes:
         base_from_link: At the tool's tip; z along the last joint, x along the tool, `(N, 4, 4)`.
-        joints: Motions of the link, in the base frame, for one unit of each joint, `(N, J, 6)`: a point at `p` goes by `v + w x p`.
+        joints: Motions of the link, in the base frame, for one unit of each joint, `(N, J, 6)`: a
+            point at `p` goes by `v + w x p`.
         tip_in_base_m: Tip of the tool, `(N, 3)`.
     """
 
@@ -37,15 +38,24 @@ def links(machine: Machine, q: np.ndarray) -> Links:
         ConfigError: the machine's geometry is not known.
     """
     found = tool(machine, q)
-    origins, axes, along, tip = found.joints_in_base_m, found.axes_in_base, found.axis_in_base, found.tip_in_base_m
+    origins, axes, along, tip = (
+        found.joints_in_base_m,
+        found.axes_in_base,
+        found.axis_in_base,
+        found.tip_in_base_m,
+    )
     z = axes[:, -1]
     x = along - (along * z).sum(-1, keepdims=True) * z
-    if np.linalg.norm(x, axis=-1).min() < 0.1:  # a tool along its own joint: any direction across will do
+    if (
+        np.linalg.norm(x, axis=-1).min() < 0.1
+    ):  # a tool along its own joint: any direction across will do
         x = axes[:, 0] - (axes[:, 0] * z).sum(-1, keepdims=True) * z
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)
     turn = np.stack([x, np.cross(z, x), z], -1)
     hinge = np.array([joint.kind == "hinge" for joint in machine.joints])[:, None]
-    motions = np.concatenate([np.where(hinge, np.cross(origins, axes), axes), np.where(hinge, axes, 0.0)], -1)
+    motions = np.concatenate(
+        [np.where(hinge, np.cross(origins, axes), axes), np.where(hinge, axes, 0.0)], -1
+    )
     return Links(rigid.pose(turn, tip), motions, tip)
 
 
@@ -54,7 +64,10 @@ def wobble(base_from_link: np.ndarray, shift_m: float, turn_rad: float) -> np.nd
     found = np.zeros((len(base_from_link), 6, 6))
     for k, unit in enumerate(np.eye(3)):
         found[:, k, :3] = shift_m * unit
-        found[:, 3 + k, :3], found[:, 3 + k, 3:] = turn_rad * np.cross(base_from_link[:, :3, 3], unit), turn_rad * unit
+        found[:, 3 + k, :3], found[:, 3 + k, 3:] = (
+            turn_rad * np.cross(base_from_link[:, :3, 3], unit),
+            turn_rad * unit,
+        )
     return found
 
 
@@ -85,7 +98,10 @@ class Track:
         """Returns joint speeds, `(N, J)`, at times; nothing moves where positions belong to frames."""
         if self.t_s is None:
             return np.zeros((len(t_s), self.q.shape[1]))
-        ends = [np.stack([np.interp(t_s + half, self.t_s, column) for column in self.q.T], 1) for half in (-over_s / 2, over_s / 2)]
+        ends = [
+            np.stack([np.interp(t_s + half, self.t_s, column) for column in self.q.T], 1)
+            for half in (-over_s / 2, over_s / 2)
+        ]
         return (ends[1] - ends[0]) / over_s
 
 
@@ -107,7 +123,9 @@ def read(path: Path, machine: Machine) -> Track:
             f"{path}: expected a recording (*.parquet), or YAML of '<stem of a frame>: [joint positions]' ({error})"
         ) from error
     if q.ndim != 2 or q.shape[1] != machine.num_joints or not np.isfinite(q).all():
-        raise ConfigError(f"{path}: expected {machine.num_joints} joint positions for each frame, in machine order, rad or m")
+        raise ConfigError(
+            f"{path}: expected {machine.num_joints} joint positions for each frame, in machine order, rad or m"
+        )
     outside = (q < machine.lower - 0.1) | (q > machine.upper + 0.1)
     if outside.any():
         row, column = np.argwhere(outside)[0]

@@ -33,7 +33,9 @@ class Log:
         """Returns poses in between, `(N, 4, 4)`: turns along the shortest way, shifts along lines."""
         inside = np.clip(t_s, self.t_s[0], self.t_s[-1])
         turns = Slerp(self.t_s, Rotation.from_matrix(self.poses[:, :3, :3]))(inside).as_matrix()
-        return rigid.pose(turns, np.stack([np.interp(inside, self.t_s, self.poses[:, k, 3]) for k in range(3)], 1))
+        return rigid.pose(
+            turns, np.stack([np.interp(inside, self.t_s, self.poses[:, k, 3]) for k in range(3)], 1)
+        )
 
 
 @spec
@@ -45,12 +47,13 @@ class ByPoses:
         camera: Poses of the board in the camera.
         arm_tells: `base_from_link`, or `link_from_base` where the log has the inverse.
         camera_tells: `camera_from_board`, or `board_from_camera`.
-        camera_on: `base`: the camera stands still and the board is on the link; `link`: the other way round, and `T_link_cam` is
-            found.
-        arm_std: By how much the link is elsewhere in each pose, standard deviation of each direction: m, rad. How much more it
-            is, the poses tell.
+        camera_on: `base`: the camera stands still and the board is on the link; `link`: the other
+            way round, and `T_link_cam` is found.
+        arm_std: By how much the link is elsewhere in each pose, standard deviation of each
+            direction: m, rad. How much more it is, the poses tell.
         camera_std: By how much a board is seen elsewhere: m, rad.
-        clock_s: Largest offset of the clocks that is looked for; 0 takes both logs to be of one clock.
+        clock_s: Largest offset of the clocks that is looked for; 0 takes both logs to be of one
+            clock.
         least_correlation: Of the speeds, below which their offset is taken for 0.
         least_turn_rad: The poses turn at least this far about two axes.
         max_poses: Of more poses, as many are used, evenly.
@@ -71,7 +74,11 @@ class ByPoses:
     work_m: float
 
     def check(self) -> None:
-        if min(*self.arm_std, *self.camera_std, self.work_m) <= 0 or self.clock_s < 0 or self.max_poses < 10:
+        if (
+            min(*self.arm_std, *self.camera_std, self.work_m) <= 0
+            or self.clock_s < 0
+            or self.max_poses < 10
+        ):
             raise ConfigError(
                 "calibration: expected arm_std, camera_std and work_m above 0, clock_s of 0 or more, max_poses of 10 or more"
             )
@@ -93,7 +100,9 @@ class ByPoses:
             turns = (eye.t_s, eye.poses[:, :3, :3], hand.t_s, hand.poses[:, :3, :3])
             offset = clock.offset(*turns, self.clock_s, self.least_correlation)
         shift_s = offset.offset_s if offset is not None and offset.is_trusted else 0.0
-        inside = np.flatnonzero((eye.t_s + shift_s >= hand.t_s[0]) & (eye.t_s + shift_s <= hand.t_s[-1]))
+        inside = np.flatnonzero(
+            (eye.t_s + shift_s >= hand.t_s[0]) & (eye.t_s + shift_s <= hand.t_s[-1])
+        )
         if len(inside) > self.max_poses:
             inside = inside[np.linspace(0, len(inside) - 1, self.max_poses).round().astype(int)]
         if len(inside) < FEWEST:
@@ -105,9 +114,13 @@ class ByPoses:
         assert solution is not None  # there are enough
         turned, _ = spread.turns_rad(views.base_from_link[solution.used])
         distance_m = np.linalg.norm(expected(views, solution.guess)[solution.used, :3, 3], axis=1)
-        missing = spread.unturned(views.base_from_link[solution.used], distance_m, self.least_turn_rad)
+        missing = spread.unturned(
+            views.base_from_link[solution.used], distance_m, self.least_turn_rad
+        )
         if turned[1] < 0.1 * self.least_turn_rad:
-            raise FrameError(f"calibration: the poses do not tell where the camera is: {'; '.join(missing)}")
+            raise FrameError(
+                f"calibration: the poses do not tell where the camera is: {'; '.join(missing)}"
+            )
         other = "T_link_board" if self.camera_on == "base" else "T_base_board"
         more = {
             other: solution.guess.link_from_board.round(9).tolist(),
@@ -116,12 +129,18 @@ class ByPoses:
             "missing": missing,
         }
         cov, judged = solution.cov[:6, :6], judgement.of_views(views, solution)
-        told = stored("poses", machine, solution.guess.base_from_camera, cov, judged, self.work_m, more)
+        told = stored(
+            "poses", machine, solution.guess.base_from_camera, cov, judged, self.work_m, more
+        )
         if self.camera_on == "base":
             return told
-        return {("T_link_cam" if name == "T_base_cam" else name): value for name, value in told.items()}
+        return {
+            ("T_link_cam" if name == "T_base_cam" else name): value for name, value in told.items()
+        }
 
-    def _views(self, hand: Log, eye_s: np.ndarray, seen: np.ndarray, shift_s: float, moving: bool) -> Views:
+    def _views(
+        self, hand: Log, eye_s: np.ndarray, seen: np.ndarray, shift_s: float, moving: bool
+    ) -> Views:
         """Returns the views. A camera on the link is the same problem with link and base in each other's place."""
         t_s = eye_s + shift_s
 
@@ -131,12 +150,26 @@ class ByPoses:
 
         poses, count = at(t_s), len(t_s)
         about = poses if self.camera_on == "base" else np.broadcast_to(np.eye(4), poses.shape)
-        slack, shared, std, names = [arm.wobble(about, *self.arm_std)], np.zeros((count, 0, 6)), [], ()
+        slack, shared, std, names = (
+            [arm.wobble(about, *self.arm_std)],
+            np.zeros((count, 0, 6)),
+            [],
+            (),
+        )
         if moving:
             before, after = at(t_s - SPEED_OVER_S / 2), at(t_s + SPEED_OVER_S / 2)
-            turn = rigid.turn_of(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2)) / SPEED_OVER_S
-            shift = (after[:, :3, 3] - before[:, :3, 3]) / SPEED_OVER_S - np.cross(turn, poses[:, :3, 3])
-            shared, std, names = np.concatenate([shift, turn], 1)[:, None], [clock.STD_S], (judgement.CLOCK,)
+            turn = (
+                rigid.turn_of(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
+                / SPEED_OVER_S
+            )
+            shift = (after[:, :3, 3] - before[:, :3, 3]) / SPEED_OVER_S - np.cross(
+                turn, poses[:, :3, 3]
+            )
+            shared, std, names = (
+                np.concatenate([shift, turn], 1)[:, None],
+                [clock.STD_S],
+                (judgement.CLOCK,),
+            )
             slack.append(clock.JITTER_S * shared)
         cov = np.diag(np.repeat(self.camera_std, 3)) ** 2
         return Views(
@@ -149,16 +182,25 @@ def read(path: Path) -> Log:
     """Returns the poses of a CSV file; a line of names may come first.
 
     Raises:
-        ConfigError: it cannot be read, times do not increase, or turns are no unit quaternions; names the line.
+        ConfigError: it cannot be read, times do not increase, or turns are no unit quaternions;
+            names the line.
     """
     try:
         lines = path.read_text().splitlines()
-        skipped = 1 if lines and any(letter.isalpha() and letter not in "eE" for letter in lines[0]) else 0
+        skipped = (
+            1
+            if lines and any(letter.isalpha() and letter not in "eE" for letter in lines[0])
+            else 0
+        )
         table = np.loadtxt(lines[skipped:], delimiter=",", ndmin=2)
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise ConfigError(f"{path}: expected CSV with the columns {','.join(COLUMNS)} ({error})") from error
+        raise ConfigError(
+            f"{path}: expected CSV with the columns {','.join(COLUMNS)} ({error})"
+        ) from error
     if table.ndim != 2 or table.shape[1] != len(COLUMNS) or not len(table):
-        raise ConfigError(f"{path}: expected the columns {','.join(COLUMNS)}, got {table.shape[-1]} columns")
+        raise ConfigError(
+            f"{path}: expected the columns {','.join(COLUMNS)}, got {table.shape[-1]} columns"
+        )
     wrong = ~np.isfinite(table).all(1) | (np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0) > 0.01)
     if wrong.any():
         raise ConfigError(
@@ -167,5 +209,7 @@ def read(path: Path) -> Log:
     if len(table) < FEWEST:
         raise ConfigError(f"{path}: {len(table)} poses, {FEWEST} are needed at least")
     if (step := np.diff(table[:, 0])).min() <= APART_S:
-        raise ConfigError(f"{path}: line {int(np.argmin(step)) + skipped + 2}: time does not increase")
+        raise ConfigError(
+            f"{path}: line {int(np.argmin(step)) + skipped + 2}: time does not increase"
+        )
     return Log(table[:, 0], rigid.pose(Rotation.from_quat(table[:, 4:]).as_matrix(), table[:, 1:4]))

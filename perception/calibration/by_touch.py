@@ -47,9 +47,11 @@ class ByTouch:
         points: YAML file; see `EXAMPLE`.
         tip_std_m: Standard deviation of the tip in each direction, from joints and geometry.
         click_px: Standard deviation of a click.
-        noise_per_m: Standard deviation of inverse depth, 1/m; a plane through the window averages it.
+        noise_per_m: Standard deviation of inverse depth, 1/m; a plane through the window averages
+            it.
         window_px: Depth is read from a plane through a window that reaches this far from the click.
-        least_width_m: Points spread at least so far across the line that fits them best (standard deviation).
+        least_width_m: Points spread at least so far across the line that fits them best (standard
+            deviation).
         work_m: How far before the camera it is used: there its uncertainty is told.
         temperature_c: Of the day, for the record; `null` where nobody measured.
     """
@@ -65,7 +67,11 @@ class ByTouch:
     temperature_c: float | None
 
     def check(self) -> None:
-        if min(self.tip_std_m, self.click_px, self.noise_per_m, self.least_width_m, self.work_m) <= 0 or self.window_px < 2:
+        if (
+            min(self.tip_std_m, self.click_px, self.noise_per_m, self.least_width_m, self.work_m)
+            <= 0
+            or self.window_px < 2
+        ):
             raise ConfigError(
                 "calibration: expected tip_std_m, click_px, noise_per_m, least_width_m and work_m above 0, window_px of 2 or more"
             )
@@ -89,13 +95,19 @@ class ByTouch:
             names.append(one.name)
             here.append(at)
             covs.append(cov)
-            there.append(one.base_m if one.q is None else arm.links(machine, one.q[None]).tip_in_base_m[0])
+            there.append(
+                one.base_m if one.q is None else arm.links(machine, one.q[None]).tip_in_base_m[0]
+            )
         found = None
         if names:
             points = touched.Points(np.array(here), np.array(there), np.array(covs))
             found = touched.fit(points, self.tip_std_m)
         if found is None:
-            why = f" Left out: {'; '.join(str(one.left_out) for one in refused[:3])}" if refused else ""
+            why = (
+                f" Left out: {'; '.join(str(one.left_out) for one in refused[:3])}"
+                if refused
+                else ""
+            )
             raise FrameError(
                 f"calibration: {len(names)} points can be used, {touched.FEWEST} are needed at least, 8 are good.{why}"
             )
@@ -118,7 +130,15 @@ class ByTouch:
             "width_m": round(width_m, 4),
             "missing": [],
         }
-        return stored("touched", machine, found.base_from_camera, found.cov, [*judged, *refused], self.work_m, more)
+        return stored(
+            "touched",
+            machine,
+            found.base_from_camera,
+            found.cov,
+            [*judged, *refused],
+            self.work_m,
+            more,
+        )
 
     def _frames(self, wanted: set[str]) -> dict[str, Frame]:
         found: dict[str, Frame] = {}
@@ -138,7 +158,11 @@ class ByTouch:
     def _seen(self, one: Touch, frames: dict[str, Frame]) -> tuple[np.ndarray, np.ndarray]:
         """Returns a point in camera coordinates, and its covariance."""
         if one.camera_m is not None:
-            z, focal_px, sight = float(one.camera_m[2]), 1000.0, one.camera_m / np.linalg.norm(one.camera_m)
+            z, focal_px, sight = (
+                float(one.camera_m[2]),
+                1000.0,
+                one.camera_m / np.linalg.norm(one.camera_m),
+            )
             return one.camera_m, _cov(sight, self.noise_per_m * z**2, self.click_px * z / focal_px)
         frame = frames.get(str(one.frame))
         if frame is None or one.pixel is None:
@@ -148,7 +172,9 @@ class ByTouch:
         return point, _cov(point / np.linalg.norm(point), along_m, across_m)
 
 
-def depth_at(frame: Frame, pixel: np.ndarray, window_px: int, noise_per_m: float) -> tuple[np.ndarray, float]:
+def depth_at(
+    frame: Frame, pixel: np.ndarray, window_px: int, noise_per_m: float
+) -> tuple[np.ndarray, float]:
     """Returns the point behind a pixel, `(3,)` m, by a plane through the depth around it, and its standard deviation along z.
 
     Raises:
@@ -167,7 +193,10 @@ def depth_at(frame: Frame, pixel: np.ndarray, window_px: int, noise_per_m: float
     rows, columns = rows[known], columns[known]
     inverse = 1.0 / frame.depth_m[rows, columns].astype(float)
     table = np.stack([columns - pixel[0], rows - pixel[1], np.ones(len(rows))], 1)
-    kept = np.abs(inverse - np.median(inverse)) <= 2.5 * 1.4826 * np.median(np.abs(inverse - np.median(inverse))) + 1e-6
+    kept = (
+        np.abs(inverse - np.median(inverse))
+        <= 2.5 * 1.4826 * np.median(np.abs(inverse - np.median(inverse))) + 1e-6
+    )
     plane = np.zeros(3)
     for _ in range(TRIMS):
         plane = np.linalg.lstsq(table[kept], inverse[kept], rcond=None)[0]
@@ -175,9 +204,15 @@ def depth_at(frame: Frame, pixel: np.ndarray, window_px: int, noise_per_m: float
         kept = away <= 2.5 * 1.4826 * np.median(away) + 1e-6
     z = 1.0 / plane[2]
     spread = np.linalg.pinv(table[kept].T @ table[kept])[2, 2]
-    flat = cv2.undistortPoints(pixel.reshape(1, 1, 2).astype(float), np.asarray(frame.camera_matrix, float), frame.distortion)
+    flat = cv2.undistortPoints(
+        pixel.reshape(1, 1, 2).astype(float),
+        np.asarray(frame.camera_matrix, float),
+        frame.distortion,
+    )
     # neighbours share a matcher's window: some ten pixels are as good as one
-    return z * np.array([*flat.ravel(), 1.0]), float(z**2 * noise_per_m * np.sqrt(min(1.0, 10.0 * spread)))
+    return z * np.array([*flat.ravel(), 1.0]), float(
+        z**2 * noise_per_m * np.sqrt(min(1.0, 10.0 * spread))
+    )
 
 
 def read(path: Path, num_joints: int) -> list[Touch]:
@@ -190,7 +225,9 @@ def read(path: Path, num_joints: int) -> list[Touch]:
         told = yaml.safe_load(path.read_text())["points"]
         found = [_touch(number, one, num_joints) for number, one in enumerate(told)]
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(f"calibration.points={path}: {type(error).__name__} {error}; {EXAMPLE}") from error
+        raise ConfigError(
+            f"calibration.points={path}: {type(error).__name__} {error}; {EXAMPLE}"
+        ) from error
     return found
 
 
@@ -201,12 +238,21 @@ def _touch(number: int, one: dict[str, Any], num_joints: int) -> Touch:
         value = values[name]
         if value is not None and (value.shape != (size,) or not np.isfinite(value).all()):
             raise ValueError(f"point {number}: {name} has {value.size} numbers, expected {size}")
-    if (values["camera_m"] is None) == (values["pixel"] is None) or (values["q"] is None) == (values["base_m"] is None):
+    if (values["camera_m"] is None) == (values["pixel"] is None) or (values["q"] is None) == (
+        values["base_m"] is None
+    ):
         raise ValueError(f"point {number} needs one of pixel and camera_m, and one of q and base_m")
     if values["pixel"] is not None and "frame" not in one:
         raise ValueError(f"point {number}: in which frame was it clicked?")
     frame = str(one["frame"]) if "frame" in one else None
-    return Touch(str(one.get("name", f"point {number}")), frame, values["pixel"], values["camera_m"], values["q"], values["base_m"])
+    return Touch(
+        str(one.get("name", f"point {number}")),
+        frame,
+        values["pixel"],
+        values["camera_m"],
+        values["q"],
+        values["base_m"],
+    )
 
 
 def _cov(sight: np.ndarray, along_m: float, across_m: float) -> np.ndarray:

@@ -77,7 +77,11 @@ def offset(
         ends = (link(times[inside] + shift).as_matrix() for times in (begin, end))
         one, other = _turned(*ends) / (end - begin)[inside], seen[inside]
         both = one.std() * other.std()
-        scores.append(float(np.mean((one - one.mean()) * (other - other.mean())) / both) if both > 1e-9 else -1.0)
+        scores.append(
+            float(np.mean((one - one.mean()) * (other - other.mean())) / both)
+            if both > 1e-9
+            else -1.0
+        )
     best = int(np.argmax(scores))
     if scores[best] <= -1.0:
         return None

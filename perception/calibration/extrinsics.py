@@ -15,7 +15,8 @@ from perception.sources import soundness
 
 SCHEMA = 1
 Place = str | tuple[tuple[float, ...], ...] | None
-"""How a config says where a camera is: a file of `mode=calibrate`, a 4 x 4 transform, or not at all."""
+"""How a config says where a camera is: a file of `mode=calibrate`, a 4 x 4 transform, or not at
+all."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class Placed:
 
     Attributes:
         base_from_camera: `(4, 4)`, `None` where nobody knows.
-        cov: Of a small motion of it in its own coordinates, `(6, 6)`, m and then rad; `None` where nobody has told.
+        cov: Of a small motion of it in its own coordinates, `(6, 6)`, m and then rad; `None` where
+            nobody has told.
     """
 
     base_from_camera: np.ndarray | None
@@ -35,7 +37,8 @@ def placed(given: Place, where: str) -> Placed:
     """Returns where a camera is as a config gives it.
 
     Raises:
-        FrameError: there is no such file, it is none of ours, the transform is not rigid, or its covariance is none.
+        FrameError: there is no such file, it is none of ours, the transform is not rigid, or its
+            covariance is none.
     """
     if given is None:
         return Placed(None, None)
@@ -43,8 +46,14 @@ def placed(given: Place, where: str) -> Placed:
         return Placed(soundness.pose(given, where), None)
     told, where = read(Path(given), where), f"{where}={given}"
     cov = np.asarray(told.get("covariance", np.zeros((6, 6))), float)
-    if cov.shape != (6, 6) or not np.isfinite(cov).all() or np.linalg.eigvalsh((cov + cov.T) / 2).min() < -1e-9:
-        raise FrameError(f"{where}: covariance: expected a covariance of six numbers, (6, 6); calibrate again")
+    if (
+        cov.shape != (6, 6)
+        or not np.isfinite(cov).all()
+        or np.linalg.eigvalsh((cov + cov.T) / 2).min() < -1e-9
+    ):
+        raise FrameError(
+            f"{where}: covariance: expected a covariance of six numbers, (6, 6); calibrate again"
+        )
     return Placed(soundness.pose(told["T_base_cam"], where), (cov + cov.T) / 2)
 
 
@@ -61,7 +70,9 @@ def read(path: Path, where: str) -> dict[str, Any]:
             f"{where}: {path} cannot be read ({error}); expected calibration.yaml of `brokk mode=calibrate`"
         ) from error
     if not isinstance(told, dict) or told.get("schema") != SCHEMA or "T_base_cam" not in told:
-        raise FrameError(f"{where}: {path} is no calibration of schema {SCHEMA}; `brokk mode=calibrate` writes one")
+        raise FrameError(
+            f"{where}: {path} is no calibration of schema {SCHEMA}; `brokk mode=calibrate` writes one"
+        )
     return told
 
 
@@ -72,7 +83,9 @@ def point_std_m(cov: np.ndarray, distance_m: float) -> float:
         cov: Of a small motion of the camera in its own frame, `(6, 6)`.
         distance_m: How far before the camera.
     """
-    lever = np.concatenate([np.eye(3), distance_m * np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 0]])], 1)
+    lever = np.concatenate(
+        [np.eye(3), distance_m * np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 0]])], 1
+    )
     return float(np.sqrt(np.trace(lever @ cov @ lever.T)))
 
 

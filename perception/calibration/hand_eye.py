@@ -1,9 +1,11 @@
 """The camera's place from sights of a board on the arm: `A_i Y = X B_i` with both ends unknown, in the presence of wrong sights.
 
-Several closed forms are refined over all views by Gauss-Newton with damping. A residual is where the camera sees the board against
-where it should, weighed by what the corners' reprojection leaves open and by how well the arm's place is known, so that a poor arm
-does not ask the pixels to bend. Weights are Student's t (Lange, Little and Taylor, 1989): wrong sights lose their say and are left
-out in the end. How well the arm is known is itself estimated, as a factor on its slack, by the median of all views.
+Several closed forms are refined over all views by Gauss-Newton with damping. A residual is where
+the camera sees the board against where it should, weighed by what the corners' reprojection leaves
+open and by how well the arm's place is known, so that a poor arm does not ask the pixels to bend.
+Weights are Student's t (Lange, Little and Taylor, 1989): wrong sights lose their say and are left
+out in the end. How well the arm is known is itself estimated, as a factor on its slack, by the
+median of all views.
 """
 
 from __future__ import annotations
@@ -35,11 +37,13 @@ class Solution:
 
     Attributes:
         guess: Camera, board, and what is wrong in all views alike.
-        cov: Covariance of a small motion of the camera in its own frame, of one of the board in its own frame, and of what is
-            wrong alike, `(12 + S, 12 + S)`.
+        cov: Covariance of a small motion of the camera in its own frame, of one of the board in its
+            own frame, and of what is wrong alike, `(12 + S, 12 + S)`.
         factor: The arm is this many times less exact than was assumed.
-        away: How far the camera sees each board from where it should, as a small motion in the board's frame, `(N, 6)`.
-        distance: The same in standard deviations, squared, `(N,)`; its mean is 6 where all is as it should be.
+        away: How far the camera sees each board from where it should, as a small motion in the
+            board's frame, `(N, 6)`.
+        distance: The same in standard deviations, squared, `(N,)`; its mean is 6 where all is as it
+            should be.
         used: Which views were believed in the end, `(N,)` bool.
     """
 
@@ -90,7 +94,14 @@ def _final(views: Views, guess: Guess, factor: float) -> Solution:
     normal = _normal(views, there, used.astype(float))[0]
     # where the views that are left disagree by more than they should, they say less than they claim
     excess = max(1.0, float(there.distance[used].sum()) / max(6.0 * used.sum() - len(normal), 1.0))
-    return Solution(guess, excess * np.linalg.pinv(normal, hermitian=True), factor, there.away, there.distance, used)
+    return Solution(
+        guess,
+        excess * np.linalg.pinv(normal, hermitian=True),
+        factor,
+        there.away,
+        there.distance,
+        used,
+    )
 
 
 @dataclass(frozen=True)
@@ -117,7 +128,8 @@ class _Compared:
 def _compare(views: Views, guess: Guess, factor: float) -> _Compared:
     board = expected(views, guess)
     slack = in_board(views, guess, board, views.slack)
-    # a covariance of the board as expected is taken for that of the board as seen: they are close, or the view is wrong anyway
+    # a covariance of the board as expected is taken for that of the board as seen: they are close,
+    # or the view is wrong anyway
     cov = views.seen_cov + factor**2 * (slack @ np.swapaxes(slack, 1, 2))[:, None]
     away = rigid.apart(views.camera_from_board, board[:, None])
     information = np.linalg.inv(cov)
@@ -133,9 +145,16 @@ def _compare(views: Views, guess: Guess, factor: float) -> _Compared:
     slopes[:, :3, 6:9], slopes[:, 3:, 9:12] = turn, np.eye(3)
     slopes[:, :, 12:] = in_board(views, guess, board, views.shared)
     slopes[:, :3, 12:] = turn @ slopes[:, :3, 12:]
-    # the motion's turn grows with a turn of the board not one to one but by the inverse Jacobian; for 0.1 rad that is 5 %, and only
-    # the way to the answer, not the answer, depends on it
-    return _Compared(away, distance[row, best], information, -np.linalg.slogdet(information)[1], slopes, guess.shared)
+    # the motion's turn grows with a turn of the board not one to one but by the inverse Jacobian;
+    # for 0.1 rad that is 5 %, and only the way to the answer, not the answer, depends on it
+    return _Compared(
+        away,
+        distance[row, best],
+        information,
+        -np.linalg.slogdet(information)[1],
+        slopes,
+        guess.shared,
+    )
 
 
 def _normal(views: Views, there: _Compared, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -153,7 +172,11 @@ def _refined(views: Views, guess: Guess, factor: float, fixed: np.ndarray | None
 
     def cost(there: _Compared) -> float:
         far = there.distance
-        size = (fixed * far).sum() if fixed is not None else ((FREEDOM + 6) * np.log1p(far / FREEDOM)).sum()
+        size = (
+            (fixed * far).sum()
+            if fixed is not None
+            else ((FREEDOM + 6) * np.log1p(far / FREEDOM)).sum()
+        )
         return float(size + (there.shared**2 / views.shared_std**2).sum())
 
     there = _compare(views, guess, factor)
@@ -175,7 +198,13 @@ def _refined(views: Views, guess: Guess, factor: float, fixed: np.ndarray | None
             damping *= 10.0
         else:
             return guess
-        gained, guess, there, now, damping = now - better, trial, after, better, max(damping / 10.0, 1e-9)
+        gained, guess, there, now, damping = (
+            now - better,
+            trial,
+            after,
+            better,
+            max(damping / 10.0, 1e-9),
+        )
         if gained < 1e-7 * (1.0 + now):
             return guess
     return guess
@@ -190,4 +219,8 @@ def _surprise(views: Views, guess: Guess, factor: float) -> np.ndarray:
 def _factor(views: Views, guess: Guess) -> float:
     """Returns the least factor with which half of all views are as near as half of the right ones should be."""
     typical = [np.median(_compare(views, guess, factor).distance) for factor in FACTORS]
-    return float(FACTORS[np.searchsorted(-np.array(typical), -HALF)]) if typical[-1] <= HALF else float(FACTORS[-1])
+    return (
+        float(FACTORS[np.searchsorted(-np.array(typical), -HALF)])
+        if typical[-1] <= HALF
+        else float(FACTORS[-1])
+    )

@@ -28,7 +28,9 @@ def of_views(views: Views, solution: Solution) -> list[Judged]:
     ]  # fmt: skip
 
 
-def told(views: Views, solution: Solution, offset: ClockOffset | None, shift_s: float) -> dict[str, Any]:
+def told(
+    views: Views, solution: Solution, offset: ClockOffset | None, shift_s: float
+) -> dict[str, Any]:
     """Returns what a file says about a solution by views, besides the camera's place.
 
     Args:

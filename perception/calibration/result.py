@@ -61,11 +61,19 @@ def stored(
         "created": record.now(),
         "machine": machine.name,
         "T_base_cam": plain(base_from_camera),
-        "covariance": plain(cov, 15),  # of a small motion of the camera in its own frame: x y z in m, then turns in rad
+        "covariance": plain(
+            cov, 15
+        ),  # of a small motion of the camera in its own frame: x y z in m, then turns in rad
         "std_m": plain(np.sqrt(np.diag(cov)[:3])),
         "std_rad": plain(np.sqrt(np.diag(cov)[3:6])),
-        "point_std_m": {"at_m": round(distance_m, 3), "std_m": round(point_std_m(cov, distance_m), 6)},
-        "residual": {"rms_m": rms([one.away_m for one in used]), "rms_rad": rms([one.away_rad for one in used])},
+        "point_std_m": {
+            "at_m": round(distance_m, 3),
+            "std_m": round(point_std_m(cov, distance_m), 6),
+        },
+        "residual": {
+            "rms_m": rms([one.away_m for one in used]),
+            "rms_rad": rms([one.away_rad for one in used]),
+        },
         "num_used": len(used),
         "num_left_out": len(judged) - len(used),
         **more,

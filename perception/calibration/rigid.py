@@ -1,6 +1,7 @@
 """Rigid transforms as arrays `(…, 4, 4)`, small motions as `(…, 6)`: shift in m, then turn in rad.
 
-A small motion of a transform acts in the transform's own frame: it shifts by `R v` and turns by `R exp(w)`.
+A small motion of a transform acts in the transform's own frame: it shifts by `R v` and turns by `R
+exp(w)`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ def inverse(transform: np.ndarray) -> np.ndarray:
 def moved(transform: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """Returns a transform, `(4, 4)`, after a small motion, `(6,)`, in its own frame."""
     turn = transform[:3, :3]
-    return pose(turn @ Rotation.from_rotvec(motion[3:]).as_matrix(), transform[:3, 3] + turn @ motion[:3])
+    return pose(
+        turn @ Rotation.from_rotvec(motion[3:]).as_matrix(), transform[:3, 3] + turn @ motion[:3]
+    )
 
 
 def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -37,13 +40,24 @@ def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 def turn_of(rotation: np.ndarray) -> np.ndarray:
     """Returns the rotation vectors, `(…, 3)` rad, of rotations."""
-    return Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(*rotation.shape[:-2], 3)
+    return (
+        Rotation.from_matrix(rotation.reshape(-1, 3, 3))
+        .as_rotvec()
+        .reshape(*rotation.shape[:-2], 3)
+    )
 
 
 def crossing(vector: np.ndarray) -> np.ndarray:
     """Returns the matrices, `(…, 3, 3)`, of the cross product with vectors: `crossing(a) @ b` is `a x b`."""
     found = np.zeros((*vector.shape, 3))
-    for row, column, part, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 0, 2, 1), (1, 2, 0, -1), (2, 0, 1, -1), (2, 1, 0, 1)):
+    for row, column, part, sign in (
+        (0, 1, 2, -1),
+        (0, 2, 1, 1),
+        (1, 0, 2, 1),
+        (1, 2, 0, -1),
+        (2, 0, 1, -1),
+        (2, 1, 0, 1),
+    ):
         found[..., row, column] = sign * vector[..., part]
     return found
 

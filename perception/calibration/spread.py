@@ -52,7 +52,13 @@ def unturned(base_from_link: np.ndarray, distance_m: np.ndarray, least_rad: floa
     return found
 
 
-def missing(machine: Machine, q: np.ndarray, base_from_link: np.ndarray, distance_m: np.ndarray, least_rad: float) -> list[str]:
+def missing(
+    machine: Machine,
+    q: np.ndarray,
+    base_from_link: np.ndarray,
+    distance_m: np.ndarray,
+    least_rad: float,
+) -> list[str]:
     """Returns in words which poses of a machine should be added; see `unturned`.
 
     Args:
@@ -67,7 +73,11 @@ def missing(machine: Machine, q: np.ndarray, base_from_link: np.ndarray, distanc
         low, high = q.min(0), q.max(0)
         for column, joint in enumerate(machine.joints):
             if joint.kind == "hinge" and high[column] - low[column] < 0.5 * least_rad:
-                room = "lower" if low[column] - joint.lower.value > joint.upper.value - high[column] else "higher"
+                room = (
+                    "lower"
+                    if low[column] - joint.lower.value > joint.upper.value - high[column]
+                    else "higher"
+                )
                 found.append(
                     f"{joint.name} stays within {np.degrees(low[column]):.0f} to {np.degrees(high[column]):.0f} degrees: add poses "
                     f"with it {room}, as far as the board stays in view"

@@ -24,7 +24,8 @@ class Points:
     Attributes:
         in_camera_m: As seen, `(N, 3)`.
         in_base_m: The tool's tip there, `(N, 3)`.
-        cov_m2: Covariance of each as seen, `(N, 3, 3)` in the camera's frame: mostly along the sight.
+        cov_m2: Covariance of each as seen, `(N, 3, 3)` in the camera's frame: mostly along the
+            sight.
     """
 
     in_camera_m: np.ndarray
@@ -54,7 +55,8 @@ class Fit:
         base_from_camera: The camera, `(4, 4)`.
         cov: Covariance of a small motion of it in its own frame, `(6, 6)`.
         factor: The tip is this many times less exact than was assumed, 1 or more.
-        away_m: How far the tip was from where the camera sees each point, `(N, 3)` in the base frame.
+        away_m: How far the tip was from where the camera sees each point, `(N, 3)` in the base
+            frame.
         used: Which points were believed in the end, `(N,)` bool.
     """
 
@@ -76,9 +78,14 @@ def fit(points: Points, tip_std_m: float) -> Fit | None:
     if count < FEWEST:
         return None
     generator = np.random.default_rng(0)
-    groups = [np.arange(count), *(generator.choice(count, 3, replace=False) for _ in range(TRIPLES))]
+    groups = [
+        np.arange(count),
+        *(generator.choice(count, 3, replace=False) for _ in range(TRIPLES)),
+    ]
     places = [points.part(group).kabsch() for group in groups]
-    place = places[int(np.argmin([np.median(np.linalg.norm(points.away_m(one), axis=1)) for one in places]))]
+    place = places[
+        int(np.argmin([np.median(np.linalg.norm(points.away_m(one), axis=1)) for one in places]))
+    ]
     # half of the points may be wrong: the median says how exact the others are
     distance = _weighed(points, place, tip_std_m, None)[0]
     std_m = tip_std_m * np.sqrt(max(1.0, np.median(distance) / chi2.ppf(0.5, 3)))
@@ -95,7 +102,9 @@ def fit(points: Points, tip_std_m: float) -> Fit | None:
 
 def width_m(in_base_m: np.ndarray) -> float:
     """Returns how far points, `(N, 3)`, spread across the line that fits them best, standard deviation; 0 lets them turn."""
-    return float(np.linalg.svd(in_base_m - in_base_m.mean(0), compute_uv=False)[1] / np.sqrt(len(in_base_m)))
+    return float(
+        np.linalg.svd(in_base_m - in_base_m.mean(0), compute_uv=False)[1] / np.sqrt(len(in_base_m))
+    )
 
 
 def _weighed(
@@ -106,12 +115,16 @@ def _weighed(
     information = np.linalg.inv(points.cov_m2 + tip_std_m**2 * np.eye(3))
     distance = np.einsum("ni,nij,nj->n", away, information, away)
     weight = (FREEDOM + 3) / (FREEDOM + distance) if fixed is None else fixed
-    slopes = np.concatenate([np.broadcast_to(-np.eye(3), (len(away), 3, 3)), rigid.crossing(points.in_camera_m)], 2)
+    slopes = np.concatenate(
+        [np.broadcast_to(-np.eye(3), (len(away), 3, 3)), rigid.crossing(points.in_camera_m)], 2
+    )
     weighted = np.swapaxes(slopes, 1, 2) @ (weight[:, None, None] * information)
     return distance, (weighted @ slopes).sum(0), (weighted @ away[..., None]).sum(0)[:, 0]
 
 
-def _refined(points: Points, place: np.ndarray, tip_std_m: float, fixed: np.ndarray | None) -> np.ndarray:
+def _refined(
+    points: Points, place: np.ndarray, tip_std_m: float, fixed: np.ndarray | None
+) -> np.ndarray:
     for _ in range(STEPS):
         _, normal, gradient = _weighed(points, place, tip_std_m, fixed)
         step = -np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]

@@ -13,15 +13,20 @@ from perception.calibration import rigid
 class Views:
     """`N` sights of a board that is fixed to a link of the arm.
 
-    Small motions of the link are given in the base frame, `(6,)`: a point at `p` moves by `v + w x p`.
+    Small motions of the link are given in the base frame, `(6,)`: a point at `p` moves by `v + w x
+    p`.
 
     Attributes:
         base_from_link: Where joint positions put the link, `(N, 4, 4)`.
-        camera_from_board: Where the camera sees the board, `(N, C, 4, 4)`: `C` candidates, since a flat board seen from afar fits
-            two poses about equally well; all the same where there is one.
-        seen_cov: Covariance of each candidate as a small motion in the board's frame, `(N, C, 6, 6)`.
-        slack: Motions by which each link may be elsewhere independently, one standard deviation each, `(N, K, 6)`.
-        shared: Motions for one unit of what is wrong in all views alike (zeros of joints, the clock), `(N, S, 6)`.
+        camera_from_board: Where the camera sees the board, `(N, C, 4, 4)`: `C` candidates, since a
+            flat board seen from afar fits two poses about equally well; all the same where there is
+            one.
+        seen_cov: Covariance of each candidate as a small motion in the board's frame, `(N, C, 6,
+            6)`.
+        slack: Motions by which each link may be elsewhere independently, one standard deviation
+            each, `(N, K, 6)`.
+        shared: Motions for one unit of what is wrong in all views alike (zeros of joints, the
+            clock), `(N, S, 6)`.
         shared_std: How wrong that may be, standard deviation in its unit, `(S,)`.
         names: Of the views.
         shared_names: Of what is wrong alike.
@@ -89,4 +94,6 @@ def in_board(views: Views, guess: Guess, board: np.ndarray, motions: np.ndarray)
     place = board[:, :3, 3] @ turn.T + guess.base_from_camera[:3, 3]
     own = np.swapaxes(turn @ board[:, :3, :3], 1, 2)  # board from base
     shift = motions[..., :3] + np.cross(motions[..., 3:], place[:, None])
-    return np.concatenate([own @ np.swapaxes(shift, 1, 2), own @ np.swapaxes(motions[..., 3:], 1, 2)], 1)
+    return np.concatenate(
+        [own @ np.swapaxes(shift, 1, 2), own @ np.swapaxes(motions[..., 3:], 1, 2)], 1
+    )

@@ -25,43 +25,73 @@ _SPACING = 1.3
 def frame_of(normal: np.ndarray, turn_rad: float) -> np.ndarray:
     """Returns a rotation whose third column is along `normal`, `(3,)`, turned about it."""
     normal = normal / np.linalg.norm(normal)
-    first = np.cross(np.array([0.0, 1.0, 0.0]) if abs(normal[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), normal)
+    first = np.cross(
+        np.array([0.0, 1.0, 0.0]) if abs(normal[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), normal
+    )
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
     return np.stack([cos * first + sin * second, cos * second - sin * first, normal], 1)
 
 
-def block_at(kind: Concrete, target: np.ndarray, normal: np.ndarray, turn_rad: float, generator: np.random.Generator) -> Block:
+def block_at(
+    kind: Concrete,
+    target: np.ndarray,
+    normal: np.ndarray,
+    turn_rad: float,
+    generator: np.random.Generator,
+) -> Block:
     """Returns a block whose drilled face looks along `normal` and has its first hole, or its middle, at `target`."""
-    half = np.array([generator.uniform(*kind.length_m), generator.uniform(*kind.width_m), generator.uniform(*kind.thickness_m)]) / 2
+    half = (
+        np.array(
+            [
+                generator.uniform(*kind.length_m),
+                generator.uniform(*kind.width_m),
+                generator.uniform(*kind.thickness_m),
+            ]
+        )
+        / 2
+    )
     radius = float(generator.uniform(*kind.radius_m))
     edge = float(generator.uniform(*kind.edge_m))
     num_holes = int(generator.integers(kind.holes[0], kind.holes[1] + 1))
     num_discs = int(generator.integers(kind.decoys[0], kind.decoys[1] + 1))
-    radii = [radius] * num_holes + [float(generator.uniform(*kind.decoy_radius_m)) for _ in range(num_discs)]
+    radii = [radius] * num_holes + [
+        float(generator.uniform(*kind.decoy_radius_m)) for _ in range(num_discs)
+    ]
     places = _scattered(half[:2], radii, edge, generator)
-    holes = [_hole(kind, np.array([*place, half[2]]), radius, FRONT, generator) for place in places[:num_holes]]
+    holes = [
+        _hole(kind, np.array([*place, half[2]]), radius, FRONT, generator)
+        for place in places[:num_holes]
+    ]
     for _ in range(int(generator.integers(kind.side_holes[0], kind.side_holes[1] + 1))):
         holes.append(_side_hole(kind, half, radius, edge, generator))
     discs = tuple(
-        Disc(np.array([*place, half[2]]), size, "paint") for place, size in zip(places[num_holes:], radii[num_holes:], strict=False)
+        Disc(np.array([*place, half[2]]), size, "paint")
+        for place, size in zip(places[num_holes:], radii[num_holes:], strict=False)
     )
     chips = tuple(chip for hole in holes[:num_holes] for chip in _chips(kind, hole, generator))
     rotation = frame_of(normal, turn_rad)
     first = np.array([*places[0], half[2]]) if places else np.array([0.0, 0.0, half[2]])
     pose = Pose(rotation, target - rotation @ first)
-    return Block(pose, half, materials_of(kind, half, holes, discs, generator), tuple(holes), chips, discs)
+    return Block(
+        pose, half, materials_of(kind, half, holes, discs, generator), tuple(holes), chips, discs
+    )
 
 
-def _scattered(half_m: np.ndarray, radii: list[float], edge_m: float, generator: np.random.Generator) -> list[np.ndarray]:
+def _scattered(
+    half_m: np.ndarray, radii: list[float], edge_m: float, generator: np.random.Generator
+) -> list[np.ndarray]:
     """Returns places on the face for discs of these radii; those that find no room are left out, the first always has it."""
     found: list[np.ndarray] = []
     for number, radius in enumerate(radii):
         room = np.maximum(half_m - radius - edge_m, 0.0)
         for _ in range(_TRIES):
             place = generator.uniform(-room, room)
-            if all(np.linalg.norm(place - other) > _SPACING * (radius + radii[k]) for k, other in enumerate(found)):
+            if all(
+                np.linalg.norm(place - other) > _SPACING * (radius + radii[k])
+                for k, other in enumerate(found)
+            ):
                 found.append(place)
                 break
         if len(found) <= number:
@@ -69,12 +99,18 @@ def _scattered(half_m: np.ndarray, radii: list[float], edge_m: float, generator:
     return found
 
 
-def _hole(kind: Concrete, center: np.ndarray, radius: float, part: int, generator: np.random.Generator) -> Hole:
-    lamp = float(generator.uniform(*kind.lamp)) if generator.random() < kind.lamp_probability else 0.0
+def _hole(
+    kind: Concrete, center: np.ndarray, radius: float, part: int, generator: np.random.Generator
+) -> Hole:
+    lamp = (
+        float(generator.uniform(*kind.lamp)) if generator.random() < kind.lamp_probability else 0.0
+    )
     return Hole(center, radius, float(generator.uniform(*kind.depth_m)), part, lamp)
 
 
-def _side_hole(kind: Concrete, half: np.ndarray, radius: float, edge: float, generator: np.random.Generator) -> Hole:
+def _side_hole(
+    kind: Concrete, half: np.ndarray, radius: float, edge: float, generator: np.random.Generator
+) -> Hole:
     """Returns a hole in one of the four faces beside the drilled one; shallow, so that it meets no other."""
     part = int(generator.integers(4))
     axis = part // 2
@@ -92,14 +128,26 @@ def bars_in(kind: Concrete, block: Block, generator: np.random.Generator) -> lis
     for hole in block.holes:
         if hole.part != FRONT or generator.random() >= kind.bar_probability:
             continue
-        angle, below = generator.uniform(-np.pi, np.pi), float(generator.uniform(0.03, hole.depth_m + 0.02))
+        angle, below = (
+            generator.uniform(-np.pi, np.pi),
+            float(generator.uniform(0.03, hole.depth_m + 0.02)),
+        )
         along = block.pose.rotation @ [np.cos(angle), np.sin(angle), 0.0]
-        aside = 0.7 * hole.radius_m * generator.uniform(-1, 1) * np.array([-np.sin(angle), np.cos(angle), 0.0])
+        aside = (
+            0.7
+            * hole.radius_m
+            * generator.uniform(-1, 1)
+            * np.array([-np.sin(angle), np.cos(angle), 0.0])
+        )
         place = block.pose.point(hole.center_m + aside - [0.0, 0.0, below])
         rust = Material((0.25, 0.16, 0.1), 0.3, 0.001, 2)
         bars.append(
             Cylinder(
-                "block", Pose(frame_of(along, 0.0), place), float(generator.uniform(0.005, 0.012)), 1.2 * hole.radius_m, (rust,)
+                "block",
+                Pose(frame_of(along, 0.0), place),
+                float(generator.uniform(0.005, 0.012)),
+                1.2 * hole.radius_m,
+                (rust,),
             )
         )
     return bars
@@ -117,10 +165,17 @@ def _chips(kind: Concrete, hole: Hole, generator: np.random.Generator) -> list[C
 
 
 def materials_of(
-    kind: Concrete, half: np.ndarray, holes: Sequence[Hole], discs: tuple[Disc, ...], generator: np.random.Generator
+    kind: Concrete,
+    half: np.ndarray,
+    holes: Sequence[Hole],
+    discs: tuple[Disc, ...],
+    generator: np.random.Generator,
 ) -> tuple[Material, ...]:
     """Returns the materials of all parts of the block; see `Block`."""
-    bright, grain = float(generator.uniform(*kind.brightness)), float(generator.uniform(*kind.grain))
+    bright, grain = (
+        float(generator.uniform(*kind.brightness)),
+        float(generator.uniform(*kind.grain)),
+    )
     tint = 1.0 + 0.04 * generator.standard_normal(3)
     texture, marks = int(generator.integers(NUM_TEXTURES)), _marks(kind, half, generator)
 
@@ -150,7 +205,11 @@ def _marks(kind: Concrete, half: np.ndarray, generator: np.random.Generator) -> 
     size = (2.4 * half[[1, 0]] / MARK_M).astype(int)
     marks = np.ones(tuple(size), np.float32)
     for _ in range(int(generator.integers(kind.stains[0], kind.stains[1] + 1))):
-        blotch = cv2.resize(generator.standard_normal((8, 8)).astype(np.float32), (size[1], size[0]), interpolation=cv2.INTER_CUBIC)
+        blotch = cv2.resize(
+            generator.standard_normal((8, 8)).astype(np.float32),
+            (size[1], size[0]),
+            interpolation=cv2.INTER_CUBIC,
+        )
         center, spread = generator.uniform(0, size[::-1]), generator.uniform(15, 120)
         x, y = np.arange(size[1], dtype=np.float32), np.arange(size[0], dtype=np.float32)
         far = np.sqrt((x[None] - center[0]) ** 2 + (y[:, None] - center[1]) ** 2) / spread
@@ -158,9 +217,19 @@ def _marks(kind: Concrete, half: np.ndarray, generator: np.random.Generator) -> 
         cover = np.clip((1.0 - far + 0.35 * blotch) / soft, 0.0, 1.0)
         marks *= 1.0 - cover * (1.0 - float(generator.uniform(*kind.stain_brightness)))
     for _ in range(int(generator.integers(kind.cracks[0], kind.cracks[1] + 1))):
-        steps = generator.standard_normal((12, 2)).cumsum(0) * 6 + generator.uniform(-1, 1, 2) * np.arange(12)[:, None] * 25
+        steps = (
+            generator.standard_normal((12, 2)).cumsum(0) * 6
+            + generator.uniform(-1, 1, 2) * np.arange(12)[:, None] * 25
+        )
         line = (steps + generator.uniform(0, size[::-1])).astype(np.int32)
         dark = float(generator.uniform(0.3, 0.8))
-        painted = cv2.polylines(np.zeros_like(marks), [line[:, None]], False, 1.0, int(generator.integers(1, 3)), cv2.LINE_AA)
+        painted = cv2.polylines(
+            np.zeros_like(marks),
+            [line[:, None]],
+            False,
+            1.0,
+            int(generator.integers(1, 3)),
+            cv2.LINE_AA,
+        )
         marks *= 1.0 - (1.0 - dark) * np.minimum(painted, 1.0)
     return marks

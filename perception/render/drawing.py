@@ -30,7 +30,11 @@ def compose(kind: Scenes, rig: Rig, generator: np.random.Generator) -> Scene:
         block = block_at(kind.block, target, normal, turn, generator)
     hidden = uniform(kind.around.hidden, generator)
     if generator.random() < kind.around.arm:
-        rim = rim_points(block, block.holes[0]) if block and block.holes else target + 0.05 * frame_of(normal, turn)[:, :2].T
+        rim = (
+            rim_points(block, block.holes[0])
+            if block and block.holes
+            else target + 0.05 * frame_of(normal, turn)[:, :2].T
+        )
         arm = arm_over(rim, rig, hidden, generator)
     return surround(kind, rig, block, arm, target, normal, generator)
 
@@ -59,7 +63,9 @@ def surround(
     """
     down = rig.down_in_camera
     if ground_m is None:
-        ground_m = max(0.5, float((block.corners_m @ down).max())) if block else float(target @ down) + 0.2
+        ground_m = (
+            max(0.5, float((block.corners_m @ down).max())) if block else float(target @ down) + 0.2
+        )
     solids: list[Solid] = [*_setting(kind, down, ground_m, generator)]
     if block:
         solids += [block, *bars_in(kind.block, block, generator)]
@@ -96,7 +102,9 @@ def rim_points(block: Block, circle: Hole | Disc) -> np.ndarray:
 def hidden_part(solids: Sequence[Solid], block: Block, circle: Hole | Disc) -> float:
     """Returns the part of the rim of a hole or disc that other solids, or the block itself, hide from the left camera."""
     rim = rim_points(block, circle)
-    outward = block.pose.rotation @ (circle.outward if isinstance(circle, Hole) else np.array([0.0, 0.0, 1.0]))
+    outward = block.pose.rotation @ (
+        circle.outward if isinstance(circle, Hole) else np.array([0.0, 0.0, 1.0])
+    )
     if (outward @ rim.mean(0)) >= 0:  # on a face that looks away
         return 1.0
     shut = np.zeros(len(rim), bool)
@@ -106,7 +114,9 @@ def hidden_part(solids: Sequence[Solid], block: Block, circle: Hole | Disc) -> f
     return float(shut.mean())
 
 
-def _target(kind: Scenes, rig: Rig, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, float]:
+def _target(
+    kind: Scenes, rig: Rig, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Returns the point on the face that is looked at, the face's normal (both `(3,)`), and the turn of the block about it."""
     inner = 1.0 - 2.0 * kind.sight.margin
     size = np.array([rig.width, rig.height])
@@ -117,10 +127,17 @@ def _target(kind: Scenes, rig: Rig, generator: np.random.Generator) -> tuple[np.
     up -= ray * (up @ ray)
     up /= np.linalg.norm(up)
     side = np.cross(ray, up)
-    azimuth, obliquity = uniform(kind.sight.azimuth_rad, generator), uniform(kind.sight.obliquity_rad, generator)
+    azimuth, obliquity = (
+        uniform(kind.sight.azimuth_rad, generator),
+        uniform(kind.sight.obliquity_rad, generator),
+    )
     lean = math.cos(azimuth) * up + math.sin(azimuth) * side
     normal = -math.cos(obliquity) * ray + math.sin(obliquity) * lean
-    return ray * uniform(kind.sight.distance_m, generator), normal, float(generator.uniform(-np.pi, np.pi))
+    return (
+        ray * uniform(kind.sight.distance_m, generator),
+        normal,
+        float(generator.uniform(-np.pi, np.pi)),
+    )
 
 
 def matt(
@@ -136,22 +153,45 @@ def matt(
     pattern = int(generator.integers(NUM_TEXTURES)) if texture is None else texture
     shift = tuple(generator.uniform(0, SIDE, 2))
     red, green, blue = np.clip(color, 0.01, 0.95)
-    return Material((float(red), float(green), float(blue)), contrast, texel_m, pattern, (float(shift[0]), float(shift[1])))
+    return Material(
+        (float(red), float(green), float(blue)),
+        contrast,
+        texel_m,
+        pattern,
+        (float(shift[0]), float(shift[1])),
+    )
 
 
-def _setting(kind: Scenes, down: np.ndarray, lowest_m: float, generator: np.random.Generator) -> tuple[Plane, Plane]:
+def _setting(
+    kind: Scenes, down: np.ndarray, lowest_m: float, generator: np.random.Generator
+) -> tuple[Plane, Plane]:
     """Returns ground and backdrop."""
-    soil = matt(uniform(kind.around.ground_brightness, generator), generator.uniform(0.15, 0.4), 0.002, generator, 0.12)
+    soil = matt(
+        uniform(kind.around.ground_brightness, generator),
+        generator.uniform(0.15, 0.4),
+        0.002,
+        generator,
+        0.12,
+    )
     wall = matt(generator.uniform(0.2, 0.6), generator.uniform(0.1, 0.3), 0.006, generator, 0.1)
     ground = Plane("ground", Pose(frame_of(-down, 0.0), down * lowest_m), (soil,))
     level = np.array([0.0, 0.0, 1.0]) - down * down[2]
     level /= np.linalg.norm(level)
-    backdrop = Plane("ground", Pose(frame_of(-level, 0.0), level * uniform(kind.around.backdrop_m, generator)), (wall,))
+    backdrop = Plane(
+        "ground",
+        Pose(frame_of(-level, 0.0), level * uniform(kind.around.backdrop_m, generator)),
+        (wall,),
+    )
     return ground, backdrop
 
 
 def _clutter(
-    kind: Scenes, rig: Rig, block: Block | None, down: np.ndarray, lowest_m: float, generator: np.random.Generator
+    kind: Scenes,
+    rig: Rig,
+    block: Block | None,
+    down: np.ndarray,
+    lowest_m: float,
+    generator: np.random.Generator,
 ) -> list[Solid]:
     """Returns things on the ground, in the picture, not in front of a rim and not inside the block."""
     wanted, found = integer(kind.around.clutter, generator), []
@@ -165,11 +205,17 @@ def _clutter(
         place = ray * way * generator.uniform(0.9, 1.0) - down * half[2]
         if not 0.8 < place[2] < 12.0:
             continue
-        tilt = frame_of(-down + 0.15 * generator.standard_normal(3), float(generator.uniform(-np.pi, np.pi)))
-        stuff = matt(generator.uniform(0.05, 0.6), generator.uniform(0.05, 0.3), 0.001, generator, 0.25)
+        tilt = frame_of(
+            -down + 0.15 * generator.standard_normal(3), float(generator.uniform(-np.pi, np.pi))
+        )
+        stuff = matt(
+            generator.uniform(0.05, 0.6), generator.uniform(0.05, 0.3), 0.001, generator, 0.25
+        )
         thing = Box("clutter", Pose(tilt, place), half, (stuff,))
         reach = float(np.linalg.norm(half))
-        if block and np.linalg.norm(place - block.pose.center_m) < reach + np.linalg.norm(block.half_m):
+        if block and np.linalg.norm(place - block.pose.center_m) < reach + np.linalg.norm(
+            block.half_m
+        ):
             continue
         if block and any(hidden_part([thing], block, hole) > 0 for hole in block.holes):
             continue
@@ -177,23 +223,43 @@ def _clutter(
     return found
 
 
-def _light(kind: Scenes, down: np.ndarray, target: np.ndarray, generator: np.random.Generator) -> Light:
+def _light(
+    kind: Scenes, down: np.ndarray, target: np.ndarray, generator: np.random.Generator
+) -> Light:
     """Returns sun and sky, and things out of sight that throw shadows on the face."""
-    elevation, azimuth = uniform(kind.light.elevation_rad, generator), generator.uniform(-np.pi, np.pi)
+    elevation, azimuth = (
+        uniform(kind.light.elevation_rad, generator),
+        generator.uniform(-np.pi, np.pi),
+    )
     frame = frame_of(-down, 0.0)
-    to_sun = frame @ [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+    to_sun = frame @ [
+        math.cos(elevation) * math.cos(azimuth),
+        math.cos(elevation) * math.sin(azimuth),
+        math.sin(elevation),
+    ]
     shade = []
     for _ in range(integer(kind.light.shadows, generator)):
-        beam = frame_of(to_sun + 0.3 * generator.standard_normal(3), float(generator.uniform(-np.pi, np.pi)))
+        beam = frame_of(
+            to_sun + 0.3 * generator.standard_normal(3), float(generator.uniform(-np.pi, np.pi))
+        )
         beside = beam[:, :2] @ generator.uniform(-0.25, 0.25, 2)
         half = np.array([generator.uniform(0.03, 0.25), 1.5, 0.02])
         dark = matt(0.3, 0.1, 0.01, generator)
         shade.append(Box("clutter", Pose(beam, target + beside + 3.0 * to_sun), half, (dark,)))
-    return Light(to_sun, uniform(kind.light.sun, generator), uniform(kind.light.ambient, generator), tuple(shade))
+    return Light(
+        to_sun,
+        uniform(kind.light.sun, generator),
+        uniform(kind.light.ambient, generator),
+        tuple(shade),
+    )
 
 
 def _exposure(
-    kind: Scenes, light: Light, normal: np.ndarray, target: np.ndarray, generator: np.random.Generator
+    kind: Scenes,
+    light: Light,
+    normal: np.ndarray,
+    target: np.ndarray,
+    generator: np.random.Generator,
 ) -> tuple[Exposure, float]:
     """Returns how the pictures are taken, and the level of light; the exposure is set for the face as it is lit without dust."""
     ranges = kind.light

@@ -1,7 +1,9 @@
 """The concrete block: a box with holes drilled into it, chips broken off the rims, and discs painted on it.
 
-What is cut away is a union of convex cavities (half-open cylinders for holes, balls for chips), so a ray through it is followed
-exactly: from its entry on, it goes to the end of each cavity that it is in, until no cavity takes it further.
+What is cut away is a union of convex cavities (half-open cylinders for holes, balls for chips), so
+a ray through it is followed
+exactly: from its entry on, it goes to the end of each cavity that it is in, until no cavity takes
+it further.
 """
 
 from __future__ import annotations
@@ -59,7 +61,9 @@ class Hole:
         away = point - self.center_m.astype(np.float32)
         return away[..., one], away[..., two], -self.sign * away[..., self.axis]
 
-    def interval(self, start: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def interval(
+        self, start: np.ndarray, along: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns where rays, `(M, 3)` each, enter and leave the cavity, and whether they leave through the floor."""
         x, y, depth = self.across_m(start)
         one, two = (self.axis + 1) % 3, (self.axis + 2) % 3
@@ -68,7 +72,9 @@ class Hole:
         b = x * dx + y * dy
         inside = b * b - a * (x * x + y * y - self.radius_m**2)
         root = np.sqrt(np.maximum(inside, 0.0))
-        floor = np.where(sink > 1e-9, (self.depth_m - depth) / np.where(sink > 1e-9, sink, 1.0), np.inf)
+        floor = np.where(
+            sink > 1e-9, (self.depth_m - depth) / np.where(sink > 1e-9, sink, 1.0), np.inf
+        )
         enter, wall = (-b - root) / a, (-b + root) / a
         leave = np.where(inside > 0, np.minimum(wall, floor), -np.inf)
         return enter, leave, floor < wall
@@ -132,11 +138,16 @@ class Block:
         t, part, _ = self.box.hit(origin, direction)
         mouth = np.zeros(len(t), bool)
         struck = np.flatnonzero(np.isfinite(t))
-        start, along = self.pose.local(origin if origin.ndim == 1 else origin[struck], direction[struck])
+        start, along = self.pose.local(
+            origin if origin.ndim == 1 else origin[struck], direction[struck]
+        )
         entry = start + t[struck, None] * along
         near = np.zeros(len(struck), bool)
         for disc_number, disc in enumerate(self.discs):
-            x, y = entry[:, 0] - np.float32(disc.center_m[0]), entry[:, 1] - np.float32(disc.center_m[1])
+            x, y = (
+                entry[:, 0] - np.float32(disc.center_m[0]),
+                entry[:, 1] - np.float32(disc.center_m[1]),
+            )
             on = (part[struck] == FRONT) & (x * x + y * y < disc.radius_m**2)
             part[struck[on]] = self.break_part + 1 + disc_number
         for hole in self.holes:
@@ -168,26 +179,37 @@ class Block:
         for _ in range(_MARCH):
             for enter, leave, end in cavities:
                 inside = (enter <= way + 1e-6) & (leave > way + 1e-6)
-                way, part = np.where(inside, leave, way).astype(np.float32), np.where(inside, end, part)
+                way, part = (
+                    np.where(inside, leave, way).astype(np.float32),
+                    np.where(inside, end, part),
+                )
         return way, part
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
         """Describes faces, breaks, discs, and the insides of the holes, where light falls off with depth."""
-        flat = np.where((part >= NUM_FACES) & (part >= self.break_part), FRONT, np.minimum(part, FRONT)).astype(np.int16)
+        flat = np.where(
+            (part >= NUM_FACES) & (part >= self.break_part), FRONT, np.minimum(part, FRONT)
+        ).astype(np.int16)
         normal, uv, *_ = self.box.surface(point, flat, to_sun)
         normal = normal.copy()
         openness, sunlit = np.ones(len(part), np.float32), np.ones(len(part), bool)
-        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(np.float32)
+        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(
+            np.float32
+        )
         sun = (to_sun @ self.pose.rotation).astype(np.float32)
         for number, hole in enumerate(self.holes):
-            rows = np.flatnonzero((part == NUM_FACES + 2 * number) | (part == NUM_FACES + 2 * number + 1))
+            rows = np.flatnonzero(
+                (part == NUM_FACES + 2 * number) | (part == NUM_FACES + 2 * number + 1)
+            )
             if len(rows):
                 inside = _inside(hole, local[rows], part[rows] == NUM_FACES + 2 * number + 1, sun)
                 normal[rows] = inside.normal @ self.pose.rotation.T.astype(np.float32)
                 uv[rows], openness[rows], sunlit[rows] = inside.uv_m, inside.openness, inside.sunlit
         for chip in self.chips:
             away = chip.center_m.astype(np.float32) - local
-            on = (part == self.break_part) & (np.abs(np.einsum("ij,ij->i", away, away) - chip.radius_m**2) < 1e-4 * chip.radius_m)
+            on = (part == self.break_part) & (
+                np.abs(np.einsum("ij,ij->i", away, away) - chip.radius_m**2) < 1e-4 * chip.radius_m
+            )
             normal[on] = (away[on] / chip.radius_m) @ self.pose.rotation.T.astype(np.float32)
         return Surface(normal, uv, openness, sunlit)
 
@@ -195,9 +217,9 @@ class Block:
 def _inside(hole: Hole, point: np.ndarray, floor: np.ndarray, sun: np.ndarray) -> Surface:
     """Describes the inside of a hole in the block's coordinates.
 
-    The part of the sky that is seen through the mouth is, for a ring of the wall at depth h, with x = h / 2r:
-    (x^2 + 1/2) / sqrt(x^2 + 1) - x, and for the middle of the floor r^2 / (r^2 + h^2) (view factors of a cylinder, Howell's
-    catalogue C-78 and C-13).
+    The part of the sky that is seen through the mouth is, for a ring of the wall at depth h, with x
+    = h / 2r: (x^2 + 1/2) / sqrt(x^2 + 1) - x, and for the middle of the floor r^2 / (r^2 + h^2)
+    (view factors of a cylinder, Howell's catalogue C-78 and C-13).
     """
     x, y, depth = hole.across_m(point)
     one, two = (hole.axis + 1) % 3, (hole.axis + 2) % 3
@@ -208,7 +230,11 @@ def _inside(hole: Hole, point: np.ndarray, floor: np.ndarray, sun: np.ndarray) -
     half = np.maximum(depth, 0.0) / (2.0 * hole.radius_m)
     ring = (half * half + 0.5) / np.sqrt(half * half + 1.0) - half
     sky = np.where(floor, hole.radius_m**2 / (hole.radius_m**2 + depth * depth), ring)
-    glow = hole.lamp * np.exp(-np.abs(hole.depth_m - depth) / (4.0 * hole.radius_m)) if hole.lamp else 0.0
+    glow = (
+        hole.lamp * np.exp(-np.abs(hole.depth_m - depth) / (4.0 * hole.radius_m))
+        if hole.lamp
+        else 0.0
+    )
     rise = sun[hole.axis] * hole.sign
     way = np.maximum(depth, 0.0) / max(rise, 1e-6)
     sunlit = ((x + way * sun[one]) ** 2 + (y + way * sun[two]) ** 2 < hole.radius_m**2) & (rise > 0)

@@ -48,7 +48,9 @@ class Rig:
     @property
     def right(self) -> Pinhole:
         """Its partner."""
-        return Pinhole(self.width, self.height, self.focal_px, np.array([self.baseline_m, 0.0, 0.0]))
+        return Pinhole(
+            self.width, self.height, self.focal_px, np.array([self.baseline_m, 0.0, 0.0])
+        )
 
     @property
     def base_from_camera(self) -> np.ndarray:

@@ -25,7 +25,8 @@ class Sight:
     Attributes:
         distance_m: Camera to the first hole's rim (or the middle of the face).
         obliquity_rad: Between the face's normal and the line of sight.
-        azimuth_rad: Direction in the picture towards which the face leans; 0 leans up, as a block on the ground does.
+        azimuth_rad: Direction in the picture towards which the face leans; 0 leans up, as a block
+            on the ground does.
         margin: Part of the picture along its border where the first hole never is.
     """
 
@@ -92,9 +93,13 @@ class Concrete:
     def check(self) -> None:
         need = 2 * (max(self.radius_m[1], self.decoy_radius_m[1]) + self.edge_m[0])
         if need > min(self.width_m[0], self.length_m[0]):
-            raise ConfigError(f"scene.block: a face of {self.width_m[0]} m has no room for a hole that needs {need:g} m")
+            raise ConfigError(
+                f"scene.block: a face of {self.width_m[0]} m has no room for a hole that needs {need:g} m"
+            )
         if self.depth_m[1] >= self.thickness_m[0]:
-            raise ConfigError(f"scene.block: holes of {self.depth_m[1]} m go through a block of {self.thickness_m[0]} m")
+            raise ConfigError(
+                f"scene.block: holes of {self.depth_m[1]} m go through a block of {self.thickness_m[0]} m"
+            )
 
 
 @spec
@@ -117,7 +122,9 @@ class Surroundings:
 
     def check(self) -> None:
         if self.hidden[1] > 0 and self.arm < 1 and self.hidden[0] > 0:
-            raise ConfigError(f"scene.around: hidden {self.hidden} needs an arm in every picture (arm: 1.0), got {self.arm}")
+            raise ConfigError(
+                f"scene.around: hidden {self.hidden} needs an arm in every picture (arm: 1.0), got {self.arm}"
+            )
 
 
 @spec
@@ -129,7 +136,8 @@ class Daylight:
         ambient: Strength of the light from everywhere.
         elevation_rad: Of the sun above the ground.
         shadows: Things out of sight that throw a shadow on the block.
-        level: Light there is, relative to what the exposure is set for; drawn evenly on a logarithmic scale.
+        level: Light there is, relative to what the exposure is set for; drawn evenly on a
+            logarithmic scale.
         exposure: Brightness of the block's lit face in the picture at level 1, 1 saturates.
         transmission: Light that the air lets through on the way to the block; 1 is clear.
         patchiness: Standard deviation of the dust's density.
@@ -158,7 +166,9 @@ class Daylight:
 
     def check(self) -> None:
         if not 0 < self.transmission[0] <= self.transmission[1] <= 1:
-            raise ConfigError(f"scene.light.transmission: expected values above 0 and up to 1, got {self.transmission}")
+            raise ConfigError(
+                f"scene.light.transmission: expected values above 0 and up to 1, got {self.transmission}"
+            )
         if min(self.level[0], self.full_well_e[0], self.gamma[0]) <= 0:
             raise ConfigError("scene.light: expected level, full_well_e and gamma above 0")
 

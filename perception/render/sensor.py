@@ -14,9 +14,11 @@ class Exposure:
 
     Attributes:
         gain: Signal for unit radiance; 1 saturates.
-        extinction_per_m: Of the dusty air: what is left of the light after z metres is exp(-extinction z).
+        extinction_per_m: Of the dusty air: what is left of the light after z metres is
+            exp(-extinction z).
         airlight: Radiance of the dust itself.
-        patchiness: Standard deviation of the dust's density over the picture, relative; it drifts before the block.
+        patchiness: Standard deviation of the dust's density over the picture, relative; it drifts
+            before the block.
         blur_px: Standard deviation of the point spread.
         full_well_e: Electrons at saturation; decides the shot noise.
         read_noise_e: Noise in the dark, electrons.
@@ -36,7 +38,11 @@ class Exposure:
 
 
 def photograph(
-    radiance: np.ndarray, depth_m: np.ndarray, exposure: Exposure, density: np.ndarray, generator: np.random.Generator
+    radiance: np.ndarray,
+    depth_m: np.ndarray,
+    exposure: Exposure,
+    density: np.ndarray,
+    generator: np.random.Generator,
 ) -> np.ndarray:
     """Returns the picture that a camera takes of a view, RGB, `(h, w, 3)` uint8.
 
@@ -57,11 +63,24 @@ def photograph(
     if exposure.blur_px > 0:
         light = cv2.GaussianBlur(light, (0, 0), exposure.blur_px)
     if exposure.vignetting > 0:
-        x, y = np.linspace(-1, 1, width, dtype=np.float32), np.linspace(-1, 1, height, dtype=np.float32)
-        light = light * (1.0 - np.float32(exposure.vignetting / 2) * (x[None] ** 2 + y[:, None] ** 2))[..., None]
+        x, y = (
+            np.linspace(-1, 1, width, dtype=np.float32),
+            np.linspace(-1, 1, height, dtype=np.float32),
+        )
+        light = (
+            light
+            * (1.0 - np.float32(exposure.vignetting / 2) * (x[None] ** 2 + y[:, None] ** 2))[
+                ..., None
+            ]
+        )
     signal = np.clip(light * np.float32(exposure.gain), 0.0, 1.0)
-    spread = np.sqrt(signal / np.float32(exposure.full_well_e) + np.float32((exposure.read_noise_e / exposure.full_well_e) ** 2))
-    signal = np.clip(signal + spread * generator.standard_normal(signal.shape, np.float32), 0.0, 1.0)
+    spread = np.sqrt(
+        signal / np.float32(exposure.full_well_e)
+        + np.float32((exposure.read_noise_e / exposure.full_well_e) ** 2)
+    )
+    signal = np.clip(
+        signal + spread * generator.standard_normal(signal.shape, np.float32), 0.0, 1.0
+    )
     if exposure.gamma != 1.0:
         signal = signal ** np.float32(1.0 / exposure.gamma)
     return (255.0 * signal + 0.5).astype(np.uint8)

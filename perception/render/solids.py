@@ -1,8 +1,9 @@
 """Solids that a ray can hit: planes, boxes, cylinders, and a block that holes are drilled into.
 
-`M` rays start at `origin`, `(3,)` or `(M, 3)`, along `direction`, `(M, 3)`, all float32 in camera coordinates (m; x right, y down,
-z forward). Directions need not be unit vectors: a hit is given as the factor `t` on the direction, `inf` for a miss. Each solid has
-parts (faces, walls of holes, …) with a material of its own.
+`M` rays start at `origin`, `(3,)` or `(M, 3)`, along `direction`, `(M, 3)`, all float32 in camera
+coordinates (m; x right, y down, z forward). Directions need not be unit vectors: a hit is given as
+the factor `t` on the direction, `inf` for a miss. Each solid has parts (faces, walls of holes, …)
+with a material of its own.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class Surface(NamedTuple):
         normal: Unit normals, `(M, 3)`.
         uv_m: Coordinates of the texture in m, `(M, 2)`.
         openness: Part of the ambient light that arrives, `(M,)`; `None` for all of it.
-        sunlit: The solid itself does not shade the point, `(M,)` bool; `None` where only the normal decides.
+        sunlit: The solid itself does not shade the point, `(M,)` bool; `None` where only the normal
+            decides.
     """
 
     normal: np.ndarray
@@ -112,7 +114,11 @@ class Plane:
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
         """Describes the plane; its texture lies along its first two axes."""
         normal = np.broadcast_to(self.pose.rotation[:, 2].astype(np.float32), point.shape)
-        return Surface(normal, (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation[:, :2].astype(np.float32))
+        return Surface(
+            normal,
+            (point - self.pose.center_m.astype(np.float32))
+            @ self.pose.rotation[:, :2].astype(np.float32),
+        )
 
 
 @dataclass(frozen=True)
@@ -145,14 +151,18 @@ class Box:
             far = (-side - start[..., axis]) / slope
             later = near > enter
             enter = np.where(later, near, enter)
-            part = np.where(later, np.where(slope > 0, 2 * axis, 2 * axis + 1).astype(np.int16), part)
+            part = np.where(
+                later, np.where(slope > 0, 2 * axis, 2 * axis + 1).astype(np.int16), part
+            )
             leave = np.minimum(leave, far)
         t = np.where((enter <= leave) & (enter > NEAR_M), enter, np.inf).astype(np.float32)
         return Hits(t, part)
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
         """Describes faces; opposite ones show different places of the texture."""
-        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(np.float32)
+        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(
+            np.float32
+        )
         axis, sign = part // 2, (2.0 * (part % 2) - 1.0).astype(np.float32)
         normal = self.pose.rotation.T.astype(np.float32)[axis] * sign[:, None]
         rows = np.arange(len(part))
@@ -181,7 +191,8 @@ class Cylinder:
         start, along = self.pose.local(origin, direction)
         across = along[:, 0] ** 2 + along[:, 1] ** 2
         across = np.maximum(across, np.float32(1e-12))
-        # about the point that is nearest to the axis: the difference of large squares would cost the digits that matter
+        # about the point that is nearest to the axis: the difference of large squares would cost
+        # the digits that matter
         middle = -(start[..., 0] * along[:, 0] + start[..., 1] * along[:, 1]) / across
         x, y = start[..., 0] + middle * along[:, 0], start[..., 1] + middle * along[:, 1]
         root = np.sqrt(np.maximum(self.radius_m**2 - x * x - y * y, 0.0) / across)
@@ -190,16 +201,22 @@ class Cylinder:
         side = np.where(slope > 0, -self.half_length_m, self.half_length_m)
         cap, end = (side - start[..., 2]) / slope, (-side - start[..., 2]) / slope
         enter, leave = np.maximum(middle - root, cap), np.minimum(middle + root, end)
-        t = np.where((enter <= leave) & (enter > NEAR_M) & ~outside, enter, np.inf).astype(np.float32)
+        t = np.where((enter <= leave) & (enter > NEAR_M) & ~outside, enter, np.inf).astype(
+            np.float32
+        )
         return Hits(t, (cap > middle - root).astype(np.int16))
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
         """Describes side and caps; the texture goes round the side."""
-        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(np.float32)
+        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(
+            np.float32
+        )
         side, up = local.copy(), np.zeros_like(local)
         side[:, 2] = 0.0
         side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
         up[:, 2] = np.sign(local[:, 2])
         normal = np.where((part == 0)[:, None], side, up) @ self.pose.rotation.T.astype(np.float32)
         around = np.stack([np.arctan2(local[:, 1], local[:, 0]) * self.radius_m, local[:, 2]], 1)
-        return Surface(normal, np.where((part == 0)[:, None], around, local[:, :2]).astype(np.float32))
+        return Surface(
+            normal, np.where((part == 0)[:, None], around, local[:, :2]).astype(np.float32)
+        )

@@ -49,8 +49,10 @@ class Studio:
         rig: The camera pair.
         scene: What there is to see.
         stereo: Makes the depth.
-        depth: `matched` makes depth of the two pictures; `exact` writes the mathematical one; `none` leaves it to the reader.
-        pair: Whether the right picture is taken; left alone, in half the time, is enough to train a segmenter on.
+        depth: `matched` makes depth of the two pictures; `exact` writes the mathematical one;
+            `none` leaves it to the reader.
+        pair: Whether the right picture is taken; left alone, in half the time, is enough to train a
+            segmenter on.
     """
 
     rig: Rig
@@ -61,11 +63,15 @@ class Studio:
 
     def check(self) -> None:
         if self.depth == "matched" and not self.pair:
-            raise ConfigError("studio.pair=false: there is no pair to match; choose studio.depth=exact or none")
+            raise ConfigError(
+                "studio.pair=false: there is no pair to match; choose studio.depth=exact or none"
+            )
 
     def prepare(self, folder: Path) -> None:
         """Writes what all frames of a folder share."""
-        dataset.write_camera(folder, self.rig.left.matrix, self.rig.base_from_camera, self.rig.baseline_m)
+        dataset.write_camera(
+            folder, self.rig.left.matrix, self.rig.base_from_camera, self.rig.baseline_m
+        )
 
     def has(self, stem: Path) -> bool:
         """Says whether the frame at `stem` is there, whole."""
@@ -86,7 +92,10 @@ class Studio:
         tracer = Tracer(scene.solids, scene.light, scene.sky)
         left = tracer.view(self.rig.left)
         density = dust(scene.exposure.patchiness, generator)
-        color, partner = photograph(left.radiance, left.depth_m, scene.exposure, density, generator), None
+        color, partner = (
+            photograph(left.radiance, left.depth_m, scene.exposure, density, generator),
+            None,
+        )
         if self.pair:
             right = tracer.view(self.rig.right)
             partner = photograph(right.radiance, right.depth_m, scene.exposure, density, generator)
@@ -102,18 +111,32 @@ class Studio:
         if block is None:
             return Truth(self.scene.name, scene.conditions, (), (), {})
         holes = tuple(
-            self._circle(block.pose.point(hole.center_m), block.pose.rotation @ hole.outward, hole.radius_m, hole.depth_m, hidden)
+            self._circle(
+                block.pose.point(hole.center_m),
+                block.pose.rotation @ hole.outward,
+                hole.radius_m,
+                hole.depth_m,
+                hidden,
+            )
             for hole, hidden in zip(block.holes, scene.hidden, strict=True)
         )
         decoys = tuple(
-            self._circle(block.pose.point(disc.center_m), block.pose.rotation[:, 2], disc.radius_m, 0.0, hidden)
+            self._circle(
+                block.pose.point(disc.center_m),
+                block.pose.rotation[:, 2],
+                disc.radius_m,
+                0.0,
+                hidden,
+            )
             for disc, hidden in zip(block.discs, scene.hidden_discs, strict=True)
         )
         place = {name: np.asarray(value).tolist() for name, value in
                  (("center_m", block.pose.center_m), ("rotation", block.pose.rotation), ("half_m", block.half_m))}  # fmt: skip
         return Truth(self.scene.name, scene.conditions, holes, decoys, place)
 
-    def _circle(self, center: np.ndarray, axis: np.ndarray, radius_m: float, depth_m: float, hidden: float) -> Circle:
+    def _circle(
+        self, center: np.ndarray, axis: np.ndarray, radius_m: float, depth_m: float, hidden: float
+    ) -> Circle:
         base = self.rig.base_from_camera
         first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
         first /= np.linalg.norm(first)
@@ -122,7 +145,10 @@ class Studio:
         in_view = False
         if rim[:, 2].min() > 0.05:
             pixel = self.rig.left.project(rim)
-            in_view = bool((pixel.min(0) >= 0).all() and (pixel.max(0) <= [self.rig.width - 1, self.rig.height - 1]).all())
+            in_view = bool(
+                (pixel.min(0) >= 0).all()
+                and (pixel.max(0) <= [self.rig.width - 1, self.rig.height - 1]).all()
+            )
         return Circle(
             tuple(center.tolist()), tuple(axis.tolist()), tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
             tuple((base[:3, :3] @ axis).tolist()), float(radius_m), float(depth_m), float(hidden), in_view,

@@ -26,7 +26,8 @@ class Material:
         texel_m: Size of the finest grain.
         texture: Which of the `NUM_TEXTURES` patterns of grain.
         shift: Where the pattern begins, texels.
-        marks: Brightness painted over it, `(h, w)` float32, 1 for none, and the size of its texels in m; repeats beyond.
+        marks: Brightness painted over it, `(h, w)` float32, 1 for none, and the size of its texels
+            in m; repeats beyond.
     """
 
     color: tuple[float, float, float]
@@ -58,23 +59,37 @@ class Material:
 def _pyramid(number: int) -> tuple[np.ndarray, ...]:
     """Returns a periodic pattern, mean 0 and standard deviation 1, and its reductions by two, down to one texel.
 
-    The patterns are the same for every scene: a scene differs in where, how strong and in which colours they appear.
+    The patterns are the same for every scene: a scene differs in where, how strong and in which
+    colours they appear.
     """
     generator = np.random.default_rng(9000 + number)
-    rise = (0.9, 1.0, 1.15, 1.3)[number]  # strength of each octave relative to the one twice as coarse: from cloudy to speckled
+    rise = (0.9, 1.0, 1.15, 1.3)[
+        number
+    ]  # strength of each octave relative to the one twice as coarse: from cloudy to speckled
     total = np.zeros((SIDE, SIDE), np.float32)
     for octave in range(_COARSEST_OCTAVE, _FINEST_OCTAVE + 1):
         coarse = generator.standard_normal((1 << octave, 1 << octave)).astype(np.float32)
         pad = 2
         scale = SIDE >> octave
-        wide = cv2.resize(np.pad(coarse, pad, mode="wrap"), None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        total += rise ** (octave - _COARSEST_OCTAVE) * wide[pad * scale : pad * scale + SIDE, pad * scale : pad * scale + SIDE]
+        wide = cv2.resize(
+            np.pad(coarse, pad, mode="wrap"),
+            None,
+            fx=scale,
+            fy=scale,
+            interpolation=cv2.INTER_CUBIC,
+        )
+        total += (
+            rise ** (octave - _COARSEST_OCTAVE)
+            * wide[pad * scale : pad * scale + SIDE, pad * scale : pad * scale + SIDE]
+        )
     if number >= NUM_TEXTURES // 2:  # gravel: bright and dark stones
         total = np.tanh(2.0 * total / total.std())
     levels = [(total - total.mean()) / total.std()]
     while levels[-1].shape[0] > 1:
         side = levels[-1].shape[0] // 2
-        levels.append(cv2.resize(levels[-1], (side, side), interpolation=cv2.INTER_AREA).reshape(side, side))
+        levels.append(
+            cv2.resize(levels[-1], (side, side), interpolation=cv2.INTER_AREA).reshape(side, side)
+        )
     return tuple(levels)
 
 
@@ -86,7 +101,9 @@ def _sampled(pyramid: tuple[np.ndarray, ...], uv: np.ndarray, level: np.ndarray)
         weight = 1.0 - np.abs(level - number)
         rows = np.flatnonzero(weight > 0)
         if len(rows):
-            total[rows] += weight[rows] * _bilinear(pyramid[number], (uv[rows] + 0.5) / np.float32(1 << number) - 0.5)
+            total[rows] += weight[rows] * _bilinear(
+                pyramid[number], (uv[rows] + 0.5) / np.float32(1 << number) - 0.5
+            )
     return total
 
 
@@ -100,6 +117,10 @@ def _bilinear(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     maps = np.zeros((2, rows * _ROW), np.float32)
     maps[:, :count] = wrapped.T
     found = cv2.remap(
-        picture, maps[0].reshape(rows, _ROW), maps[1].reshape(rows, _ROW), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+        picture,
+        maps[0].reshape(rows, _ROW),
+        maps[1].reshape(rows, _ROW),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_WRAP,
     )
     return found.reshape(-1)[:count]

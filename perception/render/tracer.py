@@ -1,7 +1,8 @@
 """Rays through pixels: what each hits, how deep, and how bright that is.
 
-Every pixel has one exact ray through its centre, which gives depth and masks. Colour comes from that ray where the pixel shows one
-surface, filtered to the pixel's size, and from `OVER` x `OVER` rays where edges of solids, rims or shadows cross it.
+Every pixel has one exact ray through its centre, which gives depth and masks. Colour comes from
+that ray where the pixel shows one surface, filtered to the pixel's size, and from `OVER` x `OVER`
+rays where edges of solids, rims or shadows cross it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,13 @@ class Pinhole:
     @property
     def matrix(self) -> np.ndarray:
         """Camera matrix, `(3, 3)`; the axis goes through the middle of the picture, pixel centres lie at whole numbers."""
-        return np.array([[self.focal_px, 0, (self.width - 1) / 2], [0, self.focal_px, (self.height - 1) / 2], [0, 0, 1.0]])
+        return np.array(
+            [
+                [self.focal_px, 0, (self.width - 1) / 2],
+                [0, self.focal_px, (self.height - 1) / 2],
+                [0, 0, 1.0],
+            ]
+        )
 
     def project(self, point_m: np.ndarray) -> np.ndarray:
         """Returns the pixels, `(…, 2)`, of points, `(…, 3)`, in front of the camera."""
@@ -101,7 +108,9 @@ class _Seen:
     @property
     def label(self) -> np.ndarray:
         """A number for each surface, lit or not: where it changes, there is an edge."""
-        return (self.solid.astype(np.int32) * 4096 + self.part * 4 + self.mouth * 2 + self.sunlit).astype(np.int32)
+        return (
+            self.solid.astype(np.int32) * 4096 + self.part * 4 + self.mouth * 2 + self.sunlit
+        ).astype(np.int32)
 
 
 class Tracer:
@@ -113,9 +122,15 @@ class Tracer:
         sky: Radiance where nothing is, RGB.
     """
 
-    def __init__(self, solids: Sequence[Solid], light: Light, sky: tuple[float, float, float]) -> None:
+    def __init__(
+        self, solids: Sequence[Solid], light: Light, sky: tuple[float, float, float]
+    ) -> None:
         self.solids, self.light, self.sky = tuple(solids), light, np.array(sky, np.float32)
-        self._casters = [Caster(solid, light.to_sun) for solid in (*solids, *light.shade) if solid.corners_m is not None]
+        self._casters = [
+            Caster(solid, light.to_sun)
+            for solid in (*solids, *light.shade)
+            if solid.corners_m is not None
+        ]
 
     def view(self, camera: Pinhole) -> View:
         """Returns what `camera` sees."""
@@ -127,17 +142,35 @@ class Tracer:
             ys = np.arange(top, min(top + rows, camera.height), dtype=np.float64)
             pixel = np.stack(np.broadcast_arrays(columns[None], ys[:, None]), -1).reshape(-1, 2)
             bands.append(self._shoot(camera, pixel))
-        whole = _Seen(*(np.concatenate([getattr(band, name) for band in bands]) for name in _Seen.__dataclass_fields__))
+        whole = _Seen(
+            *(
+                np.concatenate([getattr(band, name) for band in bands])
+                for name in _Seen.__dataclass_fields__
+            )
+        )
         radiance = whole.radiance
         edges = np.flatnonzero(_edges(whole.label.reshape(size)).ravel())
-        offsets = (np.stack(np.meshgrid(*[np.arange(OVER)] * 2), -1).reshape(-1, 2) + 0.5) / OVER - 0.5
+        offsets = (
+            np.stack(np.meshgrid(*[np.arange(OVER)] * 2), -1).reshape(-1, 2) + 0.5
+        ) / OVER - 0.5
         for part in np.array_split(edges, max(1, len(edges) * OVER**2 // CHUNK)):
             pixel = np.stack([part % camera.width, part // camera.width], 1)[:, None] + offsets
-            radiance[part] = self._shoot(camera, pixel.reshape(-1, 2)).radiance.reshape(len(part), OVER**2, 3).mean(1)
+            radiance[part] = (
+                self._shoot(camera, pixel.reshape(-1, 2))
+                .radiance.reshape(len(part), OVER**2, 3)
+                .mean(1)
+            )
         depth = np.where(whole.solid == NOTHING, np.nan, whole.depth_m).astype(np.float32)
-        return View(radiance.reshape(*size, 3), depth.reshape(size), whole.solid.reshape(size), whole.mouth.reshape(size))
+        return View(
+            radiance.reshape(*size, 3),
+            depth.reshape(size),
+            whole.solid.reshape(size),
+            whole.mouth.reshape(size),
+        )
 
-    def first(self, origin_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def first(
+        self, origin_m: np.ndarray, direction: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns factor on the direction, solid and part of the first hit of rays, `(M, 3)` float32, from one point."""
         t, solid, part, _ = self._cast(origin_m, direction, None)
         return t, solid, part
@@ -171,11 +204,18 @@ class Tracer:
         for number, thing in enumerate(self.solids):
             rows = np.flatnonzero(solid == number)
             if len(rows):
-                radiance[rows], lit[rows] = self._shaded(thing, point[rows], part[rows], direction[rows], t[rows] / camera.focal_px)
+                radiance[rows], lit[rows] = self._shaded(
+                    thing, point[rows], part[rows], direction[rows], t[rows] / camera.focal_px
+                )
         return _Seen(t, solid, part, mouth, radiance, lit)
 
     def _shaded(
-        self, thing: Solid, point: np.ndarray, part: np.ndarray, direction: np.ndarray, pixel_m: np.ndarray
+        self,
+        thing: Solid,
+        point: np.ndarray,
+        part: np.ndarray,
+        direction: np.ndarray,
+        pixel_m: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns the radiance of points of one solid, `(M, 3)`, and whether the sun reaches them, `(M,)`."""
         surface = thing.surface(point, part, self.light.to_sun)
@@ -214,7 +254,13 @@ class Caster:
     def darken(self, point: np.ndarray, lit: np.ndarray) -> None:
         """Clears `lit`, `(M,)` bool, at the points, `(M, 3)`, that the solid shades."""
         x, y = point @ self._across[:, 0], point @ self._across[:, 1]
-        rows = np.flatnonzero(lit & (x > self._low[0]) & (x < self._high[0]) & (y > self._low[1]) & (y < self._high[1]))
+        rows = np.flatnonzero(
+            lit
+            & (x > self._low[0])
+            & (x < self._high[0])
+            & (y > self._low[1])
+            & (y < self._high[1])
+        )
         if len(rows):
             sun = np.broadcast_to(self._to_sun, (len(rows), 3))
             lit[rows[np.isfinite(self.solid.hit(point[rows], sun).t)]] = False

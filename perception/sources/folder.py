@@ -30,10 +30,12 @@ class Folder:
         folder: Where they lie.
         rate_hz: How fast they followed each other; gives frame `k` the time k / rate_hz.
         least_known: Part of the picture whose depth must be known.
-        needs: What a frame must have. `depth`: all of it. `camera`: `camera.yaml`; depth may be missing, which is enough for a
-            board or a network. `nothing`: photographs, grey ones too, are enough to look for ellipses in.
-        base_from_camera: Pose of the camera in the base frame: `calibration.yaml` of `mode=calibrate`, or `(4, 4)`; `null` takes
-            `T_base_cam` of `camera.yaml`.
+        needs: What a frame must have. `depth`: all of it. `camera`: `camera.yaml`; depth may be
+            missing, which is enough for a
+            board or a network. `nothing`: photographs, grey ones too, are enough to look for
+                ellipses in.
+        base_from_camera: Pose of the camera in the base frame: `calibration.yaml` of
+            `mode=calibrate`, or `(4, 4)`; `null` takes `T_base_cam` of `camera.yaml`.
         stereo: Makes the depth of a frame that has a right picture and no depth.
     """
 
@@ -75,13 +77,19 @@ def read_camera(path: Path) -> Camera:
     try:
         told = yaml.safe_load(path.read_text())
     except FileNotFoundError as error:
-        raise FrameError(f"{path}: no such file; a folder of frames needs it (K, dist, baseline_m, T_base_cam)") from error
+        raise FrameError(
+            f"{path}: no such file; a folder of frames needs it (K, dist, baseline_m, T_base_cam)"
+        ) from error
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise FrameError(f"{path}: cannot be read as YAML ({error})") from error
     if not isinstance(told, dict) or "K" not in told:
-        raise FrameError(f"{path}: expected a mapping with K, dist, baseline_m and T_base_cam, K is missing")
+        raise FrameError(
+            f"{path}: expected a mapping with K, dist, baseline_m and T_base_cam, K is missing"
+        )
     where = str(path)
-    optional: dict[str, Any] = {name: told[name] for name in ("baseline_m", "T_base_cam") if told.get(name) is not None}
+    optional: dict[str, Any] = {
+        name: told[name] for name in ("baseline_m", "T_base_cam") if told.get(name) is not None
+    }
     return Camera(
         soundness.matrix(told["K"], where),
         soundness.distortion(told.get("dist"), where),
@@ -127,10 +135,14 @@ class FolderSource:
     def __enter__(self) -> FolderSource:
         self._stems, self._next = dataset.stems(self._place), 0
         path = self._place / dataset.CAMERA
-        self._camera = None if self._settings.needs == "nothing" and not path.exists() else read_camera(path)
+        self._camera = (
+            None if self._settings.needs == "nothing" and not path.exists() else read_camera(path)
+        )
         place = placed(self._settings.base_from_camera, "source.base_from_camera")
         if self._camera is not None and place.base_from_camera is not None:
-            self._camera = replace(self._camera, base_from_camera=place.base_from_camera, cov=place.cov)
+            self._camera = replace(
+                self._camera, base_from_camera=place.base_from_camera, cov=place.cov
+            )
         return self
 
     def __exit__(self, *exc: Any) -> None:
@@ -149,7 +161,9 @@ class FolderSource:
         return self._read(stem, number / self._settings.rate_hz)
 
     def _read(self, stem: Path, t_s: float) -> Frame:
-        paths = {ending: stem.with_name(stem.name + ending) for ending in (dataset.COLOR, dataset.RIGHT)}
+        paths = {
+            ending: stem.with_name(stem.name + ending) for ending in (dataset.COLOR, dataset.RIGHT)
+        }
         picture = read_picture(paths[dataset.COLOR])
         if self._settings.needs == "nothing" and picture.ndim == 2:
             picture = np.repeat(picture[..., None], 3, 2)
@@ -167,13 +181,21 @@ class FolderSource:
             distortion=camera.distortion, right=right, baseline_m=camera.baseline_m, name=str(stem), camera_cov=camera.cov,
         )  # fmt: skip
 
-    def _depth(self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: Camera) -> np.ndarray:
+    def _depth(
+        self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: Camera
+    ) -> np.ndarray:
         """Returns the depth of a frame: what is stored, else what its two pictures tell."""
-        stored, millimetres = (stem.with_name(stem.name + ending) for ending in (dataset.DEPTH, dataset.DEPTH_MM))
+        stored, millimetres = (
+            stem.with_name(stem.name + ending) for ending in (dataset.DEPTH, dataset.DEPTH_MM)
+        )
         least = self._settings.least_known
         if stored.exists() or millimetres.exists():
             where = stored if stored.exists() else millimetres
-            values = _array(stored) if stored.exists() else soundness.depth_of_png(read_picture(millimetres), str(millimetres))
+            values = (
+                _array(stored)
+                if stored.exists()
+                else soundness.depth_of_png(read_picture(millimetres), str(millimetres))
+            )
             found = soundness.depth(values, str(where), least)
             soundness.same_size(color, found, str(where), "depth")
             return found
@@ -184,8 +206,12 @@ class FolderSource:
                 f"{stem}: no depth; expected {stored.name}, {millimetres.name}, or {stem.name}{dataset.RIGHT} to match with"
             )
         if camera.baseline_m is None or camera.distortion is not None:
-            raise FrameError(f"{stem}: depth of a pair needs baseline_m and a rectified camera (dist 0) in {dataset.CAMERA}")
-        matched = self._settings.stereo.depth_m(color, right, float(camera.matrix[0, 0]), camera.baseline_m)
+            raise FrameError(
+                f"{stem}: depth of a pair needs baseline_m and a rectified camera (dist 0) in {dataset.CAMERA}"
+            )
+        matched = self._settings.stereo.depth_m(
+            color, right, float(camera.matrix[0, 0]), camera.baseline_m
+        )
         return soundness.depth(matched, f"{stem}: matching left and right", least)
 
 
@@ -198,7 +224,9 @@ def _array(path: Path) -> np.ndarray:
 
 def _guessed(height: int, width: int) -> np.ndarray:
     """Returns the camera matrix of an ordinary lens, for pictures of which nothing is known."""
-    return np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    return np.array(
+        [[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    )
 
 
 def _is_whole_png(data: bytes) -> bool:
@@ -207,7 +235,9 @@ def _is_whole_png(data: bytes) -> bool:
     while place + 12 <= len(data):
         length = int.from_bytes(data[place : place + 4], "big")
         end = place + 12 + length
-        if end > len(data) or zlib.crc32(data[place + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+        if end > len(data) or zlib.crc32(data[place + 4 : end - 4]) != int.from_bytes(
+            data[end - 4 : end], "big"
+        ):
             return False
         if data[place + 4 : place + 8] == b"IEND":
             return True

@@ -87,14 +87,20 @@ class LiveSource:
         device: The camera's library.
         name: What it is called in messages.
         fresh: Which frames are too old, and how long to wait.
-        base_from_camera: Where the camera is in the base frame, `(4, 4)`; `None` where nobody knows.
+        base_from_camera: Where the camera is in the base frame, `(4, 4)`; `None` where nobody
+            knows.
         camera_cov: How uncertain that is, see `Frame`.
     """
 
     num_frames = None
 
     def __init__(
-        self, device: Device, name: str, fresh: Freshness, base_from_camera: np.ndarray | None, camera_cov: np.ndarray | None = None
+        self,
+        device: Device,
+        name: str,
+        fresh: Freshness,
+        base_from_camera: np.ndarray | None,
+        camera_cov: np.ndarray | None = None,
     ) -> None:
         self._device, self._name, self._fresh = device, name, fresh
         self._pose, self._pose_cov = base_from_camera, camera_cov
@@ -104,7 +110,9 @@ class LiveSource:
     def __enter__(self) -> LiveSource:
         try:
             lens = self._device.open()
-            self._lens = Lens(soundness.matrix(lens.matrix, self._name), lens.distortion, lens.baseline_m)
+            self._lens = Lens(
+                soundness.matrix(lens.matrix, self._name), lens.distortion, lens.baseline_m
+            )
         except BaseException:
             self._device.close()
             raise
@@ -136,9 +144,13 @@ class LiveSource:
                 oldest_s = max(age_s, oldest_s or 0.0)
             left = until - time.monotonic()
         stale = (
-            "" if oldest_s is None else f"; the frames that came were up to {oldest_s:.2f} s old, {self._fresh.max_age_s:g} allowed"
+            ""
+            if oldest_s is None
+            else f"; the frames that came were up to {oldest_s:.2f} s old, {self._fresh.max_age_s:g} allowed"
         )
-        raise FrameError(f"{self._name}: no new frame for {self._fresh.timeout_s:g} s{stale}. Is it plugged in?")
+        raise FrameError(
+            f"{self._name}: no new frame for {self._fresh.timeout_s:g} s{stale}. Is it plugged in?"
+        )
 
     def _frame(self, capture: Capture, lens: Lens) -> Frame:
         soundness.same_size(capture.color, capture.depth_m, self._name, "depth")

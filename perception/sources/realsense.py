@@ -24,8 +24,8 @@ class RealSense:
         width: Pixels.
         height: Pixels.
         rate_hz: Pictures a second.
-        base_from_camera: Pose of the colour camera in the base frame: `calibration.yaml` of `mode=calibrate`,
-            or `(4, 4)`; `null` where unknown.
+        base_from_camera: Pose of the colour camera in the base frame: `calibration.yaml` of
+            `mode=calibrate`, or `(4, 4)`; `null` where unknown.
         fresh: Which frames are too old, and how long to wait.
     """
 
@@ -39,7 +39,9 @@ class RealSense:
     def build(self) -> LiveSource:
         """Returns the source, not yet opened."""
         place = placed(self.base_from_camera, "source.base_from_camera")
-        return LiveSource(RealSenseDevice(self), "RealSense camera", self.fresh, place.base_from_camera, place.cov)
+        return LiveSource(
+            RealSenseDevice(self), "RealSense camera", self.fresh, place.base_from_camera, place.cov
+        )
 
 
 class RealSenseDevice:
@@ -61,7 +63,9 @@ class RealSenseDevice:
         try:
             rs = importlib.import_module("pyrealsense2")
         except ImportError as error:
-            raise FrameError("RealSense camera: the Python package `pyrealsense2` is not installed") from error
+            raise FrameError(
+                "RealSense camera: the Python package `pyrealsense2` is not installed"
+            ) from error
         self._rs = rs
         settings, config = self._settings, rs.config()
         if settings.serial is not None:
@@ -88,7 +92,9 @@ class RealSenseDevice:
     def capture(self, timeout_s: float) -> Capture | None:
         """Returns the next capture, `None` when there is none in time."""
         try:
-            frames = self._align.process(self._pipeline.wait_for_frames(max(1, int(1000 * timeout_s))))
+            frames = self._align.process(
+                self._pipeline.wait_for_frames(max(1, int(1000 * timeout_s)))
+            )
         except RuntimeError:  # the library's way to say that time is up
             return None
         depth, color = frames.get_depth_frame(), frames.get_color_frame()
@@ -96,7 +102,8 @@ class RealSenseDevice:
             return None
         # copies: the library reuses its memory
         values = np.asanyarray(depth.get_data()).astype(np.float32) * np.float32(self._scale_m)
-        # without its global time the library stamps by the camera's own clock, which nobody else knows: the time of arrival, then
+        # without its global time the library stamps by the camera's own clock, which nobody else
+        # knows: the time of arrival, then
         own_clock = color.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock
         t_s = time.time() if own_clock else float(color.get_timestamp()) * 1e-3
         return Capture(np.array(color.get_data(), np.uint8), values, t_s)
@@ -115,8 +122,8 @@ class RealSenseDevice:
 def forward(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Returns OpenCV's coefficients `k1 k2 p1 p2 k3` of a lens of which the inverse is told, `(5,)`.
 
-    OpenCV's polynomial says where a ray is seen, RealSense's inverse one, the same in form, which ray is seen; the nearest of the
-    first kind is found on a grid over the picture.
+    OpenCV's polynomial says where a ray is seen, RealSense's inverse one, the same in form, which
+    ray is seen; the nearest of the first kind is found on a grid over the picture.
 
     Args:
         inverse: Coefficients of the inverse.
@@ -124,7 +131,12 @@ def forward(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> n
         size: Width and height of the picture, px.
     """
     columns, rows = np.meshgrid(np.linspace(0, size[0] - 1, 24), np.linspace(0, size[1] - 1, 16))
-    seen = np.stack([(columns.ravel() - matrix[0, 2]) / matrix[0, 0], (rows.ravel() - matrix[1, 2]) / matrix[1, 1]])
+    seen = np.stack(
+        [
+            (columns.ravel() - matrix[0, 2]) / matrix[0, 0],
+            (rows.ravel() - matrix[1, 2]) / matrix[1, 1],
+        ]
+    )
     ray = seen + _bend(seen) @ inverse
     table = _bend(ray)
     return np.linalg.lstsq(table.reshape(-1, 5), (seen - ray).ravel(), rcond=None)[0]

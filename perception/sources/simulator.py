@@ -30,14 +30,15 @@ class Simulated:
         rig: The camera pair.
         surroundings: Gives concrete, light, dust and ground; the block itself is the task's.
         stereo: Makes the depth.
-        task_scene: What is seen until somebody shows something else: `hole_x_m hole_y_m rim_z_m yaw_rad block_scale hole_radius_m`,
-            as the task's scenes are told.
+        task_scene: What is seen until somebody shows something else: `hole_x_m hole_y_m rim_z_m
+            yaw_rad block_scale hole_radius_m`, as the task's scenes are told.
         block_m: Length, width and height of a block of scale 1.
         hole_depth_m: Of the hole.
         arm_m: Radius of the arm's links and of the tool.
         num_frames: Frames until the source is at its end.
         rate_hz: Gives frame `k` the time k / rate_hz.
-        seed: Of stains, light and noise; these stay the same as long as the scene does, but for the noise.
+        seed: Of stains, light and noise; these stay the same as long as the scene does, but for the
+            noise.
     """
 
     rig: Rig
@@ -52,10 +53,19 @@ class Simulated:
     seed: int
 
     def check(self) -> None:
-        if min(self.block_m) <= 0 or min(self.arm_m) <= 0 or self.rate_hz <= 0 or self.num_frames < 1:
-            raise ConfigError("source: expected block_m, arm_m and rate_hz above 0 and num_frames of 1 or more")
+        if (
+            min(self.block_m) <= 0
+            or min(self.arm_m) <= 0
+            or self.rate_hz <= 0
+            or self.num_frames < 1
+        ):
+            raise ConfigError(
+                "source: expected block_m, arm_m and rate_hz above 0 and num_frames of 1 or more"
+            )
         if not 0 < self.hole_depth_m < self.block_m[2]:
-            raise ConfigError(f"source: a hole of {self.hole_depth_m} m does not fit into a block {self.block_m[2]} m high")
+            raise ConfigError(
+                f"source: a hole of {self.hole_depth_m} m does not fit into a block {self.block_m[2]} m high"
+            )
 
     def build(self) -> SimulatedSource:
         """Returns the source, not yet opened."""
@@ -70,7 +80,13 @@ class SimulatedSource:
 
     def __init__(self, settings: Simulated) -> None:
         self._settings = settings
-        self._studio = Studio(rig=settings.rig, scene=settings.surroundings, stereo=settings.stereo, depth="matched", pair=True)
+        self._studio = Studio(
+            rig=settings.rig,
+            scene=settings.surroundings,
+            stereo=settings.stereo,
+            depth="matched",
+            pair=True,
+        )
         self._scene: tuple[float, ...] = settings.task_scene
         self._chain = np.zeros((0, 3))
         self._count = -1
@@ -92,10 +108,13 @@ class SimulatedSource:
 
         Args:
             task_scene: See `Simulated.task_scene`.
-            chain_in_base_m: The arm as points in the base frame, `(P, 3)`: its joints in order, then the tip of the tool
-                (`brokk_rl.kinematics`); empty for none.
+            chain_in_base_m: The arm as points in the base frame, `(P, 3)`: its joints in order,
+                then the tip of the tool (`brokk_rl.kinematics`); empty for none.
         """
-        self._scene, self._chain = tuple(float(value) for value in task_scene), np.asarray(chain_in_base_m, float).reshape(-1, 3)
+        self._scene, self._chain = (
+            tuple(float(value) for value in task_scene),
+            np.asarray(chain_in_base_m, float).reshape(-1, 3),
+        )
 
     def read_latest(self) -> Frame | None:
         """Returns a frame of what is shown now, `None` after `num_frames`.
@@ -123,15 +142,28 @@ class SimulatedSource:
         from_base = np.linalg.inv(settings.rig.base_from_camera)
         target = from_base[:3, :3] @ [x, y, z] + from_base[:3, 3]
         if target[2] < 0.2:
-            raise FrameError(f"simulated camera: the hole at {self._scene[:3]} m in the base frame is behind the camera")
+            raise FrameError(
+                f"simulated camera: the hole at {self._scene[:3]} m in the base frame is behind the camera"
+            )
         half = np.array(settings.block_m) / 2 * [scale, scale, 1.0]
-        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        turn = np.array(
+            [[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
+        )
         rotation = from_base[:3, :3] @ turn
         hole = Hole(np.array([0.0, 0.0, half[2]]), radius_m, settings.hole_depth_m, FRONT, 0.0)
         pose = Pose(rotation, target - rotation @ hole.center_m)
         block = Block(pose, half, materials_of(kind.block, half, (hole,), (), chance), (hole,))
         down_m = float((from_base[:3, 3]) @ settings.rig.down_in_camera)
-        scene = surround(kind, settings.rig, block, self._arm(from_base), target, rotation[:, 2], chance, max(down_m, 0.3))
+        scene = surround(
+            kind,
+            settings.rig,
+            block,
+            self._arm(from_base),
+            target,
+            rotation[:, 2],
+            chance,
+            max(down_m, 0.3),
+        )
         return self._studio.shot(scene, noise)
 
     def _arm(self, from_base: np.ndarray) -> list[Solid]:
@@ -143,5 +175,13 @@ class SimulatedSource:
             if length > 1e-3:
                 radius_m = self._settings.arm_m[1 if number == len(points) - 2 else 0]
                 pose = Pose(frame_of(end - start, 0.0), (start + end) / 2)
-                parts.append(Cylinder("arm", pose, radius_m, length / 2, (Material((0.6, 0.35, 0.06), 0.1, 0.002),)))
+                parts.append(
+                    Cylinder(
+                        "arm",
+                        pose,
+                        radius_m,
+                        length / 2,
+                        (Material((0.6, 0.35, 0.06), 0.1, 0.002),),
+                    )
+                )
         return parts

@@ -23,11 +23,21 @@ def matrix(value: Any, where: str) -> np.ndarray:
     """Returns a camera matrix, `(3, 3)`, or raises a `FrameError` where it is none."""
     found = _numbers(value, (3, 3), f"{where}: K")
     if found[0, 0] <= 0 or found[1, 1] <= 0:
-        raise FrameError(f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected more than 0")
+        raise FrameError(
+            f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected more than 0"
+        )
     if not _ASPECT[0] <= found[0, 0] / found[1, 1] <= _ASPECT[1]:
-        raise FrameError(f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected them about equal")
-    if np.abs(found[[1, 2, 2], [0, 0, 1]]).max() > 1e-9 or abs(found[2, 2] - 1.0) > 1e-9 or abs(found[0, 1]) > 0.1 * found[0, 0]:
-        raise FrameError(f"{where}: K is no camera matrix, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {found.tolist()}")
+        raise FrameError(
+            f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected them about equal"
+        )
+    if (
+        np.abs(found[[1, 2, 2], [0, 0, 1]]).max() > 1e-9
+        or abs(found[2, 2] - 1.0) > 1e-9
+        or abs(found[0, 1]) > 0.1 * found[0, 0]
+    ):
+        raise FrameError(
+            f"{where}: K is no camera matrix, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {found.tolist()}"
+        )
     return found
 
 
@@ -39,7 +49,10 @@ def fits(camera_matrix: np.ndarray, height: int, width: int, where: str) -> None
             f"{where}: a focal length of {camera_matrix[0, 0]:g} px is absurd for a picture {width} px wide, expected "
             f"{_FIELD_RATIO[0] * width:g} to {_FIELD_RATIO[1] * width:g}; was K made for another resolution?"
         )
-    for name, center, size in (("cx", camera_matrix[0, 2], width), ("cy", camera_matrix[1, 2], height)):
+    for name, center, size in (
+        ("cx", camera_matrix[0, 2], width),
+        ("cy", camera_matrix[1, 2], height),
+    ):
         if abs(center - (size - 1) / 2) > _CENTER * size:
             raise FrameError(
                 f"{where}: {name} is {center:g} px in a picture of {width} x {height}, expected about {(size - 1) / 2:g}; was K "
@@ -51,7 +64,9 @@ def distortion(value: Any, where: str) -> np.ndarray | None:
     """Returns distortion coefficients, `None` where all of them are 0."""
     found = np.asarray(_numbers([] if value is None else value, None, f"{where}: dist")).reshape(-1)
     if len(found) not in _NUM_DISTORTION:
-        raise FrameError(f"{where}: dist has {len(found)} coefficients, expected {', '.join(map(str, _NUM_DISTORTION))} of them")
+        raise FrameError(
+            f"{where}: dist has {len(found)} coefficients, expected {', '.join(map(str, _NUM_DISTORTION))} of them"
+        )
     if np.abs(found).max(initial=0.0) > 100:
         raise FrameError(f"{where}: dist is absurd, {found.tolist()}")
     return found if np.any(found) else None
@@ -61,8 +76,14 @@ def pose(value: Any, where: str) -> np.ndarray:
     """Returns a pose, `(4, 4)`, or raises a `FrameError` where it is none."""
     found = _numbers(value, (4, 4), f"{where}: T_base_cam")
     turn = found[:3, :3]
-    if np.abs(found[3] - [0, 0, 0, 1]).max() > 1e-9 or np.abs(turn @ turn.T - np.eye(3)).max() > _RIGID or np.linalg.det(turn) < 0:
-        raise FrameError(f"{where}: T_base_cam is no rigid transform: expected a rotation, a shift in m and the row 0 0 0 1")
+    if (
+        np.abs(found[3] - [0, 0, 0, 1]).max() > 1e-9
+        or np.abs(turn @ turn.T - np.eye(3)).max() > _RIGID
+        or np.linalg.det(turn) < 0
+    ):
+        raise FrameError(
+            f"{where}: T_base_cam is no rigid transform: expected a rotation, a shift in m and the row 0 0 0 1"
+        )
     return found
 
 
@@ -86,9 +107,13 @@ def color(picture: np.ndarray, where: str) -> np.ndarray:
 def depth_of_png(picture: np.ndarray, where: str) -> np.ndarray:
     """Returns depth in m, `(h, w)` float32 with NaN, of a picture in mm."""
     if picture.ndim != 2:
-        raise FrameError(f"{where}: {picture.shape[2]} channels, expected one of 16 bits (depth in mm)")
+        raise FrameError(
+            f"{where}: {picture.shape[2]} channels, expected one of 16 bits (depth in mm)"
+        )
     if picture.dtype != np.uint16:
-        raise FrameError(f"{where}: {picture.dtype}, expected 16 bits (depth in mm); 8 bits cannot hold depth")
+        raise FrameError(
+            f"{where}: {picture.dtype}, expected 16 bits (depth in mm); 8 bits cannot hold depth"
+        )
     return np.where(picture > 0, picture.astype(np.float32) / 1000.0, np.float32(np.nan))
 
 

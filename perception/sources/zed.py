@@ -28,11 +28,12 @@ class Zed:
         rate_hz: Pictures a second.
         depth_mode: The SDK's name of the way depth is made.
         sensing: `standard` leaves unknown what is not seen. `fill` invents it and is refused.
-        confidence: Depth that the SDK trusts less than this, in percent of its own scale, is unknown.
+        confidence: Depth that the SDK trusts less than this, in percent of its own scale, is
+            unknown.
         nearest_m: Range of depth.
         farthest_m: Range of depth.
-        base_from_camera: Pose of the left camera in the base frame: `calibration.yaml` of `mode=calibrate`,
-            or `(4, 4)`; `null` where unknown.
+        base_from_camera: Pose of the left camera in the base frame: `calibration.yaml` of
+            `mode=calibrate`, or `(4, 4)`; `null` where unknown.
         fresh: Which frames are too old, and how long to wait.
     """
 
@@ -50,16 +51,22 @@ class Zed:
 
     def check(self) -> None:
         if self.sensing == "fill":
-            raise ConfigError("source.sensing=fill: it invents depth where nothing was seen, also across boreholes; use standard")
+            raise ConfigError(
+                "source.sensing=fill: it invents depth where nothing was seen, also across boreholes; use standard"
+            )
         if not 0 < self.nearest_m < self.farthest_m:
-            raise ConfigError(f"source: expected 0 < nearest_m < farthest_m, got {self.nearest_m} and {self.farthest_m}")
+            raise ConfigError(
+                f"source: expected 0 < nearest_m < farthest_m, got {self.nearest_m} and {self.farthest_m}"
+            )
         if not 1 <= self.confidence <= 100:
             raise ConfigError(f"source.confidence: expected 1 to 100, got {self.confidence}")
 
     def build(self) -> LiveSource:
         """Returns the source, not yet opened."""
         place = placed(self.base_from_camera, "source.base_from_camera")
-        return LiveSource(ZedDevice(self), "ZED camera", self.fresh, place.base_from_camera, place.cov)
+        return LiveSource(
+            ZedDevice(self), "ZED camera", self.fresh, place.base_from_camera, place.cov
+        )
 
 
 class ZedDevice:
@@ -90,14 +97,19 @@ class ZedDevice:
         init.depth_mode = _named(sl.DEPTH_MODE, settings.depth_mode, "source.depth_mode")
         init.coordinate_units = sl.UNIT.METER
         init.coordinate_system = sl.COORDINATE_SYSTEM.IMAGE  # x right, y down, z forward
-        init.depth_minimum_distance, init.depth_maximum_distance = settings.nearest_m, settings.farthest_m
+        init.depth_minimum_distance, init.depth_maximum_distance = (
+            settings.nearest_m,
+            settings.farthest_m,
+        )
         if settings.serial is not None:
             init.set_from_serial_number(settings.serial)
         if settings.recording is not None:
             init.set_from_svo_file(settings.recording)
         self._sl, self._camera = sl, sl.Camera()
         if (status := self._camera.open(init)) != sl.ERROR_CODE.SUCCESS:
-            raise FrameError(f"ZED camera: cannot be opened ({status}). Is it plugged in, and free of other programs?")
+            raise FrameError(
+                f"ZED camera: cannot be opened ({status}). Is it plugged in, and free of other programs?"
+            )
         self._picture, self._right, self._depth = sl.Mat(), sl.Mat(), sl.Mat()
         self._runtime = sl.RuntimeParameters()
         self._runtime.confidence_threshold = settings.confidence
@@ -107,8 +119,12 @@ class ZedDevice:
             self._runtime.sensing_mode = sl.SENSING_MODE.STANDARD
         information = self._camera.get_camera_information()
         # SDK 4 moved the calibration into the configuration
-        calibration = getattr(information, "camera_configuration", information).calibration_parameters
-        left = calibration.left_cam  # rectified: its distortion is that of the raw picture, which is not used
+        calibration = getattr(
+            information, "camera_configuration", information
+        ).calibration_parameters
+        left = (
+            calibration.left_cam
+        )  # rectified: its distortion is that of the raw picture, which is not used
         matrix = np.array([[left.fx, 0.0, left.cx], [0.0, left.fy, left.cy], [0.0, 0.0, 1.0]])
         return Lens(matrix, None, abs(float(calibration.get_camera_baseline())))
 
@@ -116,7 +132,10 @@ class ZedDevice:
         """Returns the next capture, `None` when there is none in time or the recording has ended."""
         sl, until = self._sl, time.monotonic() + timeout_s
         while (status := self._camera.grab(self._runtime)) != sl.ERROR_CODE.SUCCESS:
-            self.has_ended = self._settings.recording is not None and status == sl.ERROR_CODE.END_OF_SVOFILE_REACHED
+            self.has_ended = (
+                self._settings.recording is not None
+                and status == sl.ERROR_CODE.END_OF_SVOFILE_REACHED
+            )
             if self.has_ended or time.monotonic() > until:
                 return None
             time.sleep(_TRIES_S)
@@ -124,12 +143,21 @@ class ZedDevice:
         self._camera.retrieve_image(self._right, sl.VIEW.RIGHT)
         self._camera.retrieve_measure(self._depth, sl.MEASURE.DEPTH)
         t_s = self._camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds() * 1e-9
-        color, right = (soundness.color(np.asarray(mat.get_data()), "ZED camera") for mat in (self._picture, self._right))
-        return Capture(color, np.array(self._depth.get_data(), np.float32), t_s, right)  # the SDK reuses its memory
+        color, right = (
+            soundness.color(np.asarray(mat.get_data()), "ZED camera")
+            for mat in (self._picture, self._right)
+        )
+        return Capture(
+            color, np.array(self._depth.get_data(), np.float32), t_s, right
+        )  # the SDK reuses its memory
 
     def now_s(self) -> float:
         """Returns the time on the SDK's clock; that of a recording stands at its pictures."""
-        reference = self._sl.TIME_REFERENCE.IMAGE if self._settings.recording else self._sl.TIME_REFERENCE.CURRENT
+        reference = (
+            self._sl.TIME_REFERENCE.IMAGE
+            if self._settings.recording
+            else self._sl.TIME_REFERENCE.CURRENT
+        )
         return self._camera.get_timestamp(reference).get_nanoseconds() * 1e-9
 
     def close(self) -> None:

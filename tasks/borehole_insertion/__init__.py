@@ -47,10 +47,12 @@ class Success:
 
     Attributes:
         strict_depth_m: Depth of the tip below the rim, inside the hole.
-        chisel_radius_m: Radius of the chisel; the tip is inside when it is off axis by no more than the clearance.
+        chisel_radius_m: Radius of the chisel; the tip is inside when it is off axis by no more than
+            the clearance.
         slack_m: Softness of contacts and the corners of the polygon that stands for the round hole.
         paper_alignment: Both r^d and r^o at least this.
-        paper_height_m: Height of the tip below the rim at the paper's limit (0.7 m with a nominal rim of 0.75 m).
+        paper_height_m: Height of the tip below the rim at the paper's limit (0.7 m with a nominal
+            rim of 0.75 m).
     """
 
     strict_depth_m: float
@@ -68,12 +70,15 @@ class BoreholeInsertion:
         episode_s: Time limit.
         end_on_success: Whether strict success ends the episode.
         limit_margin: Distance to a joint limit (rad or m) at which the episode ends.
-        depth_m: Depth below the rim of the target point (paper: 0.1 m; a little more makes the controller pass the strict depth).
+        depth_m: Depth below the rim of the target point (paper: 0.1 m; a little more makes the
+            controller pass the strict depth).
         hole: Where the hole may be.
         arms: Where the arm may begin.
         success: Criteria.
-        memory: Newest samples of history that the policy sees; the machine's `num_history` for all of them.
-        advice: How to propose to a person who moves the levers; `null` where the policy's commands are given as they are.
+        memory: Newest samples of history that the policy sees; the machine's `num_history` for all
+            of them.
+        advice: How to propose to a person who moves the levers; `null` where the policy's commands
+            are given as they are.
         noise: What the policy is told is wrong by.
         switch: When only q2 moves.
         action: How the policy's output becomes commands.
@@ -100,7 +105,9 @@ class BoreholeInsertion:
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Returns the task for `num_envs` environments on `device`."""
-        return ToolPoseProcess(Insertion(self, machine), Options.of(self), machine, num_envs, device)
+        return ToolPoseProcess(
+            Insertion(self, machine), Options.of(self), machine, num_envs, device
+        )
 
 
 class Insertion:
@@ -116,7 +123,9 @@ class Insertion:
 
         def draw(uniform: Uniform) -> Targets:
             distance, bearing = uniform(hole.distance_m), uniform(hole.bearing_rad)
-            rim = torch.stack((distance * bearing.cos(), distance * bearing.sin(), uniform(hole.rim_z_m)), 1)
+            rim = torch.stack(
+                (distance * bearing.cos(), distance * bearing.sin(), uniform(hole.rim_z_m)), 1
+            )
             columns = {
                 "hole_x_m": rim[:, 0],
                 "hole_y_m": rim[:, 1],
@@ -134,10 +143,20 @@ class Insertion:
 
         controller = task.classical.build(self._machine, torch.device("cpu"))
         return random_starts(
-            count, seed, draw, task.arms, self._machine, controller, task.switch.reach_m, task.depth_m, "borehole_insertion"
+            count,
+            seed,
+            draw,
+            task.arms,
+            self._machine,
+            controller,
+            task.switch.reach_m,
+            task.depth_m,
+            "borehole_insertion",
         )
 
-    def judge(self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def judge(
+        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
+    ) -> dict[str, torch.Tensor]:
         """See `tasks.process.Goal`."""
         rules, rim = self._task.success, start["target_m"]
         lateral = (tip_m - rim)[:, :2].norm(dim=1)
@@ -148,7 +167,9 @@ class Insertion:
         target[:, 2] -= self._task.depth_m
         distance = (target - tip_m).norm(dim=1)
         turn = (start["target_pitch_rad"] - pitch_rad).abs()
-        aligned = (1 / (1 + distance) >= rules.paper_alignment) & (1 / (1 + turn) >= rules.paper_alignment)
+        aligned = (1 / (1 + distance) >= rules.paper_alignment) & (
+            1 / (1 + turn) >= rules.paper_alignment
+        )
         return {
             "success": inside & (below >= rules.strict_depth_m),
             "paper_success": aligned & (below >= rules.paper_height_m),
@@ -157,10 +178,19 @@ class Insertion:
 
 
 def _closeness(
-    distance_m: torch.Tensor, lateral_m: torch.Tensor, turn_rad: torch.Tensor, inside_m: torch.Tensor, depth_m: float
+    distance_m: torch.Tensor,
+    lateral_m: torch.Tensor,
+    turn_rad: torch.Tensor,
+    inside_m: torch.Tensor,
+    depth_m: float,
 ) -> torch.Tensor:
     """Returns how near an insertion is to done, 0 to 1: distance at three scales, alignment at three, depth inside the hole."""
     approach = sum(1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.1)) / 3
     aligned = sum(1 / (1 + lateral_m / scale) for scale in (0.1, 0.03, 0.01)) / 3
     upright = 1 / (1 + turn_rad / 0.2)
-    return 0.3 * approach + 0.3 * aligned * approach + 0.1 * upright + 0.3 * (inside_m / depth_m).clamp(0.0, 1.0)
+    return (
+        0.3 * approach
+        + 0.3 * aligned * approach
+        + 0.1 * upright
+        + 0.3 * (inside_m / depth_m).clamp(0.0, 1.0)
+    )

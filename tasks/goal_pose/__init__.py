@@ -16,7 +16,8 @@ from tasks.starts import Arms, Targets, Uniform, random_starts
 from tasks.tool_pose import Action, Noise, Switch
 
 BLOCK_AWAY_M = -20.0
-"""Where the block stands along x: behind the machine and out of its reach, so that nothing but the ground is in the way."""
+"""Where the block stands along x: behind the machine and out of its reach, so that nothing but the
+ground is in the way."""
 
 
 @spec
@@ -39,7 +40,9 @@ class Pose:
         for name in ("distance_m", "bearing_rad", "height_m", "pitch_rad"):
             low, high = getattr(self, name)
             if low > high:
-                raise ConfigError(f"task.pose.{name}: expected (lowest, highest), got [{low}, {high}]")
+                raise ConfigError(
+                    f"task.pose.{name}: expected (lowest, highest), got [{low}, {high}]"
+                )
 
 
 @spec
@@ -68,8 +71,10 @@ class GoalPose:
         pose: Which poses are asked for.
         arms: Where the arm may begin.
         tolerance: Criteria of success.
-        memory: Newest samples of history that the policy sees; the machine's `num_history` for all of them.
-        advice: How to propose to a person who moves the levers; `null` where the policy's commands are given as they are.
+        memory: Newest samples of history that the policy sees; the machine's `num_history` for all
+            of them.
+        advice: How to propose to a person who moves the levers; `null` where the policy's commands
+            are given as they are.
         noise: What the policy is told is wrong by.
         switch: When only q2 moves.
         action: How the policy's output becomes commands.
@@ -101,7 +106,9 @@ class GoalPose:
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Returns the task for `num_envs` environments on `device`."""
-        return ToolPoseProcess(Reaching(self, machine), Options.of(self, depth_m=0.0), machine, num_envs, device)
+        return ToolPoseProcess(
+            Reaching(self, machine), Options.of(self, depth_m=0.0), machine, num_envs, device
+        )
 
 
 class Reaching:
@@ -120,23 +127,38 @@ class Reaching:
             place = scene.nominal(len(distance))
             place[:, scene.COLUMNS.index("hole_x_m")] = BLOCK_AWAY_M
             return Targets(
-                target_m=torch.stack((distance * bearing.cos(), distance * bearing.sin(), uniform(pose.height_m)), 1),
+                target_m=torch.stack(
+                    (distance * bearing.cos(), distance * bearing.sin(), uniform(pose.height_m)), 1
+                ),
                 pitch_rad=uniform(pose.pitch_rad),
                 scene=place,
                 object_z_m=torch.zeros_like(distance),
             )
 
         controller = task.classical.build(self._machine, torch.device("cpu"))
-        return random_starts(count, seed, draw, task.arms, self._machine, controller, task.switch.reach_m, 0.0, "goal_pose")
+        return random_starts(
+            count,
+            seed,
+            draw,
+            task.arms,
+            self._machine,
+            controller,
+            task.switch.reach_m,
+            0.0,
+            "goal_pose",
+        )
 
-    def judge(self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def judge(
+        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
+    ) -> dict[str, torch.Tensor]:
         """See `tasks.process.Goal`."""
         rules = self._task.tolerance
         distance = (start["target_m"] - tip_m).norm(dim=1)
         turn = (start["target_pitch_rad"] - pitch_rad).abs()
         return {
             "success": (distance <= rules.strict_distance_m) & (turn <= rules.strict_pitch_rad),
-            "paper_success": (1 / (1 + distance) >= rules.paper_alignment) & (1 / (1 + turn) >= rules.paper_alignment),
+            "paper_success": (1 / (1 + distance) >= rules.paper_alignment)
+            & (1 / (1 + turn) >= rules.paper_alignment),
             "closeness": _closeness(distance, turn),
         }
 

@@ -13,7 +13,11 @@ from omegaconf import DictConfig, OmegaConf
 from brokk_rl import registry
 
 OVERRIDES = ("experiment", "ablation", "preset", "search")
-PARTS = [(entry.group, entry.name) for entry in registry.options() if entry.group not in (*OVERRIDES, "mode")]
+PARTS = [
+    (entry.group, entry.name)
+    for entry in registry.options()
+    if entry.group not in (*OVERRIDES, "mode")
+]
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -54,7 +58,9 @@ def test_every_job_of_every_ablation_composes(name: str) -> None:
         composed(f"ablation={name}", *job)
 
 
-@pytest.mark.parametrize("entry", registry.options(), ids=lambda entry: f"{entry.group}={entry.name}")
+@pytest.mark.parametrize(
+    "entry", registry.options(), ids=lambda entry: f"{entry.group}={entry.name}"
+)
 def test_every_option_says_in_one_line_what_it_is(entry: registry.Option) -> None:
     assert len(entry.summary()) > 10
 

@@ -110,7 +110,14 @@ def mine(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
 def test_its_options_show_in_the_list(mine: Path, brokk: Callable[..., Any]) -> None:
     done = brokk("mode=list")
     assert done.code == 0
-    for part in ("sticky", "An actuator that never moves.", "wave", "dowser", "Finds nothing, ever.", "(mine.conf)"):
+    for part in (
+        "sticky",
+        "An actuator that never moves.",
+        "wave",
+        "dowser",
+        "Finds nothing, ever.",
+        "(mine.conf)",
+    ):
         assert part in done.out
 
 
@@ -121,8 +128,12 @@ def test_its_options_run_beside_ours(mine: Path, brokk: Callable[..., Any], tmp_
     assert (tmp_path / "ours" / "seen.json").read_text() == '["Sticky", "Wave", "Truth"]'
 
 
-def test_an_option_that_two_packages_offer_is_an_error_that_names_both(mine: Path, brokk: Callable[..., Any]) -> None:
-    install(mine, "yours", {"conf/actuator/sticky.yaml": "_target_: mine.parts.Sticky\nshare: 0.5\n"})
+def test_an_option_that_two_packages_offer_is_an_error_that_names_both(
+    mine: Path, brokk: Callable[..., Any]
+) -> None:
+    install(
+        mine, "yours", {"conf/actuator/sticky.yaml": "_target_: mine.parts.Sticky\nshare: 0.5\n"}
+    )
     done = brokk("mode=list")
     assert done.code == 2
     for part in ("actuator=sticky", "mine.conf", "yours.conf"):
@@ -130,7 +141,9 @@ def test_an_option_that_two_packages_offer_is_an_error_that_names_both(mine: Pat
 
 
 def test_an_entry_point_without_its_package_is_named(mine: Path, brokk: Callable[..., Any]) -> None:
-    (mine / "mine-1.0.dist-info" / "entry_points.txt").write_text("[brokk_rl.conf]\nmine = mine.missing\n")
+    (mine / "mine-1.0.dist-info" / "entry_points.txt").write_text(
+        "[brokk_rl.conf]\nmine = mine.missing\n"
+    )
     done = brokk("mode=list")
     assert done.code == 2
     assert "mine.missing" in done.err
@@ -140,7 +153,9 @@ def test_nothing_is_ours_but_conf_without_extensions() -> None:
     assert next(iter(registry.packages())) == registry.CORE
 
 
-def test_a_failed_run_says_so_in_its_record(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_failed_run_says_so_in_its_record(
+    mine: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     done = brokk("mode=show", "session.out=run", "fails='by us'")
     assert done.code == 1
     assert "RuntimeError: our own fault" in done.err
@@ -149,39 +164,63 @@ def test_a_failed_run_says_so_in_its_record(mine: Path, brokk: Callable[..., Any
     assert "our own fault" in record
 
 
-def test_an_interrupted_run_says_so_in_its_record(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_an_interrupted_run_says_so_in_its_record(
+    mine: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     assert brokk("mode=show", "session.out=run", "fails='by hand'").code == 130
     assert '"outcome": "interrupted"' in (tmp_path / "run" / "session.json").read_text()
 
 
-def test_an_objective_that_is_no_number_does_not_break_the_record(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_an_objective_that_is_no_number_does_not_break_the_record(
+    mine: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     assert brokk("mode=show", "session.out=run", "fails='to learn'").code == 0
     assert '"objective": null' in (tmp_path / "run" / "session.json").read_text()
 
 
-def test_a_group_may_be_chosen_as_a_list(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_group_may_be_chosen_as_a_list(
+    mine: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     assert brokk("mode=show", "perception=[truth]", "session.out=run").code == 0
     assert '"perception": "[truth]"' in (tmp_path / "run" / "session.json").read_text()
 
 
-def test_a_sweep_has_one_folder_for_each_job_and_no_others(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
-    assert brokk("-m", "mode=show", "session.seed=3,4", "actuator.share=0.5,0.75", "session.out=sweep").code == 0
+def test_a_sweep_has_one_folder_for_each_job_and_no_others(
+    mine: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    assert (
+        brokk(
+            "-m", "mode=show", "session.seed=3,4", "actuator.share=0.5,0.75", "session.out=sweep"
+        ).code
+        == 0
+    )
     jobs = [
         f"{i}_actuator.share={share},session.seed={seed}"
         for i, (seed, share) in enumerate(((3, 0.5), (3, 0.75), (4, 0.5), (4, 0.75)))
     ]
     assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == [*jobs, "multirun.yaml"]
-    assert sorted(path.name for path in (tmp_path / "sweep" / jobs[1]).iterdir()) == ["resolved.yaml", "seen.json", "session.json"]
+    assert sorted(path.name for path in (tmp_path / "sweep" / jobs[1]).iterdir()) == [
+        "resolved.yaml",
+        "seen.json",
+        "session.json",
+    ]
     assert '"objective": 0.75' in (tmp_path / "sweep" / jobs[1] / "session.json").read_text()
     assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
 
 
-def test_the_jobs_of_a_sweep_go_on_when_one_fails(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_jobs_of_a_sweep_go_on_when_one_fails(
+    mine: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     assert brokk("-m", "mode=show", "session.seed=x,4", "session.out=sweep").code == 2
-    assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == ["1_session.seed=4", "multirun.yaml"]
+    assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == [
+        "1_session.seed=4",
+        "multirun.yaml",
+    ]
 
 
-def test_resolved_runs_again_in_a_new_folder(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_resolved_runs_again_in_a_new_folder(
+    mine: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     assert brokk("mode=show", "actuator.share=0.5", "session.out=run").code == 0
     assert brokk("--config-dir", "run", "--config-name", "resolved", "session.out=again").code == 0
     first, again = ((tmp_path / name / "resolved.yaml").read_text() for name in ("run", "again"))
@@ -190,7 +229,9 @@ def test_resolved_runs_again_in_a_new_folder(mine: Path, brokk: Callable[..., An
     assert [path.name.split("_", 2)[2] for path in (tmp_path / "runs").iterdir()] == ["parts"]
 
 
-def test_a_folder_that_holds_a_run_is_refused(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_folder_that_holds_a_run_is_refused(
+    mine: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     assert brokk("mode=show", "session.out=run").code == 0
     before = (tmp_path / "run" / "session.json").read_text()
     done = brokk("mode=show", "session.out=run")

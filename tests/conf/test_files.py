@@ -30,8 +30,12 @@ def composed(brokk: Callable[..., Any], *overrides: str) -> dict[str, Any]:
     return yaml.safe_load(done.out)
 
 
-@pytest.mark.parametrize("name", ["lag.yaml", "fits of today/lag.yaml", "../above/lag.yaml", "no_ending"])
-def test_a_file_is_an_option_of_its_group(name: str, brokk: Callable[..., Any], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name", ["lag.yaml", "fits of today/lag.yaml", "../above/lag.yaml", "no_ending"]
+)
+def test_a_file_is_an_option_of_its_group(
+    name: str, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     path = tmp_path / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(LAG)
@@ -40,50 +44,113 @@ def test_a_file_is_an_option_of_its_group(name: str, brokk: Callable[..., Any], 
     assert changed["actuator"]["gain"] == 0.9
 
 
-def test_a_file_may_hold_several_effects_and_stand_in_a_list(brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_file_may_hold_several_effects_and_stand_in_a_list(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     (tmp_path / "found, today.yaml").write_text(EFFECTS)
-    (tmp_path / "one.yaml").write_text("_target_: actuators.effects.speed.FlowGain\njoints: all\ngain: [0.9, 1.1]\n")
-    effect = composed(brokk, "mode=train", 'effect=["@found, today.yaml", lag, @one.yaml]')["effect"]
+    (tmp_path / "one.yaml").write_text(
+        "_target_: actuators.effects.speed.FlowGain\njoints: all\ngain: [0.9, 1.1]\n"
+    )
+    effect = composed(brokk, "mode=train", 'effect=["@found, today.yaml", lag, @one.yaml]')[
+        "effect"
+    ]
     assert list(effect) == ["stiction", "backlash", "lag", "flow_gain"]
     assert effect["backlash"]["gap_rad"] == 0.031
     assert effect["flow_gain"]["gain"] == [0.9, 1.1]
-    assert list(composed(brokk, "mode=train", "effect='@found, today.yaml'")["effect"]) == ["stiction", "backlash"]
+    assert list(composed(brokk, "mode=train", "effect='@found, today.yaml'")["effect"]) == [
+        "stiction",
+        "backlash",
+    ]
 
 
-def test_a_file_replaces_a_part_of_another_option(brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_file_replaces_a_part_of_another_option(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     (tmp_path / "lag.yaml").write_text(LAG)
-    fit = composed(brokk, "mode=identify", "fit=lag", "actuator@fit.actuator=@lag.yaml", "identify.recordings=x", "session.out=x")
+    fit = composed(
+        brokk,
+        "mode=identify",
+        "fit=lag",
+        "actuator@fit.actuator=@lag.yaml",
+        "identify.recordings=x",
+        "session.out=x",
+    )
     assert fit["fit"]["actuator"]["dead_time_s"] == {"q1": 0.5, "other": 0.45}
 
 
 def test_an_experiment_may_be_a_file(brokk: Callable[..., Any], tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text("defaults: [override /task: goal_pose]\nsession: {seed: 7}\n")
+    (tmp_path / "mine.yaml").write_text(
+        "defaults: [override /task: goal_pose]\nsession: {seed: 7}\n"
+    )
     cfg = composed(brokk, "mode=train", "experiment=@mine.yaml")
     assert cfg["session"]["seed"] == 7
     assert "goal_pose" in cfg["task"]["_target_"]
 
 
-def test_a_sweep_takes_files_beside_options(brokk: Callable[..., Any], tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_sweep_takes_files_beside_options(
+    brokk: Callable[..., Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / "fits").mkdir()
     (tmp_path / "fits" / "lag.yaml").write_text(LAG)
-    done = brokk("-m", "mode=bench", "actuator=ideal,@fits/lag.yaml", "bench.num_envs=[0]", "session.out=sweep")
+    done = brokk(
+        "-m",
+        "mode=bench",
+        "actuator=ideal,@fits/lag.yaml",
+        "bench.num_envs=[0]",
+        "session.out=sweep",
+    )
     assert done.code == 2
     for job in (0, 1):  # each was composed, and refused for its size alone
-        assert f"job {job} failed: bench.num_envs: expected one or more positive numbers" in caplog.text
+        assert (
+            f"job {job} failed: bench.num_envs: expected one or more positive numbers"
+            in caplog.text
+        )
     assert not (tmp_path / "sweep").exists()
 
 
 @pytest.mark.parametrize(
     ("group", "text", "told"),
     [
-        ("actuator", "_target_: os.system\n", ("'_target_: os.system' is no actuator", "actuators.lag.Lag")),
-        ("actuator", "_target_: actuators.effects.speed.Backlash\ngap_rad: 0.1\n", ("is no actuator",)),
-        ("effect", "backlash: {_target_: os.system}\n", ("'backlash._target_: os.system' is no effect",)),
-        ("effect", "a: {_target_: actuators.effects.speed.Backlash, gap_rad: {_target_: os.getcwd}}\n", ("nothing of ours",)),
-        ("actuator", "_target_: actuators.ideal.Ideal\nspeed_scale: ${oc.env:HOME}\n", ("interpolation", "${oc.env:HOME}")),
-        ("actuator", '_target_: actuators.ideal.Ideal\nspeed_scale: "\\x24{now:}"\n', ("interpolation",)),
-        ("actuator", "_target_: actuators.ideal.Ideal\n_partial_: true\n", ("'_partial_' is a setting of Hydra's",)),
-        ("actuator", "# @package _global_\n_target_: actuators.ideal.Ideal\n", ("lies outside 'actuator'",)),
+        (
+            "actuator",
+            "_target_: os.system\n",
+            ("'_target_: os.system' is no actuator", "actuators.lag.Lag"),
+        ),
+        (
+            "actuator",
+            "_target_: actuators.effects.speed.Backlash\ngap_rad: 0.1\n",
+            ("is no actuator",),
+        ),
+        (
+            "effect",
+            "backlash: {_target_: os.system}\n",
+            ("'backlash._target_: os.system' is no effect",),
+        ),
+        (
+            "effect",
+            "a: {_target_: actuators.effects.speed.Backlash, gap_rad: {_target_: os.getcwd}}\n",
+            ("nothing of ours",),
+        ),
+        (
+            "actuator",
+            "_target_: actuators.ideal.Ideal\nspeed_scale: ${oc.env:HOME}\n",
+            ("interpolation", "${oc.env:HOME}"),
+        ),
+        (
+            "actuator",
+            '_target_: actuators.ideal.Ideal\nspeed_scale: "\\x24{now:}"\n',
+            ("interpolation",),
+        ),
+        (
+            "actuator",
+            "_target_: actuators.ideal.Ideal\n_partial_: true\n",
+            ("'_partial_' is a setting of Hydra's",),
+        ),
+        (
+            "actuator",
+            "# @package _global_\n_target_: actuators.ideal.Ideal\n",
+            ("lies outside 'actuator'",),
+        ),
         ("experiment", "hydra: {sweep: {dir: /}}\n", ("Hydra's own settings",)),
         ("experiment", "defaults: [override /hydra/launcher: joblib]\n", ("Hydra's own settings",)),
         ("actuator", "a: 1\nb: [2\nc: 3\n", ("line 3: no valid YAML",)),
@@ -120,5 +187,11 @@ def test_a_table_in_the_place_of_a_range_is_explained(brokk: Callable[..., Any])
     done = brokk("mode=train", "effect=[stiction]", f"effect.stiction.start={table}")
     assert done.code == 2
     assert "effect.stiction.start holds a list and you gave a table" in done.err
-    effect = composed(brokk, "mode=train", "effect=[stiction]", "~effect.stiction.start", f"+effect.stiction.start={table}")
+    effect = composed(
+        brokk,
+        "mode=train",
+        "effect=[stiction]",
+        "~effect.stiction.start",
+        f"+effect.stiction.start={table}",
+    )
     assert effect["effect"]["stiction"]["start"] == {"q1": [0.05, 0.1], "other": 0.12}

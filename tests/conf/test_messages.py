@@ -22,7 +22,10 @@ COMPARE = ("mode=compare", "compare.runs=nowhere")
         (("mode=list", "mode.x=["), ("input",)),
         (("mode=list", "list.group=a,b"), ("--multirun",)),
         (("mode=list", "experiment=nothing"), ("there is no", "experiment")),
-        ((*COMPARE, "session.seed=abc"), ("Session.seed", "expected int", "'abc'", "session.<field>=")),
+        (
+            (*COMPARE, "session.seed=abc"),
+            ("Session.seed", "expected int", "'abc'", "session.<field>="),
+        ),
         ((*COMPARE, "session.seed=-1"), ("session.seed", "0 or more")),
         ((*COMPARE, "session.device=gpu"), ("session.device", "cpu", "'gpu'")),
         ((*COMPARE, "+session.sed=1"), ("no field 'sed'", "did you mean 'seed'?")),
@@ -48,7 +51,9 @@ def test_the_message_says_what_to_change(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_traceback_comes_on_request(brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_traceback_comes_on_request(
+    brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("BROKK_TRACE", "1")
     assert "Traceback" in brokk("mode=lst").err
 

@@ -25,7 +25,9 @@ class Filter:
     """A first-order actuator that keeps every promise; each test breaks one."""
 
     def __init__(self, machine: Machine, num_envs: int, device: torch.device) -> None:
-        self._scale = torch.as_tensor(machine.max_speed * machine.period_s, dtype=torch.float32, device=device)
+        self._scale = torch.as_tensor(
+            machine.max_speed * machine.period_s, dtype=torch.float32, device=device
+        )
         self.state = {"u": torch.zeros(num_envs, machine.num_joints, device=device)}
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -119,17 +121,30 @@ def overriding(**methods: Callable[..., Any]) -> Any:
         ({"command": lambda original, action: action}, "leaves"),
         ({"starts": lambda original, count, seed: original(count, 7)}, "another seed"),
         (
-            {"step": lambda original, history, world: replace(original(history, world), reward=torch.full((4,), torch.nan))},
+            {
+                "step": lambda original, history, world: replace(
+                    original(history, world), reward=torch.full((4,), torch.nan)
+                )
+            },
             "not finite",
         ),
         (
-            {"step": lambda original, *a: replace(original(*a), timed_out=torch.zeros(4, dtype=torch.bool))},
+            {
+                "step": lambda original, *a: replace(
+                    original(*a), timed_out=torch.zeros(4, dtype=torch.bool)
+                )
+            },
             "reason must be|no time-out",
         ),
-        ({"reset": lambda original, mask, start: original(torch.ones_like(mask), start)}, "outside the mask"),
+        (
+            {"reset": lambda original, mask, start: original(torch.ones_like(mask), start)},
+            "outside the mask",
+        ),
     ],
 )
-def test_a_broken_task_is_found(methods: dict[str, Callable[..., Any]], message: str, machine: Machine) -> None:
+def test_a_broken_task_is_found(
+    methods: dict[str, Callable[..., Any]], message: str, machine: Machine
+) -> None:
     with pytest.raises(AssertionError, match=message):
         check_task(overriding(**methods), machine)
 
@@ -178,9 +193,15 @@ def test_a_link_must_not_send_what_is_no_number(machine: Machine) -> None:
         ({"name": "before_00"}, "names repeat"),
     ],
 )
-def test_a_broken_excitation_is_found(change: dict[str, Any], message: str, machine: Machine) -> None:
-    segment = Segment(name="a_00", start=machine.home, u=np.zeros((10, 5)), stops="home", stop_margin=0.1)
-    broken: Any = SimpleNamespace(weight=lambda before: 1.0, segments=lambda *_: [replace(segment, **change)])
+def test_a_broken_excitation_is_found(
+    change: dict[str, Any], message: str, machine: Machine
+) -> None:
+    segment = Segment(
+        name="a_00", start=machine.home, u=np.zeros((10, 5)), stops="home", stop_margin=0.1
+    )
+    broken: Any = SimpleNamespace(
+        weight=lambda before: 1.0, segments=lambda *_: [replace(segment, **change)]
+    )
     with pytest.raises(AssertionError, match=message):
         check_excitation(broken, machine)
 

@@ -47,7 +47,9 @@ def test_it_is_an_excitation(name: str, machine: Machine) -> None:
 
 @pytest.mark.parametrize("num_runs", [1, 3])
 @pytest.mark.parametrize("actuator", names("actuator"))
-def test_the_simulated_machine_is_a_link(actuator: str, num_runs: int, machine: Machine, tmp_path: Path) -> None:
+def test_the_simulated_machine_is_a_link(
+    actuator: str, num_runs: int, machine: Machine, tmp_path: Path
+) -> None:
     connection = Simulated(actuator=option("actuator", actuator), noise=0.001)
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     check_link(connection.build(machine, num_runs, session), machine, num_runs)

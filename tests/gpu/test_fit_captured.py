@@ -27,7 +27,9 @@ def recording(machine: Machine, seed: int) -> Recording:
     """Returns two minutes of joints that follow their commands after 0.5 s."""
     generator = np.random.default_rng(seed)
     u = np.repeat(generator.uniform(-1.0, 1.0, (120, machine.num_joints)), 20, 0)
-    q = machine.home + 0.005 * np.cumsum(np.vstack([np.zeros((10, machine.num_joints)), u])[: len(u)], 0)
+    q = machine.home + 0.005 * np.cumsum(
+        np.vstack([np.zeros((10, machine.num_joints)), u])[: len(u)], 0
+    )
     q = q + 3e-4 * generator.standard_normal(q.shape)
     return Recording(
         machine=machine.name, joints=machine.joint_names, units=("rad",) * machine.num_joints, rate_hz=20.0,
@@ -37,7 +39,9 @@ def recording(machine: Machine, seed: int) -> Recording:
 
 @pytest.mark.parametrize("coupled", [False, True])
 @pytest.mark.parametrize("horizon", [1, 20])
-def test_a_captured_update_is_the_update(coupled: bool, horizon: int, machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_captured_update_is_the_update(
+    coupled: bool, horizon: int, machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def as_it_is(step: Callable[[], None], device: torch.device, gradients: bool = False) -> Any:
         return SimpleNamespace(replay=torch.enable_grad()(step))
 
@@ -49,19 +53,36 @@ def test_a_captured_update_is_the_update(coupled: bool, horizon: int, machine: M
             networks = JointNetworks(5, 13, 32, coupled, torch.Generator().manual_seed(0))
             networks.increment_scale.fill_(0.01)
             at_work = Descent(networks.cuda(), machine, 3)
-            update = at_work.updater(Windows([recording(machine, 0)], machine, horizon, torch.device("cuda")), 32, 0.2, 0.2)
-            assert all((value == 0).all() for name, value in at_work.state().items() if name.startswith("adam"))
+            update = at_work.updater(
+                Windows([recording(machine, 0)], machine, horizon, torch.device("cuda")),
+                32,
+                0.2,
+                0.2,
+            )
+            assert all(
+                (value == 0).all()
+                for name, value in at_work.state().items()
+                if name.startswith("adam")
+            )
             for number in range(10):
                 at_work.steer(number, 0.003, 0.9)
                 update()
             found.append({name: value.clone() for name, value in at_work.state().items()})
     for name, value in found[0].items():
-        torch.testing.assert_close(value, found[1][name], atol=2e-5, rtol=2e-3, msg=lambda text, name=name: f"{name}: {text}")
+        torch.testing.assert_close(
+            value,
+            found[1][name],
+            atol=2e-5,
+            rtol=2e-3,
+            msg=lambda text, name=name: f"{name}: {text}",
+        )
     assert not torch.equal(found[0]["networks.weight.0"], found[0]["averaged.weight.0"])
 
 
 @pytest.mark.parametrize("name", ["mlp", "coupled"])
-def test_a_fit_on_the_gpu_is_as_good_as_on_the_cpu(name: str, machine: Machine, tmp_path: Path) -> None:
+def test_a_fit_on_the_gpu_is_as_good_as_on_the_cpu(
+    name: str, machine: Machine, tmp_path: Path
+) -> None:
     config = dataclasses.replace(
         option("fit", name),
         one_step_updates=200,

@@ -50,7 +50,9 @@ def test_a_captured_control_step_does_what_the_eager_one_does(machine, spec):
     graphed.load_state_dict(start)
     speed = torch.tensor(machine.max_speed, device="cuda", dtype=torch.float32)
     for _ in range(20):
-        increment.copy_(0.05 * speed * (torch.rand(increment.shape, device="cuda", generator=generator) - 0.5))
+        increment.copy_(
+            0.05 * speed * (torch.rand(increment.shape, device="cuda", generator=generator) - 0.5)
+        )
         eager.step(increment)
         graph.replay()
     assert not eager.faults.any()

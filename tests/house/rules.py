@@ -22,7 +22,8 @@ FLOORS = (
     ("brokk_rl.errors", 0),
     ("brokk_rl", 1),
 )
-"""Floor of each package, the first that fits: roof, modes, rooms and diagnosis, sim and rl, bedrock, and ground for the rest."""
+"""Floor of each package, the first that fits: roof, modes, rooms and diagnosis, sim and rl,
+bedrock, and ground for the rest."""
 DOORS = {
     "hydra": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep"),
     "omegaconf": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep"),
@@ -42,10 +43,12 @@ CLOSED = {
     "deploy.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
 }
-"""What a package must not import, whatever its floor: the machine's own computer has neither simulator nor trainer."""
+"""What a package must not import, whatever its floor: the machine's own computer has neither
+simulator nor trainer."""
 VAGUE = {"utils", "util", "helpers", "helper", "common", "base", "manager", "misc"}
 HOOKS = {"check"}
-"""Methods that mean the same everywhere and are explained where they are called: `check` in `brokk_rl.spec`."""
+"""Methods that mean the same everywhere and are explained where they are called: `check` in
+`brokk_rl.spec`."""
 OTHER_UNITS = ("_deg", "_mm", "_cm", "_ms", "_km_h", "_bar")
 
 
@@ -90,7 +93,9 @@ def floors(sources: Mapping[str, str]) -> list[str]:
             up = other > mine
             into_room = top in (*ROOMS, "conf") and top != room
             if up or into_room:
-                found.append(f"{module}:{entry.line} imports {entry.name}, which is {'above it' if up else 'a room of its own'}")
+                found.append(
+                    f"{module}:{entry.line} imports {entry.name}, which is {'above it' if up else 'a room of its own'}"
+                )
     return found
 
 
@@ -101,10 +106,14 @@ def doors(sources: Mapping[str, str]) -> list[str]:
         for entry in imports(tree):
             allowed = DOORS.get(entry.name.split(".")[0])
             if allowed and not any(within(module, package) for package in allowed):
-                found.append(f"{module}:{entry.line} imports {entry.name}; only {' and '.join(allowed)} may")
+                found.append(
+                    f"{module}:{entry.line} imports {entry.name}; only {' and '.join(allowed)} may"
+                )
             for package, closed in CLOSED.items():
                 if within(module, package) and any(within(entry.name, name) for name in closed):
-                    found.append(f"{module}:{entry.line} imports {entry.name}, which {package} must do without")
+                    found.append(
+                        f"{module}:{entry.line} imports {entry.name}, which {package} must do without"
+                    )
     return found
 
 
@@ -123,7 +132,12 @@ def prints(sources: Mapping[str, str]) -> list[str]:
 
 def vague_names(sources: Mapping[str, str]) -> list[str]:
     """Modules and folders are nouns that say what is in them."""
-    return [f"{module}: '{part}' says nothing" for module in sources for part in module.split(".") if part in VAGUE]
+    return [
+        f"{module}: '{part}' says nothing"
+        for module in sources
+        for part in module.split(".")
+        if part in VAGUE
+    ]
 
 
 def docstrings(sources: Mapping[str, str]) -> list[str]:
@@ -133,7 +147,9 @@ def docstrings(sources: Mapping[str, str]) -> list[str]:
         if not ast.get_docstring(tree):
             found.append(f"{module} has no docstring")
         found += [
-            f"{module}:{node.lineno} {node.name} has no docstring" for node in _public(tree.body) if not ast.get_docstring(node)
+            f"{module}:{node.lineno} {node.name} has no docstring"
+            for node in _public(tree.body)
+            if not ast.get_docstring(node)
         ]
     return found
 
@@ -143,7 +159,11 @@ def units(sources: Mapping[str, str]) -> list[str]:
     found = []
     for module, tree in _trees(sources):
         for node in ast.walk(tree):
-            name = node.target.id if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) else None
+            name = (
+                node.target.id
+                if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+                else None
+            )
             name = node.arg if isinstance(node, ast.arg) else name
             if name and name.endswith(OTHER_UNITS):
                 found.append(f"{module}: {name} is not in SI units")
@@ -156,7 +176,9 @@ def lengths(sources: Mapping[str, str], limit: int, reasons: Mapping[str, str]) 
     """No module is longer than `limit` lines without a reason."""
     counts = {module: text.count("\n") for module, text in sources.items()}
     return [
-        f"{module} has {count} lines, over {limit}" for module, count in counts.items() if count > limit and module not in reasons
+        f"{module} has {count} lines, over {limit}"
+        for module, count in counts.items()
+        if count > limit and module not in reasons
     ]
 
 
@@ -165,11 +187,17 @@ def _trees(sources: Mapping[str, str]) -> Iterator[tuple[str, ast.Module]]:
         yield module, ast.parse(text)
 
 
-def _public(body: list[ast.stmt]) -> Iterator[ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef]:
+def _public(
+    body: list[ast.stmt],
+) -> Iterator[ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef]:
     for node in body:
-        if not isinstance(node, (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) or node.name.startswith("_"):
+        if not isinstance(
+            node, (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+        ) or node.name.startswith("_"):
             continue
-        if node.name not in HOOKS and not any(isinstance(d, ast.Attribute) and d.attr == "setter" for d in node.decorator_list):
+        if node.name not in HOOKS and not any(
+            isinstance(d, ast.Attribute) and d.attr == "setter" for d in node.decorator_list
+        ):
             yield node
         if isinstance(node, ast.ClassDef):
             yield from _public(node.body)
@@ -177,7 +205,11 @@ def _public(body: list[ast.stmt]) -> Iterator[ast.ClassDef | ast.FunctionDef | a
 
 def _without_type_checking(node: ast.AST) -> Iterator[ast.AST]:
     for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING":
+        if (
+            isinstance(child, ast.If)
+            and isinstance(child.test, ast.Name)
+            and child.test.id == "TYPE_CHECKING"
+        ):
             continue
         yield child
         yield from _without_type_checking(child)

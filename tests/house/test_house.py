@@ -15,23 +15,30 @@ LONG: dict[str, str] = {
     "brokk_rl.contracts": "the seams between all parts stand in one place",
     "brokk_rl.sight": "the seams between the parts of perception stand in one place",
 }
-"""Modules of over 300 lines, and why."""
+"""Modules of over 500 lines, and why."""
 
 
 def module_name(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-SOURCES = {module_name(path): path.read_text() for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))}
+SOURCES = {
+    module_name(path): path.read_text()
+    for package in PACKAGES
+    for path in sorted((ROOT / package).rglob("*.py"))
+}
 
 
-@pytest.mark.parametrize("rule", [rules.floors, rules.doors, rules.prints, rules.vague_names, rules.docstrings, rules.units])
+@pytest.mark.parametrize(
+    "rule",
+    [rules.floors, rules.doors, rules.prints, rules.vague_names, rules.docstrings, rules.units],
+)
 def test_the_sources_keep(rule: Callable[[Mapping[str, str]], list[str]]) -> None:
     assert rule(SOURCES) == []
 
 
 def test_no_module_is_long_without_a_reason() -> None:
-    assert rules.lengths(SOURCES, 300, LONG) == []
+    assert rules.lengths(SOURCES, 500, LONG) == []
 
 
 @pytest.mark.parametrize(
@@ -39,7 +46,11 @@ def test_no_module_is_long_without_a_reason() -> None:
     [
         (rules.floors, "brokk_rl.machine", "from brokk_rl.sim import model"),
         (rules.floors, "brokk_rl.spec", "import brokk_rl.machine"),
-        (rules.floors, "brokk_rl.rl.runner", "def f():\n    from brokk_rl.modes.train import Train"),
+        (
+            rules.floors,
+            "brokk_rl.rl.runner",
+            "def f():\n    from brokk_rl.modes.train import Train",
+        ),
         (rules.floors, "brokk_rl.modes.train", "from tasks.reward import Term"),
         (rules.floors, "tasks.reward", "import actuators.lag"),
         (rules.floors, "brokk_rl.modes.list", "from brokk_rl import extensions"),
@@ -56,7 +67,9 @@ def test_no_module_is_long_without_a_reason() -> None:
         (rules.units, "brokk_rl.a", "def f(n_envs): pass"),
     ],
 )
-def test_a_planted_violation_is_found(rule: Callable[[Mapping[str, str]], list[str]], module: str, text: str) -> None:
+def test_a_planted_violation_is_found(
+    rule: Callable[[Mapping[str, str]], list[str]], module: str, text: str
+) -> None:
     assert len(rule({module: text})) == 1
 
 
@@ -71,18 +84,32 @@ def test_a_planted_violation_is_found(rule: Callable[[Mapping[str, str]], list[s
         ),
         (rules.doors, "brokk_rl.sim.probe", "import mujoco"),
         (rules.prints, "brokk_rl.modes.list", "print('hello')"),
-        (rules.docstrings, "brokk_rl.a", '"""A."""\ndef _b(): pass\nclass C:\n    """C."""\n    def check(self): pass'),
+        (
+            rules.docstrings,
+            "brokk_rl.a",
+            '"""A."""\ndef _b(): pass\nclass C:\n    """C."""\n    def check(self): pass',
+        ),
         (rules.units, "brokk_rl.a", "def f(num_envs, tilt_rad): pass"),
     ],
 )
-def test_what_is_allowed_is_not_found(rule: Callable[[Mapping[str, str]], list[str]], module: str, text: str) -> None:
+def test_what_is_allowed_is_not_found(
+    rule: Callable[[Mapping[str, str]], list[str]], module: str, text: str
+) -> None:
     assert rule({module: text}) == []
 
 
 def test_no_file_names_the_workplace_it_was_written_at() -> None:
     # put together here, so that this file does not name them either
-    places = ["/" + "work/", ".." + "/shared", "shared" + "/notes", "/opt" + "/wheels", "/opt" + "/pypi"]
-    listed = subprocess.run(["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True)
+    places = [
+        "/" + "work/",
+        ".." + "/shared",
+        "shared" + "/notes",
+        "/opt" + "/wheels",
+        "/opt" + "/pypi",
+    ]
+    listed = subprocess.run(
+        ["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True
+    )
     if listed.returncode:
         pytest.skip("no checkout")
     found = []

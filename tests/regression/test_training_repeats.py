@@ -20,24 +20,47 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
 
 
 def test_the_same_seed_trains_the_same_weights(machine: Machine, tmp_path: Path) -> None:
-    first, second = (runs.train(machine, tmp_path / name, runs.small(max_env_steps=6 * ITERATION)) for name in "ab")
+    first, second = (
+        runs.train(machine, tmp_path / name, runs.small(max_env_steps=6 * ITERATION))
+        for name in "ab"
+    )
     assert same(runs.weights(first), runs.weights(second))
-    assert runs.progress(tmp_path / "a") == runs.progress(tmp_path / "b") and len(runs.progress(tmp_path / "a")) == 6
+    assert (
+        runs.progress(tmp_path / "a") == runs.progress(tmp_path / "b")
+        and len(runs.progress(tmp_path / "a")) == 6
+    )
 
 
 @pytest.mark.parametrize("save_interval", [1, 3])
-def test_a_resumed_run_is_the_run_that_was_never_interrupted(save_interval: int, machine: Machine, tmp_path: Path) -> None:
-    whole = runs.train(machine, tmp_path / "whole", runs.small(max_env_steps=9 * ITERATION, save_interval=save_interval))
-    runs.train(machine, tmp_path / "parts", runs.small(max_env_steps=3 * ITERATION, save_interval=save_interval))
+def test_a_resumed_run_is_the_run_that_was_never_interrupted(
+    save_interval: int, machine: Machine, tmp_path: Path
+) -> None:
+    whole = runs.train(
+        machine,
+        tmp_path / "whole",
+        runs.small(max_env_steps=9 * ITERATION, save_interval=save_interval),
+    )
+    runs.train(
+        machine,
+        tmp_path / "parts",
+        runs.small(max_env_steps=3 * ITERATION, save_interval=save_interval),
+    )
     checkpoint = tmp_path / "parts" / "model_3.pt"
     resumed = runs.train(
-        machine, tmp_path / "parts", runs.small(max_env_steps=9 * ITERATION, save_interval=save_interval), checkpoint
+        machine,
+        tmp_path / "parts",
+        runs.small(max_env_steps=9 * ITERATION, save_interval=save_interval),
+        checkpoint,
     )
     assert same(runs.weights(whole), runs.weights(resumed))
     assert runs.progress(tmp_path / "whole") == runs.progress(tmp_path / "parts")
     assert whole.alg.learning_rate == resumed.alg.learning_rate
-    ends = [torch.load(tmp_path / name / "model_9.pt", weights_only=True) for name in ("whole", "parts")]
-    assert same(ends[0]["env"]["tensors"], ends[1]["env"]["tensors"]) and same(ends[0]["random"], ends[1]["random"])
+    ends = [
+        torch.load(tmp_path / name / "model_9.pt", weights_only=True) for name in ("whole", "parts")
+    ]
+    assert same(ends[0]["env"]["tensors"], ends[1]["env"]["tensors"]) and same(
+        ends[0]["random"], ends[1]["random"]
+    )
     state = [end["optimizer_state_dict"]["state"] for end in ends]
     assert all(same(state[0][key], state[1][key]) for key in state[0])
 
@@ -50,21 +73,40 @@ def test_a_resumed_run_settles_as_the_run_that_was_never_interrupted(
     whole = runs.train(machine, tmp_path / "run", replace(training, keep_checkpoints=9))
     again = runs.train(machine, tmp_path / "run", training, tmp_path / "run" / "model_5.pt")
     assert same(runs.weights(whole), runs.weights(again))
-    assert whole.alg.desired_kl == again.alg.desired_kl == pytest.approx(0.01 * (1 - 0.9 * (6 / 8 - 0.2) / 0.8))
+    assert (
+        whole.alg.desired_kl
+        == again.alg.desired_kl
+        == pytest.approx(0.01 * (1 - 0.9 * (6 / 8 - 0.2) / 0.8))
+    )
 
 
-def test_how_often_a_checkpoint_is_written_does_not_change_training(machine: Machine, tmp_path: Path) -> None:
+def test_how_often_a_checkpoint_is_written_does_not_change_training(
+    machine: Machine, tmp_path: Path
+) -> None:
     often, once = (
-        runs.train(machine, tmp_path / str(interval), runs.small(max_env_steps=4 * ITERATION, save_interval=interval))
+        runs.train(
+            machine,
+            tmp_path / str(interval),
+            runs.small(max_env_steps=4 * ITERATION, save_interval=interval),
+        )
         for interval in (1, 50)
     )
-    assert same(runs.weights(often), runs.weights(once)) and runs.progress(tmp_path / "1") == runs.progress(tmp_path / "50")
+    assert same(runs.weights(often), runs.weights(once)) and runs.progress(
+        tmp_path / "1"
+    ) == runs.progress(tmp_path / "50")
 
 
-def test_going_back_to_an_older_checkpoint_drops_the_progress_after_it(machine: Machine, tmp_path: Path) -> None:
+def test_going_back_to_an_older_checkpoint_drops_the_progress_after_it(
+    machine: Machine, tmp_path: Path
+) -> None:
     whole = runs.train(machine, tmp_path / "run", runs.small(max_env_steps=6 * ITERATION))
     before = runs.progress(tmp_path / "run")
-    again = runs.train(machine, tmp_path / "run", runs.small(max_env_steps=6 * ITERATION), tmp_path / "run" / "model_4.pt")
+    again = runs.train(
+        machine,
+        tmp_path / "run",
+        runs.small(max_env_steps=6 * ITERATION),
+        tmp_path / "run" / "model_4.pt",
+    )
     assert runs.progress(tmp_path / "run") == before and len(before) == 6
     assert same(runs.weights(whole), runs.weights(again))
 

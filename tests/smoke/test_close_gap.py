@@ -20,14 +20,23 @@ FOUND = "# @package effect\ndead_band: {_target_: actuators.effects.command.Dead
 
 
 @pytest.mark.slow
-def test_a_policy_is_retrained_and_judged_on_three_plants(brokk: Callable[..., Done], tmp_path: Path) -> None:
+def test_a_policy_is_retrained_and_judged_on_three_plants(
+    brokk: Callable[..., Done], tmp_path: Path
+) -> None:
     (tmp_path / "found.yaml").write_text(FOUND)
     assert (done := brokk(*SMALL)).code == 0, done.err
     run = tmp_path / "run"
     found = json.loads((run / "close_gap.json").read_text())
     assert list(found["success"]) == ["before", "after", "classical"] and found["episodes"] == 8
-    assert found["plants"] == {"simulator": "lag", "repaired": "lag + dead_band", "machine": "lag + dead_band"}
-    assert found["retraining"]["trained with"] == "lag + library + dead_band" and found["retraining"]["control steps"] == 768
+    assert found["plants"] == {
+        "simulator": "lag",
+        "repaired": "lag + dead_band",
+        "machine": "lag + dead_band",
+    }
+    assert (
+        found["retraining"]["trained with"] == "lag + library + dead_band"
+        and found["retraining"]["control steps"] == 768
+    )
     for policy in found["success"].values():
         # the stand-in is just the repaired simulator, and all meet the same starts and noise
         assert policy["repaired"] == policy["machine"]

@@ -41,12 +41,23 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def check_evaluation(found: dict[str, Any], policy: str, episodes: int) -> None:
-    assert found.keys() >= FIELDS and found["policy"] == policy and found["actuator"] == "lag" and found["episodes"] == episodes
+    assert (
+        found.keys() >= FIELDS
+        and found["policy"] == policy
+        and found["actuator"] == "lag"
+        and found["episodes"] == episodes
+    )
     for name in ("success_strict", "success_paper"):
         low, high = found[name]["ci95"]
         assert 0 <= low <= found[name]["mean"] <= high <= 1
-    assert found["time_to_insert_s"].keys() == {"median", "p95"} and sum(found["terminations"].values()) == episodes
-    assert all(isinstance(found[name], float) for name in ("lateral_error_m", "peak_force_n", "valve_travel"))
+    assert (
+        found["time_to_insert_s"].keys() == {"median", "p95"}
+        and sum(found["terminations"].values()) == episodes
+    )
+    assert all(
+        isinstance(found[name], float)
+        for name in ("lateral_error_m", "peak_force_n", "valve_travel")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +79,19 @@ def test_training_leaves_all_that_is_needed_to_judge_and_use_the_policy(run: Pat
         assert [float(row["env_steps"]) for row in csv.DictReader(file)] == [384, 768, 1152]
 
 
-def test_the_trained_policy_is_evaluated_beside_the_classical_and_the_untrained_one(run: Path) -> None:
+def test_the_trained_policy_is_evaluated_beside_the_classical_and_the_untrained_one(
+    run: Path,
+) -> None:
     found = read(run / "evaluation.json")
     check_evaluation(found, "trained", 8)
     assert list(found["policies"]) == ["trained", "classical", "untrained"]
     assert found["policies"]["classical"]["success_strict"]["mean"] >= 0.5
     record = read(run / "session.json")
-    assert record["outcome"] == "finished" and record["objective"] == found["success_strict"]["mean"] and record["seed"] == 0
+    assert (
+        record["outcome"] == "finished"
+        and record["objective"] == found["success_strict"]["mean"]
+        and record["seed"] == 0
+    )
     assert record["machine"] == "brokk170" and record["choices"]["actuator"] == "lag"
 
 
@@ -82,7 +99,10 @@ def test_the_resolved_config_runs_again_to_the_same_result(run: Path) -> None:
     command(run.parent, "--config-dir", str(run), "--config-name", "resolved", "session.out=again")
     first, again = (read(folder / "evaluation.json") for folder in (run, run.parent / "again"))
     assert first == again
-    weights = [torch.load(folder / "model_3.pt", weights_only=True)["actor_state_dict"] for folder in (run, run.parent / "again")]
+    weights = [
+        torch.load(folder / "model_3.pt", weights_only=True)["actor_state_dict"]
+        for folder in (run, run.parent / "again")
+    ]
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
 
 
@@ -91,14 +111,26 @@ def test_a_resumed_command_ends_where_an_uninterrupted_one_does(run: Path) -> No
     command(run.parent, *arguments, "rl.budget.max_env_steps=768")
     command(run.parent, *arguments, "resume=parts")
     parts = run.parent / "parts"
-    weights = [torch.load(folder / "model_3.pt", weights_only=True)["actor_state_dict"] for folder in (run, parts)]
+    weights = [
+        torch.load(folder / "model_3.pt", weights_only=True)["actor_state_dict"]
+        for folder in (run, parts)
+    ]
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
-    assert read(parts / "evaluation.json") == read(run / "evaluation.json") and len(read(parts / "session.json")["resumed"]) == 1
+    assert (
+        read(parts / "evaluation.json") == read(run / "evaluation.json")
+        and len(read(parts / "session.json")["resumed"]) == 1
+    )
 
 
 def test_evaluating_the_policy_again_gives_the_same_figures(run: Path) -> None:
     command(
-        run.parent, "mode=evaluate", f"policy.folder={run}", "session.out=evaluation", "actuator=lag", "session.device=cpu", *FEW
+        run.parent,
+        "mode=evaluate",
+        f"policy.folder={run}",
+        "session.out=evaluation",
+        "actuator=lag",
+        "session.device=cpu",
+        *FEW,
     )
     found = read(run.parent / "evaluation" / "evaluation.json")
     check_evaluation(found, "trained", 8)
@@ -108,12 +140,28 @@ def test_evaluating_the_policy_again_gives_the_same_figures(run: Path) -> None:
 
 def test_a_policy_alone_can_be_evaluated_on_any_task(run: Path) -> None:
     out = "session.out=poses"
-    command(run.parent, "mode=evaluate", "task=goal_pose", "policy=classical", out, "actuator=lag", "session.device=cpu", *FEW)
+    command(
+        run.parent,
+        "mode=evaluate",
+        "task=goal_pose",
+        "policy=classical",
+        out,
+        "actuator=lag",
+        "session.device=cpu",
+        *FEW,
+    )
     check_evaluation(read(run.parent / "poses" / "evaluation.json"), "classical", 8)
 
 
 def test_exporting_a_checkpoint_makes_the_same_policy(run: Path) -> None:
-    command(run.parent, "mode=export", f"checkpoint={run}", "session.out=export", "actuator=lag", "num_checked=8")
+    command(
+        run.parent,
+        "mode=export",
+        f"checkpoint={run}",
+        "session.out=export",
+        "actuator=lag",
+        "num_checked=8",
+    )
     made = run.parent / "export"
     assert {path.name for path in made.iterdir()} == {
         "golden.json", "policy.json", "policy.onnx", "policy.safetensors", "resolved.yaml", "session.json",
@@ -126,29 +174,56 @@ def test_exporting_a_checkpoint_makes_the_same_policy(run: Path) -> None:
 def test_goal_pose_trains_and_exports_with_the_pitch_in_the_vector(run: Path) -> None:
     command(run.parent, "mode=train", "task=goal_pose", "session.out=goal", *SMALL, *FEW)
     contract = read(run.parent / "goal" / "policy.json")
-    assert contract["observation"]["size"] == 134 and contract["observation"]["order"][-1] == "pitch_rad (1)"
+    assert (
+        contract["observation"]["size"] == 134
+        and contract["observation"]["order"][-1] == "pitch_rad (1)"
+    )
     graph = onnx.load(run.parent / "goal" / "policy.onnx").graph
     assert graph.input[0].type.tensor_type.shape.dim[1].dim_value == 134
 
 
 def test_bench_measures_physics_control_step_and_training(run: Path) -> None:
     sizes = ("bench.num_envs=[8,16]", "bench.seconds=0.05", "bench.iterations=1")
-    command(run.parent, "mode=bench", "session.out=bench", "actuator=lag", "session.device=cpu", "rl.num_starts=32", *sizes)
+    command(
+        run.parent,
+        "mode=bench",
+        "session.out=bench",
+        "actuator=lag",
+        "session.device=cpu",
+        "rl.num_starts=32",
+        *sizes,
+    )
     found = read(run.parent / "bench" / "benchmark.json")
     rates = ("physics_env_steps_per_s", "env_steps_per_s", "train_env_steps_per_s")
     assert (
-        found["num_envs"] == 16 and found["graph"] is False and found["device"].startswith("cpu") and "torch" in found["versions"]
+        found["num_envs"] == 16
+        and found["graph"] is False
+        and found["device"].startswith("cpu")
+        and "torch" in found["versions"]
     )
     assert [row["num_envs"] for row in found["rows"]] == [8, 16]
     assert all(row[name] > 0 for row in found["rows"] for name in rates) and all(
         found[name] == found["rows"][-1][name] for name in rates
     )
-    assert found["physics_env_steps_per_s"] > found["env_steps_per_s"] > found["train_env_steps_per_s"]
-    assert found["of_batch"]["env_steps_per_s"] == found["env_steps_per_s"] / found["batch_env_steps_per_s"]
+    assert (
+        found["physics_env_steps_per_s"] > found["env_steps_per_s"] > found["train_env_steps_per_s"]
+    )
+    assert (
+        found["of_batch"]["env_steps_per_s"]
+        == found["env_steps_per_s"] / found["batch_env_steps_per_s"]
+    )
 
 
-def test_a_policy_of_another_task_is_refused_by_message(run: Path, brokk: Callable[..., Any]) -> None:
+def test_a_policy_of_another_task_is_refused_by_message(
+    run: Path, brokk: Callable[..., Any]
+) -> None:
     done = brokk(
-        "mode=evaluate", "task=goal_pose", f"policy.folder={run}", "actuator=lag", "session.out=wrong", "session.device=cpu", *FEW
+        "mode=evaluate",
+        "task=goal_pose",
+        f"policy.folder={run}",
+        "actuator=lag",
+        "session.out=wrong",
+        "session.device=cpu",
+        *FEW,
     )
     assert done.code == 2 and "task=" in done.err and not Path("wrong").exists()

@@ -33,13 +33,25 @@ BENCH = (
 
 def started(folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        arguments, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"} | environment, capture_output=True, text=True, timeout=240
+        arguments,
+        cwd=folder,
+        env=os.environ | {"OMP_NUM_THREADS": "1"} | environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
     )
 
 
 def together(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Runs the command in two processes."""
-    return started(folder, str(BIN / "torchrun"), "--standalone", "--nproc-per-node=2", str(BIN / "brokk"), *arguments)
+    return started(
+        folder,
+        str(BIN / "torchrun"),
+        "--standalone",
+        "--nproc-per-node=2",
+        str(BIN / "brokk"),
+        *arguments,
+    )
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -59,24 +71,36 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_two_processes_train_one_policy_and_one_writes(run: Path) -> None:
     assert [path.name for path in run.parent.iterdir()] == ["run"]
     rows = (run / "progress.csv").read_text().splitlines()[1:]
-    assert [float(row.split(",")[1]) for row in rows] == [768.0, 1536.0, 2304.0, 3072.0], "steps of both"
+    assert [float(row.split(",")[1]) for row in rows] == [768.0, 1536.0, 2304.0, 3072.0], (
+        "steps of both"
+    )
     assert read(run / "session.json")["outcome"] == "finished" and (run / "policy.onnx").exists()
 
 
 def test_the_processes_see_different_worlds(run: Path) -> None:
     content = torch.load(run / "model_4.pt", weights_only=True)
     first, second = content["env"]["tensors"], content["others"][0]["env"]["tensors"]
-    assert first["history.q"].shape == second["history.q"].shape and not torch.equal(first["history.q"], second["history.q"])
+    assert first["history.q"].shape == second["history.q"].shape and not torch.equal(
+        first["history.q"], second["history.q"]
+    )
 
 
 @pytest.mark.slow
 def test_two_processes_that_were_stopped_go_on_exactly(run: Path) -> None:
     arguments = ("mode=train", "session.out=parts", *SMALL)
     assert together(run.parent, *arguments, "rl.budget.max_env_steps=2304").returncode == 0
-    assert together(run.parent, *arguments, "rl.budget.max_env_steps=3072", "resume=parts").returncode == 0
-    whole, parts = (torch.load(folder / "model_4.pt", weights_only=True) for folder in (run, run.parent / "parts"))
+    assert (
+        together(run.parent, *arguments, "rl.budget.max_env_steps=3072", "resume=parts").returncode
+        == 0
+    )
+    whole, parts = (
+        torch.load(folder / "model_4.pt", weights_only=True)
+        for folder in (run, run.parent / "parts")
+    )
     for network in ("actor_state_dict", "critic_state_dict"):
-        assert all(torch.equal(whole[network][name], parts[network][name]) for name in whole[network])
+        assert all(
+            torch.equal(whole[network][name], parts[network][name]) for name in whole[network]
+        )
 
 
 DIFFER = """
@@ -95,7 +119,9 @@ except DistributedError as error:
 
 def test_processes_that_no_longer_agree_stop(tmp_path: Path) -> None:
     (tmp_path / "differ.py").write_text(DIFFER)
-    done = started(tmp_path, str(BIN / "torchrun"), "--standalone", "--nproc-per-node=2", "differ.py")
+    done = started(
+        tmp_path, str(BIN / "torchrun"), "--standalone", "--nproc-per-node=2", "differ.py"
+    )
     assert done.returncode == 1 and "exitcode  : 7" in done.stderr
 
 
@@ -153,26 +179,47 @@ def test_two_gpus_learn_together_what_rsl_rls_own_learn(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_bench_adds_up_what_two_processes_reach_and_compares_it_with_one(tmp_path: Path) -> None:
+def test_the_bench_adds_up_what_two_processes_reach_and_compares_it_with_one(
+    tmp_path: Path,
+) -> None:
     assert started(tmp_path, str(BIN / "brokk"), *BENCH, "session.out=one").returncode == 0
     one = tmp_path / "one" / "benchmark.json"
     assert together(tmp_path, *BENCH, "session.out=run", f"bench.against={one}").returncode == 0
     found = read(tmp_path / "run" / "benchmark.json")
     rates = [rank["train_env_steps_per_s"] for rank in found["per_rank"]]
-    assert found["ranks"] == len(rates) == 2 and found["train_env_steps_per_s"] == pytest.approx(sum(rates))
-    assert found["weak_scaling"]["train_env_steps_per_s"] == pytest.approx(sum(rates) / 2 / read(one)["train_env_steps_per_s"])
+    assert found["ranks"] == len(rates) == 2 and found["train_env_steps_per_s"] == pytest.approx(
+        sum(rates)
+    )
+    assert found["weak_scaling"]["train_env_steps_per_s"] == pytest.approx(
+        sum(rates) / 2 / read(one)["train_env_steps_per_s"]
+    )
 
 
 def test_a_local_sweep_run_again_does_only_what_is_missing(tmp_path: Path) -> None:
-    sweep = (str(BIN / "brokk"), "-m", *BENCH, "hydra/launcher=submitit_local", "session.seed=0,1", "session.out=sweep")
+    sweep = (
+        str(BIN / "brokk"),
+        "-m",
+        *BENCH,
+        "hydra/launcher=submitit_local",
+        "session.seed=0,1",
+        "session.out=sweep",
+    )
     assert started(tmp_path, *sweep, BROKK_PLACES="cpu,cpu").returncode == 0
-    jobs = sorted(path for path in (tmp_path / "sweep").iterdir() if path.is_dir() and path.name[0] in "01")
+    jobs = sorted(
+        path for path in (tmp_path / "sweep").iterdir() if path.is_dir() and path.name[0] in "01"
+    )
     before = [read(job / "session.json") for job in jobs]
-    assert [record["outcome"] for record in before] == ["finished"] * 2 and before[0]["pid"] != before[1]["pid"]
+    assert [record["outcome"] for record in before] == ["finished"] * 2 and before[0][
+        "pid"
+    ] != before[1]["pid"]
     (jobs[1] / "session.json").write_text(json.dumps(before[1] | {"outcome": "interrupted"}))
     assert started(tmp_path, *sweep, BROKK_PLACES="cpu,cpu").returncode == 0
     after = [read(job / "session.json") for job in jobs]
-    assert after[0] == before[0] and after[1]["outcome"] == "finished" and len(after[1]["resumed"]) == 1
+    assert (
+        after[0] == before[0]
+        and after[1]["outcome"] == "finished"
+        and len(after[1]["resumed"]) == 1
+    )
 
 
 SBATCH = '#!/bin/sh\ncp "$1" "$KEPT"\necho "no cluster here" >&2\nexit 1\n'
@@ -195,7 +242,14 @@ def test_a_sweep_for_slurm_asks_for_a_gpu_for_each_job(tmp_path: Path) -> None:
     path = f"{tmp_path / 'bin'}:{os.environ['PATH']}"
     started(tmp_path, str(BIN / "brokk"), *sweep, PATH=path, KEPT=str(tmp_path / "kept.sh"))
     script = (tmp_path / "kept.sh").read_text()
-    for line in ("--gpus-per-node=1", "--cpus-per-task=8", "--time=240", "--partition=gpu", "--array=0-2%3", "--nodes=1"):
+    for line in (
+        "--gpus-per-node=1",
+        "--cpus-per-task=8",
+        "--time=240",
+        "--partition=gpu",
+        "--array=0-2%3",
+        "--nodes=1",
+    ):
         assert f"#SBATCH {line}" in script
     assert "srun" in script and "submitit.core._submit" in script
 
@@ -221,7 +275,9 @@ def test_optuna_chooses_values_and_run_again_repeats_nothing(tmp_path: Path) -> 
     assert done.stderr.count("is done already") == 2
 
 
-def test_a_search_without_optuna_says_what_to_install(brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_without_optuna_says_what_to_install(
+    brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     if util.find_spec("optuna") is not None:
         with hydra.initialize_config_module("conf", version_base="1.3"):
             assert hydra.compose("config", overrides=["search=learning_rate"])

@@ -24,7 +24,9 @@ CPU = torch.device("cpu")
 ALL = ("ideal", "lag", "hydraulic", "mlp")
 
 
-def roll(actuator: Any, machine: Machine, u: torch.Tensor, q: torch.Tensor | None = None) -> torch.Tensor:
+def roll(
+    actuator: Any, machine: Machine, u: torch.Tensor, q: torch.Tensor | None = None
+) -> torch.Tensor:
     """Returns the positions `(T + 1, N, J)` under the commands `u` `(T, N, J)`, from rest at `q` or at home."""
     model = actuator.build(machine, u.shape[1], CPU)
     at = torch.as_tensor(machine.home, dtype=torch.float32).expand(u.shape[1:]) if q is None else q
@@ -71,8 +73,21 @@ def hydraulic(**changes: Any) -> Hydraulic:
 
 def plain_plant(**changes: Any) -> Hydraulic:
     """A plant without load sensitivity, dry friction, overlap, notch and drift: speed is flow, and well damped."""
-    none = {"overlap_extend": 0.0, "overlap_retract": 0.0, "hysteresis": 0.0, "notch": 0.0, "load_sensitivity": 0.0}
-    quiet = {"coulomb": 0.0, "breakaway": 0.0, "viscous": 0.3, "leak_hz": 0.0, "thermal_gain": 0.0, "speed_scale": 1.0}
+    none = {
+        "overlap_extend": 0.0,
+        "overlap_retract": 0.0,
+        "hysteresis": 0.0,
+        "notch": 0.0,
+        "load_sensitivity": 0.0,
+    }
+    quiet = {
+        "coulomb": 0.0,
+        "breakaway": 0.0,
+        "viscous": 0.3,
+        "leak_hz": 0.0,
+        "thermal_gain": 0.0,
+        "speed_scale": 1.0,
+    }
     return hydraulic(**(none | quiet | {"retract_ratio": 1.0, "flow_share": 0.1} | changes))
 
 
@@ -97,14 +112,17 @@ def test_a_joint_stays_at_its_stop(name: str, machine: Machine) -> None:
 
 def test_lag_follows_the_analytic_step_response(machine: Machine) -> None:
     delay_s, constant_s, level = 0.23, 0.12, 0.6
-    path = roll(lag(dead_time_s=delay_s, time_constant_s=constant_s), machine, held(machine, 24, q1=level))
+    path = roll(
+        lag(dead_time_s=delay_s, time_constant_s=constant_s), machine, held(machine, 24, q1=level)
+    )
     t_s = np.maximum(0.0, 0.05 * np.arange(25) - delay_s)
     expected = 0.4 * level * (t_s - constant_s * (1.0 - np.exp(-t_s / constant_s)))
     np.testing.assert_allclose(path[:, 0, 0], expected, atol=2e-6)
 
 
 def test_a_dead_time_between_samples_is_exact(machine: Machine) -> None:
-    # 0.33 s = 6.6 periods: after 7 periods the joint has moved for 0.4 of one, 0.4 * 0.05 s * 0.4 rad/s
+    # 0.33 s = 6.6 periods: after 7 periods the joint has moved for 0.4 of one, 0.4 * 0.05 s * 0.4
+    # rad/s
     path = roll(lag(dead_time_s=0.33), machine, held(machine, 8, q1=1.0))
     np.testing.assert_allclose(path[[6, 7, 8], 0, 0], [0.0, 0.008, 0.028], atol=1e-6)
 
@@ -146,7 +164,10 @@ def test_gravity_of_a_hanging_arm_is_the_sum_of_moments(machine: Machine) -> Non
 def test_gravity_is_the_slope_of_potential_energy(machine: Machine) -> None:
     q = torch.tensor([[0.3, -0.7, 0.9, 0.5, -0.4]], dtype=torch.float64)
     load = Gravity(machine, CPU).load(q.float())[0]
-    slope = [(_energy(machine, q + step) - _energy(machine, q - step)) / 2e-4 for step in 1e-4 * torch.eye(5, dtype=torch.float64)]
+    slope = [
+        (_energy(machine, q + step) - _energy(machine, q - step)) / 2e-4
+        for step in 1e-4 * torch.eye(5, dtype=torch.float64)
+    ]
     np.testing.assert_allclose(load, -np.array(slope), atol=2.0)
 
 
@@ -157,7 +178,9 @@ def _energy(machine: Machine, q: torch.Tensor) -> float:
     for body, length, angle in zip(machine.bodies[1:], lengths, q[0, 1:].tolist(), strict=True):
         pitch += angle
         x, _, z = body.com_m
-        energy += body.mass_kg.value * GRAVITY_M_S2 * (height - x * math.sin(pitch) + z * math.cos(pitch))
+        energy += (
+            body.mass_kg.value * GRAVITY_M_S2 * (height - x * math.sin(pitch) + z * math.cos(pitch))
+        )
         height -= length * math.sin(pitch)
     return energy
 
@@ -165,7 +188,10 @@ def _energy(machine: Machine, q: torch.Tensor) -> float:
 def test_the_plant_starts_to_move_near_the_machines_dead_time(machine: Machine) -> None:
     for name in machine.joint_names:
         path = roll(option("actuator", "hydraulic"), machine, held(machine, 20, **{name: 1.0}))
-        moved = (path[:, 0, machine.joint_names.index(name)] - path[0, 0, machine.joint_names.index(name)]).abs() > 0.002
+        moved = (
+            path[:, 0, machine.joint_names.index(name)]
+            - path[0, 0, machine.joint_names.index(name)]
+        ).abs() > 0.002
         assert int(moved.int().argmax()) in (11, 12, 13)  # within 0.55 to 0.65 s
 
 
@@ -177,7 +203,10 @@ def test_the_plant_reaches_about_the_machines_speed(machine: Machine) -> None:
 
 def test_retracting_is_faster_by_the_area_ratio(machine: Machine) -> None:
     plant = plain_plant(retract_ratio=1.4)
-    out, back = (speed(roll(plant, machine, held(machine, 40, q3=level)), machine, "q3") for level in (0.5, -0.5))
+    out, back = (
+        speed(roll(plant, machine, held(machine, 40, q3=level)), machine, "q3")
+        for level in (0.5, -0.5)
+    )
     assert back / out == pytest.approx(-1.4, rel=0.01)
     assert out == pytest.approx(0.5 * 0.26, rel=0.01)
 
@@ -205,7 +234,10 @@ def test_a_command_inside_the_overlap_moves_nothing(machine: Machine) -> None:
 
 def test_lowering_is_faster_than_lifting_under_load(machine: Machine) -> None:
     plant = plain_plant(load_sensitivity=1.0, viscous=0.02)
-    down, up = (speed(roll(plant, machine, held(machine, 40, q2=level)), machine, "q2") for level in (1.0, -1.0))
+    down, up = (
+        speed(roll(plant, machine, held(machine, 40, q2=level)), machine, "q2")
+        for level in (1.0, -1.0)
+    )
     assert down > 0.18 > -up > 0.1
 
 
@@ -223,13 +255,17 @@ def test_oil_warms_with_work_and_speeds_the_machine_up(machine: Machine) -> None
     history.u[:] = held(machine, 13, q1=1.0)[:, 0]
     early = float((model.step(history) - history.q[:, -1])[0, 0])
     steps = [float((model.step(history) - history.q[:, -1])[0, 0]) for _ in range(200)]
-    assert model.state["oil_c"].item() == pytest.approx(20.0 + 45.0 * 0.4, abs=0.5)  # q1 takes 0.4 of the pump
+    assert model.state["oil_c"].item() == pytest.approx(
+        20.0 + 45.0 * 0.4, abs=0.5
+    )  # q1 takes 0.4 of the pump
     assert steps[-1] > early
     assert steps[-1] / steps[40] > 1.005
 
 
 def test_half_the_time_step_gives_the_same_path(machine: Machine) -> None:
-    u = (torch.rand(60, 1, 5, generator=torch.Generator().manual_seed(3)) * 2.0 - 1.0).repeat_interleave(5, 0)
+    u = (
+        torch.rand(60, 1, 5, generator=torch.Generator().manual_seed(3)) * 2.0 - 1.0
+    ).repeat_interleave(5, 0)
     coarse, fine = (roll(hydraulic(substep_s=step_s), machine, u) for step_s in (0.005, 0.0025))
     assert (coarse - fine).abs().max() < 0.01
 
@@ -283,7 +319,13 @@ def test_an_unknown_spread_lists_the_choices(machine: Machine) -> None:
 
 def test_a_table_by_joint_needs_every_joint_or_other(machine: Machine) -> None:
     assert per_joint({"q2": 2, "other": 1}, machine, "x").tolist() == [1, 2, 1, 1, 1]
-    assert per_joint({"boom": 9, "other": 1}, machine, "x").tolist() == [1, 1, 1, 1, 1]  # a table for several machines
+    assert per_joint({"boom": 9, "other": 1}, machine, "x").tolist() == [
+        1,
+        1,
+        1,
+        1,
+        1,
+    ]  # a table for several machines
     with pytest.raises(ConfigError, match="x: no value for q1, q3, q4, q5"):
         per_joint({"q2": 2.0}, machine, "x")
     with pytest.raises(ConfigError, match="x: 'q6' is no joint"):
@@ -299,7 +341,9 @@ def test_a_table_by_joint_needs_every_joint_or_other(machine: Machine) -> None:
         ({"substep_s": 0.02}, "substep_s"),
     ],
 )
-def test_a_plant_that_makes_no_sense_is_refused(machine: Machine, changes: dict[str, float], message: str) -> None:
+def test_a_plant_that_makes_no_sense_is_refused(
+    machine: Machine, changes: dict[str, float], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         hydraulic(**changes).build(machine, 1, CPU)
 
@@ -315,9 +359,14 @@ def test_a_step_can_be_captured_in_a_cuda_graph(name: str, machine: Machine) -> 
         model = option("actuator", name).build(machine, num_envs, device)
         shape = (num_envs, machine.num_history, machine.num_joints)
         history = History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
-        mask, command = torch.ones(num_envs, dtype=torch.bool, device=device), torch.zeros(num_envs, 5, device=device)
+        mask, command = (
+            torch.ones(num_envs, dtype=torch.bool, device=device),
+            torch.zeros(num_envs, 5, device=device),
+        )
 
-        def period(model: Any = model, history: History = history, command: torch.Tensor = command) -> None:
+        def period(
+            model: Any = model, history: History = history, command: torch.Tensor = command
+        ) -> None:
             history.push_u(command)
             history.push_q(model.step(history))
 

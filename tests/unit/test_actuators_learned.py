@@ -38,12 +38,16 @@ def test_one_batched_network_is_five_networks() -> None:
     inputs = torch.randn(5, 7, 26)
     together = batched(inputs)
     for joint in range(5):
-        alone = nn.Sequential(nn.Linear(26, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1))
+        alone = nn.Sequential(
+            nn.Linear(26, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1)
+        )
         with torch.no_grad():
             for layer, weight, bias in zip(alone[::2], batched.weight, batched.bias, strict=True):
                 layer.weight.copy_(weight[joint].T)
                 layer.bias.copy_(bias[joint, 0])
-        torch.testing.assert_close(together[joint], alone(inputs[joint])[:, 0], atol=1e-6, rtol=1e-5)
+        torch.testing.assert_close(
+            together[joint], alone(inputs[joint])[:, 0], atol=1e-6, rtol=1e-5
+        )
 
 
 def test_inputs_are_commands_increments_and_the_newest_position() -> None:
@@ -62,14 +66,20 @@ def test_inputs_are_commands_increments_and_the_newest_position() -> None:
 def test_a_free_run_in_one_go_is_step_by_step(kind: str, machine: Machine, tmp_path: Path) -> None:
     made = networks(3, kind == "coupled")
     made.increment_scale.fill_(0.01)
-    lower, upper = (torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper))
+    lower, upper = (
+        torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper)
+    )
     generator = torch.Generator().manual_seed(1)
     u = torch.rand(5, 4, 12 + 30, generator=generator) * 2.0 - 1.0
     q = (0.03 * torch.rand(5, 4, 13, generator=generator)).cumsum(2) - 0.3
     path = made.roll_out(u, q, lower, upper)
     checkpoint.write(tmp_path / "a.safetensors", kind, machine, made.state_dict(), {"width": 32})
-    model = {"mlp": Mlp, "coupled": Coupled}[kind](checkpoint=str(tmp_path / "a.safetensors")).build(machine, 4, CPU)
-    history = History(q=q.permute(1, 2, 0).clone(), u=u[..., :13].roll(1, 2).permute(1, 2, 0).clone())
+    model = {"mlp": Mlp, "coupled": Coupled}[kind](
+        checkpoint=str(tmp_path / "a.safetensors")
+    ).build(machine, 4, CPU)
+    history = History(
+        q=q.permute(1, 2, 0).clone(), u=u[..., :13].roll(1, 2).permute(1, 2, 0).clone()
+    )
     for k in range(30):
         history.push_u(u[..., 12 + k].T)
         history.push_q(model.step(history))
@@ -91,7 +101,9 @@ def test_joints_share_a_flow_when_they_ask_for_more_than_there_is() -> None:
     commands[:, 1, 1] = torch.tensor([1.0, -1.0, 0.0])  # 1.2
     commands[:, 2, 1] = torch.tensor([-1.0, 1.0, 1.0])  # 1.8
     commands[:, 3, 2] = 1.0  # at another time: nothing
-    torch.testing.assert_close(flow(commands), torch.tensor([1.0, 1 / 1.2, 1 / 1.8, 1.0, 1.0]), atol=2e-3, rtol=0)
+    torch.testing.assert_close(
+        flow(commands), torch.tensor([1.0, 1 / 1.2, 1 / 1.8, 1.0, 1.0]), atol=2e-3, rtol=0
+    )
 
 
 def test_the_pose_changes_the_speed_of_coupled_joints_only_and_moves_none_that_rests() -> None:
@@ -117,16 +129,24 @@ def test_increments_below_the_noise_are_none() -> None:
     made = networks()
     made.quiet.fill_(0.001)
     output = torch.tensor([[-0.004, -0.0005, 0.0, 0.001, 0.003]]).expand(5, 5)
-    torch.testing.assert_close(made.increment(output)[0], torch.tensor([-0.003, 0.0, 0.0, 0.0, 0.002]))
+    torch.testing.assert_close(
+        made.increment(output)[0], torch.tensor([-0.003, 0.0, 0.0, 0.0, 0.002])
+    )
 
 
 @pytest.mark.parametrize("name", ["mlp", "coupled"])
 def test_the_shipped_machine_at_rest_stays_at_rest(name: str, machine: Machine) -> None:
     actuator, num_envs = option("actuator", name), 64
     generator = torch.Generator().manual_seed(0)
-    lower, upper = (torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper))
+    lower, upper = (
+        torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper)
+    )
     q = lower + (upper - lower) * torch.rand(num_envs, 5, generator=generator)
-    for level in (0.0, 0.03, -0.03):  # half of the smallest dead band of the plant; close to it the fit is a few mrad worse
+    for level in (
+        0.0,
+        0.03,
+        -0.03,
+    ):  # half of the smallest dead band of the plant; close to it the fit is a few mrad worse
         model = actuator.build(machine, num_envs, CPU)
         history = History(q=torch.zeros(num_envs, 13, 5), u=torch.zeros(num_envs, 13, 5))
         history.reset(torch.ones(num_envs, dtype=torch.bool), q)
@@ -154,7 +174,10 @@ def test_the_shipped_model_reaches_a_target_and_stays(name: str, machine: Machin
 
 
 def test_a_missing_checkpoint_names_what_ships(machine: Machine) -> None:
-    with pytest.raises(CheckpointError, match=r"no file 'nowhere\.safetensors'.*brokk170\.safetensors.*mode=identify"):
+    with pytest.raises(
+        CheckpointError,
+        match=r"no file 'nowhere\.safetensors'.*brokk170\.safetensors.*mode=identify",
+    ):
         load("nowhere.safetensors", "mlp", machine)
 
 
@@ -167,12 +190,16 @@ def test_a_truncated_checkpoint_is_refused(tmp_path: Path, machine: Machine, kee
 
 
 def test_nan_weights_are_refused(tmp_path: Path, machine: Machine) -> None:
-    path = written(tmp_path / "a.safetensors", machine, quiet=torch.tensor([0.0, 0.0, float("nan"), 0.0, 0.0]))
+    path = written(
+        tmp_path / "a.safetensors", machine, quiet=torch.tensor([0.0, 0.0, float("nan"), 0.0, 0.0])
+    )
     with pytest.raises(CheckpointError, match=r"tensor 'quiet' holds NaN"):
         load(str(path), "mlp", machine)
 
 
-def test_a_checkpoint_of_another_machine_names_what_differs(tmp_path: Path, machine: Machine) -> None:
+def test_a_checkpoint_of_another_machine_names_what_differs(
+    tmp_path: Path, machine: Machine
+) -> None:
     other = dataclasses.replace(machine, name="brokk400", period_s=0.06)
     with pytest.raises(CheckpointError, match="made for another machine: name, control differ"):
         load(str(written(tmp_path / "a.safetensors", other)), "mlp", machine)

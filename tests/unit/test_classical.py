@@ -37,7 +37,8 @@ def at_rest(q: torch.Tensor, machine: Machine) -> tuple[torch.Tensor, torch.Tens
 def test_commands_in_flight_are_counted_as_motion_to_come(machine: Machine) -> None:
     """With 2.5 samples in flight and a dead band of 0.08, the last three commands of 0.54 make (0.54 - 0.08) / 0.92 = half speed.
 
-    q1 runs at 0.4 rad/s, so that 2.5 samples of 50 ms add 0.2 rad/s x 0.125 s = 0.025 rad; older commands have acted already.
+    q1 runs at 0.4 rad/s, so that 2.5 samples of 50 ms add 0.2 rad/s x 0.125 s = 0.025 rad; older
+    commands have acted already.
     """
     classical = controller(machine, in_flight_samples=2.5, dead_band=0.08)
     q, u = at_rest(torch.tensor(machine.home, dtype=torch.float32)[None], machine)
@@ -59,7 +60,9 @@ def test_prediction_counts_what_left_the_joint_and_measures_the_reach_now(machin
     u[0, :, 1] = 1.0
     moving = classical.guide(q, u, target, torch.tensor([1.57]), RANGE_M)
     assert torch.equal(still.reach_m, moving.reach_m) and torch.equal(still.tip_z_m, moving.tip_z_m)
-    assert moving.error_m[0, 2] - still.error_m[0, 2] > 0.2, "12 samples of q2 at 0.18 rad/s lower a tool 2.7 m away by some 0.29 m"
+    assert moving.error_m[0, 2] - still.error_m[0, 2] > 0.2, (
+        "12 samples of q2 at 0.18 rad/s lower a tool 2.7 m away by some 0.29 m"
+    )
 
 
 def test_the_reach_is_measured_in_the_plane_of_the_arm(machine: Machine) -> None:
@@ -71,7 +74,10 @@ def test_the_reach_is_measured_in_the_plane_of_the_arm(machine: Machine) -> None
     target = torch.tensor([[x + 2.0, 0.0, z]]).repeat(2, 1)
     found = classical.guide(*at_rest(q, machine), target, torch.full((2,), 1.57), RANGE_M)
     assert found.reach_m.tolist() == pytest.approx([2.0, 2.0], abs=1e-4)
-    assert found.reach_3d_m[0].item() == pytest.approx(2.0, abs=1e-4) and found.reach_3d_m[1].item() > 2.1
+    assert (
+        found.reach_3d_m[0].item() == pytest.approx(2.0, abs=1e-4)
+        and found.reach_3d_m[1].item() > 2.1
+    )
 
 
 def test_exclusive_joints_rest_in_the_approach(machine: Machine) -> None:
@@ -80,7 +86,11 @@ def test_exclusive_joints_rest_in_the_approach(machine: Machine) -> None:
     pose, jacobian = classical.kinematics.pose_and_jacobian(q)
     error = torch.randn(64, 3)
     share = classical.approach(jacobian.tip, jacobian.pitch, error, error[:, 2], torch.randn(64))
-    assert (share[:, 1] == 0).all() and (share[:, [0, 2, 3, 4]].abs().amax(1) > 0).all() and (share.abs() <= 1).all()
+    assert (
+        (share[:, 1] == 0).all()
+        and (share[:, [0, 2, 3, 4]].abs().amax(1) > 0).all()
+        and (share.abs() <= 1).all()
+    )
     assert pose.tip_in_base_m.isfinite().all()
 
 
@@ -101,11 +111,15 @@ def test_the_valve_map_is_inverted_where_it_moves_anything(machine: Machine) -> 
     classical = controller(machine)
     share = torch.linspace(0.06, 1.0, 20)[:, None].repeat(1, 5)  # creep is 0.06
     share[1::2] *= -1
-    torch.testing.assert_close(classical.rate(classical.valve(share)) / classical.speed, share, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        classical.rate(classical.valve(share)) / classical.speed, share, rtol=0, atol=1e-6
+    )
 
 
 def test_small_speeds_become_pulses_of_creep_and_tiny_ones_nothing(machine: Machine) -> None:
-    classical = controller(machine)  # dead band 0.08, creep 0.06, rest 0.004: the smallest command is 0.08 + 0.92 x 0.06 = 0.1352
+    classical = controller(
+        machine
+    )  # dead band 0.08, creep 0.06, rest 0.004: the smallest command is 0.08 + 0.92 x 0.06 = 0.1352
     found = classical.valve(torch.tensor([0.003, -0.003, 0.005, -0.02, 3.0]))
     assert found.tolist() == pytest.approx([0.0, 0.0, 0.1352, -0.1352, 1.0])
 
@@ -118,7 +132,12 @@ def test_nothing_is_driven_into_a_limit(machine: Machine) -> None:
     further = pose.pitch_rad + torch.tensor([0.5, -0.5])
     found = classical.guide(*at_rest(q, machine), pose.tip_in_base_m, further, RANGE_M)
     assert found.command[:, 4].tolist() == [0.0, 0.0]
-    back = classical.guide(*at_rest(q, machine), pose.tip_in_base_m, pose.pitch_rad - torch.tensor([0.5, -0.5]), RANGE_M)
+    back = classical.guide(
+        *at_rest(q, machine),
+        pose.tip_in_base_m,
+        pose.pitch_rad - torch.tensor([0.5, -0.5]),
+        RANGE_M,
+    )
     assert back.command[0, 4] < 0 < back.command[1, 4]
 
 
@@ -127,8 +146,18 @@ def test_whoever_commands_within_the_bounds_slows_down_before_the_ends(machine: 
     classical = controller(machine, margin_rad=0.05, brake_s=0.2, dead_band=0.08)
     speed, upper = torch.tensor(machine.max_speed), torch.tensor(machine.upper)
     q = torch.stack([upper - 0.05 - share * speed * 0.2 for share in (0.0, 0.5, 2.0)]).float()
-    found = classical.guide(*at_rest(q, machine), torch.tensor([[2.8, 0.0, 0.75]]).repeat(3, 1), torch.full((3,), 1.57), RANGE_M)
-    torch.testing.assert_close(found.highest[1:], torch.tensor([[0.08 + 0.92 * 0.5], [1.0]]).expand(-1, 5), atol=1e-5, rtol=0)
+    found = classical.guide(
+        *at_rest(q, machine),
+        torch.tensor([[2.8, 0.0, 0.75]]).repeat(3, 1),
+        torch.full((3,), 1.57),
+        RANGE_M,
+    )
+    torch.testing.assert_close(
+        found.highest[1:],
+        torch.tensor([[0.08 + 0.92 * 0.5], [1.0]]).expand(-1, 5),
+        atol=1e-5,
+        rtol=0,
+    )
     assert (found.highest[0] <= 0.081).all() and (found.lowest == -1.0).all()
 
 
@@ -147,19 +176,28 @@ def test_errors_are_told_in_the_plane_of_the_arm(machine: Machine) -> None:
     q = torch.tensor(machine.home, dtype=torch.float32)[None].clone()
     q[0, 0] = torch.pi / 2  # the arm points along y
     tip = classical.kinematics.pose(q).tip_in_base_m
-    found = classical.guide(*at_rest(q, machine), tip + torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([1.57]), RANGE_M)
-    assert found.error_m[0].tolist() == pytest.approx([0.2, -0.1, 0.3], abs=1e-5)  # radial, tangential, up
+    found = classical.guide(
+        *at_rest(q, machine), tip + torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([1.57]), RANGE_M
+    )
+    assert found.error_m[0].tolist() == pytest.approx(
+        [0.2, -0.1, 0.3], abs=1e-5
+    )  # radial, tangential, up
 
 
 def test_the_block_solver_agrees_with_torch() -> None:
     torch.manual_seed(0)
     factor = torch.randn(256, 4, 5, dtype=torch.float64)
-    a, b = factor @ factor.transpose(1, 2) + 0.05 * torch.eye(4, dtype=torch.float64), torch.randn(256, 4, 1, dtype=torch.float64)
+    a, b = (
+        factor @ factor.transpose(1, 2) + 0.05 * torch.eye(4, dtype=torch.float64),
+        torch.randn(256, 4, 1, dtype=torch.float64),
+    )
     torch.testing.assert_close(_solve_4(a, b), torch.linalg.solve(a, b))
 
 
 @pytest.mark.parametrize(("name", "least"), [("borehole_insertion", 0.97), ("goal_pose", 0.95)])
-def test_it_gets_there_from_many_starts_through_dead_time_and_lag(name: str, least: float, machine: Machine) -> None:
+def test_it_gets_there_from_many_starts_through_dead_time_and_lag(
+    name: str, least: float, machine: Machine
+) -> None:
     """No physics: joints go where the lag model says. Noise and masks are the task's."""
     num = 128
     torch.manual_seed(0)
@@ -169,7 +207,9 @@ def test_it_gets_there_from_many_starts_through_dead_time_and_lag(name: str, lea
     start = process.starts(num, 11)
     everywhere = torch.ones(num, dtype=torch.bool)
     world.reset(everywhere, start["q"], start["scene"])
-    history = History(q=torch.zeros(num, machine.num_history, 5), u=torch.zeros(num, machine.num_history, 5))
+    history = History(
+        q=torch.zeros(num, machine.num_history, 5), u=torch.zeros(num, machine.num_history, 5)
+    )
     history.reset(everywhere, start["q"])
     model.reset(everywhere)
     process.reset(everywhere, start)

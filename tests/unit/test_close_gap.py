@@ -28,22 +28,38 @@ def spread(actor: Any) -> torch.Tensor:
 
 
 def row(rate: float) -> dict[str, Any]:
-    return {"episodes": EPISODES, "success_strict": {"mean": rate}, "time_to_insert_s": {"median": 9.0 if rate else None}}
+    return {
+        "episodes": EPISODES,
+        "success_strict": {"mean": rate},
+        "time_to_insert_s": {"median": 9.0 if rate else None},
+    }
 
 
 def evaluations(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]:
     """Returns what `mode=evaluate` says on simulator, repaired simulator and machine, from rates by policy."""
     return {
-        place: {"episodes": EPISODES, "policies": {policy: row(three[number]) for policy, three in rates.items()}}
+        place: {
+            "episodes": EPISODES,
+            "policies": {policy: row(three[number]) for policy, three in rates.items()},
+        }
         for number, place in enumerate(downstream.PLANTS)
     }
 
 
 def test_success_that_fell_and_came_back_is_told_as_such(tmp_path: Path) -> None:
-    found = downstream.compare(evaluations(before=(0.95, 0.2, 0.15), after=(0.9, 0.95, 0.93), classical=(0.9, 0.1, 0.1)))
+    found = downstream.compare(
+        evaluations(before=(0.95, 0.2, 0.15), after=(0.9, 0.95, 0.93), classical=(0.9, 0.1, 0.1))
+    )
     text, tone = downstream.headline(found)
-    assert tone == "good" and "It is back" in text and "95 % (91 to 97)" in text and "15 % (11 to 21)" in text
-    assert found["fall"]["mean"] == pytest.approx(0.8) and found["return"]["mean"] == pytest.approx(0.78)
+    assert (
+        tone == "good"
+        and "It is back" in text
+        and "95 % (91 to 97)" in text
+        and "15 % (11 to 21)" in text
+    )
+    assert found["fall"]["mean"] == pytest.approx(0.8) and found["return"]["mean"] == pytest.approx(
+        0.78
+    )
     assert found["predicted"]["mean"] == 0.95 and found["achieved"]["mean"] == 0.93
     downstream_page.write(found | {"plants": {}, "retraining": {}}, tmp_path)
     assert "It is back" in (tmp_path / downstream_page.PAGE).read_text()
@@ -53,7 +69,11 @@ def test_success_that_fell_and_came_back_is_told_as_such(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("after", "said", "tone"),
-    [(0.5, "A part is back", "good"), (0.16, "did not bring it back", "bad"), (0.05, "did not bring it back", "bad")],
+    [
+        (0.5, "A part is back", "good"),
+        (0.16, "did not bring it back", "bad"),
+        (0.05, "did not bring it back", "bad"),
+    ],
 )
 def test_what_did_not_come_back_is_not_sold_as_success(after: float, said: str, tone: str) -> None:
     found = downstream.compare(evaluations(before=(0.95, 0.2, 0.15), after=(0.9, 0.95, after)))
@@ -67,22 +87,33 @@ def test_without_a_fall_there_is_nothing_to_regain() -> None:
 
 def test_the_interval_of_a_difference_is_newcombe_s() -> None:
     # his table II, case (a), 56/70 and 48/80: 0.0524 to 0.3339
-    first, second = ({"mean": k / n, "ci95": list(downstream.wilson(k, n))} for k, n in ((56, 70), (48, 80)))
+    first, second = (
+        {"mean": k / n, "ci95": list(downstream.wilson(k, n))} for k, n in ((56, 70), (48, 80))
+    )
     assert downstream.difference(first, second)["ci95"] == pytest.approx([0.0524, 0.3339], abs=5e-5)
 
 
 def test_a_wrong_order_costs_what_it_would_lose_on_the_machine() -> None:
-    # the simulator swaps the first two; choosing by it loses 0.3 for each of them, nothing for the third
-    assert downstream.rank_violation([0.8, 0.9, 0.1], [0.9, 0.6, 0.2]) == pytest.approx((0.3 + 0.3 + 0.0) / 3)
+    # the simulator swaps the first two; choosing by it loses 0.3 for each of them, nothing for the
+    # third
+    assert downstream.rank_violation([0.8, 0.9, 0.1], [0.9, 0.6, 0.2]) == pytest.approx(
+        (0.3 + 0.3 + 0.0) / 3
+    )
     assert downstream.rank_violation([0.5, 0.6, 0.7], [0.1, 0.2, 0.9]) == 0.0
 
 
 def test_a_simulator_without_an_order_claims_none() -> None:
-    found = downstream.compare(evaluations(before=(0.9, 0.2, 0.2), after=(0.9, 0.8, 0.7), classical=(0.9, 0.1, 0.1)))
-    assert found["agreement"]["simulator"]["kendall"] is None and found["agreement"]["repaired"]["kendall"] == pytest.approx(1.0)
+    found = downstream.compare(
+        evaluations(before=(0.9, 0.2, 0.2), after=(0.9, 0.8, 0.7), classical=(0.9, 0.1, 0.1))
+    )
+    assert found["agreement"]["simulator"]["kendall"] is None and found["agreement"]["repaired"][
+        "kendall"
+    ] == pytest.approx(1.0)
 
 
-def test_training_that_begins_with_a_policy_has_its_network_and_its_own_exploration(machine: Machine, tmp_path: Path) -> None:
+def test_training_that_begins_with_a_policy_has_its_network_and_its_own_exploration(
+    machine: Machine, tmp_path: Path
+) -> None:
     training = small(max_env_steps=64)
     runner = train(machine, tmp_path / "old", training)
     old = runner.alg.actor
@@ -108,7 +139,9 @@ def test_without_an_effect_there_is_nothing_to_retrain_with(brokk: Callable[...,
     assert done.code == 2 and "no effect to retrain with" in done.err
 
 
-def test_an_interrupted_run_goes_on_in_its_own_folder_only(brokk: Callable[..., Done], tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_in_its_own_folder_only(
+    brokk: Callable[..., Done], tmp_path: Path
+) -> None:
     (tmp_path / "found.yaml").write_text(
         "# @package effect\nlag: {_target_: actuators.effects.speed.Lag, joints: all, time_constant_s: 0.1}\n"
     )

@@ -28,18 +28,31 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.sim.link import Simulated
 
-SMALL = ("collect.num_runs=2", "collect.run_minutes=0.5", "collect.file_minutes=0.2", "actuator=lag")
+SMALL = (
+    "collect.num_runs=2",
+    "collect.run_minutes=0.5",
+    "collect.file_minutes=0.2",
+    "actuator=lag",
+)
 
 
 def made(folder: Path, machine: Machine) -> dict[str, Recording]:
-    return {path.stem: record.read(path, machine) for path in sorted((folder / "recordings").glob("*.parquet"))}
+    return {
+        path.stem: record.read(path, machine)
+        for path in sorted((folder / "recordings").glob("*.parquet"))
+    }
 
 
 def mode(out: Path, *overrides: str) -> Collect:
     with initialize_config_module("conf", version_base="1.3"):
-        cfg = compose("config", overrides=["mode=collect", f"session.out={out}", "session.seed=0", *overrides])
+        cfg = compose(
+            "config", overrides=["mode=collect", f"session.out={out}", "session.seed=0", *overrides]
+        )
     out.mkdir(exist_ok=True)
-    parts = {name: instantiate(cfg[name], _convert_="all") for name in ("session", "machine", "link", "excitation", "collect")}
+    parts = {
+        name: instantiate(cfg[name], _convert_="all")
+        for name in ("session", "machine", "link", "excitation", "collect")
+    }
     return Collect(**parts)
 
 
@@ -50,7 +63,9 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_every_run_is_cut_into_files_that_know_each_other(collected: Path, machine: Machine) -> None:
+def test_every_run_is_cut_into_files_that_know_each_other(
+    collected: Path, machine: Machine
+) -> None:
     files = made(collected, machine)
     assert list(files) == [f"sine_{n:02d}_{part:02d}" for n in range(2) for part in range(3)]
     assert [file.num_samples for file in files.values()] == [240, 240, 120] * 2
@@ -58,7 +73,10 @@ def test_every_run_is_cut_into_files_that_know_each_other(collected: Path, machi
     assert len(set(runs)) == 2 and runs[:3] == [runs[0]] * 3
     first, second, *_ = files.values()
     assert second.metadata["created"] == record.later(first.metadata["created"], 12.0)
-    assert first.metadata["source"] == "simulator: Lag, excitation: sine" and first.metadata["seed"] == "0"
+    assert (
+        first.metadata["source"] == "simulator: Lag, excitation: sine"
+        and first.metadata["seed"] == "0"
+    )
     assert json.loads(first.metadata["fingerprint"]) == machine.fingerprint()
     assert first.t_s[0] == second.t_s[0] == 0.0
 
@@ -69,7 +87,9 @@ def test_the_notes_of_the_files_tell_what_moved(collected: Path, machine: Machin
             if note["part"] == "program":
                 inside = (file.t_s >= note["start_s"]) & (file.t_s < note["end_s"] - 1e-6)
                 moved = np.flatnonzero(np.abs(file.u[inside]).max(0))
-                assert {machine.joint_names[j] for j in moved} <= {note["name"].removeprefix("sine_")}
+                assert {machine.joint_names[j] for j in moved} <= {
+                    note["name"].removeprefix("sine_")
+                }
 
 
 def test_the_plan_says_beforehand_what_the_run_will_do(collected: Path, machine: Machine) -> None:
@@ -94,23 +114,36 @@ def test_only_the_plan(tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "plan").iterdir()} == {"plan.json", "plan.png"}
 
 
-def test_the_same_seed_records_the_same_and_another_does_not(collected: Path, machine: Machine, tmp_path: Path) -> None:
+def test_the_same_seed_records_the_same_and_another_does_not(
+    collected: Path, machine: Machine, tmp_path: Path
+) -> None:
     for out, seed in ((tmp_path / "again", 0), (tmp_path / "other", 1)):
         torch.rand(3)  # whatever else drew from the global generator
         mode(out, *SMALL, f"session.seed={seed}").run()
-    first, again, other = (made(folder, machine) for folder in (collected, tmp_path / "again", tmp_path / "other"))
+    first, again, other = (
+        made(folder, machine) for folder in (collected, tmp_path / "again", tmp_path / "other")
+    )
     for name, file in first.items():
         assert np.array_equal(file.u, again[name].u) and np.array_equal(file.q, again[name].q)
     assert any(not np.array_equal(file.u, other[name].u) for name, file in first.items())
 
 
-def test_actuator_and_effects_are_chosen_as_everywhere(brokk: Callable[..., Any], machine: Machine) -> None:
+def test_actuator_and_effects_are_chosen_as_everywhere(
+    brokk: Callable[..., Any], machine: Machine
+) -> None:
     small = ("collect.num_runs=1", "collect.run_minutes=0.4", "collect.file_minutes=0.4")
-    chosen = ("actuator=hydraulic", "effect=[backlash,stiction]", "effect.backlash.gap_rad=0.01", "excitation=levels")
+    chosen = (
+        "actuator=hydraulic",
+        "effect=[backlash,stiction]",
+        "effect.backlash.gap_rad=0.01",
+        "excitation=levels",
+    )
     done = brokk("mode=collect", "session.out=run", *chosen, *small)
     assert done.code == 0, done.err
     (file,) = made(Path("run"), machine).values()
-    assert file.metadata["source"] == "simulator: Hydraulic + backlash + stiction, excitation: levels"
+    assert (
+        file.metadata["source"] == "simulator: Hydraulic + backlash + stiction, excitation: levels"
+    )
     assert file.extra["oil_c"].shape == (file.num_samples,) and 0.0 < file.extra["oil_c"][0] < 60.0
     again = brokk("--config-dir", "run", "--config-name", "resolved", "session.out=again")
     assert again.code == 0, again.err
@@ -123,7 +156,10 @@ def test_actuator_and_effects_are_chosen_as_everywhere(brokk: Callable[..., Any]
     [
         (("link=simulatd",), ("there is no link=simulatd", "did you mean 'simulated'?")),
         (("excitation=[levels,hold]",), ("there is no excitation=hold",)),
-        (("excitation=[holds,ramps]", "collect.run_minutes=0.2", "collect.file_minutes=0.2"), ("excitation=holds", "run_minutes")),
+        (
+            ("excitation=[holds,ramps]", "collect.run_minutes=0.2", "collect.file_minutes=0.2"),
+            ("excitation=holds", "run_minutes"),
+        ),
         (("excitation=[repeat]",), ("nothing before it",)),
         (("collect.guards.max_command=2",), ("collect.guards.max_command", "(0, 1]")),
         (("collect.flush_s=0",), ("collect.flush_s",)),
@@ -169,7 +205,9 @@ class Connected:
 
 
 @pytest.mark.parametrize("link", [Fails, Interrupted])
-def test_what_was_recorded_before_an_interruption_is_kept(link: type[Fails], tmp_path: Path, machine: Machine) -> None:
+def test_what_was_recorded_before_an_interruption_is_kept(
+    link: type[Fails], tmp_path: Path, machine: Machine
+) -> None:
     collect = replace(mode(tmp_path / "run", *SMALL), link=Connected(link))
     with pytest.raises(link.error):
         collect.run()
@@ -190,13 +228,20 @@ class Killed(Nominal):
         return super().send(command)
 
 
-def test_a_file_that_grows_is_on_the_disk_before_it_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_grows_is_on_the_disk_before_it_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     collect = replace(mode(tmp_path / "run", *SMALL), link=Connected(Killed))
     collect = replace(collect, collect=replace(collect.collect, flush_s=1.0))
     Killed.folder, clock_s = tmp_path / "run", iter(np.arange(0.0, 1e3, 0.05))
-    monkeypatch.setattr("brokk_rl.modes.collect.time", type("Clock", (), {"monotonic": staticmethod(lambda: next(clock_s))}))
+    monkeypatch.setattr(
+        "brokk_rl.modes.collect.time",
+        type("Clock", (), {"monotonic": staticmethod(lambda: next(clock_s))}),
+    )
     collect.run()
-    assert Killed.seen is not None and len(Killed.seen) == 2 and min(Killed.seen) >= 160, "of 200 samples"
+    assert Killed.seen is not None and len(Killed.seen) == 2 and min(Killed.seen) >= 160, (
+        "of 200 samples"
+    )
 
 
 class RealTime(Nominal):
@@ -219,8 +264,15 @@ class RealTime(Nominal):
         return Command(np.asarray(command.u) * 0.5)  # a guard on the machine halves it
 
 
-def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(tmp_path: Path, machine: Machine) -> None:
-    small = ("excitation=levels", "collect.num_runs=1", "collect.run_minutes=0.04", "collect.file_minutes=0.04")
+def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(
+    tmp_path: Path, machine: Machine
+) -> None:
+    small = (
+        "excitation=levels",
+        "collect.num_runs=1",
+        "collect.run_minutes=0.04",
+        "collect.file_minutes=0.04",
+    )
     collect = replace(mode(tmp_path / "run", *small), link=Connected(RealTime))
     before = time.monotonic()
     collect.run()
@@ -228,17 +280,29 @@ def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(tmp_path: Path, 
     files = list(made(tmp_path / "run", machine).values())
     first, last = files[0], files[-1]
     assert first.metadata["run"] == last.metadata["run"] and first is not last
-    periods_s = np.concatenate([np.diff(file.t_s) for file in files])  # busy computers come late more than once
-    assert np.median(periods_s) == pytest.approx(0.05, abs=0.006) and len(np.unique(periods_s)) > 3, "as measured"
+    periods_s = np.concatenate(
+        [np.diff(file.t_s) for file in files]
+    )  # busy computers come late more than once
+    assert (
+        np.median(periods_s) == pytest.approx(0.05, abs=0.006) and len(np.unique(periods_s)) > 3
+    ), "as measured"
     assert 0.0 < max(np.abs(file.u).max() for file in (first, last)) <= 0.5, "as sent"
 
 
-def test_a_simulated_machine_is_its_actuator_model_with_noise(machine: Machine, tmp_path: Path) -> None:
-    plant = Affected(actuator=option("actuator", "lag"), effects={"backlash": option("effect", "backlash")})
+def test_a_simulated_machine_is_its_actuator_model_with_noise(
+    machine: Machine, tmp_path: Path
+) -> None:
+    plant = Affected(
+        actuator=option("actuator", "lag"), effects={"backlash": option("effect", "backlash")}
+    )
     session = Session(out=str(tmp_path), seed=0, device="cpu")
-    quiet, noisy = (Simulated(actuator=plant, noise=noise).build(machine, 2, session) for noise in (0.0, 0.01))
+    quiet, noisy = (
+        Simulated(actuator=plant, noise=noise).build(machine, 2, session) for noise in (0.0, 0.01)
+    )
     model = option("actuator", "lag").build(machine, 2, torch.device("cpu"))
-    neutral = Simulated(actuator=Affected(actuator=option("actuator", "lag"), effects={}), noise=0.0).build(machine, 2, session)
+    neutral = Simulated(
+        actuator=Affected(actuator=option("actuator", "lag"), effects={}), noise=0.0
+    ).build(machine, 2, session)
     home = torch.as_tensor(machine.home, dtype=torch.float32).repeat(2, 1)
     history = History(q=home[:, None].repeat(1, 13, 1), u=torch.zeros(2, 13, 5))
     generator, differences, played = np.random.default_rng(0), [], []

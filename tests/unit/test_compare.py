@@ -42,7 +42,9 @@ def write_run(folder: Path, actuator: str, seed: int, strict: float, **more: Any
 
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
-    for index, (actuator, seed, strict) in enumerate((("ideal", 0, 0.2), ("ideal", 1, 0.4), ("mlp", 0, 0.9), ("mlp", 1, 0.9))):
+    for index, (actuator, seed, strict) in enumerate(
+        (("ideal", 0, 0.2), ("ideal", 1, 0.4), ("mlp", 0, 0.9), ("mlp", 1, 0.9))
+    ):
         write_run(tmp_path / "sweep" / f"{index}_{actuator}", actuator, seed, strict)
     return tmp_path / "sweep"
 
@@ -63,7 +65,10 @@ def test_student_is_that_of_the_books() -> None:
 def test_runs_are_found_in_their_order_below_a_sweep(sweep: Path) -> None:
     (sweep / "1_ideal").rename(sweep / "10_ideal")
     assert [path.name for path in find([str(sweep)])] == ["0_ideal", "2_mlp", "3_mlp", "10_ideal"]
-    assert [path.name for path in find([str(sweep / "*_mlp"), str(sweep / "2_mlp")])] == ["2_mlp", "3_mlp"]
+    assert [path.name for path in find([str(sweep / "*_mlp"), str(sweep / "2_mlp")])] == [
+        "2_mlp",
+        "3_mlp",
+    ]
 
 
 def test_only_what_differs_is_a_column_and_seeds_are_not(sweep: Path) -> None:
@@ -71,7 +76,9 @@ def test_only_what_differs_is_a_column_and_seeds_are_not(sweep: Path) -> None:
 
 
 def test_seeds_become_one_row_with_the_interval_over_them(sweep: Path) -> None:
-    results = [result for folder in find([str(sweep)]) for result in load(folder).results(["actuator"])]
+    results = [
+        result for folder in find([str(sweep)]) for result in load(folder).results(["actuator"])
+    ]
     ideal, mlp = grouped(results)
     assert ideal["variation"] == {"actuator": "ideal"}
     assert ideal["seeds"] == [0, 1]
@@ -107,7 +114,9 @@ def test_a_broken_evaluation_is_named(sweep: Path) -> None:
         load(sweep / "0_ideal")
 
 
-def test_the_command_writes_table_csv_and_picture(sweep: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_command_writes_table_csv_and_picture(
+    sweep: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     done = brokk("mode=compare", f"compare.runs={sweep}", "session.out=compared")
     assert done.code == 0
     for part in ("ideal", "mlp", "0.3", "strict", "travel"):
@@ -133,7 +142,10 @@ def test_an_evaluation_elsewhere_belongs_to_the_run_that_trained(tmp_path: Path)
     columns = differing(runs)
     assert columns == ["actuator", "evaluated on"]
     ideal, mlp = grouped([result for run in runs for result in run.results(columns)])
-    assert (ideal["variation"], ideal["seeds"]) == ({"actuator": "ideal", "evaluated on": "hydraulic"}, [0, 1])
+    assert (ideal["variation"], ideal["seeds"]) == (
+        {"actuator": "ideal", "evaluated on": "hydraulic"},
+        [0, 1],
+    )
     assert (ideal["success_strict"]["mean"], mlp["success_strict"]["mean"]) == (0.5, 0.7)
 
 
@@ -143,8 +155,12 @@ def test_a_sweep_over_a_whole_node_is_told_apart_by_its_values(tmp_path: Path) -
         record = json.loads((tmp_path / str(index) / "session.json").read_text())
         record["overrides"] = [f"task.reward={{progress:{{weight:{weight}}}}}"]
         (tmp_path / str(index) / "session.json").write_text(json.dumps(record))
-        (tmp_path / str(index) / "resolved.yaml").write_text(f"task: {{reward: {{progress: {{weight: {weight}}}}}}}\n")
-    assert differing([load(folder) for folder in find([str(tmp_path)])]) == ["task.reward.progress.weight"]
+        (tmp_path / str(index) / "resolved.yaml").write_text(
+            f"task: {{reward: {{progress: {{weight: {weight}}}}}}}\n"
+        )
+    assert differing([load(folder) for folder in find([str(tmp_path)])]) == [
+        "task.reward.progress.weight"
+    ]
 
 
 def test_learning_curves_are_thinned_and_say_when_success_was_reached(
@@ -162,6 +178,13 @@ def test_learning_curves_are_thinned_and_say_when_success_was_reached(
 
 
 def test_a_row_says_only_what_most_others_do_not_share() -> None:
-    rows = [{"task.noise.a": 1, "rl.a": 2}, {"task.noise.a": 1, "rl.a": 3}, {"task.noise.a": 4, "rl.a": 2}]
+    rows = [
+        {"task.noise.a": 1, "rl.a": 2},
+        {"task.noise.a": 1, "rl.a": 3},
+        {"task.noise.a": 4, "rl.a": 2},
+    ]
     assert unlike_most([{"variation": row} for row in rows]) == ["", "rl.a 3", "noise.a 4"]
-    assert unlike_most([{"variation": {"task.memory": 13}}, {"variation": {"task.memory": 1}}]) == ["memory 13", "memory 1"]
+    assert unlike_most([{"variation": {"task.memory": 13}}, {"variation": {"task.memory": 1}}]) == [
+        "memory 13",
+        "memory 1",
+    ]

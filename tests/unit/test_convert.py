@@ -39,7 +39,9 @@ def lines(seconds: float = 8.0, start_s: float = 100.0) -> list[str]:
     return [row(start_s + 0.053 * k) for k in range(int(seconds / 0.053) + 1)]
 
 
-def logged(folder: Path, rows: list[str], header: str = HEADER, end: str = "\n", name: str = "dig.csv") -> Path:
+def logged(
+    folder: Path, rows: list[str], header: str = HEADER, end: str = "\n", name: str = "dig.csv"
+) -> Path:
     path = folder / name
     path.write_text("\n".join([header, *rows]) + end)
     return path
@@ -47,18 +49,29 @@ def logged(folder: Path, rows: list[str], header: str = HEADER, end: str = "\n",
 
 def test_commands_are_full_at_the_stated_values_whichever_side_they_lie_on() -> None:
     column = CommandColumn(column="c", neutral=7.0, full_plus=10.0, full_minus=5.0)
-    np.testing.assert_allclose(column.command(np.array([7.0, 10.0, 5.0, 8.5, 6.0])), [0.0, 1.0, -1.0, 0.5, -0.5])
+    np.testing.assert_allclose(
+        column.command(np.array([7.0, 10.0, 5.0, 8.5, 6.0])), [0.0, 1.0, -1.0, 0.5, -0.5]
+    )
     turned = CommandColumn(column="c", neutral=7.0, full_plus=5.0, full_minus=10.0)
-    np.testing.assert_allclose(turned.command(np.array([7.0, 10.0, 5.0, 8.5])), [0.0, -1.0, 1.0, -0.5])
+    np.testing.assert_allclose(
+        turned.command(np.array([7.0, 10.0, 5.0, 8.5])), [0.0, -1.0, 1.0, -0.5]
+    )
 
 
 def test_a_neutral_outside_the_full_commands_is_refused() -> None:
-    with pytest.raises(ConfigError, match="neutral 4 must lie between full_plus 10 and full_minus 5"):
+    with pytest.raises(
+        ConfigError, match="neutral 4 must lie between full_plus 10 and full_minus 5"
+    ):
         CommandColumn(column="c", neutral=4.0, full_plus=10.0, full_minus=5.0)
 
 
-def test_positions_are_interpolated_and_commands_held(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
-    rows = [row(10.0 + 0.08 * k, "10.01,6.9645,7.614,7.4695" if k >= 50 else REST, 8.0 + 0.01 * k) for k in range(101)]
+def test_positions_are_interpolated_and_commands_held(
+    tmp_path: Path, excavator: Machine, reader: ColumnMap
+) -> None:
+    rows = [
+        row(10.0 + 0.08 * k, "10.01,6.9645,7.614,7.4695" if k >= 50 else REST, 8.0 + 0.01 * k)
+        for k in range(101)
+    ]
     (recording,) = reader.read(logged(tmp_path, rows), excavator)
     assert recording.t_s[0] == 0.0
     np.testing.assert_allclose(np.diff(recording.t_s), excavator.period_s)
@@ -66,7 +79,9 @@ def test_positions_are_interpolated_and_commands_held(tmp_path: Path, excavator:
     # 0.01 cm every 0.08 s, in m
     np.testing.assert_allclose(recording.q[:, 0], 0.08 + 0.0001 * recording.t_s / 0.08, atol=1e-7)
     # the command of row 50 is in force from 4.0 s on, not before
-    np.testing.assert_array_equal(recording.u[:, 0], (recording.t_s >= 4.0 - 1e-6).astype(np.float32))
+    np.testing.assert_array_equal(
+        recording.u[:, 0], (recording.t_s >= 4.0 - 1e-6).astype(np.float32)
+    )
     assert np.abs(recording.u[:, 1:]).max() == 0.0
     assert recording.metadata["resampled_from"] == "12.5 Hz, periods of 0.080 to 0.080 s"
 
@@ -84,9 +99,16 @@ def test_a_log_is_split_at_its_gaps_and_its_pieces_share_the_run(
         record.check(piece, "piece")
 
 
-@pytest.mark.parametrize(("tail", "end"), [("108.1,7.4745,6.96", ""), ("108.1,7.4745,6.96", "\n"), (row(108.1)[:-1], "")])
+@pytest.mark.parametrize(
+    ("tail", "end"), [("108.1,7.4745,6.96", ""), ("108.1,7.4745,6.96", "\n"), (row(108.1)[:-1], "")]
+)
 def test_a_last_line_that_a_crash_cut_off_is_left_out_and_said(
-    tmp_path: Path, excavator: Machine, reader: ColumnMap, caplog: pytest.LogCaptureFixture, tail: str, end: str
+    tmp_path: Path,
+    excavator: Machine,
+    reader: ColumnMap,
+    caplog: pytest.LogCaptureFixture,
+    tail: str,
+    end: str,
 ) -> None:
     whole = reader.read(logged(tmp_path, lines()), excavator)
     with caplog.at_level(logging.WARNING):
@@ -110,36 +132,55 @@ def put(at: int, cell: int, text: str) -> list[str]:
         (put(7, 1, "off"), r"dig\.csv: line 9 \(row 7\), column 'Boom Cmd': 'off' is not a number"),
         (put(7, 6, ""), r"dig\.csv: line 9 \(row 7\), column 'Stick Ms': '' is not a number"),
         (put(3, 8, "nan"), r"dig\.csv: line 5 \(row 3\), column 'Swing Ms': nan is not a number"),
-        (put(7, 0, "100.1"), r"dig\.csv: line 9 \(row 7\), column 'Time': time does not increase \(100\.318 s, then 100\.1 s\)"),
+        (
+            put(7, 0, "100.1"),
+            r"dig\.csv: line 9 \(row 7\), column 'Time': time does not increase \(100\.318 s, then 100\.1 s\)",
+        ),
         (
             put(7, 3, "11.5"),
             r"dig\.csv: line 9 \(row 7\), column 'Bucket Cmd': command 1\.608\d* is beyond full by more than 0\.02",
         ),
-        ([*lines()[:4], "100.2,7.5", *lines()[4:]], r"dig\.csv: line 6 \(row 4\): 2 cells, the header has 9"),
+        (
+            [*lines()[:4], "100.2,7.5", *lines()[4:]],
+            r"dig\.csv: line 6 \(row 4\): 2 cells, the header has 9",
+        ),
         ([], r"dig\.csv: 0 rows of data"),
         (lines(3.0), r"dig\.csv: no piece of 5 s or more"),
     ],
 )
-def test_a_bad_log_is_refused_by_name(tmp_path: Path, excavator: Machine, reader: ColumnMap, rows: list[str], message: str) -> None:
+def test_a_bad_log_is_refused_by_name(
+    tmp_path: Path, excavator: Machine, reader: ColumnMap, rows: list[str], message: str
+) -> None:
     with pytest.raises(RecordingError, match=message):
         reader.read(logged(tmp_path, rows), excavator)
 
 
-def test_a_missing_column_is_refused_with_the_nearest_name(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
+def test_a_missing_column_is_refused_with_the_nearest_name(
+    tmp_path: Path, excavator: Machine, reader: ColumnMap
+) -> None:
     path = logged(tmp_path, lines(), HEADER.replace("Stick Ms", "Stick Mes"))
-    with pytest.raises(RecordingError, match=r"dig\.csv: column 'Stick Ms' is missing; did you mean 'Stick Mes'\?"):
+    with pytest.raises(
+        RecordingError, match=r"dig\.csv: column 'Stick Ms' is missing; did you mean 'Stick Mes'\?"
+    ):
         reader.read(path, excavator)
 
 
-def test_two_columns_of_one_name_are_refused(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
+def test_two_columns_of_one_name_are_refused(
+    tmp_path: Path, excavator: Machine, reader: ColumnMap
+) -> None:
     path = logged(tmp_path, [f"{line},1.0" for line in lines()], HEADER + ",Boom Ms")
     with pytest.raises(RecordingError, match=r"dig\.csv: 2 columns are named 'Boom Ms'"):
         reader.read(path, excavator)
 
 
-def test_a_log_with_decimal_commas_and_windows_line_ends_is_read(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
+def test_a_log_with_decimal_commas_and_windows_line_ends_is_read(
+    tmp_path: Path, excavator: Machine, reader: ColumnMap
+) -> None:
     (expected,) = reader.read(logged(tmp_path, lines()), excavator)
-    text = "\n".join([HEADER, *lines()]).replace(",", ";").replace(".", ",").replace("\n", "\r\n") + "\r\n"
+    text = (
+        "\n".join([HEADER, *lines()]).replace(",", ";").replace(".", ",").replace("\n", "\r\n")
+        + "\r\n"
+    )
     (tmp_path / "dig.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())  # as a spreadsheet saves it
     (recording,) = replace(reader, delimiter=";", decimal=",").read(tmp_path / "dig.csv", excavator)
     np.testing.assert_array_equal(recording.q, expected.q)
@@ -152,15 +193,24 @@ def test_what_is_no_text_is_refused(tmp_path: Path, excavator: Machine, reader: 
         reader.read(tmp_path / "dig.csv", excavator)
 
 
-def test_a_map_of_another_machine_is_refused(tmp_path: Path, machine: Machine, reader: ColumnMap) -> None:
-    with pytest.raises(ConfigError, match=r"the map names the joints boom, .* machine 'brokk170' has q1, .*machine=… and import=…"):
+def test_a_map_of_another_machine_is_refused(
+    tmp_path: Path, machine: Machine, reader: ColumnMap
+) -> None:
+    with pytest.raises(
+        ConfigError,
+        match=r"the map names the joints boom, .* machine 'brokk170' has q1, .*machine=… and import=…",
+    ):
         reader.read(logged(tmp_path, lines()), machine)
 
 
-def test_optional_columns_are_read_and_may_have_empty_cells(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
+def test_optional_columns_are_read_and_may_have_empty_cells(
+    tmp_path: Path, excavator: Machine, reader: ColumnMap
+) -> None:
     oil = [f"{line},{'' if k == 3 else 30 + k}" for k, line in enumerate(lines())]
     path = logged(tmp_path, oil, HEADER + ",Oil F")
-    with_oil = replace(reader, optional={"oil_c": Column(column="Oil F", scale=5.0 / 9.0, offset=-160.0 / 9.0)})
+    with_oil = replace(
+        reader, optional={"oil_c": Column(column="Oil F", scale=5.0 / 9.0, offset=-160.0 / 9.0)}
+    )
     (recording,) = with_oil.read(path, excavator)
     assert recording.extra["oil_c"][0] == pytest.approx((30 - 32) * 5 / 9, abs=1e-5)
     assert np.isnan(recording.extra["oil_c"][3])
@@ -171,7 +221,12 @@ def test_convert_from_the_command(brokk: Callable[..., object], excavator: Machi
     Path("logs").mkdir()
     logged(Path("logs"), [*lines(8.0, 0.0), *lines(6.0, 30.0)])
     logged(Path("logs"), lines(), name="lift.csv")
-    choice = ("mode=convert", "machine=mini_excavator", "import=mini_excavator", "convert.input=logs/*.csv")
+    choice = (
+        "mode=convert",
+        "machine=mini_excavator",
+        "import=mini_excavator",
+        "convert.input=logs/*.csv",
+    )
     done = brokk(*choice, "session.out=out")
     assert done.code == 0, done.err
     names = [path.name for path in sorted(Path("out/recordings").iterdir())]
@@ -183,13 +238,21 @@ def test_convert_from_the_command(brokk: Callable[..., object], excavator: Machi
 def test_one_bad_log_leaves_no_recording_of_the_others(brokk: Callable[..., object]) -> None:
     logged(Path(), lines(), name="a.csv")
     logged(Path(), put(7, 1, "off"), name="b.csv")
-    done = brokk("mode=convert", "machine=mini_excavator", "import=mini_excavator", "convert.input=*.csv", "session.out=out")
+    done = brokk(
+        "mode=convert",
+        "machine=mini_excavator",
+        "import=mini_excavator",
+        "convert.input=*.csv",
+        "session.out=out",
+    )
     assert done.code == 2
     assert "b.csv: line 9 (row 7), column 'Boom Cmd': 'off' is not a number" in done.err
     assert not list(Path().rglob("*.parquet"))
 
 
-def test_a_map_and_a_machine_that_do_not_belong_together_are_said(brokk: Callable[..., object]) -> None:
+def test_a_map_and_a_machine_that_do_not_belong_together_are_said(
+    brokk: Callable[..., object],
+) -> None:
     logged(Path(), lines())
     done = brokk("mode=convert", "machine=mini_excavator", "convert.input=*.csv")
     assert done.code == 2
@@ -200,7 +263,13 @@ def test_two_logs_of_one_name_are_refused(brokk: Callable[..., object]) -> None:
     for folder in ("monday", "tuesday"):
         Path(folder).mkdir()
         logged(Path(folder), lines())
-    done = brokk("mode=convert", "machine=mini_excavator", "import=mini_excavator", "convert.input=*/dig.csv", "session.out=out")
+    done = brokk(
+        "mode=convert",
+        "machine=mini_excavator",
+        "import=mini_excavator",
+        "convert.input=*/dig.csv",
+        "session.out=out",
+    )
     assert done.code == 2
     assert "monday/dig.csv and" in done.err or "tuesday/dig.csv and" in done.err
     assert not list(Path().rglob("*.parquet"))
@@ -209,9 +278,17 @@ def test_two_logs_of_one_name_are_refused(brokk: Callable[..., object]) -> None:
 def test_a_recording_written_as_csv_comes_back_as_it_was(tmp_path: Path, machine: Machine) -> None:
     generator = np.random.default_rng(0)
     t_s = np.arange(200) * machine.period_s
-    u, q = generator.uniform(-1.0, 1.0, (200, 5)).astype(np.float32), generator.uniform(-0.2, 0.0, (200, 5)).astype(np.float32)
+    u, q = (
+        generator.uniform(-1.0, 1.0, (200, 5)).astype(np.float32),
+        generator.uniform(-0.2, 0.0, (200, 5)).astype(np.float32),
+    )
     names = ["t_s", *(f"u_q{j}" for j in range(1, 6)), *(f"q_q{j}_rad" for j in range(1, 6))]
-    rows = [",".join(repr(float(value)) for value in (t, *a, *b)) for t, a, b in zip(t_s, u, q, strict=True)]
-    (recording,) = option("import", "brokk170").read(logged(tmp_path, rows, ",".join(names)), machine)
+    rows = [
+        ",".join(repr(float(value)) for value in (t, *a, *b))
+        for t, a, b in zip(t_s, u, q, strict=True)
+    ]
+    (recording,) = option("import", "brokk170").read(
+        logged(tmp_path, rows, ",".join(names)), machine
+    )
     np.testing.assert_array_equal(recording.u, u)
     np.testing.assert_allclose(recording.q, q, atol=1e-7)

@@ -41,7 +41,9 @@ def test_sign_dead_time_and_speed_of_a_joint_are_found(sign: float, dead_s: floa
     q, flow = answer(sign, dead_s)
     found = judge(T_S, q, flow, travel=2.0)
     assert found is not None and found.agrees is (sign > 0)
-    assert found.dead_time_s == pytest.approx(dead_s, abs=0.02) and found.speed == pytest.approx(0.2, abs=0.02)
+    assert found.dead_time_s == pytest.approx(dead_s, abs=0.02) and found.speed == pytest.approx(
+        0.2, abs=0.02
+    )
 
 
 def test_a_joint_that_moved_one_way_only_or_not_at_all_says_nothing() -> None:
@@ -59,7 +61,9 @@ def operator(stop: threading.Event, wire: Wire, port: int, machine: Machine) -> 
         while not stop.is_set():
             pace.wait()
             pace.begin()
-            t_s = (time.monotonic() - begun_s) % 9.6  # first q1, q3, q4 and q5 together, then q2 with the button
+            t_s = (
+                time.monotonic() - begun_s
+            ) % 9.6  # first q1, q3, q4 and q5 together, then q2 with the button
             remote.deadman = 0.5 < t_s % 2 < 1.0
             if int(t_s) % 4 == 1 and not asked:
                 with contextlib.suppress(TimeoutError):
@@ -77,9 +81,20 @@ def test_the_checklist_runs_with_an_operator_and_finds_a_sound_machine(
 ) -> None:
     bus_port, port = free_port(), free_port()
     wire = Wire(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=bus_port)
-    twin = Twin(wire=wire, dbc=DBC, remote=False, deadman=False, again_s=None, fault_port=port, seconds=None, realtime=False)
+    twin = Twin(
+        wire=wire,
+        dbc=DBC,
+        remote=False,
+        deadman=False,
+        again_s=None,
+        fault_port=port,
+        seconds=None,
+        realtime=False,
+    )
     session, stop = Session(out=str(tmp_path / "twin"), seed=0, device="cpu"), threading.Event()
-    child = Child("twin", "deploy.twin.twin:run", (twin, machine, NominalMachine(), session), (), 60)
+    child = Child(
+        "twin", "deploy.twin.twin:run", (twin, machine, NominalMachine(), session), (), 60
+    )
     time.sleep(2.0)
     hands = threading.Thread(target=operator, args=(stop, wire, port, machine))
     hands.start()
@@ -93,8 +108,13 @@ def test_the_checklist_runs_with_an_operator_and_finds_a_sound_machine(
         hands.join()
         child.end(3.0)
     assert done.code == 0
-    findings = {one["check"]: one for one in json.loads((tmp_path / "report/bringup.json").read_text())["findings"]}
+    findings = {
+        one["check"]: one
+        for one in json.loads((tmp_path / "report/bringup.json").read_text())["findings"]
+    }
     assert list(findings) == ["bus", "positions", "dead-man", "e-stop", "joints", "shadow"]
     failed = {name: one["text"] for name, one in findings.items() if not one["passed"]}
     assert not failed
-    assert findings["joints"]["values"]["q1"]["dead_time_s"] == pytest.approx(machine.dead_time_s, abs=0.1)
+    assert findings["joints"]["values"]["q1"]["dead_time_s"] == pytest.approx(
+        machine.dead_time_s, abs=0.1
+    )

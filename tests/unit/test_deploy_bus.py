@@ -39,13 +39,21 @@ def test_the_crc_is_that_of_sae_j1850_over_data_and_data_id(data: bytes, data_id
 
 @settings(max_examples=50)
 @given(st.lists(st.floats(-1, 1), min_size=5, max_size=5), st.integers(0, 100))
-def test_commands_arrive_as_they_were_sent_to_half_a_step(machine: Machine, u: list[float], counter: int) -> None:
+def test_commands_arrive_as_they_were_sent_to_half_a_step(
+    machine: Machine, u: list[float], counter: int
+) -> None:
     bus = Description(DBC, machine)
     names = [f"Command_q{j}" for j in range(1, 6)]
     data = bus.encode("ValveCmd", dict(zip(names, u, strict=True)) | {"CommandMode": 1}, counter)
     values = bus.decode(bus.command, data)
-    assert isinstance(values, dict) and values["Counter"] == counter % 16 and values["CommandMode"] == 1
-    assert all(abs(values[name] - wanted) <= 0.001 + 1e-12 for name, wanted in zip(names, u, strict=True))
+    assert (
+        isinstance(values, dict)
+        and values["Counter"] == counter % 16
+        and values["CommandMode"] == 1
+    )
+    assert all(
+        abs(values[name] - wanted) <= 0.001 + 1e-12 for name, wanted in zip(names, u, strict=True)
+    )
 
 
 def test_every_single_wrong_bit_is_found_in_every_message(bus: Description) -> None:
@@ -58,13 +66,18 @@ def test_every_single_wrong_bit_is_found_in_every_message(bus: Description) -> N
 
 
 def test_a_message_under_the_name_of_another_is_found(bus: Description) -> None:
-    for one, other in itertools.permutations([layout for layout in bus.layouts.values() if layout.length == 8], 2):
+    for one, other in itertools.permutations(
+        [layout for layout in bus.layouts.values() if layout.length == 8], 2
+    ):
         assert bus.decode(other, bus.encode(one.name, {}, 1)) is Fault.CRC
     assert bus.decode(bus.command, bus.encode("ValveCmd", {}, 1)[:-1]) is Fault.LENGTH
 
 
 def heard(channel: Channel, counters: list[int | None]) -> list[Fault | None]:
-    return [channel.refuse(Fault.CRC) if counter is None else channel.take(counter) for counter in counters]
+    return [
+        channel.refuse(Fault.CRC) if counter is None else channel.take(counter)
+        for counter in counters
+    ]
 
 
 def test_a_channel_is_believed_after_two_messages_in_order() -> None:
@@ -78,7 +91,11 @@ def test_a_channel_is_believed_after_two_messages_in_order() -> None:
 @pytest.mark.parametrize(
     ("counters", "faults", "trust"),
     [
-        ([0, 1, 2, 15, 0], [None, None, None, Fault.SEQUENCE, None], Trust.VALID),  # one out of order
+        (
+            [0, 1, 2, 15, 0],
+            [None, None, None, Fault.SEQUENCE, None],
+            Trust.VALID,
+        ),  # one out of order
         ([14, 15, 0, 1], [None] * 4, Trust.VALID),  # the counter goes round
         ([0, 1, 5, 6], [None] * 4, Trust.VALID),  # three lost
         ([0, 1, 6, 7], [None, None, Fault.SEQUENCE, None], Trust.VALID),  # four lost: one error
@@ -89,7 +106,9 @@ def test_a_channel_is_believed_after_two_messages_in_order() -> None:
     ],
     ids=str,
 )
-def test_a_channel_judges_by_counter_and_crc(counters: list[int | None], faults: list[Fault | None], trust: Trust) -> None:
+def test_a_channel_judges_by_counter_and_crc(
+    counters: list[int | None], faults: list[Fault | None], trust: Trust
+) -> None:
     channel = Channel(16)
     assert heard(channel, counters) == faults
     assert channel.trust is trust
@@ -148,7 +167,9 @@ def test_a_silent_wire_says_nothing_in_time(make: Callable[[Path], Wire], tmp_pa
 
 
 @WIRES
-def test_a_closed_wire_is_an_error_and_may_be_closed_again(make: Callable[[Path], Wire], tmp_path: Path) -> None:
+def test_a_closed_wire_is_an_error_and_may_be_closed_again(
+    make: Callable[[Path], Wire], tmp_path: Path
+) -> None:
     one = make(tmp_path).open()
     one.close()
     one.close()
@@ -165,12 +186,22 @@ def test_a_replay_says_what_was_recorded_in_its_own_time_and_sends_nothing(tmp_p
     path = tmp_path / "frames.blf"
     with BLFWriter(path) as writer:
         for number in range(5):
-            message = can.Message(timestamp=1000.0 + 0.02 * number, arbitration_id=0x100 + number, data=[number], is_rx=number != 3)
+            message = can.Message(
+                timestamp=1000.0 + 0.02 * number,
+                arbitration_id=0x100 + number,
+                data=[number],
+                is_rx=number != 3,
+            )
             writer.on_message_received(message)
     with Replay(path=str(path), speed=2.0).open() as one:
         one.send(Wired(0x200, b""))
         found = [one.recv(0.5) for _ in range(4)]
-        assert [frame.frame_id for frame in found if frame] == [0x100, 0x101, 0x102, 0x104]  # what was sent from here is left out
+        assert [frame.frame_id for frame in found if frame] == [
+            0x100,
+            0x101,
+            0x102,
+            0x104,
+        ]  # what was sent from here is left out
         with pytest.raises(LinkError, match="over"):
             one.recv(0.5)
 
@@ -189,7 +220,9 @@ def test_a_replay_of_nothing_is_refused(tmp_path: Path) -> None:
     ],
     ids=["signal", "crc", "syntax"],
 )  # fmt: skip
-def test_a_description_that_does_not_do_is_refused(machine: Machine, tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_a_description_that_does_not_do_is_refused(
+    machine: Machine, tmp_path: Path, old: str, new: str, message: str
+) -> None:
     text = described.located(DBC).read_text()
     assert old in text
     path = tmp_path / "other.dbc"
@@ -213,7 +246,10 @@ def test_another_layout_with_the_same_names_is_as_good(machine: Machine, tmp_pat
 
 def test_a_description_for_other_joints_is_refused(machine: Machine) -> None:
     other = replace(
-        machine, joints=tuple(replace(joint, name=f"j{n}") for n, joint in enumerate(machine.joints)), exclusive=(), levers=()
+        machine,
+        joints=tuple(replace(joint, name=f"j{n}") for n, joint in enumerate(machine.joints)),
+        exclusive=(),
+        levers=(),
     )
     with pytest.raises(ConfigError, match="Command_j0"):
         Description(DBC, other)
@@ -233,12 +269,19 @@ int main(void) {{
   printf("%d", brokk_crc8(data, BROKK_VALVE_CMD_LENGTH, BROKK_VALVE_CMD_CRC_BYTE, BROKK_VALVE_CMD_DATA_ID));
 }}"""
     )
-    subprocess.run(["cc", "-Wall", "-Werror", "-std=c99", "-o", "main", "main.c"], cwd=tmp_path, check=True)
-    found = subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    subprocess.run(
+        ["cc", "-Wall", "-Werror", "-std=c99", "-o", "main", "main.c"], cwd=tmp_path, check=True
+    )
+    found = subprocess.run(
+        ["./main"], cwd=tmp_path, check=True, capture_output=True, text=True
+    ).stdout
     assert int(found) == data[layout.crc_byte]
 
 
 def test_the_header_for_a_gateway_says_what_the_description_says(bus: Description) -> None:
     text = c_header(bus)
-    assert "#define BROKK_VALVE_CMD_ID 0xD001027u" in text and "#define BROKK_VALVE_CMD_DATA_ID 0x1031u" in text
+    assert (
+        "#define BROKK_VALVE_CMD_ID 0xD001027u" in text
+        and "#define BROKK_VALVE_CMD_DATA_ID 0x1031u" in text
+    )
     assert "#define BROKK_JOINT_POS1_PERIOD_MS 10u" in text and "brokk_crc8" in text

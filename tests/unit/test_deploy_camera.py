@@ -37,7 +37,9 @@ PIXELS = 640 * 360
 
 def pose(x: float, y: float, std_m: float = 0.004, score: float = 0.9) -> HolePose:
     center_m, cov = np.array([x, y, 0.75]), std_m**2 * np.eye(3)
-    return HolePose(center_m, np.array([0.0, 0.0, 1.0]), 0.05, cov, 1e-4 * np.eye(3), "base", score, 0.0)
+    return HolePose(
+        center_m, np.array([0.0, 0.0, 1.0]), 0.05, cov, 1e-4 * np.eye(3), "base", score, 0.0
+    )
 
 
 def seen_at(frame: Frame, center_m: Any) -> tuple[float, float]:
@@ -57,7 +59,9 @@ def exchange() -> Iterator[Exchange]:
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda one: one.name)
-def test_a_click_into_a_borehole_gives_its_centre_though_its_mouth_has_no_depth(target: Any) -> None:
+def test_a_click_into_a_borehole_gives_its_centre_though_its_mouth_has_no_depth(
+    target: Any,
+) -> None:
     found = borehole_at(FRAME, *seen_at(FRAME, np.array(target.center_in_base_m)), target.radius_m)
     assert found is not None
     off_m = np.linalg.norm(found[0] - np.array(target.center_in_base_m))
@@ -75,7 +79,9 @@ def test_a_frame_is_handed_on_whole_or_shrunk_with_its_camera(exchange: Exchange
     eyes._publish(exchange.frame, FRAME, PIXELS, 5.0)
     assert exchange.frame.peek("t_s") == 5.0 and exchange.frame.number == 1
     whole = frame_of(exchange.frame.read())
-    assert np.array_equal(whole.color, FRAME.color) and np.array_equal(whole.depth_m, FRAME.depth_m, equal_nan=True)
+    assert np.array_equal(whole.color, FRAME.color) and np.array_equal(
+        whole.depth_m, FRAME.depth_m, equal_nan=True
+    )
     eyes._publish(exchange.frame, FRAME, PIXELS // 4, 6.0)
     small = frame_of(exchange.frame.read())
     assert small.color.shape == (180, 320, 3) and exchange.frame.number == 2
@@ -89,22 +95,30 @@ def test_boreholes_keep_their_names_are_averaged_by_variance_and_forgotten() -> 
     known.take([pose(2.2, 0.4), pose(2.61, 0.0, 0.008)], 2.0)
     first, second = known.plain()
     assert (first["name"], second["name"]) == (1, 2)
-    assert first["center_in_base_m"][0] == pytest.approx(2.6 + 0.01 / 5, abs=1e-4)  # four times the variance, a fifth of the weight
+    assert first["center_in_base_m"][0] == pytest.approx(
+        2.6 + 0.01 / 5, abs=1e-4
+    )  # four times the variance, a fifth of the weight
     assert first["std_m"] == pytest.approx(0.004 * np.sqrt(0.8), abs=1e-5)
     known.take([pose(2.6, 0.0)], 11.9)
     assert [one["name"] for one in known.plain()] == [1, 2]
     known.take([pose(2.9, -0.4)], 12.5)
-    assert [one["name"] for one in known.plain()] == [1, 3], "the second was not seen for more than 10 s"
+    assert [one["name"] for one in known.plain()] == [1, 3], (
+        "the second was not seen for more than 10 s"
+    )
 
 
 def test_what_the_calibration_is_wrong_by_is_never_averaged_away() -> None:
-    calibration = replace(pose(2.6, 0.0), cov_m2=(0.004**2 + 0.003**2) * np.eye(3), shared_m2=0.003**2 * np.eye(3))
+    calibration = replace(
+        pose(2.6, 0.0), cov_m2=(0.004**2 + 0.003**2) * np.eye(3), shared_m2=0.003**2 * np.eye(3)
+    )
     known = KnownHoles(10.0)
     for number in range(4):
         known.take([calibration], float(number))
     # of its own 4 mm, over four frames 2 mm; of the calibration 3 mm, in all of them: sqrt(4 + 9)
     assert known.plain()[0]["std_m"] == pytest.approx(0.001 * np.sqrt(13.0), abs=1e-5)
-    surer = replace(calibration, center_m=np.array([2.605, 0.0, 0.75]), cov_m2=(0.002**2 + 0.003**2) * np.eye(3))
+    surer = replace(
+        calibration, center_m=np.array([2.605, 0.0, 0.75]), cov_m2=(0.002**2 + 0.003**2) * np.eye(3)
+    )
     known.take([surer], 4.0)
     # 2 mm of its own, as what is known: half way
     assert known.plain()[0]["center_in_base_m"][0] == pytest.approx(2.6025, abs=1e-4)
@@ -131,7 +145,9 @@ def aimed(exchange: Exchange) -> list[float]:
     return [round(float(value), 4) for value in record["center_in_base_m"]]
 
 
-def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(exchange: Exchange, tmp_path: Path) -> None:
+def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(
+    exchange: Exchange, tmp_path: Path
+) -> None:
     path = tmp_path / "target.json"
     aim = Aim(File(path=str(path)).build(), exchange.target, exchange.holes)
     aim.refresh()
@@ -175,20 +191,40 @@ def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(exchange:
     aim.refresh()
     show(exchange, pose(2.2, 0.4, score=0.95), pose(2.9, 0.4, score=0.6))
     aim.refresh()
-    assert aimed(exchange) == [2.9, 0.4, 0.75], "it does not leap to another that looks surer for a moment"
+    assert aimed(exchange) == [2.9, 0.4, 0.75], (
+        "it does not leap to another that looks surer for a moment"
+    )
 
 
 @pytest.fixture
 def feed(exchange: Exchange, tmp_path: Path) -> LoopFeed:
     session = Session(out=str(tmp_path), seed=1, device="cpu")
     return LoopFeed(
-        Beside(option("page", "local"), MACHINE, option("guidance", "machine"), session, 0.15, 0.15, 600.0, 1.0), exchange
+        Beside(
+            option("page", "local"),
+            MACHINE,
+            option("guidance", "machine"),
+            session,
+            0.15,
+            0.15,
+            600.0,
+            1.0,
+        ),
+        exchange,
     )
 
 
-def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(exchange: Exchange, feed: LoopFeed, tmp_path: Path) -> None:
+def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
+    exchange: Exchange, feed: LoopFeed, tmp_path: Path
+) -> None:
     aim = Aim(File(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes)
-    wanted = Wanted(exchange, Recorder(exchange, tmp_path, lambda folder: None), aim, armed=False, commands=False)  # type: ignore[arg-type,return-value]
+    wanted = Wanted(
+        exchange,
+        Recorder(exchange, tmp_path, lambda folder: None),
+        aim,
+        armed=False,
+        commands=False,
+    )  # type: ignore[arg-type,return-value]
     center_m = np.array(TARGETS[1].center_in_base_m)
     point = Wish("point", "{:.4f},{:.4f}".format(*seen_at(FRAME, center_m)))
     assert not feed.wish(point), "there is no picture yet"
@@ -202,7 +238,10 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(exchange: Exch
     assert next(one for one in shown.streams if one.name == "camera").age_s is not None
     show(exchange, pose(2.95, -0.4), pose(2.25, 0.41))
     wanted.refresh()
-    assert [(one.name, one.chosen) for one in feed.shown().targets] == [("1", False), ("2", True)], "perception knows it by now"
+    assert [(one.name, one.chosen) for one in feed.shown().targets] == [
+        ("1", False),
+        ("2", True),
+    ], "perception knows it by now"
     assert feed.wish(Wish("target", "1")) and not feed.wish(Wish("target", "9"))
     wanted.refresh()
     assert aimed(exchange) == [2.95, -0.4, 0.75]
@@ -238,12 +277,16 @@ class Blinking:
         return Sighting([pose(2.6, 0.0)], [], [], None)
 
 
-def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recorded(exchange: Exchange) -> None:
+def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recorded(
+    exchange: Exchange,
+) -> None:
     source: Any = Blinking()
     eyes.run(lambda: False, camera(source), exchange)
     assert exchange.frame is not None and exchange.frame.number == 2
     said = [json.loads(data[1:]) for data in exchange.sight_log.take()]
-    assert [one["topic"] for one in said] == ["holes"] * 2 and said[1]["holes"][0]["center_in_base_m"] == [2.6, 0.0, 0.75]
+    assert [one["topic"] for one in said] == ["holes"] * 2 and said[1]["holes"][0][
+        "center_in_base_m"
+    ] == [2.6, 0.0, 0.75]
 
 
 def camera(source: Any) -> Camera:
@@ -252,7 +295,9 @@ def camera(source: Any) -> Camera:
     )  # fmt: skip
 
 
-def test_pictures_are_recorded_as_often_as_asked_and_come_back(exchange: Exchange, tmp_path: Path) -> None:
+def test_pictures_are_recorded_as_often_as_asked_and_come_back(
+    exchange: Exchange, tmp_path: Path
+) -> None:
     import cv2
 
     assert exchange.frame is not None
@@ -267,6 +312,8 @@ def test_pictures_are_recorded_as_often_as_asked_and_come_back(exchange: Exchang
 
     found = reading.read(tmp_path / "capture.mcap").messages["camera"]
     assert [t_s for t_s, _ in found] == [100.0], "the other two came within half a second"
-    picture = cv2.imdecode(np.frombuffer(base64.b64decode(found[0][1]["data"]), np.uint8), cv2.IMREAD_COLOR)
+    picture = cv2.imdecode(
+        np.frombuffer(base64.b64decode(found[0][1]["data"]), np.uint8), cv2.IMREAD_COLOR
+    )
     assert picture is not None and np.abs(picture[..., ::-1].astype(int) - FRAME.color).mean() < 6
     assert Pictures(exchange.frame, 0.0).due() is None and Pictures(None, 2.0).due() is None

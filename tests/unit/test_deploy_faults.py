@@ -1,6 +1,7 @@
 """The fault catalogue against every mode: what must stop the machine, what takes the advice away, and what nobody notices.
 
-On a stage with a clock of its own; `test_deploy_processes.py` and `benchmarks/deploy/reactions.py` do the same with real processes.
+On a stage with a clock of its own; `test_deploy_processes.py` and `benchmarks/deploy/reactions.py`
+do the same with real processes.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ COMMANDING = ("collect", "auto")
 
 
 @pytest.fixture(scope="module")
-def stages(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stage]]:
+def stages(
+    machine: Machine, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[dict[str, Stage]]:
     found = {mode: Stage(machine, mode, tmp_path_factory.mktemp(mode)) for mode in MODES}
     yield found
     for stage in found.values():
@@ -44,7 +47,9 @@ STOPS: list[tuple[str, str, float]] = [
     ("estop", "", AT_ONCE), ("deadman_released", "", AT_ONCE), ("remote_off", "", AT_ONCE), ("second_sender", "", AT_ONCE),
 ]  # fmt: skip
 """Faults that end a motion, and within which time."""
-HARMLESS = [(fault, message) for fault in ("drop_some", "duplicate", "reorder") for message in MESSAGES] + [("flood", "")]
+HARMLESS = [
+    (fault, message) for fault in ("drop_some", "duplicate", "reorder") for message in MESSAGES
+] + [("flood", "")]
 """Faults that are borne, or end in zero; what is wrong is never used."""
 OPERATORS = {"deadman_released", "estop", "remote_off", "second_sender", "lever"}
 """Faults that say nothing against the positions: an advice goes on."""
@@ -69,11 +74,17 @@ def test_what_must_stop_the_machine_stops_it_in_time_and_for_good(
     stage.fault(fault, message)
     assert stage.stops_within_s() <= limit_s + 0.011  # the twin takes a fault up in its next cycle
     safety = stage.view.safety
-    assert safety is not None and (safety.state == "LATCHED" or fault == "deadman_released") and not any(safety.sent)
+    assert (
+        safety is not None
+        and (safety.state == "LATCHED" or fault == "deadman_released")
+        and not any(safety.sent)
+    )
     stage.fault("none")
     stage.go(0.3)
     if fault != "deadman_released":
-        assert not stage.moves, "nothing moves again before somebody has released the dead-man and pressed it"
+        assert not stage.moves, (
+            "nothing moves again before somebody has released the dead-man and pressed it"
+        )
 
 
 @pytest.mark.parametrize(("mode", "fault", "message", "limit_s"), against(STOPS, "listen"))
@@ -84,7 +95,11 @@ def test_what_speaks_against_the_positions_takes_the_advice_away_and_nothing_is_
     stage.get_going()
     stage.fault(fault, message)
     stage.go(limit_s + 0.061)  # the policy's period
-    elsewhere = message in ("LeverState", "MachineStatus", "ValveFeedback") and fault in ("drop", "wrong_id", "delay")
+    elsewhere = message in ("LeverState", "MachineStatus", "ValveFeedback") and fault in (
+        "drop",
+        "wrong_id",
+        "delay",
+    )
     assert stage.advised == (fault in OPERATORS or elsewhere)
     assert not stage.air.sent
 
@@ -116,12 +131,16 @@ def test_the_operators_lever_always_wins(stages: dict[str, Stage], mode: str) ->
 
 @pytest.mark.parametrize("mode", COMMANDING)
 @pytest.mark.parametrize("seconds", [0.3, 5.0, 3600.0 / 20])
-def test_a_process_that_stood_still_moves_nothing_when_it_wakes_up(stages: dict[str, Stage], mode: str, seconds: float) -> None:
+def test_a_process_that_stood_still_moves_nothing_when_it_wakes_up(
+    stages: dict[str, Stage], mode: str, seconds: float
+) -> None:
     stage = stages[mode]
     stage.get_going()
     begun_ms = stage.ms
     stage.pause(seconds)
-    assert stage.stopped_ms is not None and (stage.stopped_ms - begun_ms) / 1e3 <= 0.1, "the gateway waits for nobody"
+    assert stage.stopped_ms is not None and (stage.stopped_ms - begun_ms) / 1e3 <= 0.1, (
+        "the gateway waits for nobody"
+    )
     stage.go(0.5)
     safety = stage.view.safety
     assert not stage.moves and safety is not None and safety.state in ("LATCHED", "READY")
@@ -140,7 +159,9 @@ def test_a_bus_that_goes_down_is_zero_and_begins_anew(stages: dict[str, Stage], 
     assert not stage.moves and stage.view.safety is not None and stage.view.safety.bus_up
 
 
-def test_a_policy_that_dies_is_slow_or_talks_nonsense_stops_the_machine(stages: dict[str, Stage]) -> None:
+def test_a_policy_that_dies_is_slow_or_talks_nonsense_stops_the_machine(
+    stages: dict[str, Stage],
+) -> None:
     stage = stages["collect"]
     for change, limit_s in (
         ({"request_s": 60.0}, 0.17), ({"request_s": 0.4}, 0.22), ({"wanted": (float("nan"), 0, 0, 0, 0)}, 0.07),
@@ -154,7 +175,9 @@ def test_a_policy_that_dies_is_slow_or_talks_nonsense_stops_the_machine(stages: 
 
 
 @pytest.mark.parametrize("mode", COMMANDING)
-def test_a_bus_on_which_one_hears_oneself_changes_nothing(stages: dict[str, Stage], mode: str) -> None:
+def test_a_bus_on_which_one_hears_oneself_changes_nothing(
+    stages: dict[str, Stage], mode: str
+) -> None:
     stage = stages[mode]
     stage.get_going()
     stage.air.echo = True
@@ -178,7 +201,10 @@ def test_a_wall_clock_that_is_moved_by_an_hour_changes_nothing(
 def test_a_full_disk_ends_the_log_says_so_and_leaves_what_was_written(
     machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    exchange, capture = Exchange.new(machine.num_joints, commands=False), Capture(tmp_path, DBC, machine, {"source": "test"}, 0.0)
+    exchange, capture = (
+        Exchange.new(machine.num_joints, commands=False),
+        Capture(tmp_path, DBC, machine, {"source": "test"}, 0.0),
+    )
     sync, flush, count = os.fsync, Log.flush, [0]
 
     def full(file: int) -> None:

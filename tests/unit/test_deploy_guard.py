@@ -36,7 +36,13 @@ class Hand:
     def __init__(self, limits: Limits = LIMITS) -> None:
         self.guard, self.now_s = Guard(limits, BODY), 100.0
 
-    def decide(self, seen: Seen = WELL, u: tuple[float, ...] | None = STILL, armed: bool = True, **change: Any) -> Decision:
+    def decide(
+        self,
+        seen: Seen = WELL,
+        u: tuple[float, ...] | None = STILL,
+        armed: bool = True,
+        **change: Any,
+    ) -> Decision:
         self.now_s += change.pop("dt", DT)
         age_s = change.pop("age_s", 0.0)
         request = None if u is None else Request(u, age_s)
@@ -68,7 +74,12 @@ def test_arming_alone_moves_nothing_and_neither_does_a_dead_man_held_from_the_st
     hand = Hand()
     hand.decide(WELL)
     decision = hand.decide(WELL, (0.5, 0.0, 0.0))
-    assert decision.state is State.LATCHED and decision.sends and decision.u == STILL and decision.trip is Trip.NOT_ARMED
+    assert (
+        decision.state is State.LATCHED
+        and decision.sends
+        and decision.u == STILL
+        and decision.trip is Trip.NOT_ARMED
+    )
 
 
 def test_the_way_to_the_valves_is_release_then_press() -> None:
@@ -127,11 +138,18 @@ ASKED = [
 
 
 @pytest.mark.parametrize(("change", "trip"), WRONG, ids=str)
-def test_anything_wrong_is_zero_in_the_same_cycle_and_latches_until_release_and_press(change: dict[str, Any], trip: Trip) -> None:
+def test_anything_wrong_is_zero_in_the_same_cycle_and_latches_until_release_and_press(
+    change: dict[str, Any], trip: Trip
+) -> None:
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.1))
     decision = hand.decide(u=(0.1, 0.0, 0.1), **change)
-    assert decision.state is State.LATCHED and decision.u == STILL and decision.trip is trip and decision.cause is trip
+    assert (
+        decision.state is State.LATCHED
+        and decision.u == STILL
+        and decision.trip is trip
+        and decision.cause is trip
+    )
     again = hand.decide(u=(0.1, 0.0, 0.1))
     assert again.state is State.LATCHED and again.u == STILL and again.trip is trip
     assert hand.decide(RELEASED).state is State.READY
@@ -139,8 +157,12 @@ def test_anything_wrong_is_zero_in_the_same_cycle_and_latches_until_release_and_
     assert pressed.state is State.ACTIVE and pressed.cause is Trip.NONE
 
 
-@pytest.mark.parametrize("change", [change for change, _ in WRONG if "dt" not in change] + [{"deadman": False}], ids=str)
-def test_what_ends_a_motion_is_known_when_it_is_seen_and_nothing_else_needs_haste(change: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "change", [change for change, _ in WRONG if "dt" not in change] + [{"deadman": False}], ids=str
+)
+def test_what_ends_a_motion_is_known_when_it_is_seen_and_nothing_else_needs_haste(
+    change: dict[str, Any],
+) -> None:
     hand = Hand()
     assert not hand.guard.stops(replace(WELL, **change))  # nothing moves: the next cycle does
     hand.active()
@@ -151,7 +173,9 @@ def test_what_ends_a_motion_is_known_when_it_is_seen_and_nothing_else_needs_hast
 
 
 @pytest.mark.parametrize(("change", "trip"), WRONG, ids=str)
-def test_nobody_is_let_out_of_the_latch_while_something_is_wrong(change: dict[str, Any], trip: Trip) -> None:
+def test_nobody_is_let_out_of_the_latch_while_something_is_wrong(
+    change: dict[str, Any], trip: Trip
+) -> None:
     hand = Hand()
     hand.decide(RELEASED)
     hand.decide(RELEASED)
@@ -161,7 +185,9 @@ def test_nobody_is_let_out_of_the_latch_while_something_is_wrong(change: dict[st
 
 
 @pytest.mark.parametrize(("u", "age_s", "trip"), ASKED, ids=str)
-def test_a_request_that_makes_no_sense_is_refused_before_use(u: tuple[float, ...] | None, age_s: float, trip: Trip) -> None:
+def test_a_request_that_makes_no_sense_is_refused_before_use(
+    u: tuple[float, ...] | None, age_s: float, trip: Trip
+) -> None:
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.1))
     decision = hand.decide(u=u, age_s=age_s)
@@ -199,7 +225,18 @@ def test_commands_grow_by_the_rate_and_end_at_the_limit() -> None:
     hand = Hand().active()
     found = [hand.decide(u=(1.0, 0.0, -1.0)).u for _ in range(10)]
     assert [round(u[0], 6) for u in found] == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.8, 0.8]
-    assert [round(u[2], 6) for u in found] == [-0.1, -0.2, -0.3, -0.4, -0.5, -0.6, -0.7, -0.8, -0.8, -0.8]
+    assert [round(u[2], 6) for u in found] == [
+        -0.1,
+        -0.2,
+        -0.3,
+        -0.4,
+        -0.5,
+        -0.6,
+        -0.7,
+        -0.8,
+        -0.8,
+        -0.8,
+    ]
 
 
 def test_growth_goes_by_time_not_by_cycles() -> None:
@@ -272,12 +309,26 @@ def test_whatever_happens_the_guard_keeps_its_promises(story: list[dict[str, Any
         for j, (value, last) in enumerate(zip(decision.u, before, strict=True)):
             grown = abs(value) - (abs(last) if value * last > 0 else 0.0)
             assert grown <= LIMITS.max_rate_1_s * dt + 1e-9
-            at, lower, upper = cycle["q"][j], BODY.lower[j] + LIMITS.stop_margin, BODY.upper[j] - LIMITS.stop_margin
+            at, lower, upper = (
+                cycle["q"][j],
+                BODY.lower[j] + LIMITS.stop_margin,
+                BODY.upper[j] - LIMITS.stop_margin,
+            )
             assert not (value > 0 and at >= upper) and not (value < 0 and at <= lower)
         if any(moved):
             assert decision.state is State.ACTIVE and state is State.ACTIVE
-            assert cycle["armed"] and cycle["deadman"] and not cycle["estop"] and cycle["lever"] == 0 and pressed
-            assert cycle["u"] is not None and all(map(math.isfinite, cycle["u"])) and cycle["age_s"] <= LIMITS.request_s
+            assert (
+                cycle["armed"]
+                and cycle["deadman"]
+                and not cycle["estop"]
+                and cycle["lever"] == 0
+                and pressed
+            )
+            assert (
+                cycle["u"] is not None
+                and all(map(math.isfinite, cycle["u"]))
+                and cycle["age_s"] <= LIMITS.request_s
+            )
             assert dt <= LIMITS.gap_s and cycle["joints_age_s"] <= LIMITS.joints_s
         if decision.state is State.ACTIVE and state is not State.ACTIVE:
             assert state is State.READY and cycle["deadman"] and not any(moved)
@@ -305,7 +356,10 @@ def test_a_joint_that_stays_at_its_new_place_is_believed_once_it_could_have_got_
     assert not any(found[:32]) and all(found[32:])  # (0.5 - 0.01) / 1.5 rad/s = 0.327 s
 
 
-@pytest.mark.parametrize(("position", "good"), [(1.2, True), (1.2001, False), (-1.2, True), (-1.2001, False), (math.nan, False)])
+@pytest.mark.parametrize(
+    ("position", "good"),
+    [(1.2, True), (1.2001, False), (-1.2, True), (-1.2001, False), (math.nan, False)],
+)
 def test_a_position_beyond_the_limits_is_refused(position: float, good: bool) -> None:
     assert Plausibility(LIMITS, BODY).accept(0, 0.0, position) is good
 
@@ -333,7 +387,14 @@ def test_limits_that_make_no_sense_are_refused(change: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"max_command": 1.0}, {"overrun": 0.0}, {"stop_margin": 0.0}, {"jump_margin": 1.0}, {"num_jumps": 1}, {"neutral": 0.999}],
+    [
+        {"max_command": 1.0},
+        {"overrun": 0.0},
+        {"stop_margin": 0.0},
+        {"jump_margin": 1.0},
+        {"num_jumps": 1},
+        {"neutral": 0.999},
+    ],
     ids=str,
 )
 def test_limits_at_their_ends_are_allowed(change: dict[str, Any]) -> None:
@@ -352,7 +413,9 @@ def test_a_gateway_that_does_not_follow_is_noticed() -> None:
     for _ in range(3):
         hand.decide(u=(0.05, 0.0, 0.0), dt=0.1, followed=False)
     decision = hand.decide(u=(0.05, 0.0, 0.0), dt=0.01, followed=False)
-    assert decision.state is State.LATCHED and decision.u == STILL and decision.cause is Trip.IGNORED
+    assert (
+        decision.state is State.LATCHED and decision.u == STILL and decision.cause is Trip.IGNORED
+    )
 
 
 def test_a_gateway_has_all_of_the_time_that_it_is_given_to_follow() -> None:
@@ -374,7 +437,12 @@ def test_nobody_needs_to_follow_what_is_not_commanded() -> None:
 
 
 def test_the_states_have_the_numbers_that_travel_on_the_bus() -> None:
-    assert {state.name: state.value for state in State} == {"SILENT": 0, "LATCHED": 1, "READY": 2, "ACTIVE": 3}
+    assert {state.name: state.value for state in State} == {
+        "SILENT": 0,
+        "LATCHED": 1,
+        "READY": 2,
+        "ACTIVE": 3,
+    }
 
 
 def test_what_lies_exactly_on_a_limit_of_time_or_reach_is_allowed() -> None:
@@ -383,9 +451,16 @@ def test_what_lies_exactly_on_a_limit_of_time_or_reach_is_allowed() -> None:
     hand.now_s = 0.0
     hand.decide(RELEASED, dt=0.25)
     hand.decide(RELEASED, dt=0.25)
-    assert hand.decide(WELL, dt=0.25).state is State.ACTIVE and hand.decide(WELL, dt=0.25).trip is Trip.NONE
+    assert (
+        hand.decide(WELL, dt=0.25).state is State.ACTIVE
+        and hand.decide(WELL, dt=0.25).trip is Trip.NONE
+    )
     watch = Plausibility(limits, BODY)
-    assert watch.accept(0, 0.0, 0.0) and watch.accept(0, 0.25, 0.5) and not watch.accept(0, 0.25, 0.7501)
+    assert (
+        watch.accept(0, 0.0, 0.0)
+        and watch.accept(0, 0.25, 0.5)
+        and not watch.accept(0, 0.25, 0.7501)
+    )
 
 
 def test_positions_are_plausible_until_as_many_jumps_as_it_takes() -> None:

@@ -54,7 +54,9 @@ def test_a_writer_killed_in_the_middle_leaves_the_record_before_it() -> None:
         record["a"] = number
         slot.write(record)
     at = 8 + slot._stride * (3 % 2)
-    slot.memory.bytes[at : at + 8] = b"torn ..."  # the third record was begun, its number never written
+    slot.memory.bytes[at : at + 8] = (
+        b"torn ..."  # the third record was begun, its number never written
+    )
     found = slot.read()
     assert found is not None and found["a"] == 2.0
     slot.memory.close()
@@ -81,18 +83,29 @@ def test_a_deadline_that_was_missed_is_skipped_and_counted(monkeypatch: pytest.M
         assert pace.begin() == skipped
         assert pace.next_s == pytest.approx(next_s)
     report = pace.report()
-    assert report["cycles"] == 3 and report["missed"] == 2 and report["late_max_s"] == pytest.approx(0.12)
+    assert (
+        report["cycles"] == 3
+        and report["missed"] == 2
+        and report["late_max_s"] == pytest.approx(0.12)
+    )
 
 
 def state(machine: Machine, number: int, flow: float, q: float, now_s: float = 0.0) -> Any:
     record = np.zeros((), state_fields(machine.num_joints))
     record["t_s"] = record["q_t_s"] = now_s
-    record["q"], record["flow_number"], record["flow_sum"], record["flow"] = q, number, flow * number, flow
+    record["q"], record["flow_number"], record["flow_sum"], record["flow"] = (
+        q,
+        number,
+        flow * number,
+        flow,
+    )
     record["q_plausible"] = record["trusted"] = True
     return record
 
 
-def test_the_ring_holds_positions_and_mean_flows_of_each_period_as_training_does(machine: Machine) -> None:
+def test_the_ring_holds_positions_and_mean_flows_of_each_period_as_training_does(
+    machine: Machine,
+) -> None:
     ring = Ring(machine)
     for k in range(machine.num_history):
         assert not ring.full
@@ -120,7 +133,9 @@ def test_valves_that_say_nothing_more_empty_the_ring(machine: Machine) -> None:
         ring.sample(state(machine, k + 1, 0.0, 1.0), missed=0)
     late = state(machine, 13, 0.4, 1.0)
     ring.sample(late, missed=0)
-    assert ring.full and ring.u[-1].tolist() == [0.4] * 5, "one period without a message: they still get what they got"
+    assert ring.full and ring.u[-1].tolist() == [0.4] * 5, (
+        "one period without a message: they still get what they got"
+    )
     ring.sample(late, missed=0)
     assert ring.filled == 1
     ring.sample(late, missed=0)
@@ -130,20 +145,29 @@ def test_valves_that_say_nothing_more_empty_the_ring(machine: Machine) -> None:
 def test_levers_are_those_of_the_paper(machine: Machine) -> None:
     levers = LeverMap(machine.levers, machine)
     angles, button = levers.levers(np.array([0.1, 0.0, 0.3, 0.4, 0.5]))
-    assert angles == pytest.approx([0.35 * 0.4, 0.35 * 0.1, 0.35 * 0.3, 0.35 * 0.5]) and not button  # left q4, q1; right q3, q5
+    assert (
+        angles == pytest.approx([0.35 * 0.4, 0.35 * 0.1, 0.35 * 0.3, 0.35 * 0.5]) and not button
+    )  # left q4, q1; right q3, q5
     angles, button = levers.levers(np.array([0.0, -0.6, 0.0, 0.0, 0.0]))
-    assert angles == pytest.approx([0.0, 0.0, -0.21, 0.0]) and button  # q2 on the right lever, with the button
+    assert (
+        angles == pytest.approx([0.0, 0.0, -0.21, 0.0]) and button
+    )  # q2 on the right lever, with the button
 
 
 @pytest.mark.parametrize("name", ["machine", "iso", "sae"])
 def test_hands_that_follow_exactly_give_the_command(name: str, machine: Machine) -> None:
-    levers, generator = LeverMap(option("guidance", name).levers or machine.levers, machine), np.random.default_rng(0)
+    levers, generator = (
+        LeverMap(option("guidance", name).levers or machine.levers, machine),
+        np.random.default_rng(0),
+    )
     for alone in (True, False) * 20:
         command = np.where(machine.is_exclusive == alone, generator.uniform(-1, 1, 5), 0.0)
         assert levers.command(*levers.levers(command)) == pytest.approx(command)
 
 
-def test_what_is_shown_changes_no_faster_than_a_hand_and_passes_neutral_before_the_button(machine: Machine) -> None:
+def test_what_is_shown_changes_no_faster_than_a_hand_and_passes_neutral_before_the_button(
+    machine: Machine,
+) -> None:
     display = LeverDisplay(option("guidance", "machine"), machine)
     before, shown = np.zeros(4), []
     for u in [np.array([0, 0, 1.0, 0, 0])] * 6 + [np.array([0, 1.0, 0, 0, 0])] * 12:
@@ -185,12 +209,16 @@ def change(folder: Path, name: str, **values: Any) -> None:
 
 def test_the_shipped_policy_acts_here_as_where_it_was_made(machine: Machine) -> None:
     bundle = Bundle(SHIPPED, machine)
-    golden = json.loads((Path(__file__).parents[2] / "tasks/policies/borehole_insertion/golden.json").read_text())
+    golden = json.loads(
+        (Path(__file__).parents[2] / "tasks/policies/borehole_insertion/golden.json").read_text()
+    )
     found = bundle.command(np.array(golden["observation"], np.float32))
     assert np.abs(found - np.array(golden["command"])).max() < 1e-3 and np.abs(found).max() > 0.5
 
 
-def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(machine: Machine, copied: Path) -> None:
+def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
+    machine: Machine, copied: Path
+) -> None:
     others = {
         "joints": replace(machine, joints=machine.joints[::-1]),
         "control": replace(machine, num_history=14),
@@ -215,13 +243,17 @@ def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(mac
     ],
     ids=str,
 )
-def test_a_contract_that_says_otherwise_is_refused(machine: Machine, copied: Path, values: dict[str, Any], message: str) -> None:
+def test_a_contract_that_says_otherwise_is_refused(
+    machine: Machine, copied: Path, values: dict[str, Any], message: str
+) -> None:
     change(copied, "policy.json", **values)
     with pytest.raises(CheckpointError, match=message):
         Bundle(str(copied), machine)
 
 
-def test_a_policy_that_was_told_its_observations_otherwise_is_refused(machine: Machine, copied: Path) -> None:
+def test_a_policy_that_was_told_its_observations_otherwise_is_refused(
+    machine: Machine, copied: Path
+) -> None:
     observation = json.loads((copied / "policy.json").read_text())["observation"]
     observation["q"]["std"][0] *= 2
     change(copied, "policy.json", observation=observation)
@@ -229,7 +261,9 @@ def test_a_policy_that_was_told_its_observations_otherwise_is_refused(machine: M
         Bundle(str(copied), machine)
 
 
-def test_a_bundle_that_is_mixed_damaged_or_incomplete_is_refused(machine: Machine, copied: Path) -> None:
+def test_a_bundle_that_is_mixed_damaged_or_incomplete_is_refused(
+    machine: Machine, copied: Path
+) -> None:
     golden = json.loads((copied / "golden.json").read_text())
     golden["command"][3][2] += 0.01
     (copied / "golden.json").write_text(json.dumps(golden))
@@ -249,11 +283,15 @@ def test_a_bundle_that_is_mixed_damaged_or_incomplete_is_refused(machine: Machin
 @pytest.fixture
 def adviser(machine: Machine) -> Adviser:
     exchange = Exchange.new(machine.num_joints, commands=False)
-    counsel = Counsel(machine, SHIPPED, option("guidance", "machine"), stale_s=0.15, target_s=60.0, pitch_rad=None)
+    counsel = Counsel(
+        machine, SHIPPED, option("guidance", "machine"), stale_s=0.15, target_s=60.0, pitch_rad=None
+    )
     return Adviser(counsel, Bundle(SHIPPED, machine), exchange)
 
 
-def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(adviser: Adviser, machine: Machine) -> None:
+def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(
+    adviser: Adviser, machine: Machine
+) -> None:
     exchange, now_s, found = adviser._exchange, 1000.0, []
     assert adviser.cycle(0, now_s) is Advised.NO_STATE
     for k in range(30):
@@ -267,7 +305,9 @@ def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(adv
             exchange.target.write(target)
         found.append(adviser.cycle(0, now_s))
     assert (
-        found[:12] == [Advised.WARMING_UP] * 12 and found[12:15] == [Advised.NO_TARGET] * 3 and set(found[15:]) == {Advised.VALID}
+        found[:12] == [Advised.WARMING_UP] * 12
+        and found[12:15] == [Advised.NO_TARGET] * 3
+        and set(found[15:]) == {Advised.VALID}
     )
     shown = view(exchange)
     assert shown.advice is not None and shown.advice.valid and any(shown.advice.command)
@@ -278,7 +318,8 @@ def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(adv
 
 
 @pytest.mark.parametrize(
-    ("change", "reason"), [({"q_plausible": False}, Advised.IMPLAUSIBLE), ({"trusted": False}, Advised.IMPLAUSIBLE)]
+    ("change", "reason"),
+    [({"q_plausible": False}, Advised.IMPLAUSIBLE), ({"trusted": False}, Advised.IMPLAUSIBLE)],
 )
 def test_positions_that_are_not_to_be_believed_give_no_advice(
     adviser: Adviser, machine: Machine, change: dict[str, bool], reason: Advised
@@ -290,12 +331,18 @@ def test_positions_that_are_not_to_be_believed_give_no_advice(
     assert adviser.cycle(0, 1000.0) is reason
 
 
-def test_an_answer_that_makes_no_sense_is_not_shown(adviser: Adviser, machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_that_makes_no_sense_is_not_shown(
+    adviser: Adviser, machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     exchange, now_s = adviser._exchange, 1000.0
     target = exchange.target.new()
     target["t_s"] = now_s
     exchange.target.write(target)
-    for answer in (np.array([np.nan, 0, 0, 0, 0]), np.array([1.1, 0, 0, 0, 0]), np.array([0.1, 0.1, 0, 0, 0])):
+    for answer in (
+        np.array([np.nan, 0, 0, 0, 0]),
+        np.array([1.1, 0, 0, 0, 0]),
+        np.array([0.1, 0.1, 0, 0, 0]),
+    ):
         monkeypatch.setattr(adviser._bundle, "command", lambda _, answer=answer: answer[None])
         for _ in range(14):
             now_s += machine.period_s
@@ -313,7 +360,11 @@ def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_pa
     path.write_text('{"center_in_base_m": [2.5, 0.1, 0.7]}')
     os.utime(path, ns=(time.time_ns() - 5 * 10**9,) * 2)
     first = target.news([])
-    assert first is not None and first.center_in_base_m.tolist() == [2.5, 0.1, 0.7] and first.t_s is not None
+    assert (
+        first is not None
+        and first.center_in_base_m.tolist() == [2.5, 0.1, 0.7]
+        and first.t_s is not None
+    )
     assert time.monotonic() - first.t_s == pytest.approx(5.0, abs=0.5)
     assert target.news([]) is None
     path.write_text('{"center": 1}')

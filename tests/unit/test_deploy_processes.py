@@ -17,7 +17,8 @@ from deploy.loop.outlet import view
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 SLACK = 3.0 if os.environ.get("CI") or os.cpu_count() == 2 else 1.0
-"""On shared cores a process without real-time priority may be late itself; the figures proper are the benchmark's."""
+"""On shared cores a process without real-time priority may be late itself; the figures proper are
+the benchmark's."""
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,9 @@ FAULTS = [  # the whole catalogue; the normal suite tries those without a mark
 
 
 @pytest.mark.parametrize(("fault", "message", "limit_s"), FAULTS)
-def test_a_fault_stops_the_machine_in_time(desk: Desk, fault: str, message: str, limit_s: float) -> None:
+def test_a_fault_stops_the_machine_in_time(
+    desk: Desk, fault: str, message: str, limit_s: float
+) -> None:
     desk.set_moving()
     since_s = desk.fault(fault, message)
     found_s = _stopped(desk, fault, since_s)
@@ -89,13 +92,18 @@ def test_the_operators_lever_always_wins(desk: Desk) -> None:
     time.sleep(0.1)
     heard = desk.heard("ValveFeedback", 0.1)
     desk.fault("none")
-    assert heard and all(values["FlowSource"] == 1 and values["Flow_q1"] == 0 and values["Flow_q4"] > 0.4 for _, values in heard)
+    assert heard and all(
+        values["FlowSource"] == 1 and values["Flow_q1"] == 0 and values["Flow_q4"] > 0.4
+        for _, values in heard
+    )
     state = desk.exchange.state.read()
     assert state is not None and not state["sent"].any()
 
 
 @pytest.mark.parametrize("fault", ["drop_some", "duplicate"])
-def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero_but_is_never_used(desk: Desk, fault: str) -> None:
+def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero_but_is_never_used(
+    desk: Desk, fault: str
+) -> None:
     desk.set_moving()
     desk.fault(fault, "JointPos1", 0.5)
     time.sleep(0.5)

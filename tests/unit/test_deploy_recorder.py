@@ -27,17 +27,30 @@ from deploy.recorder.conversion import CaptureLog
 READER = CaptureLog(longest_gap_s=0.15, shortest_s=1.0)
 
 
-def write(folder: Path, machine: Machine, seconds: float = 3.0, gap_s: float = 0.0, close: bool = True) -> Log:
+def write(
+    folder: Path, machine: Machine, seconds: float = 3.0, gap_s: float = 0.0, close: bool = True
+) -> Log:
     """Writes a capture of a machine whose first joint follows a known path: q1 = 0.1 t, flow a step of 0.5 at 1.025 s."""
-    bus, log = Description(DBC, machine), Log(Capture(folder, DBC, machine, {"source": "test"}, 0.0))
+    bus, log = (
+        Description(DBC, machine),
+        Log(Capture(folder, DBC, machine, {"source": "test"}, 0.0)),
+    )
     begun_s, counter = time.monotonic(), 0
     for k in range(round(seconds * 100)):
         t_s = k * 0.01
-        values = {f"Position_q{j}": 0.1 * t_s for j in range(1, 6)} | {f"Valid_q{j}": 1 for j in range(1, 6)}
-        values |= {f"Flow_q{j}": 0.5 if t_s > 1.02 else 0.0 for j in (1, 3)} | {"OilTemperature": 35}
+        values = {f"Position_q{j}": 0.1 * t_s for j in range(1, 6)} | {
+            f"Valid_q{j}": 1 for j in range(1, 6)
+        }
+        values |= {f"Flow_q{j}": 0.5 if t_s > 1.02 else 0.0 for j in (1, 3)} | {
+            "OilTemperature": 35
+        }
         if gap_s and 1.5 <= t_s < 1.5 + gap_s:
             continue
-        names = ["JointPos1", "JointPos2", *(("ValveFeedback", "MachineStatus") if k % 2 == 0 else ())]
+        names = [
+            "JointPos1",
+            "JointPos2",
+            *(("ValveFeedback", "MachineStatus") if k % 2 == 0 else ()),
+        ]
         data = b""
         for name in names:
             payload = bus.encode(name, values, counter)
@@ -67,31 +80,48 @@ def test_a_capture_becomes_the_recording_of_what_happened(machine: Machine, tmp_
     assert again.rate_hz == 20.0 and again.num_samples == pytest.approx(59, abs=2)
     assert again.q[:, 0] == pytest.approx(0.1 * again.t_s, abs=1e-3)
     step = int(np.flatnonzero(again.u[:, 0] > 0)[0])
-    assert again.t_s[step] == pytest.approx(1.0) and again.u[step, 0] == pytest.approx(0.2, abs=0.11)  # part of that period
+    assert again.t_s[step] == pytest.approx(1.0) and again.u[step, 0] == pytest.approx(
+        0.2, abs=0.11
+    )  # part of that period
     assert (again.u[step + 1 :, 0] == pytest.approx(0.5)) and not again.u[:, 1].any()
     assert again.extra["oil_c"] == pytest.approx(35.0) and np.isnan(again.extra["advice_q1"][5])
-    assert again.extra["advice_q1"][20] == pytest.approx(0.1) and again.metadata["source"] == "capture: test"
+    assert (
+        again.extra["advice_q1"][20] == pytest.approx(0.1)
+        and again.metadata["source"] == "capture: test"
+    )
 
 
 def test_a_gap_splits_the_recording(machine: Machine, tmp_path: Path) -> None:
     write(tmp_path, machine, seconds=4.0, gap_s=0.4)
     pieces = READER.read(tmp_path / MCAP, machine)
-    assert [round(piece.duration_s, 1) for piece in pieces] == [pytest.approx(1.4, abs=0.11), pytest.approx(2.0, abs=0.11)]
+    assert [round(piece.duration_s, 1) for piece in pieces] == [
+        pytest.approx(1.4, abs=0.11),
+        pytest.approx(2.0, abs=0.11),
+    ]
     assert pieces[0].metadata["run"] == pieces[1].metadata["run"]
 
 
-def test_nothing_that_was_flushed_is_lost_when_the_log_is_killed(machine: Machine, tmp_path: Path) -> None:
+def test_nothing_that_was_flushed_is_lost_when_the_log_is_killed(
+    machine: Machine, tmp_path: Path
+) -> None:
     log = write(tmp_path, machine, close=False)  # never closed, as after SIGKILL
     contents = reading.read(tmp_path / MCAP)
     positions = contents.messages["JointPos1"]
-    assert not contents.whole and positions[-1][0] - positions[0][0] >= 2.49  # flushed last at 2.5 s
+    assert (
+        not contents.whole and positions[-1][0] - positions[0][0] >= 2.49
+    )  # flushed last at 2.5 s
     frames = list(reading.frames(tmp_path / BLF))
-    assert frames[-1].timestamp - frames[0].timestamp >= 2.49 and abs(frames[0].timestamp - time.time()) < 60
+    assert (
+        frames[-1].timestamp - frames[0].timestamp >= 2.49
+        and abs(frames[0].timestamp - time.time()) < 60
+    )
     log.__exit__(None)
 
 
 @pytest.mark.parametrize("part", [0.3, 0.5, 0.9, 0.999])
-def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(machine: Machine, tmp_path: Path, part: float) -> None:
+def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(
+    machine: Machine, tmp_path: Path, part: float
+) -> None:
     write(tmp_path, machine)
     whole = len(reading.read(tmp_path / MCAP).messages["JointPos1"])
     for name in (MCAP, BLF):
@@ -100,11 +130,21 @@ def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(machine: Machine, t
     count = reading.recover_mcap(tmp_path / f"cut_{MCAP}", tmp_path / "new.mcap")
     with (tmp_path / "new.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
-    assert summary is not None and summary.statistics is not None and summary.statistics.message_count == count
+    assert (
+        summary is not None
+        and summary.statistics is not None
+        and summary.statistics.message_count == count
+    )
     found = reading.read(tmp_path / "new.mcap")
-    assert found.whole and found.facts["source"] == "test" and 0 < len(found.messages["JointPos1"]) <= whole
+    assert (
+        found.whole
+        and found.facts["source"] == "test"
+        and 0 < len(found.messages["JointPos1"]) <= whole
+    )
     assert len(found.messages["JointPos1"]) >= min(1.0, part - 0.25) * whole
-    assert reading.recover_blf(tmp_path / f"cut_{BLF}", tmp_path / "new.blf") == len(list(can.BLFReader(tmp_path / "new.blf")))
+    assert reading.recover_blf(tmp_path / f"cut_{BLF}", tmp_path / "new.blf") == len(
+        list(can.BLFReader(tmp_path / "new.blf"))
+    )
 
 
 def test_frames_that_were_refused_are_kept_and_said(machine: Machine, tmp_path: Path) -> None:
@@ -112,23 +152,34 @@ def test_frames_that_were_refused_are_kept_and_said(machine: Machine, tmp_path: 
     with Log(Capture(tmp_path, DBC, machine, {}, 0.0)) as log:
         payload = bytearray(bus.encode("JointPos1", {}, 1))
         payload[0] ^= 1
-        log.add(FRAMES + FRAME.pack(time.monotonic(), bus.layouts["JointPos1"].frame_id, 0, 8) + payload)
+        log.add(
+            FRAMES + FRAME.pack(time.monotonic(), bus.layouts["JointPos1"].frame_id, 0, 8) + payload
+        )
     assert reading.read(tmp_path / MCAP).messages["refused"][0][1]["fault"] == "wrong CRC"
     assert bytes(next(iter(reading.frames(tmp_path / BLF))).data) == bytes(payload)
 
 
-def test_a_step_of_the_wall_clock_shows_nowhere(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_of_the_wall_clock_shows_nowhere(
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real, shift_ns = time.time_ns, 0
     monkeypatch.setattr("time.time_ns", lambda: real() + shift_ns)
     with Log(Capture(tmp_path, DBC, machine, {}, 0.0)) as log:
         for shift_ns in (0, 3600 * 10**9, -3600 * 10**9):  # noqa: B007
-            log.add(TEXT + json.dumps({"topic": "advice", "t_s": time.monotonic(), "reason": "valid", "u": [0.0] * 5}).encode())
+            log.add(
+                TEXT
+                + json.dumps(
+                    {"topic": "advice", "t_s": time.monotonic(), "reason": "valid", "u": [0.0] * 5}
+                ).encode()
+            )
     with (tmp_path / MCAP).open("rb") as file:
         times = [message.log_time for _, _, message in make_reader(file).iter_messages(["advice"])]
     assert len(times) == 3 and 0 <= times[2] - times[0] < 5 * 10**9
 
 
-def test_a_capture_of_another_machine_or_of_nothing_is_refused(machine: Machine, tmp_path: Path) -> None:
+def test_a_capture_of_another_machine_or_of_nothing_is_refused(
+    machine: Machine, tmp_path: Path
+) -> None:
     write(tmp_path, machine, seconds=1.5)
     with pytest.raises(RecordingError, match="another machine"):
         READER.read(tmp_path / MCAP, replace(machine, name="other"))
@@ -141,26 +192,42 @@ def test_a_capture_of_another_machine_or_of_nothing_is_refused(machine: Machine,
         READER.read(tmp_path / "none.mcap", machine)
 
 
-def test_recover_and_convert_are_commands(brokk: Callable[..., Any], machine: Machine, tmp_path: Path) -> None:
+def test_recover_and_convert_are_commands(
+    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
+) -> None:
     write(tmp_path / "run", machine, seconds=6.5)
     content = (tmp_path / "run" / MCAP).read_bytes()
     (tmp_path / "run" / MCAP).write_bytes(content[:-200])
     (tmp_path / "run/timing.json").write_text("{}")
     assert brokk("mode=recover", "recover.input=run/*", "session.out=whole").code == 0
     assert brokk("mode=recover", "recover.input=run/*.json", "session.out=x").code == 2
-    assert {path.name for path in (tmp_path / "whole").iterdir()} >= {"run_capture.mcap", "run_frames.blf"}
+    assert {path.name for path in (tmp_path / "whole").iterdir()} >= {
+        "run_capture.mcap",
+        "run_frames.blf",
+    }
     done = brokk("mode=convert", "import=capture", "convert.input=whole/*.mcap", "session.out=made")
     assert done.code == 0 and len(record.read_all("made/recordings/*.parquet", machine)) == 1
     assert brokk("mode=recover", "recover.input=nothing/*", "session.out=x").code == 2
 
 
 def test_messages_of_numbers_are_kept_by_column_and_others_as_they_are() -> None:
-    said = [(0.1, {"q": 1.5, "sent": True}), (0.2, {"q": 2, "sent": False}), (0.3, {"q": -1.0, "sent": True})]
+    said = [
+        (0.1, {"q": 1.5, "sent": True}),
+        (0.2, {"q": 2, "sent": False}),
+        (0.3, {"q": -1.0, "sent": True}),
+    ]
     messages = reading.Messages()
     for t_s, values in said:
         messages.add(t_s, values)
-    assert list(messages) == said and messages[-1] == said[-1] and messages[:2] == said[:2] and len(messages) == 3
-    assert messages.series("q").tolist() == [1.5, 2.0, -1.0] and messages.series("t_s").tolist() == [0.1, 0.2, 0.3]
+    assert (
+        list(messages) == said
+        and messages[-1] == said[-1]
+        and messages[:2] == said[:2]
+        and len(messages) == 3
+    )
+    assert messages.series("q").tolist() == [1.5, 2.0, -1.0] and messages.series(
+        "t_s"
+    ).tolist() == [0.1, 0.2, 0.3]
     said += [(0.4, {"q": 0.0, "why": "text"}), (0.5, {"q": 7.0})]
     for t_s, values in said[3:]:
         messages.add(t_s, values)

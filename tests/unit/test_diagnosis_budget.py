@@ -22,13 +22,19 @@ PERIOD_S, DELAY = 0.05, 11
 DEAD_TIME_S = np.full(5, DELAY * PERIOD_S)
 
 
-def recording(machine: Machine, seed: int, seconds: float = 90.0, u: np.ndarray | None = None) -> Recording:
+def recording(
+    machine: Machine, seed: int, seconds: float = 90.0, u: np.ndarray | None = None
+) -> Recording:
     """Returns a recording of all joints but q2 moving at random levels."""
     rng, steps = np.random.default_rng(seed), round(seconds / PERIOD_S)
     if u is None:
         u = np.zeros((steps, 5))
         for begin in range(0, steps, 30):
-            u[begin : begin + 30] = rng.choice([-0.9, -0.5, -0.2, 0.0, 0.2, 0.5, 0.9], 5) * [1, 0, 1, 1, 1] * (rng.random(5) < 0.4)
+            u[begin : begin + 30] = (
+                rng.choice([-0.9, -0.5, -0.2, 0.0, 0.2, 0.5, 0.9], 5)
+                * [1, 0, 1, 1, 1]
+                * (rng.random(5) < 0.4)
+            )
     moved = np.zeros((steps, 5))
     moved[DELAY:] = 0.2 * u[:-DELAY] * machine.max_speed * PERIOD_S
     q = machine.home + np.cumsum(moved, 0)
@@ -41,7 +47,9 @@ def recording(machine: Machine, seed: int, seconds: float = 90.0, u: np.ndarray 
 def runs(machine: Machine, recordings: list[Recording], change=lambda speed, r: speed) -> FreeRuns:
     """Returns free runs of 5 s whose simulated speed is `change` of the measured one, `(T, J)`."""
     row = np.concatenate([np.arange(40, r.num_samples - 99, 100) for r in recordings])
-    source = np.concatenate([np.full(len(np.arange(40, r.num_samples - 99, 100)), n) for n, r in enumerate(recordings)])
+    source = np.concatenate(
+        [np.full(len(np.arange(40, r.num_samples - 99, 100)), n) for n, r in enumerate(recordings)]
+    )
     empty = FreeRuns(recordings, source, row, np.zeros((len(row), 100, 5)))
     speed = empty.cut([change(np.diff(r.q, axis=0, prepend=r.q[:1]), r) for r in recordings])
     start = np.stack([recordings[s].q[k - 1] for s, k in zip(source, row, strict=True)])
@@ -56,14 +64,22 @@ def test_a_slewing_error_moves_the_tip_along_its_circle(machine: Machine) -> Non
     still = replace(recording(machine, 0), q=np.tile(machine.home, (1800, 1)))
     quiet = runs(machine, [still])
     turned = replace(quiet, simulated=quiet.simulated + np.array([0.01, 0.0, 0.0, 0.0, 0.0]))
-    x, y, _ = Kinematics(machine).pose(torch.tensor(machine.home, dtype=torch.float32)).tip_in_base_m.tolist()
+    x, y, _ = (
+        Kinematics(machine)
+        .pose(torch.tensor(machine.home, dtype=torch.float32))
+        .tip_in_base_m.tolist()
+    )
     found = account(turned, machine)
-    assert found.tip_rms_m == pytest.approx(2.0 * np.sin(0.005) * np.hypot(x, y), rel=1e-3)  # a chord
+    assert found.tip_rms_m == pytest.approx(
+        2.0 * np.sin(0.005) * np.hypot(x, y), rel=1e-3
+    )  # a chord
     assert found.joint_rms_m["q1"] == pytest.approx(0.01 * np.hypot(x, y), rel=1e-3)
     assert found.joint_part["q1"] == pytest.approx(1.0) and found.joint_rms_m["q3"] == 0.0
 
 
-def test_joints_share_the_tip_error_and_those_that_cancel_count_below_zero(machine: Machine) -> None:
+def test_joints_share_the_tip_error_and_those_that_cancel_count_below_zero(
+    machine: Machine,
+) -> None:
     still = replace(recording(machine, 0), q=np.tile(machine.home, (1800, 1)))
     quiet = runs(machine, [still])
     error = np.array([0.0, 0.010, -0.004, 0.0, 0.0])
@@ -82,15 +98,23 @@ def test_joints_share_the_tip_error_and_those_that_cancel_count_below_zero(machi
         ("encoder_scale q4", 0.03, lambda q: q * np.where(np.arange(5) == 3, 1.03, 1.0)),
     ],
 )
-def test_an_error_of_geometry_is_named_with_its_size(machine: Machine, cause: str, size: float, change) -> None:
+def test_an_error_of_geometry_is_named_with_its_size(
+    machine: Machine, cause: str, size: float, change
+) -> None:
     moved = recording(machine, 0)
-    tip = Kinematics(machine).pose(torch.as_tensor(moved.q, dtype=torch.float32)).tip_in_base_m.numpy()
+    tip = (
+        Kinematics(machine)
+        .pose(torch.as_tensor(moved.q, dtype=torch.float32))
+        .tip_in_base_m.numpy()
+    )
     tip = tip + 0.0005 * np.random.default_rng(0).standard_normal(tip.shape)
     extra = dict(zip(COLUMNS, tip.T, strict=True))
     sound = geometry([replace(moved, extra=extra)], machine)
     assert sound is not None and sound.rms_m == pytest.approx(0.0005 * np.sqrt(3.0), rel=0.05)
     found = geometry([replace(moved, q=change(moved.q), extra=extra)], machine)
-    assert found is not None and found.cause == cause and found.size == pytest.approx(size, rel=0.03)
+    assert (
+        found is not None and found.cause == cause and found.size == pytest.approx(size, rel=0.03)
+    )
     assert found.explained > 0.95
     assert geometry([moved], machine) is None
 
@@ -98,9 +122,14 @@ def test_an_error_of_geometry_is_named_with_its_size(machine: Machine, cause: st
 def test_the_noise_of_a_sensor_is_told_from_its_motion(machine: Machine) -> None:
     moved = recording(machine, 0)
     noisy = replace(
-        moved, q=moved.q + np.array([0.0003, 0.001, 0.002, 0.0, 0.004]) * np.random.default_rng(0).standard_normal((1800, 5))
+        moved,
+        q=moved.q
+        + np.array([0.0003, 0.001, 0.002, 0.0, 0.004])
+        * np.random.default_rng(0).standard_normal((1800, 5)),
     )
-    assert measurement_noise([noisy])[[0, 1, 2, 4]] == pytest.approx([0.0003, 0.001, 0.002, 0.004], rel=0.15)
+    assert measurement_noise([noisy])[[0, 1, 2, 4]] == pytest.approx(
+        [0.0003, 0.001, 0.002, 0.004], rel=0.15
+    )
     assert measurement_noise([moved]).max() < 1e-6
 
 
@@ -129,15 +158,21 @@ def early(speed: np.ndarray, _: Recording) -> np.ndarray:
         ("flow_sharing", "q1", 0.2, alone),
     ],
 )
-def test_the_probe_of_what_was_planted_stands_out(machine: Machine, effect: str, joint: str, value: float, change) -> None:
+def test_the_probe_of_what_was_planted_stands_out(
+    machine: Machine, effect: str, joint: str, value: float, change
+) -> None:
     field = [recording(machine, seed) for seed in range(3)]
     reference = [recording(machine, seed) for seed in range(10, 16)]
     rng = np.random.default_rng(0)
 
     def shaken(run: FreeRuns) -> FreeRuns:
-        return replace(run, simulated=run.simulated + 1e-4 * rng.standard_normal(run.simulated.shape).cumsum(1))
+        return replace(
+            run, simulated=run.simulated + 1e-4 * rng.standard_normal(run.simulated.shape).cumsum(1)
+        )
 
-    found = probes(shaken(runs(machine, field, change)), shaken(runs(machine, reference)), machine, DEAD_TIME_S)
+    found = probes(
+        shaken(runs(machine, field, change)), shaken(runs(machine, reference)), machine, DEAD_TIME_S
+    )
     assert found[0].joint == joint
     (probe,) = (probe for probe in found if (probe.effect, probe.joint) == (effect, joint))
     assert probe.is_clear and probe.value == pytest.approx(value, rel=0.15)
@@ -151,11 +186,18 @@ def test_the_stage_is_where_the_error_was_planted(machine: Machine) -> None:
 
     def found(run: FreeRuns) -> tuple[str | None, dict[str, float | None]]:
         mine, other = (
-            replace(r, simulated=r.simulated + 1e-4 * rng.standard_normal(r.simulated.shape).cumsum(1)) for r in (run, reference)
+            replace(
+                r, simulated=r.simulated + 1e-4 * rng.standard_normal(r.simulated.shape).cumsum(1)
+            )
+            for r in (run, reference)
         )
         location = locate(mine, other, machine, DEAD_TIME_S, np.random.default_rng(0))
         known = Known(
-            location, probes(mine, other, machine, DEAD_TIME_S), Budget(account(mine, machine), None, None, {}), None, None
+            location,
+            probes(mine, other, machine, DEAD_TIME_S),
+            Budget(account(mine, machine), None, None, {}),
+            None,
+            None,
         )
         rows = stages(known, mine, other, machine)
         return foremost(rows, location.has_gap), {row.stage: row.part for row in rows}
@@ -165,23 +207,42 @@ def test_the_stage_is_where_the_error_was_planted(machine: Machine) -> None:
     assert found(runs(machine, field, lambda v, _: np.roll(v, -3, 0)))[0] == "timing"
     noisy = [replace(r, q=r.q + 0.004 * rng.standard_normal(r.q.shape)) for r in field]
     quiet = runs(machine, field)
-    start = np.stack([noisy[s].q[k - 1] - field[s].q[k - 1] for s, k in zip(quiet.source, quiet.row, strict=True)])[:, None]
-    assert found(replace(quiet, recordings=noisy, simulated=quiet.simulated + start))[0] == "sensing"
+    start = np.stack(
+        [
+            noisy[s].q[k - 1] - field[s].q[k - 1]
+            for s, k in zip(quiet.source, quiet.row, strict=True)
+        ]
+    )[:, None]
+    assert (
+        found(replace(quiet, recordings=noisy, simulated=quiet.simulated + start))[0] == "sensing"
+    )
     assert found(runs(machine, field))[0] is None
 
 
 def test_touches_are_held_against_the_estimated_hole(machine: Machine) -> None:
     still = recording(machine, 0)
-    tip = Kinematics(machine).pose(torch.as_tensor(still.q, dtype=torch.float32)).tip_in_base_m.numpy()
+    tip = (
+        Kinematics(machine)
+        .pose(torch.as_tensor(still.q, dtype=torch.float32))
+        .tip_in_base_m.numpy()
+    )
     force = np.zeros(1800)
     force[[300, 301, 302, 900, 901]] = 1000.0
-    extra = dict(zip(TARGET, (tip + np.array([0.03, 0.04, 0.0])).T, strict=True)) | {"force_n": force}
+    extra = dict(zip(TARGET, (tip + np.array([0.03, 0.04, 0.0])).T, strict=True)) | {
+        "force_n": force
+    }
     found = perception([replace(still, extra=extra)], machine)
-    assert found is not None and found.rms_m == pytest.approx(0.05, rel=1e-3) and "2 touches" in found.text
+    assert (
+        found is not None
+        and found.rms_m == pytest.approx(0.05, rel=1e-3)
+        and "2 touches" in found.text
+    )
     assert perception([still], machine) is None
 
 
-def test_a_biased_encoder_is_a_matter_of_kinematics_only_where_tool_points_were_measured(machine: Machine) -> None:
+def test_a_biased_encoder_is_a_matter_of_kinematics_only_where_tool_points_were_measured(
+    machine: Machine,
+) -> None:
     sound = runs(machine, [recording(machine, 0), recording(machine, 1)])
     location = locate(sound, None, machine, DEAD_TIME_S, np.random.default_rng(0))
 
@@ -189,9 +250,17 @@ def test_a_biased_encoder_is_a_matter_of_kinematics_only_where_tool_points_were_
         shapes = []
         for bias in (bias_rad, 0.0):
             moved = recording(machine, 0)
-            tip = Kinematics(machine).pose(torch.as_tensor(moved.q, dtype=torch.float32)).tip_in_base_m.numpy()
+            tip = (
+                Kinematics(machine)
+                .pose(torch.as_tensor(moved.q, dtype=torch.float32))
+                .tip_in_base_m.numpy()
+            )
             tip = tip + 0.002 * np.random.default_rng(0).standard_normal(tip.shape)
-            biased = replace(moved, q=moved.q + bias * (np.arange(5) == 2), extra=dict(zip(COLUMNS, tip.T, strict=True)))
+            biased = replace(
+                moved,
+                q=moved.q + bias * (np.arange(5) == 2),
+                extra=dict(zip(COLUMNS, tip.T, strict=True)),
+            )
             shapes.append(geometry([biased], machine))
         found = stages(Known(location, [], None, shapes[0], shapes[1]), sound, None, machine)
         return foremost(found, False), next(row.rms_m for row in found if row.stage == "kinematics")
@@ -201,7 +270,9 @@ def test_a_biased_encoder_is_a_matter_of_kinematics_only_where_tool_points_were_
     assert name == "kinematics" and rms_m is not None and 0.02 < rms_m < 0.1
 
 
-def test_starts_that_vary_and_stops_that_ring_are_seen_on_the_joint_that_does(machine: Machine) -> None:
+def test_starts_that_vary_and_stops_that_ring_are_seen_on_the_joint_that_does(
+    machine: Machine,
+) -> None:
     rng = np.random.default_rng(0)
 
     def shaken(r: Recording) -> Recording:
@@ -224,7 +295,10 @@ def test_starts_that_vary_and_stops_that_ring_are_seen_on_the_joint_that_does(ma
         replace(runs(machine, field), recordings=[shaken(r) for r in field]),
         runs(
             machine,
-            [replace(r, q=r.q + 2e-4 * rng.standard_normal(r.q.shape)) for r in map(recording, [machine] * 6, range(10, 16))],
+            [
+                replace(r, q=r.q + 2e-4 * rng.standard_normal(r.q.shape))
+                for r in map(recording, [machine] * 6, range(10, 16))
+            ],
         ),
         machine,
         DEAD_TIME_S,

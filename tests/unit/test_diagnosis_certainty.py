@@ -30,38 +30,58 @@ def weights() -> Certainty:
     return option("certainty", "default")
 
 
-def moving(machine: Machine, random: np.random.Generator, windows: int = 60, steps: int = 20) -> Evidence:
+def moving(
+    machine: Machine, random: np.random.Generator, windows: int = 60, steps: int = 20
+) -> Evidence:
     """Returns a simulator's motion in levels, whose errors have a noise of 1."""
     full = machine.max_speed * machine.period_s * remainder.SPAN
-    way = np.repeat(random.uniform(-0.4, 0.4, (windows, steps // 5, machine.num_joints)), 5, 1) * full
+    way = (
+        np.repeat(random.uniform(-0.4, 0.4, (windows, steps // 5, machine.num_joints)), 5, 1) * full
+    )
     middle, travel = (machine.lower + machine.upper) / 2, machine.upper - machine.lower
     start = middle + random.uniform(-0.4, 0.4, (windows, machine.num_joints)) * travel
-    cut = SimpleNamespace(run=np.repeat(["first", "second"], [windows // 2, windows - windows // 2]))
-    candidates = SimpleNamespace(machine=machine, running_s=np.linspace(0.0, 1800.0, windows), cut=cut)
+    cut = SimpleNamespace(
+        run=np.repeat(["first", "second"], [windows // 2, windows - windows // 2])
+    )
+    candidates = SimpleNamespace(
+        machine=machine, running_s=np.linspace(0.0, 1800.0, windows), cut=cut
+    )
     white = {"whitened_joint": lambda columns, j: columns.reshape(-1, columns.shape[-1])}
     base = start[:, None] + np.cumsum(np.repeat(way, remainder.SPAN, 1) / remainder.SPAN, 1)
-    return cast(Evidence, SimpleNamespace(way=way, base=base, start=start, candidates=candidates, **white))
+    return cast(
+        Evidence, SimpleNamespace(way=way, base=base, start=start, candidates=candidates, **white)
+    )
 
 
 @pytest.mark.parametrize(
     ("clue", "error"),
     [
         ("its position", lambda m: m.own * m.sides[0] * np.maximum(0.0, m.place.mean(0) - 0.6)),
-        ("the angle that the sensor reads", lambda m: np.diff(np.sin(6 * np.pi * m.place), axis=0)[0]),
+        (
+            "the angle that the sensor reads",
+            lambda m: np.diff(np.sin(6 * np.pi * m.place), axis=0)[0],
+        ),
         ("the other joints", lambda m: np.maximum(m.share[..., 3], 0.0)),
         ("running time", lambda m: m.own * m.time[-1]),
         ("timing over the running time", lambda m: m.slip * m.time[0]),
         ("what it did before", lambda m: m.own * m.faded(np.minimum(m.work, 1.0), 0.94)),
         (remainder.STARTS, lambda m: np.diff(m.own, axis=1, prepend=m.own[:, :1])),
-        (remainder.CURVE, lambda m: np.sign(m.own) * np.maximum(np.abs(m.share[..., m.j]) - 0.2, 0.0)),
+        (
+            remainder.CURVE,
+            lambda m: np.sign(m.own) * np.maximum(np.abs(m.share[..., m.j]) - 0.2, 0.0),
+        ),
     ],
 )
-def test_what_is_left_is_traced_to_what_it_depends_on(machine: Machine, clue: str, error: remainder.Callable) -> None:
+def test_what_is_left_is_traced_to_what_it_depends_on(
+    machine: Machine, clue: str, error: remainder.Callable
+) -> None:
     random = np.random.default_rng(0)
     evidence = moving(machine, random)
     motion = remainder.Motion(evidence, 2)
     column, own = error(motion).ravel(), motion.own.ravel()
-    column = column if clue in remainder.FORMS else column - own * (own @ column) / (own @ own)  # another gain is form
+    column = (
+        column if clue in remainder.FORMS else column - own * (own @ column) / (own @ own)
+    )  # another gain is form
     z = random.standard_normal((machine.num_joints, column.size))
     z[2] += 0.5 * column / column.std()
     earned = remainder.predictable(evidence, z)
@@ -70,29 +90,46 @@ def test_what_is_left_is_traced_to_what_it_depends_on(machine: Machine, clue: st
     assert np.delete(earned, 2, 1).max() < 6.0, "chance earns little on the other joints"
 
 
-def test_work_is_remembered_from_window_to_window_of_a_recording_and_no_further(machine: Machine) -> None:
-    motion = remainder.Motion(moving(machine, np.random.default_rng(6), windows=4), 2)  # two windows a recording
+def test_work_is_remembered_from_window_to_window_of_a_recording_and_no_further(
+    machine: Machine,
+) -> None:
+    motion = remainder.Motion(
+        moving(machine, np.random.default_rng(6), windows=4), 2
+    )  # two windows a recording
     worked = np.zeros((4, 20))
     worked[0, 19] = 1.0
     found = motion.faded(worked, 0.5)
-    np.testing.assert_allclose(found[1], 0.5 ** np.arange(1, 21), rtol=1e-12)  # half is new, and half of that is kept
+    np.testing.assert_allclose(
+        found[1], 0.5 ** np.arange(1, 21), rtol=1e-12
+    )  # half is new, and half of that is kept
     assert not found[[0, 2, 3]].any()
 
 
 def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> None:
-    # a dead band halves all speeds: errors of 5 % of what is left are 2.5 % of what was simulated before
-    random, noise = np.random.default_rng(7), Noise(sensor=1e-5, change=0.0, wander=0.05, memory=0.01)
+    # a dead band halves all speeds: errors of 5 % of what is left are 2.5 % of what was simulated
+    # before
+    random, noise = (
+        np.random.default_rng(7),
+        Noise(sensor=1e-5, change=0.0, wander=0.05, memory=0.01),
+    )
     windows, joints = 120, machine.num_joints
-    way = np.repeat(random.uniform(0.02, 0.05, (windows, 20, joints)), remainder.SPAN, 1) / remainder.SPAN
+    way = (
+        np.repeat(random.uniform(0.02, 0.05, (windows, 20, joints)), remainder.SPAN, 1)
+        / remainder.SPAN
+    )
     before, start = np.cumsum(way, 1), np.zeros((windows, joints))
     steady = np.repeat(0.05 * random.standard_normal((windows, 20, joints)), remainder.SPAN, 1)
     measured = 0.5 * np.cumsum(way * (1.0 + steady), 1)
     q = np.concatenate([start[:, None], measured], 1)
     cut = Windows(np.zeros((windows, 100, joints)), q, np.repeat("one", windows), 1, 1)
     candidates = Candidates(cast(Actuator, None), machine, cut, np.zeros(windows), 0)
-    evidence = Evidence(candidates, [noise] * joints, np.ones((windows, joints), dtype=bool), runs=before)
+    evidence = Evidence(
+        candidates, [noise] * joints, np.ones((windows, joints), dtype=bool), runs=before
+    )
     none = np.zeros((0, joints))
-    repair = Repair([], none.astype(bool), none, none[None], 0.5 * before, 0.5 * before, evidence.z, none)
+    repair = Repair(
+        [], none.astype(bool), none, none[None], 0.5 * before, 0.5 * before, evidence.z, none
+    )
     left = remainder.repaired(evidence, repair)
     np.testing.assert_allclose(left.z.std(1), 1.0, atol=0.06)
     np.testing.assert_allclose(remainder.strayed(left, left.error), 1.0, atol=0.25)
@@ -101,7 +138,10 @@ def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> 
 
 
 def test_free_runs_stray_as_far_as_their_noise_says() -> None:
-    random, noise = np.random.default_rng(1), Noise(sensor=1e-3, change=0.03, wander=0.05, memory=12.0)
+    random, noise = (
+        np.random.default_rng(1),
+        Noise(sensor=1e-3, change=0.03, wander=0.05, memory=12.0),
+    )
     way = np.repeat(random.uniform(-0.05, 0.05, (1, 4)), 5, 1)
     root = np.linalg.cholesky(noise.covariance(way)[0])
     drawn = np.cumsum(random.standard_normal((20_000, way.shape[1])) @ root.T, 1)
@@ -110,17 +150,28 @@ def test_free_runs_stray_as_far_as_their_noise_says() -> None:
 
 def test_the_error_of_a_form_is_added_to_that_of_a_size() -> None:
     low, size, high = certainty.widened(np.array([0.5 - 1.96 * 0.03, 0.5, 0.5 + 1.96 * 0.03]), 0.08)
-    assert size == 0.5 and high - size == pytest.approx(1.96 * 0.05) and size - low == pytest.approx(1.96 * 0.05)  # 3, 4, 5
+    assert (
+        size == 0.5
+        and high - size == pytest.approx(1.96 * 0.05)
+        and size - low == pytest.approx(1.96 * 0.05)
+    )  # 3, 4, 5
 
 
 def test_weights_of_signs_are_those_that_made_the_truth() -> None:
     random = np.random.default_rng(2)
-    signs = [{"constant": 1.0, "margin": m, "names": n} for m, n in random.standard_normal((6000, 2))]
-    true = [random.random() < certainty.chance({"constant": -1.0, "margin": 2.0, "names": 0.0}, one) for one in signs]
+    signs = [
+        {"constant": 1.0, "margin": m, "names": n} for m, n in random.standard_normal((6000, 2))
+    ]
+    true = [
+        random.random() < certainty.chance({"constant": -1.0, "margin": 2.0, "names": 0.0}, one)
+        for one in signs
+    ]
     begin = {"constant": 0.0, "margin": 0.5, "names": 1.0}
     found = logistic(signs, true, begin)
     assert found == pytest.approx({"constant": -1.0, "margin": 2.0, "names": 0.0}, abs=0.15)
-    few = logistic(signs[:4], true[:4], begin)  # a handful of answers changes little but how often anything is true
+    few = logistic(
+        signs[:4], true[:4], begin
+    )  # a handful of answers changes little but how often anything is true
     assert [few[name] for name in ("margin", "names")] == pytest.approx([0.5, 1.0], abs=0.2)
 
 
@@ -128,7 +179,9 @@ def found(subsets: tuple[str, ...], others: tuple[str, ...] = ()) -> Findings:
     """Returns effects by joint, named by a letter each, and what sensors, frames and tool points show."""
     fields = {field.name: None for field in dataclasses.fields(Findings)}
     chosen = Chosen(tuple(frozenset(one) for one in subsets), 50.0)
-    shown = [SimpleNamespace(kind=SimpleNamespace(name=name, stage="kinematics")) for name in others]
+    shown = [
+        SimpleNamespace(kind=SimpleNamespace(name=name, stage="kinematics")) for name in others
+    ]
     return Findings(**cast(dict, {**fields, "chosen": chosen, "others": shown}))
 
 
@@ -141,17 +194,24 @@ def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
     assert verdict.is_unknown(found(("a", ""), ("t",)), cast(Prices, None), weights) is unknown
 
 
-def test_what_was_named_only_beside_another_goes_with_it(monkeypatch: pytest.MonkeyPatch, weights: Certainty) -> None:
+def test_what_was_named_only_beside_another_goes_with_it(
+    monkeypatch: pytest.MonkeyPatch, weights: Certainty
+) -> None:
     beside = {
         frozenset("abc"): {"a": 0.9, "b": 0.6, "c": 0.4},
         frozenset("ab"): {"a": 0.9, "b": 0.2},
         frozenset("de"): {"d": 0.45, "e": 0.4},
         frozenset("d"): {"d": 0.3},
     }
-    monkeypatch.setattr(verdict, "named_chances", lambda found, *_: beside.get(found.chosen.names, {"a": 0.9}))
+    monkeypatch.setattr(
+        verdict, "named_chances", lambda found, *_: beside.get(found.chosen.names, {"a": 0.9})
+    )
 
     def kept(subsets: tuple[str, ...]) -> tuple[set[str], ...]:
-        return tuple(set(one) for one in verdict.likely(found(subsets), cast(Prices, None), weights).chosen.subsets)
+        return tuple(
+            set(one)
+            for one in verdict.likely(found(subsets), cast(Prices, None), weights).chosen.subsets
+        )
 
     assert kept(("ab", "c", "")) == ({"a"}, set(), set())
     assert kept(("de", "d")) == ({"d"}, {"d"}), "the most probable one stays"
@@ -159,7 +219,9 @@ def test_what_was_named_only_beside_another_goes_with_it(monkeypatch: pytest.Mon
 
 def test_no_answer_is_surer_than_answers_can_tell(weights: Certainty) -> None:
     sure = certainty.right(margin=1e6, adds=1.0, size=1.0, names=1, outside=-6.0)
-    assert certainty.chance({**weights.right, "margin": 5.0}, sure) == pytest.approx(1.0 / (1.0 + np.exp(-6.0)))
+    assert certainty.chance({**weights.right, "margin": 5.0}, sure) == pytest.approx(
+        1.0 / (1.0 + np.exp(-6.0))
+    )
 
 
 def test_a_missing_or_unknown_sign_is_named(weights: Certainty) -> None:
@@ -171,9 +233,21 @@ def test_a_missing_or_unknown_sign_is_named(weights: Certainty) -> None:
 
 def test_halves_to_fit_and_to_judge_share_no_family() -> None:
     def item(effects: list[str], outside: str | None) -> Item:
-        return Item({"effects": [{"effect": e} for e in effects], "outside": {"ailment": outside} if outside else None}, {})
+        return Item(
+            {
+                "effects": [{"effect": e} for e in effects],
+                "outside": {"ailment": outside} if outside else None,
+            },
+            {},
+        )
 
-    cases = [item(["lag"], None), item([], "fading"), item(["backlash", "lag"], None), item([], None), item([], None)] * 3
+    cases = [
+        item(["lag"], None),
+        item([], "fading"),
+        item(["backlash", "lag"], None),
+        item([], None),
+        item([], None),
+    ] * 3
     first, second = halves(cases)
     assert len(first) + len(second) == len(cases)
     assert {one.family for one in first} & {one.family for one in second} <= {"none"}

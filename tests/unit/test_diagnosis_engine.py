@@ -20,7 +20,17 @@ from actuators.lag import Lag
 from brokk_rl import record
 from brokk_rl.contracts import Effect
 from brokk_rl.diagnosis import already, answer, case, library, prescription, simulator
-from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, JointGap, NextExperiment, Ranked, RegimeGap, Selected, Where
+from brokk_rl.diagnosis.answer import (
+    Answer,
+    Estimate,
+    Gap,
+    JointGap,
+    NextExperiment,
+    Ranked,
+    RegimeGap,
+    Selected,
+    Where,
+)
 from brokk_rl.diagnosis.case import Case
 from brokk_rl.diagnosis.conclusion import Diagnosis
 from brokk_rl.diagnosis.engine import Prices
@@ -30,7 +40,14 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
-PLANT = Lag(dead_time_s=0.31, dead_band_extend=0.07, dead_band_retract=0.1, gain=0.9, time_constant_s=0.08, spread={})
+PLANT = Lag(
+    dead_time_s=0.31,
+    dead_band_extend=0.07,
+    dead_band_retract=0.1,
+    gain=0.9,
+    time_constant_s=0.08,
+    spread={},
+)
 PRICES = Prices(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06, tool=2.0)
 
 
@@ -38,16 +55,23 @@ PRICES = Prices(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06, too
 def axis(machine: Machine) -> Machine:
     """A single servo axis, known by nothing but its limits."""
     joint = dataclasses.replace(machine.joints[2], body=None)
-    return dataclasses.replace(machine, name="axis", mjcf=None, tool_m=None, joints=(joint,), exclusive=(), levers=())
+    return dataclasses.replace(
+        machine, name="axis", mjcf=None, tool_m=None, joints=(joint,), exclusive=(), levers=()
+    )
 
 
-def driven(machine: Machine, effects: dict[str, Effect], count: int, seconds: float, seed: int) -> list[Recording]:
+def driven(
+    machine: Machine, effects: dict[str, Effect], count: int, seconds: float, seed: int
+) -> list[Recording]:
     """Returns recordings of the plant with effects under levels and rests, its speed wandering by a percent or two."""
     random, steps = np.random.default_rng(seed), round(seconds / machine.period_s)
     model = Affected(actuator=PLANT, effects=effects).build(machine, count, CPU)
     shape = (count, machine.num_history, machine.num_joints)
     history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-    history.reset(torch.ones(count, dtype=torch.bool), torch.as_tensor(machine.home, dtype=torch.float32).expand(count, -1))
+    history.reset(
+        torch.ones(count, dtype=torch.bool),
+        torch.as_tensor(machine.home, dtype=torch.float32).expand(count, -1),
+    )
     level, left, wander = np.zeros(shape[::2]), np.zeros(shape[::2]), np.zeros(shape[::2])
     commands, positions, margin = [], [], 0.2 * (machine.upper - machine.lower)
     for _ in range(steps):
@@ -62,7 +86,10 @@ def driven(machine: Machine, effects: dict[str, Effect], count: int, seconds: fl
         history.push_u(torch.as_tensor(level, dtype=torch.float32))
         wander = 0.99 * wander + 0.003 * random.standard_normal(wander.shape)
         before = history.q[:, -1].clone()
-        history.push_q(before + (model.step(history) - before) * torch.as_tensor(1.0 + wander, dtype=torch.float32))
+        history.push_q(
+            before
+            + (model.step(history) - before) * torch.as_tensor(1.0 + wander, dtype=torch.float32)
+        )
     u, q = (np.stack(rows, 1).astype(np.float32) for rows in (commands, positions))
     return [
         Recording(
@@ -78,13 +105,17 @@ def reference(axis: Machine) -> list[Recording]:
     return driven(axis, {}, 3, 120.0, 1)
 
 
-def diagnosed(axis: Machine, reference: Sequence[Recording], effects: dict[str, Effect], folder: Path) -> Answer:
+def diagnosed(
+    axis: Machine, reference: Sequence[Recording], effects: dict[str, Effect], folder: Path
+) -> Answer:
     given = Case(axis, reference, driven(axis, effects, 2, 100.0, 2))
     base = simulator.fitted(given, option("fit", "valve"), folder, 0, CPU)
     thresholds, generator = option("thresholds", "default"), np.random.default_rng(0)
     excitations = {"levels": option("excitation", "levels")}
     certainty = option("certainty", "default")
-    work = Diagnosis(given, base, library.load(axis), PRICES, certainty, thresholds, excitations, generator)
+    work = Diagnosis(
+        given, base, library.load(axis), PRICES, certainty, thresholds, excitations, generator
+    )
     outcome = work.run(lambda doing, done: None)
     outcome.save(folder)
     return answer.read(folder / answer.FILE)
@@ -104,24 +135,36 @@ def test_a_speed_that_changed_is_found_on_a_single_axis_without_geometry(
     assert found.gap.closed.mean > 0.8
 
 
-def test_nothing_is_found_where_nothing_was_changed(axis: Machine, reference: list[Recording], tmp_path: Path) -> None:
+def test_nothing_is_found_where_nothing_was_changed(
+    axis: Machine, reference: list[Recording], tmp_path: Path
+) -> None:
     found = diagnosed(axis, reference, {}, tmp_path)
     assert found.verdict == "none" and not found.selected
     assert found.ranking[0].effect == "none"
 
 
-def test_what_the_reference_shows_already_is_put_around_the_simulator(axis: Machine, tmp_path: Path) -> None:
-    soft = driven(axis, {"compliance": Compliance(joints="all", ringing_s=0.3, damping=0.12)}, 3, 120.0, 4)
+def test_what_the_reference_shows_already_is_put_around_the_simulator(
+    axis: Machine, tmp_path: Path
+) -> None:
+    soft = driven(
+        axis, {"compliance": Compliance(joints="all", ringing_s=0.3, damping=0.12)}, 3, 120.0, 4
+    )
     kinds, fit = library.load(axis, ("compliance", "dead_band", "lag")), option("fit", "valve")
     given = Case(axis, soft, soft[:1])
-    after = simulator.fitted(given, fit, tmp_path, 0, CPU, lambda base: already.refined(base, kinds, axis))
+    after = simulator.fitted(
+        given, fit, tmp_path, 0, CPU, lambda base: already.refined(base, kinds, axis)
+    )
     ((kind, values),) = after.field.evidence.candidates.fixed
     assert kind.name == "compliance" and values["ringing_s"][0, 0] == pytest.approx(0.3, abs=0.1)
 
 
 @pytest.mark.slow
-def test_a_dead_band_is_not_taken_for_a_speed(axis: Machine, reference: list[Recording], tmp_path: Path) -> None:
-    found = diagnosed(axis, reference, {"dead_band": DeadBand(joints="all", extend=0.08, retract=0.08)}, tmp_path)
+def test_a_dead_band_is_not_taken_for_a_speed(
+    axis: Machine, reference: list[Recording], tmp_path: Path
+) -> None:
+    found = diagnosed(
+        axis, reference, {"dead_band": DeadBand(joints="all", extend=0.08, retract=0.08)}, tmp_path
+    )
     assert [one.effect for one in found.selected] == ["dead_band"]
     assert found.selected[0].parameters["extend"]["q3"].mean == pytest.approx(0.08, abs=0.02)
 
@@ -152,16 +195,26 @@ def test_a_case_without_its_half_is_refused(tmp_path: Path, machine: Machine) ->
 def test_recordings_of_another_machine_are_refused(tmp_path: Path, machine: Machine) -> None:
     stretched = dataclasses.replace(machine.joints[2].upper, value=1.9)
     other = dataclasses.replace(
-        machine, joints=(*machine.joints[:2], dataclasses.replace(machine.joints[2], upper=stretched), *machine.joints[3:])
+        machine,
+        joints=(
+            *machine.joints[:2],
+            dataclasses.replace(machine.joints[2], upper=stretched),
+            *machine.joints[3:],
+        ),
     )
     for part in ("reference", "field"):
         one = driven(other, {}, 1, 10.0, 3)[0]
-        record.write(dataclasses.replace(one, metadata={"fingerprint": record.stamp(other)}), tmp_path / part / "a.parquet")
+        record.write(
+            dataclasses.replace(one, metadata={"fingerprint": record.stamp(other)}),
+            tmp_path / part / "a.parquet",
+        )
     with pytest.raises(RecordingError, match="limits differ"):
         case.load(tmp_path, machine)
 
 
-def test_too_little_reference_to_judge_by_is_refused(axis: Machine, reference: list[Recording], tmp_path: Path) -> None:
+def test_too_little_reference_to_judge_by_is_refused(
+    axis: Machine, reference: list[Recording], tmp_path: Path
+) -> None:
     given = Case(axis, reference[:1], reference[1:])
     with pytest.raises(RecordingError, match="not fitted to"):
         simulator.fitted(given, option("fit", "valve"), tmp_path, 0, CPU)
@@ -174,7 +227,12 @@ def said() -> Answer:
         parameters={"gap_rad": {"q3": Estimate(0.031, (0.028, 0.034))}}, gap_closed=Estimate(0.91, (0.86, 0.95)),
         same_as=("lag",), decided_by="a dial gauge",
     )  # fmt: skip
-    where = Where({"q3": JointGap(0.03, 0.002, 1.0)}, (RegimeGap("q3", "after a reversal", 0.8),), "actuation", {"q3": "rad"})
+    where = Where(
+        {"q3": JointGap(0.03, 0.002, 1.0)},
+        (RegimeGap("q3", "after a reversal", 0.8),),
+        "actuation",
+        {"q3": "rad"},
+    )
     return Answer(
         verdict="effects", selected=(selected,), ranking=(Ranked("backlash", ("q3",), 0.97),), where=where,
         gap=Gap(0.03, 0.004, 0.002, Estimate(0.93, (0.88, 0.96))),
@@ -187,7 +245,10 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
     said().write(path)
     found = json.loads(path.read_text())
     assert found["schema"] == 1 and found["sanity"] == [{"a": 1}]
-    assert found["selected"][0]["parameters"]["gap_rad"]["q3"] == {"mean": 0.031, "ci95": [0.028, 0.034]}
+    assert found["selected"][0]["parameters"]["gap_rad"]["q3"] == {
+        "mean": 0.031,
+        "ci95": [0.028, 0.034],
+    }
     assert found["where"]["joints"]["q3"] == {"rmse_rad": 0.03, "floor_rad": 0.002, "share": 1.0}
     assert found["gap"]["before"] == {"rmse_rad": 0.03}
     assert answer.read(path) == said()
@@ -196,7 +257,9 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
         answer.read(path)
 
 
-def test_training_takes_the_found_effects_as_they_are(tmp_path: Path, machine: Machine, brokk: Callable[..., Any]) -> None:
+def test_training_takes_the_found_effects_as_they_are(
+    tmp_path: Path, machine: Machine, brokk: Callable[..., Any]
+) -> None:
     path = tmp_path / prescription.FILE
     prescription.write(said(), library.load(machine), path)
     done = brokk("mode=train", f"effect=@{path}", "--cfg", "job")

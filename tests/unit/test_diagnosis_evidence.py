@@ -24,9 +24,14 @@ def motion(random: np.random.Generator, rows: int = 80, steps: int = 60) -> np.n
 
 
 def test_errors_of_a_wandering_speed_are_white_after_division_by_their_noise() -> None:
-    random, truth = np.random.default_rng(0), Noise(sensor=4e-4, change=0.04, wander=0.05, memory=15.0)
+    random, truth = (
+        np.random.default_rng(0),
+        Noise(sensor=4e-4, change=0.04, wander=0.05, memory=15.0),
+    )
     way = motion(random)
-    error = np.stack([np.linalg.cholesky(c) @ random.standard_normal(len(c)) for c in truth.covariance(way)])
+    error = np.stack(
+        [np.linalg.cholesky(c) @ random.standard_normal(len(c)) for c in truth.covariance(way)]
+    )
     z = (truth.whitener(way) @ error[..., None])[..., 0]
     assert z.std() == pytest.approx(1.0, abs=0.03)
     assert abs(np.corrcoef(z[:, :-1].ravel(), z[:, 1:].ravel())[0, 1]) < 0.05
@@ -36,12 +41,19 @@ def test_errors_of_a_wandering_speed_are_white_after_division_by_their_noise() -
 
 
 def test_what_a_coarse_reading_adds_to_one_increment_it_takes_from_the_next() -> None:
-    random, truth = np.random.default_rng(9), Noise(sensor=1e-4, change=0.0, wander=0.0, memory=10.0, reading=2e-3)
+    random, truth = (
+        np.random.default_rng(9),
+        Noise(sensor=1e-4, change=0.0, wander=0.0, memory=10.0, reading=2e-3),
+    )
     error = np.diff(truth.reading * random.standard_normal((4000, 13)), axis=1)
     covariance = truth.covariance(np.zeros((1, 12)))[0]
     np.testing.assert_allclose(np.cov(error.T), covariance, atol=6e-7)
     # the position after a minute is no less sure than after a second
-    np.testing.assert_allclose(truth.strayed(np.zeros((1, 12)))[0], 2 * truth.reading**2 + 1e-8 * np.arange(1, 13), rtol=1e-9)
+    np.testing.assert_allclose(
+        truth.strayed(np.zeros((1, 12)))[0],
+        2 * truth.reading**2 + 1e-8 * np.arange(1, 13),
+        rtol=1e-9,
+    )
 
 
 def test_increments_add_up_to_the_way_since_the_start() -> None:
@@ -52,7 +64,9 @@ def test_increments_add_up_to_the_way_since_the_start() -> None:
     np.testing.assert_allclose(found.sum(2), paths[:, :, -1] - start, atol=1e-12)
 
 
-def joint(z: np.ndarray, shapes: dict[str, list[Shape]], faults: list[np.ndarray] | None = None) -> Table:
+def joint(
+    z: np.ndarray, shapes: dict[str, list[Shape]], faults: list[np.ndarray] | None = None
+) -> Table:
     block = np.arange(len(z)) // 80
     return Table(plain(z, faults or []), shapes, block)
 
@@ -83,8 +97,12 @@ def test_what_an_effect_earns_is_its_bayes_factor() -> None:
         z = size * column + random.standard_normal(400)
         fine = np.linspace(-2.0, 2.0, 4001)
         likely = -noise.loss(z[:, None] - fine * column[:, None], 0) + noise.loss(z)
-        whole = np.trapezoid(np.exp(likely - 0.5 * fine**2) / np.sqrt(2.0 * np.pi), fine)  # over the prior of the size
-        assert earned(plain(z, []), [line(column)])[0].sum() == pytest.approx(np.log(whole), abs=0.25)
+        whole = np.trapezoid(
+            np.exp(likely - 0.5 * fine**2) / np.sqrt(2.0 * np.pi), fine
+        )  # over the prior of the size
+        assert earned(plain(z, []), [line(column)])[0].sum() == pytest.approx(
+            np.log(whole), abs=0.25
+        )
 
 
 def test_an_effect_that_is_not_there_earns_less_than_nothing() -> None:
@@ -98,11 +116,18 @@ def test_an_effect_that_is_not_there_earns_less_than_nothing() -> None:
 def test_what_begins_at_a_threshold_is_found_beside_another() -> None:
     random = np.random.default_rng(12)
     a, b = 2.0 * random.standard_normal((2, 800))
-    z = 0.8 * a + 0.16 * 6.0 * b + random.standard_normal(800)  # size 0.66 of the second, 0.7 of which is below its threshold
+    z = (
+        0.8 * a + 0.16 * 6.0 * b + random.standard_normal(800)
+    )  # size 0.66 of the second, 0.7 of which is below its threshold
     table = joint(z, {"a": [line(a)], "b": [bend(6.0 * b)]})
-    both, alone = table.score(frozenset("ab")), [table.score(frozenset(name)).total for name in "ab"]
+    both, alone = (
+        table.score(frozenset("ab")),
+        [table.score(frozenset(name)).total for name in "ab"],
+    )
     assert both.total > max(alone) + 50.0
-    assert both.sizes["b"][0] == pytest.approx(0.66, abs=0.03) and both.sizes["a"][0] == pytest.approx(0.8, abs=0.05)
+    assert both.sizes["b"][0] == pytest.approx(0.66, abs=0.03) and both.sizes["a"][
+        0
+    ] == pytest.approx(0.8, abs=0.05)
 
 
 def test_a_pair_is_found_of_which_neither_pays_alone() -> None:
@@ -134,7 +159,9 @@ def test_two_joints_with_the_same_cause_get_one_name_where_another_would_hardly_
     z = columns + random.standard_normal(columns.shape)
     tables = []
     for j, (own, like) in enumerate(zip(columns, near, strict=True)):
-        names = ("a", "b") if j == 0 else ("b", "a")  # on the second joint b is a little nearer to the truth
+        names = (
+            ("a", "b") if j == 0 else ("b", "a")
+        )  # on the second joint b is a little nearer to the truth
         tables.append(joint(z[j], {names[0]: [line(own)], names[1]: [line(like)]}))
         tables[-1].explore({"a": 5.0, "b": 5.0}, 3)
     chosen = choose(tables, lambda j, subset: 5.0 * len(subset), 2.0, 0.1)
@@ -162,16 +189,30 @@ def test_a_cause_that_all_joints_share_may_earn_little_on_each() -> None:
     for table in tables:
         table.explore({"clock": 0.0}, 3)
     apart = choose(tables, lambda j, subset: 12.0 * len(subset), 12.0, 0.03, least=12.0)
-    together = choose(tables, lambda j, subset: 0.0, 12.0, 0.03, shared=frozenset({"clock"}), partial=16.0, least=12.0)
+    together = choose(
+        tables,
+        lambda j, subset: 0.0,
+        12.0,
+        0.03,
+        shared=frozenset({"clock"}),
+        partial=16.0,
+        least=12.0,
+    )
     assert len(frozenset().union(*apart.subsets)) == 0 or not all(apart.subsets)
     assert together.subsets == (frozenset({"clock"}),) * 5
 
 
-def test_a_cause_that_all_joints_share_gets_the_size_that_most_of_them_have(machine: Machine) -> None:
-    random, sizes = np.random.default_rng(10), (0.5, 0.55, 0.45, 2.0, 0.5)  # the fourth joint has another effect too
+def test_a_cause_that_all_joints_share_gets_the_size_that_most_of_them_have(
+    machine: Machine,
+) -> None:
+    random, sizes = (
+        np.random.default_rng(10),
+        (0.5, 0.55, 0.45, 2.0, 0.5),
+    )  # the fourth joint has another effect too
     columns = random.standard_normal((5, 800))
     tables = [
-        joint(size * x + random.standard_normal(800), {"clock_offset": [line(x)]}) for size, x in zip(sizes, columns, strict=True)
+        joint(size * x + random.standard_normal(800), {"clock_offset": [line(x)]})
+        for size, x in zip(sizes, columns, strict=True)
     ]
     (kind,) = library.load(machine, ("clock_offset",))
     grown = {"clock_offset": rays(kind)}
@@ -179,7 +220,9 @@ def test_a_cause_that_all_joints_share_gets_the_size_that_most_of_them_have(mach
     (way,) = ways["clock_offset"]
     assert way.is_tied and way.sizes[1] == pytest.approx(0.5, abs=0.1) and way.sizes[-1] < 0.8
     for mine, column in zip(shapes, columns, strict=True):
-        np.testing.assert_allclose(mine["clock_offset"][0].at(float(way.sizes[1]))[0], way.sizes[1] * column, atol=1e-9)
+        np.testing.assert_allclose(
+            mine["clock_offset"][0].at(float(way.sizes[1]))[0], way.sizes[1] * column, atol=1e-9
+        )
 
 
 def test_the_closed_share_of_a_worked_example() -> None:
@@ -197,9 +240,13 @@ def test_shares_of_effects_that_pay_only_together_are_equal_and_add_up() -> None
     assert sum(found.values()) == pytest.approx(0.53)
 
 
-def test_the_weight_of_a_planar_arm_by_sums_of_angles_is_that_of_the_mechanics(machine: Machine) -> None:
+def test_the_weight_of_a_planar_arm_by_sums_of_angles_is_that_of_the_mechanics(
+    machine: Machine,
+) -> None:
     pose = Pose(machine, torch.device("cpu"))
-    lower, upper = (torch.as_tensor(side, dtype=torch.float32) for side in (machine.lower, machine.upper))
+    lower, upper = (
+        torch.as_tensor(side, dtype=torch.float32) for side in (machine.lower, machine.upper)
+    )
     q = lower + (upper - lower) * torch.rand(50, 5, generator=torch.Generator().manual_seed(9))
     force = torch.tensor([body.yield_force.value for body in machine.bodies])
     weight = Gravity(machine, torch.device("cpu")).load(q) / force
@@ -211,14 +258,23 @@ def test_of_two_effects_that_are_alike_one_stays() -> None:
     a = 2.0 * random.standard_normal(800)
     z = 1.0 * a + random.standard_normal(800)
     table = joint(
-        z, {"a": [line(a)], "b": [line(a * 0.98 + 0.02 * random.standard_normal(800))], "c": [line(random.standard_normal(800))]}
+        z,
+        {
+            "a": [line(a)],
+            "b": [line(a * 0.98 + 0.02 * random.standard_normal(800))],
+            "c": [line(random.standard_normal(800))],
+        },
     )
     kept = around.paying([table], [frozenset("abc")], lambda j, subset: 4.0 * len(subset), 5.0)
     assert len(kept[0]) == 1 and kept[0] <= frozenset("ab")
-    assert around.paying([table], [frozenset("c")], lambda j, subset: 4.0 * len(subset), 5.0) == (frozenset(),)
+    assert around.paying([table], [frozenset("c")], lambda j, subset: 4.0 * len(subset), 5.0) == (
+        frozenset(),
+    )
 
 
-def test_an_effect_that_rings_is_simulated_at_sizes_so_close_that_those_between_are_in_step(machine: Machine) -> None:
+def test_an_effect_that_rings_is_simulated_at_sizes_so_close_that_those_between_are_in_step(
+    machine: Machine,
+) -> None:
     kind = next(kind for kind in library.load(machine) if kind.name == "compliance")
     number, t_s = kind.numbers["ringing_s"], np.arange(0.0, 1.5, machine.period_s)
 
@@ -227,10 +283,14 @@ def test_an_effect_that_rings_is_simulated_at_sizes_so_close_that_those_between_
         return np.exp(-0.12 * w * t_s) * np.sin(w * t_s)
 
     def in_step(sizes: np.ndarray) -> float:
-        between = np.sqrt(sizes[1:] * sizes[:-1])  # what is shorter than four samples cannot be seen to ring
+        between = np.sqrt(
+            sizes[1:] * sizes[:-1]
+        )  # what is shorter than four samples cannot be seen to ring
         seen = number.typical * between > 4 * machine.period_s
         told = (ringing(sizes)[1:] + ringing(sizes)[:-1]) / 2.0
-        return min(np.corrcoef(a, b)[0, 1] for a, b in zip(told[seen], ringing(between)[seen], strict=True))
+        return min(
+            np.corrcoef(a, b)[0, 1] for a, b in zip(told[seen], ringing(between)[seen], strict=True)
+        )
 
     (found,), (coarse,) = rays_of(kind), rays(kind)
     assert in_step(found.sizes[found.sizes > 0.0]) > 0.95

@@ -21,7 +21,14 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
-PLANT = Lag(dead_time_s=0.3, dead_band_extend=0.05, dead_band_retract=0.05, gain=1.0, time_constant_s=0.1, spread={})
+PLANT = Lag(
+    dead_time_s=0.3,
+    dead_band_extend=0.05,
+    dead_band_retract=0.05,
+    gain=1.0,
+    time_constant_s=0.1,
+    spread={},
+)
 
 
 def swept(machine: Machine, seconds: float, seed: int, noise: float = 3e-4) -> Recording:
@@ -33,7 +40,11 @@ def swept(machine: Machine, seconds: float, seed: int, noise: float = 3e-4) -> R
         for t in range(count):
             if t % 40 == 0:
                 middle = (machine.lower[j] + machine.upper[j]) / 2
-                level = 0.0 if random.random() < 0.3 else -np.sign(at - middle + 0.2 * random.standard_normal())
+                level = (
+                    0.0
+                    if random.random() < 0.3
+                    else -np.sign(at - middle + 0.2 * random.standard_normal())
+                )
             u[t, j], q[t, j] = 0.5 * level, at
             at += 0.5 * level * speed * machine.period_s
     q += noise * random.standard_normal(q.shape)
@@ -48,19 +59,38 @@ def test_a_coarse_sensor_and_a_noisy_one_are_told_apart_with_their_sizes(machine
     q = field.q.copy()
     q[:, 1] += 1.5e-3 * np.random.default_rng(4).standard_normal(len(q))
     q[:, 3] = np.round(q[:, 3] / 0.004) * 0.004
-    found = sensors.search(Case(machine, reference, [dataclasses.replace(field, q=q)]), library.load(machine), 8.0, 12.0)
+    found = sensors.search(
+        Case(machine, reference, [dataclasses.replace(field, q=q)]),
+        library.load(machine),
+        8.0,
+        12.0,
+    )
     names = {one.kind.name: one for one in found}
     assert names.keys() == {"sensor_noise", "quantisation"}
     assert names["sensor_noise"].joints.tolist() == [False, True, False, False, False]
-    assert names["sensor_noise"].parameters["sigma_rad"]["q2"].mean == pytest.approx(1.5e-3, rel=0.15)
+    assert names["sensor_noise"].parameters["sigma_rad"]["q2"].mean == pytest.approx(
+        1.5e-3, rel=0.15
+    )
     assert names["quantisation"].parameters["step_rad"]["q4"].mean == pytest.approx(0.004, rel=0.15)
     assert not sensors.search(Case(machine, reference, [field]), library.load(machine), 8.0, 12.0)
 
 
-def tracked(recording: Recording, machine: Machine, bias: np.ndarray, tilt_rad: float, seed: int) -> Recording:
+def tracked(
+    recording: Recording, machine: Machine, bias: np.ndarray, tilt_rad: float, seed: int
+) -> Recording:
     """Returns a recording with tool points as measured beside a machine whose encoders show too much and whose base is tilted."""
-    tip = Kinematics(machine, CPU).pose(torch.as_tensor(recording.q - bias, dtype=torch.float32)).tip_in_base_m.numpy()
-    turn = np.array([[1, 0, 0], [0, np.cos(tilt_rad), -np.sin(tilt_rad)], [0, np.sin(tilt_rad), np.cos(tilt_rad)]])
+    tip = (
+        Kinematics(machine, CPU)
+        .pose(torch.as_tensor(recording.q - bias, dtype=torch.float32))
+        .tip_in_base_m.numpy()
+    )
+    turn = np.array(
+        [
+            [1, 0, 0],
+            [0, np.cos(tilt_rad), -np.sin(tilt_rad)],
+            [0, np.sin(tilt_rad), np.cos(tilt_rad)],
+        ]
+    )
     seen = tip @ turn.T + 2e-3 * np.random.default_rng(seed).standard_normal(tip.shape)
     return dataclasses.replace(recording, extra=dict(zip(tool.COLUMNS, seen.T, strict=True)))
 
@@ -69,7 +99,10 @@ def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Mac
     none, bias = np.zeros(5), np.array([0.0, 0.0, 0.015, 0.0, 0.0])
     reference = tracked(swept(machine, 120.0, 5), machine, none, 0.0, 6)
     kinds = library.load(machine)
-    biased, tilted = (tracked(swept(machine, 120.0, 7), machine, b, tilt, 8) for b, tilt in ((bias, 0.0), (none, 0.03)))
+    biased, tilted = (
+        tracked(swept(machine, 120.0, 7), machine, b, tilt, 8)
+        for b, tilt in ((bias, 0.0), (none, 0.03))
+    )
     one = tool.search(Case(machine, [reference], [biased]), kinds, 8.0, 12.0)
     assert [found.kind.name for found in one.found] == ["encoder_bias"] and one.left < 1.2
     assert one.found[0].parameters["bias_rad"]["q3"].mean == pytest.approx(0.015, abs=0.002)
@@ -77,9 +110,15 @@ def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Mac
     assert [found.kind.name for found in other.found] == ["base_tilt"]
     assert other.found[0].parameters["roll_rad"]["machine"].mean == pytest.approx(0.03, abs=0.003)
     assert not tool.search(Case(machine, [reference], [reference]), kinds, 8.0, 12.0).found
-    # two milliradians are seen, explained, and not worth a name; nothing else is named in their place
+    # two milliradians are seen, explained, and not worth a name; nothing else is named in their
+    # place
     faint = tool.search(
-        Case(machine, [reference], [tracked(swept(machine, 120.0, 7), machine, bias / 7.5, 0.0, 8)]), kinds, 8.0, 12.0
+        Case(
+            machine, [reference], [tracked(swept(machine, 120.0, 7), machine, bias / 7.5, 0.0, 8)]
+        ),
+        kinds,
+        8.0,
+        12.0,
     )
     assert not faint.found and faint.left < 1.2
 
@@ -89,11 +128,15 @@ def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine:
 
     def late(recording: Recording) -> Recording:
         return dataclasses.replace(
-            recording, extra={name: np.concatenate([row[:1], row[:-1]]) for name, row in recording.extra.items()}
+            recording,
+            extra={
+                name: np.concatenate([row[:1], row[:-1]]) for name, row in recording.extra.items()
+            },
         )
 
     reference, field, biased = (
-        late(tracked(swept(machine, 120.0, seed), machine, b, 0.0, seed)) for seed, b in ((5, none), (7, none), (7, bias))
+        late(tracked(swept(machine, 120.0, seed), machine, b, 0.0, seed))
+        for seed, b in ((5, none), (7, none), (7, bias))
     )
     kinds = library.load(machine)
     one = tool.search(Case(machine, [reference], [biased]), kinds, 8.0, 12.0)
@@ -107,13 +150,22 @@ def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine:
 
 def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) -> None:
     one = swept(machine, 20.0, 9)
-    assert tool.search(Case(machine, [one], [one]), library.load(machine), 8.0, 12.0) == tool.Seen([], 1.0)
+    assert tool.search(Case(machine, [one], [one]), library.load(machine), 8.0, 12.0) == tool.Seen(
+        [], 1.0
+    )
 
 
-def held_over(machine: Machine, lost: float, seed: int, late: tuple[int, ...] = (0,) * 5, only: slice = slice(None)) -> Recording:
+def held_over(
+    machine: Machine,
+    lost: float,
+    seed: int,
+    late: tuple[int, ...] = (0,) * 5,
+    only: slice = slice(None),
+) -> Recording:
     """Returns two minutes of a lag plant under levels to and fro, each lost frame holding the level before for a period more.
 
-    `late`: periods by which all commands of each joint come later still; `only`: joints whose commands get lost.
+    `late`: periods by which all commands of each joint come later still; `only`: joints whose
+    commands get lost.
     """
     random = np.random.default_rng(seed)
     levels = random.uniform(0.3, 0.8, (120, 5)) * np.where(np.arange(120) % 2, -1.0, 1.0)[:, None]
@@ -123,7 +175,9 @@ def held_over(machine: Machine, lost: float, seed: int, late: tuple[int, ...] = 
         sent[t, only] = sent[t - 1, only] if missing[t] else u[t, only]
     sent = np.stack([np.roll(column, by) for column, by in zip(sent.T, late, strict=True)], 1)
     model, size = PLANT.build(machine, 1, CPU), machine.num_history
-    known = torch.as_tensor(np.concatenate([np.zeros((size - 1, 5)), sent])[None], dtype=torch.float32)
+    known = torch.as_tensor(
+        np.concatenate([np.zeros((size - 1, 5)), sent])[None], dtype=torch.float32
+    )
     q = torch.as_tensor(machine.home, dtype=torch.float32)[None]
     model.reset(torch.ones(1, dtype=torch.bool))
     path = [q[0].numpy()]
@@ -135,7 +189,11 @@ def held_over(machine: Machine, lost: float, seed: int, late: tuple[int, ...] = 
     measured = path[0] + np.cumsum(steps, 0) + 2e-4 * random.standard_normal(u.shape)
     blank = swept(machine, 1.0, 0)
     return dataclasses.replace(
-        blank, t_s=np.arange(len(u)) * 0.05, u=u.astype(np.float32), q=measured.astype(np.float32), metadata={"run": f"{seed}"}
+        blank,
+        t_s=np.arange(len(u)) * 0.05,
+        u=u.astype(np.float32),
+        q=measured.astype(np.float32),
+        metadata={"run": f"{seed}"},
     )
 
 
@@ -150,16 +208,23 @@ def test_frames_that_were_lost_are_counted_by_where_joints_end_up(machine: Machi
     assert found and found.kind.name == "frame_loss" and found.joints.all()
     assert found.parameters["probability"]["q1"].mean == pytest.approx(0.2, abs=0.08)
     assert frames.search(frames.Changes(other), other.error, [whole], kinds, 8.0, 12.0) is None
-    # with their delays taken for chance, errors scatter far less: the rest is that lost frames delay on average too
+    # with their delays taken for chance, errors scatter far less: the rest is that lost frames
+    # delay on average too
     chancy = dataclasses.replace(lossy, late=changes.spread(lossy.error))
     before, after = (float(np.mean(np.minimum(one.z**2, 25.0))) for one in (lossy, chancy))
     assert before > 5.0 and after < 0.4 * before
     for j in range(2):
-        np.testing.assert_allclose(chancy.rewhitened(lossy, lossy.z[j : j + 1], j)[0], chancy.z[j], atol=1e-6)
+        np.testing.assert_allclose(
+            chancy.rewhitened(lossy, lossy.z[j : j + 1], j)[0], chancy.z[j], atol=1e-6
+        )
 
 
 def test_what_one_joint_alone_is_late_by_is_no_lost_frame(machine: Machine) -> None:
-    rows = [held_over(machine, 0.0, 10), held_over(machine, 0.2, 12, only=slice(2, 3)), held_over(machine, 0.05, 13)]
+    rows = [
+        held_over(machine, 0.0, 10),
+        held_over(machine, 0.2, 12, only=slice(2, 3)),
+        held_over(machine, 0.05, 13),
+    ]
     held = [simulator.held(PLANT, [(one, 0.0)], machine, 0) for one in rows]
     noises = simulator.noises(held[:1], machine)
     whole, alone, seldom = (dataclasses.replace(one.evidence, noise=noises) for one in held)
@@ -174,10 +239,19 @@ def test_what_one_joint_alone_is_late_by_is_no_lost_frame(machine: Machine) -> N
 
 def test_delays_err_as_they_do_where_no_frame_is_late() -> None:
     random, error = np.random.default_rng(3), np.full(4000, 0.3)
-    found = frames.Usual.of([frames.Delays(1.2 * error * random.standard_t(5.0, 4000), error, np.zeros(4000))])
-    assert found.scale == pytest.approx(1.15, abs=0.11) and found.freedom in (5.0, 7.0)  # a little is what all timing is off by
+    found = frames.Usual.of(
+        [frames.Delays(1.2 * error * random.standard_t(5.0, 4000), error, np.zeros(4000))]
+    )
+    assert found.scale == pytest.approx(1.15, abs=0.11) and found.freedom in (
+        5.0,
+        7.0,
+    )  # a little is what all timing is off by
     seen = frames.Delays(np.repeat([0.0, 1.0], [90, 10]), np.full(100, 0.1), np.zeros(100))
-    assert found.gain(seen, np.repeat([0.0, 1.0], [9, 1])) > 0.0 > found.gain(seen, np.repeat([0.0, 1.0], [1, 9]))
+    assert (
+        found.gain(seen, np.repeat([0.0, 1.0], [9, 1]))
+        > 0.0
+        > found.gain(seen, np.repeat([0.0, 1.0], [1, 9]))
+    )
 
 
 def test_the_mean_of_delays_by_chance_is_what_all_joints_are_late_by(machine: Machine) -> None:
@@ -189,15 +263,21 @@ def test_the_mean_of_delays_by_chance_is_what_all_joints_are_late_by(machine: Ma
 
     def late_s(evidence: Evidence) -> list[float]:
         shapes = [Shape(ray.sizes, change) for change in evidence.response(ray)]
-        return [late.size("dead_time_s") * fitted(z, [shape])[0] for z, shape in zip(evidence.z, shapes, strict=True)]
+        return [
+            late.size("dead_time_s") * fitted(z, [shape])[0]
+            for z, shape in zip(evidence.z, shapes, strict=True)
+        ]
 
     def expected(lost: float) -> list[float]:
-        every = {"probability": {name: Estimate(lost, (lost, lost)) for name in machine.joint_names}}
+        every = {
+            "probability": {name: Estimate(lost, (lost, lost)) for name in machine.joint_names}
+        }
         found = Found(loss, np.ones(5, bool), every, 0.0, 0.0, 0.0, {})
         return late_s(frames.expected(evidence, found, []))
 
     assert late_s(evidence) == pytest.approx([0.05, 0.05, 0.05, 0.2, 0.05], abs=0.012)
-    # where half of the frames are lost, these wait a period on average, and may two; what one joint has alone is left
+    # where half of the frames are lost, these wait a period on average, and may two; what one joint
+    # has alone is left
     shared = np.array(expected(0.5))
     assert (np.abs(np.delete(shared, 3)) < 0.02).all() and shared[3] > 0.08
     # one in ten lost does not make all late by a period

@@ -46,10 +46,26 @@ def runs(machine: Machine, count: int, seed: int, factor: float) -> FreeRuns:
 
 @pytest.fixture(scope="module")
 def seen(machine: Machine) -> tuple[Outcome, Survey]:
-    before, after, floor = runs(machine, 3, 0, 1.25), runs(machine, 3, 0, 1.01), runs(machine, 6, 1, 1.0)
+    before, after, floor = (
+        runs(machine, 3, 0, 1.25),
+        runs(machine, 3, 0, 1.01),
+        runs(machine, 6, 1, 1.0),
+    )
     thresholds = option("thresholds", "default")
-    found = survey(before, floor, after, machine, thresholds, np.full(5, 0.55), np.random.default_rng(0), before)
-    rivals = [{"name": "flow gain q4", "score": 40.0, "selected": True}, {"name": "backlash q3", "score": -1.0}]
+    found = survey(
+        before,
+        floor,
+        after,
+        machine,
+        thresholds,
+        np.full(5, 0.55),
+        np.random.default_rng(0),
+        before,
+    )
+    rivals = [
+        {"name": "flow gain q4", "score": 40.0, "selected": True},
+        {"name": "backlash q3", "score": -1.0},
+    ]
     answer = Answer(
         verdict="effects", selected=(GAIN,), ranking=(), where=found.where(),
         gap=Gap(0.03, 0.006, 0.004, Estimate(0.93, (0.88, 0.96))),
@@ -72,23 +88,37 @@ def test_the_report_says_verdict_gap_cause_place_and_what_to_do(
         "at the tool, mm", "by running time", "grows with the way",
     ):  # fmt: skip
         assert part in text, part
-    assert "https:" not in text and "<run>" not in text and "&lt;run&gt;" in text and "nan" not in text.split("base64")[0]
+    assert (
+        "https:" not in text
+        and "<run>" not in text
+        and "&lt;run&gt;" in text
+        and "nan" not in text.split("base64")[0]
+    )
     assert text.count("data:image/png;base64,") == 6
 
 
 def test_the_survey_finds_the_joint_and_the_stage(seen: tuple[Outcome, Survey]) -> None:
     where = seen[1].where()
-    assert where.joints["q4"].share > 0.9 and where.stage == "actuation" and where.regimes[0].joint == "q4"
+    assert (
+        where.joints["q4"].share > 0.9
+        and where.stage == "actuation"
+        and where.regimes[0].joint == "q4"
+    )
     assert seen[1].budget is not None and seen[1].budget.before.joint_part["q4"] > 0.7
     assert sum(joint.share for joint in where.joints.values()) == pytest.approx(1.0)
     assert seen[1].budget.floor is not None
 
 
-def test_what_a_report_is_made_of_is_saved_and_read_again(machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path) -> None:
+def test_what_a_report_is_made_of_is_saved_and_read_again(
+    machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path
+) -> None:
     seen[0].save(tmp_path)
     again = outcome.load(tmp_path, machine)
     assert again.answer.to_json() == seen[0].answer.to_json()
-    assert again.before.error == pytest.approx(seen[0].before.error, abs=1e-6) and again.after is not None
+    assert (
+        again.before.error == pytest.approx(seen[0].before.error, abs=1e-6)
+        and again.after is not None
+    )
     (tmp_path / "diagnosis.npz").write_bytes(b"half")
     with pytest.raises(RecordingError, match="cannot be read"):
         outcome.load(tmp_path, machine)
@@ -99,9 +129,21 @@ def test_an_answer_without_effects_is_said_in_plain_words(
     machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path, verdict
 ) -> None:
     answer = replace(
-        seen[0].answer, verdict=verdict, selected=(), gap=Gap(0.012, 0.012, 0.01, None), next_experiment=None, reason="Few data."
+        seen[0].answer,
+        verdict=verdict,
+        selected=(),
+        gap=Gap(0.012, 0.012, 0.01, None),
+        next_experiment=None,
+        reason="Few data.",
     )
-    bare = replace(answer, more={key: value for key, value in answer.more.items() if key not in ("evidence", "budget", "probes")})
+    bare = replace(
+        answer,
+        more={
+            key: value
+            for key, value in answer.more.items()
+            if key not in ("evidence", "budget", "probes")
+        },
+    )
     text, tone = wording.headline(bare)
     assert tone == ("good" if verdict == "none" else "warn")
     assert ("No gap" in text) == (verdict == "none") and ("in q4" in text) == (verdict == "unknown")
@@ -112,22 +154,33 @@ def test_an_answer_without_effects_is_said_in_plain_words(
 def test_what_moves_the_tool_alone_is_told_where_the_tool_is(seen: tuple[Outcome, Survey]) -> None:
     one = replace(seen[0].answer.selected[0], effect="link_length")
     said = "measured tool points lie 32.9 mm from forward kinematics"
-    more = {"geometry": {"cause": "link_length q1"}, "stages": [{"stage": "kinematics", "part": None, "text": said}]}
+    more = {
+        "geometry": {"cause": "link_length q1"},
+        "stages": [{"stage": "kinematics", "part": None, "text": said}],
+    }
     answer = replace(seen[0].answer, selected=(one,), more=more)
     assert f" M{said[1:]}." in wording.headline(answer)[0]
     assert "tool" not in wording.headline(replace(answer, selected=seen[0].answer.selected))[0]
 
 
-def test_an_answer_that_cannot_tell_says_why(machine: Machine, seen: tuple[Outcome, Survey]) -> None:
+def test_an_answer_that_cannot_tell_says_why(
+    machine: Machine, seen: tuple[Outcome, Survey]
+) -> None:
     bare = Answer(
         verdict="unknown", selected=(), ranking=(), where=Where({}, (), None), gap=Gap(0.01, 0.01, 0.01, None),
         next_experiment=None, reason="cannot tell, because nothing moves",
     )  # fmt: skip
-    assert wording.headline(bare)[0].startswith("There is no telling. Cannot tell, because nothing moves. Error over 5 s")
+    assert wording.headline(bare)[0].startswith(
+        "There is no telling. Cannot tell, because nothing moves. Error over 5 s"
+    )
     assert pictures.paths(Outcome(bare, seen[0].before, None, None), machine).axes
 
 
 def test_lists_and_classes_read_as_sentences() -> None:
-    assert wording.listed(["a"]) == "a" and wording.listed(["a", "b", "c"]) == "a, b and c" and wording.listed([]) == ""
+    assert (
+        wording.listed(["a"]) == "a"
+        and wording.listed(["a", "b", "c"]) == "a, b and c"
+        and wording.listed([]) == ""
+    )
     assert wording.same_as(replace(GAIN, same_as=())) == ""
     assert "probability of 0.97 is that of one of them" in wording.same_as(GAIN)

@@ -25,18 +25,31 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
-LINEAR = Lag(dead_time_s=0.0, dead_band_extend=0.0, dead_band_retract=0.0, gain=1.0, time_constant_s=0.0, spread={})
+LINEAR = Lag(
+    dead_time_s=0.0,
+    dead_band_extend=0.0,
+    dead_band_retract=0.0,
+    gain=1.0,
+    time_constant_s=0.0,
+    spread={},
+)
 
 
 def held(base: np.ndarray, measured: np.ndarray) -> Any:
-    return SimpleNamespace(base=base, candidates=SimpleNamespace(cut=SimpleNamespace(measured=measured)))
+    return SimpleNamespace(
+        base=base, candidates=SimpleNamespace(cut=SimpleNamespace(measured=measured))
+    )
 
 
 def reach(machine: Machine, before: float, after: float, own: float, floor: float) -> Reach:
     """Errors of one size everywhere: 40 windows, 10 steps."""
     measured = np.zeros((40, 10, machine.num_joints))
     null = SimpleNamespace(evidence=held(measured + floor, measured))
-    base: Any = SimpleNamespace(field=SimpleNamespace(evidence=held(measured + before, measured)), nulls=[null], is_flexible=False)
+    base: Any = SimpleNamespace(
+        field=SimpleNamespace(evidence=held(measured + before, measured)),
+        nulls=[null],
+        is_flexible=False,
+    )
     return Reach(base, machine, measured + after, measured + own, np.random.default_rng(0))
 
 
@@ -45,7 +58,9 @@ def test_what_is_closed_and_what_was_foretold_are_told_apart(machine: Machine) -
     found, foretold = seen.gap(), seen.foretold()
     assert found.closed and foretold
     assert found.closed.mean == pytest.approx(18 / 28) and foretold.mean == pytest.approx(21 / 28)
-    assert found.joints["q3"].closed == pytest.approx(18 / 28) and found.joints["q3"].share == pytest.approx(0.6)
+    assert found.joints["q3"].closed == pytest.approx(18 / 28) and found.joints[
+        "q3"
+    ].share == pytest.approx(0.6)
     assert seen.beyond() == list(machine.joint_names)  # 12 is far beyond 2
     assert reach(machine, 0.030, 0.0022, 0.0022, 0.002).beyond() == []
 
@@ -65,15 +80,22 @@ def test_errors_in_metres_and_radians_are_taken_over_the_travel(machine: Machine
 def test_the_part_of_an_effect_has_an_interval() -> None:
     value = {frozenset(): np.zeros(3), frozenset("a"): np.array([0.5, 0.4, 0.6]), frozenset("b"): np.array([0.2, 0.1, 0.3]),
              frozenset("ab"): np.array([0.9, 0.8, 1.0])}  # fmt: skip
-    found = {name: gap.estimate(values) for name, values in gap.shapley(["a", "b"], lambda some: value[some]).items()}
-    assert found["a"].mean == pytest.approx(0.6) and found["b"].mean == pytest.approx(0.3)  # (0.5 + 0.7) / 2, (0.2 + 0.4) / 2
+    found = {
+        name: gap.estimate(values)
+        for name, values in gap.shapley(["a", "b"], lambda some: value[some]).items()
+    }
+    assert found["a"].mean == pytest.approx(0.6) and found["b"].mean == pytest.approx(
+        0.3
+    )  # (0.5 + 0.7) / 2, (0.2 + 0.4) / 2
     assert found["a"].ci95[0] < 0.6 < found["a"].ci95[1]
 
 
 @pytest.fixture(scope="module")
 def axis(machine: Machine) -> Machine:
     joint = replace(machine.joints[2], body=None)
-    return replace(machine, name="axis", mjcf=None, tool_m=None, joints=(joint,), exclusive=(), levers=())
+    return replace(
+        machine, name="axis", mjcf=None, tool_m=None, joints=(joint,), exclusive=(), levers=()
+    )
 
 
 def driven(machine: Machine, seed: int, dead_band: float = 0.35, gentle: bool = False) -> Recording:
@@ -85,37 +107,58 @@ def driven(machine: Machine, seed: int, dead_band: float = 0.35, gentle: bool = 
         "dead_band": DeadBand(joints="all", extend=dead_band, retract=dead_band),
         "saturation": Saturation(joints="all", level=0.7),
     }
-    model, random = Affected(actuator=LINEAR, effects=effects).build(machine, 1, CPU), np.random.default_rng(seed)
-    history = History(q=torch.zeros(1, machine.num_history, 1), u=torch.zeros(1, machine.num_history, 1))
-    history.reset(torch.ones(1, dtype=torch.bool), torch.as_tensor(machine.home, dtype=torch.float32)[None])
+    model, random = (
+        Affected(actuator=LINEAR, effects=effects).build(machine, 1, CPU),
+        np.random.default_rng(seed),
+    )
+    history = History(
+        q=torch.zeros(1, machine.num_history, 1), u=torch.zeros(1, machine.num_history, 1)
+    )
+    history.reset(
+        torch.ones(1, dtype=torch.bool), torch.as_tensor(machine.home, dtype=torch.float32)[None]
+    )
     u, q, level, left = [], [], 0.0, 0
     for k in range(round(120 / machine.period_s)):
         if left == 0:
             most = 0.6 if gentle and not 26.0 < k * machine.period_s % 40.0 < 36.0 else 1.0
             level, left = random.uniform(-most, most), int(random.integers(10, 50))
         here = float(history.q[0, -1, 0])
-        level = -abs(level) if here > machine.upper[0] - 0.3 else abs(level) if here < machine.lower[0] + 0.3 else level
+        level = (
+            -abs(level)
+            if here > machine.upper[0] - 0.3
+            else abs(level)
+            if here < machine.lower[0] + 0.3
+            else level
+        )
         left -= 1
         u.append(level)
         q.append(here + 2e-4 * random.standard_normal())
         history.push_u(torch.full((1, 1), level))
         before = history.q[:, -1].clone()
-        history.push_q(before + (model.step(history) - before) * (1.0 + 0.01 * random.standard_normal()))
+        history.push_q(
+            before + (model.step(history) - before) * (1.0 + 0.01 * random.standard_normal())
+        )
     return Recording(
         machine=machine.name, joints=machine.joint_names, units=("rad",), rate_hz=20.0, t_s=np.arange(len(u)) * 0.05,
         u=np.array(u, np.float32)[:, None], q=np.array(q, np.float32)[:, None], metadata={"run": str(seed)},
     )  # fmt: skip
 
 
-def test_a_dead_band_and_a_saturation_far_beyond_the_typical_are_fitted_together(axis: Machine, tmp_path: Path) -> None:
+def test_a_dead_band_and_a_saturation_far_beyond_the_typical_are_fitted_together(
+    axis: Machine, tmp_path: Path
+) -> None:
     case = Case(axis, [], [driven(axis, seed) for seed in (1, 2)])
     base = simulator.given(case, LINEAR, option("fit", "valve"), tmp_path, 0, CPU)
     assert base.is_flexible and base.nulls  # the floor is that of a flexible model
     evidence = base.field.evidence
     ways = {kind.name: rays(kind) for kind in library.load(axis, ["dead_band", "saturation"])}
     all_rays = [ray for name in sorted(ways) for ray in ways[name]]
-    known = np.array([[2.5], [2.5], [0.0]])  # a dead band of 0.15, as a search that adds effects up would begin with
-    sizes = repair.searched(evidence, all_rays, np.ones((3, 1), bool), known, np.random.default_rng(0))
+    known = np.array(
+        [[2.5], [2.5], [0.0]]
+    )  # a dead band of 0.15, as a search that adds effects up would begin with
+    sizes = repair.searched(
+        evidence, all_rays, np.ones((3, 1), bool), known, np.random.default_rng(0)
+    )
     start = [{"dead_band": sizes[:2, 0], "saturation": sizes[2:, 0]}]
     found = repair.repair(evidence, [frozenset(ways)], ways, start)
     extend, retract, saturation = found.sizes[:, 0] * [0.06, 0.06, -0.25] + [0.0, 0.0, 1.0]
@@ -125,9 +168,13 @@ def test_a_dead_band_and_a_saturation_far_beyond_the_typical_are_fitted_together
     assert np.std(found.after - measured) < 0.15 * np.std(evidence.base - measured)
 
 
-def test_a_half_of_the_recordings_that_says_nothing_of_a_size_does_not_deny_it(axis: Machine) -> None:
+def test_a_half_of_the_recordings_that_says_nothing_of_a_size_does_not_deny_it(
+    axis: Machine,
+) -> None:
     held = simulator.held(LINEAR, [(driven(axis, 3, 0.0, gentle=True), 0.0)], axis, 0)
-    evidence = replace(held.evidence, noise=[Noise(sensor=4e-4, change=0.01, wander=0.01, memory=10.0)])
+    evidence = replace(
+        held.evidence, noise=[Noise(sensor=4e-4, change=0.01, wander=0.01, memory=10.0)]
+    )
     told = [float(np.square(evidence.z[:, evidence.fold == half]).mean()) for half in (0, 1)]
     assert 10.0 * min(told) < max(told)  # the saturation shows in one half only
     ways = {kind.name: rays(kind) for kind in library.load(axis, ["saturation"])}

@@ -19,10 +19,16 @@ Brokk = Callable[..., Done]
 LONG_S = 120.0
 
 
-def driven(machine: Machine, seconds: float = LONG_S, level: float = 0.4, alternating: bool = True) -> Recording:
+def driven(
+    machine: Machine, seconds: float = LONG_S, level: float = 0.4, alternating: bool = True
+) -> Recording:
     """Returns a recording in which all joints but q2 go to and fro, or are given one command all the time."""
     steps = round(seconds / machine.period_s)
-    turns = np.array([0.0, 1.0, 0.0, -1.0])[(np.arange(steps) // 60) % 4] if alternating else np.ones(steps)
+    turns = (
+        np.array([0.0, 1.0, 0.0, -1.0])[(np.arange(steps) // 60) % 4]
+        if alternating
+        else np.ones(steps)
+    )
     u = np.outer(turns, level * np.array([1.0, 0.0, 1.0, 1.0, 1.0]))
     q = machine.home + np.cumsum(u * machine.max_speed * machine.period_s * alternating, 0)
     return Recording(
@@ -54,14 +60,18 @@ def test_recordings_that_can_tell_nothing_get_no_name_but_a_reason(
     done = brokk("mode=diagnose", field, "actuator=lag", "session.out=out", "session.device=cpu")
     assert done.code == 0, done.err
     found = json.loads(Path("out/diagnosis.json").read_text())
-    assert found["verdict"] == "unknown" and not found["selected"] and found["gap"]["closed"] is None
+    assert (
+        found["verdict"] == "unknown" and not found["selected"] and found["gap"]["closed"] is None
+    )
     assert "cannot tell, because" in found["reason"] and reason in found["reason"]
     assert "There is no telling" in Path("out/report.html").read_text()
     lines = Path("out/effects.yaml").read_text().splitlines()
     assert all(line.startswith("#") for line in lines if line)  # nothing that training would take
 
 
-def test_neither_a_simulator_nor_a_reference_is_refused(machine: Machine, brokk: Brokk, tmp_path: Path) -> None:
+def test_neither_a_simulator_nor_a_reference_is_refused(
+    machine: Machine, brokk: Brokk, tmp_path: Path
+) -> None:
     done = brokk("mode=diagnose", given(tmp_path / "field", driven(machine)), "session.out=out")
     assert done.code != 0 and "add actuator=<name>" in done.err
     done = brokk("mode=diagnose", f"diagnosis.case={tmp_path}", "session.out=out2")
@@ -70,19 +80,29 @@ def test_neither_a_simulator_nor_a_reference_is_refused(machine: Machine, brokk:
     assert done.code != 0 and "give either case=" in done.err
 
 
-def test_recordings_of_another_machine_are_refused_by_name(machine: Machine, brokk: Brokk, tmp_path: Path) -> None:
+def test_recordings_of_another_machine_are_refused_by_name(
+    machine: Machine, brokk: Brokk, tmp_path: Path
+) -> None:
     stretched = replace(machine.joints[2], upper=replace(machine.joints[2].upper, value=2.5))
     other = replace(machine, joints=(*machine.joints[:2], stretched, *machine.joints[3:]))
     stamped = replace(driven(machine), metadata={"fingerprint": record.stamp(other)})
-    done = brokk("mode=diagnose", given(tmp_path / "field", stamped), "actuator=lag", "session.out=out")
+    done = brokk(
+        "mode=diagnose", given(tmp_path / "field", stamped), "actuator=lag", "session.out=out"
+    )
     assert done.code != 0 and "limits differ" in done.err and "0.parquet" in done.err
     done = brokk(
-        "mode=diagnose", f"diagnosis.field={tmp_path}/field/*", "machine=mini_excavator", "actuator=lag", "session.out=out2"
+        "mode=diagnose",
+        f"diagnosis.field={tmp_path}/field/*",
+        "machine=mini_excavator",
+        "actuator=lag",
+        "session.out=out2",
     )
     assert done.code != 0 and "brokk170" in done.err
 
 
-def test_a_position_that_is_no_number_is_refused_by_name(machine: Machine, brokk: Brokk, tmp_path: Path) -> None:
+def test_a_position_that_is_no_number_is_refused_by_name(
+    machine: Machine, brokk: Brokk, tmp_path: Path
+) -> None:
     import pyarrow.parquet as pq
 
     given(tmp_path / "field", driven(machine), driven(machine))
@@ -92,5 +112,12 @@ def test_a_position_that_is_no_number_is_refused_by_name(machine: Machine, brokk
     values = table.column(place).to_numpy().copy()
     values[100] = np.nan
     pq.write_table(table.set_column(place, table.field(place), [values]), path)
-    done = brokk("mode=diagnose", f"diagnosis.field={tmp_path}/field/*", "actuator=lag", "session.out=out")
-    assert done.code != 0 and "1.parquet" in done.err and "q_q3_rad" in done.err and not Path("out/diagnosis.json").exists()
+    done = brokk(
+        "mode=diagnose", f"diagnosis.field={tmp_path}/field/*", "actuator=lag", "session.out=out"
+    )
+    assert (
+        done.code != 0
+        and "1.parquet" in done.err
+        and "q_q3_rad" in done.err
+        and not Path("out/diagnosis.json").exists()
+    )

@@ -23,7 +23,9 @@ def thresholds() -> Thresholds:
     return option("thresholds", "default")
 
 
-def recording(machine: Machine, ignored: np.ndarray | None = None, seconds: float = 240.0) -> Recording:
+def recording(
+    machine: Machine, ignored: np.ndarray | None = None, seconds: float = 240.0
+) -> Recording:
     """Returns a recording in which all joints but q2 go to and fro; `ignored`, `(T,)`: where q3 does not obey."""
     steps = round(seconds / PERIOD_S)
     u = np.zeros((steps, 5))
@@ -35,7 +37,11 @@ def recording(machine: Machine, ignored: np.ndarray | None = None, seconds: floa
         obeyed[ignored, 2] = 0.0
     moved = np.zeros((steps, 5))
     moved[DELAY:] = obeyed[:-DELAY] * machine.max_speed * PERIOD_S
-    q = machine.home + np.cumsum(moved, 0) + NOISE * np.random.default_rng(0).standard_normal((steps, 5))
+    q = (
+        machine.home
+        + np.cumsum(moved, 0)
+        + NOISE * np.random.default_rng(0).standard_normal((steps, 5))
+    )
     return Recording(
         machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(steps) * PERIOD_S,
         u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": "planted"},
@@ -46,26 +52,43 @@ def named(remarks: list[Remark]) -> dict[str, Remark]:
     return {remark.name: remark for remark in remarks}
 
 
-def test_a_sound_recording_says_only_which_joint_rested(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_sound_recording_says_only_which_joint_rested(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     (remark,) = examine([recording(machine)], machine, thresholds)
     assert (remark.name, remark.joint, remark.severity) == ("joint at rest", "q2", "note")
 
 
-def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     sound = recording(machine)
-    found = named(examine([recording(machine, np.abs(sound.u[:, 3]) > 0)], machine, thresholds))["interlock"]
-    assert found.joint == "q3" and found.severity == "bad" and found.recording == "planted" and found.count >= 5
+    found = named(examine([recording(machine, np.abs(sound.u[:, 3]) > 0)], machine, thresholds))[
+        "interlock"
+    ]
+    assert (
+        found.joint == "q3"
+        and found.severity == "bad"
+        and found.recording == "planted"
+        and found.count >= 5
+    )
     assert "q3 ignores its command when q4 is commanded" in found.amount
 
 
-def test_a_joint_locked_in_a_pose_is_an_interlock_and_says_where(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_joint_locked_in_a_pose_is_an_interlock_and_says_where(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     sound = recording(machine)
     limit = float(np.quantile(sound.q[:, 0], 0.5))
-    found = named(examine([recording(machine, np.roll(sound.q[:, 0] > limit, -DELAY))], machine, thresholds))["interlock"]
+    found = named(
+        examine([recording(machine, np.roll(sound.q[:, 0] > limit, -DELAY))], machine, thresholds)
+    )["interlock"]
     assert found.joint == "q3" and "q3 ignores its command when q1 is above" in found.amount
 
 
-def test_a_lock_without_a_common_condition_stays_unexplained(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_lock_without_a_common_condition_stays_unexplained(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     ignored = np.zeros(4800, dtype=bool)
     for begin in np.random.default_rng(3).integers(0, 4700, 12):
         ignored[begin : begin + 60] = True
@@ -83,7 +106,9 @@ def test_a_lock_without_a_common_condition_stays_unexplained(machine: Machine, t
         (lambda t: t * 1.004, "clock rate"),
     ],
 )
-def test_what_is_wrong_with_a_clock_is_told_apart(machine: Machine, thresholds: Thresholds, change, name: str | None) -> None:
+def test_what_is_wrong_with_a_clock_is_told_apart(
+    machine: Machine, thresholds: Thresholds, change, name: str | None
+) -> None:
     sound = recording(machine)
     found = named(examine([replace(sound, t_s=change(sound.t_s))], machine, thresholds))
     assert {key for key in found if "clock" in key} == ({name} if name else set())
@@ -93,18 +118,26 @@ def test_what_is_wrong_with_a_clock_is_told_apart(machine: Machine, thresholds: 
         assert found[name].amount.startswith("+4000 ppm")
 
 
-def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_not(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_not(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     sound = recording(machine)
     middle = float(sound.q[:, 2].min() + 0.7 * np.ptp(sound.q[:, 2]))
     q = sound.q.copy()
     q[:, 2] = np.minimum(q[:, 2], middle)
     found = named(examine([replace(sound, q=q)], machine, thresholds))["saturated sensor"]
     assert found.joint == "q3" and found.severity == "bad"
-    shifted = q + np.where(np.arange(5) == 2, machine.upper[2] - q[:, 2].max(), 0.0).astype(np.float32)
-    assert "saturated sensor" not in named(examine([replace(sound, q=shifted)], machine, thresholds))
+    shifted = q + np.where(np.arange(5) == 2, machine.upper[2] - q[:, 2].max(), 0.0).astype(
+        np.float32
+    )
+    assert "saturated sensor" not in named(
+        examine([replace(sound, q=shifted)], machine, thresholds)
+    )
 
 
-def test_lost_frames_and_broken_rules_are_one_remark_each(machine: Machine, thresholds: Thresholds) -> None:
+def test_lost_frames_and_broken_rules_are_one_remark_each(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     sound = recording(machine)
     q, u = sound.q.copy(), sound.u.copy()
     for row in range(100, 4000, 97):
@@ -115,9 +148,21 @@ def test_lost_frames_and_broken_rules_are_one_remark_each(machine: Machine, thre
     assert found["exclusive joint"].from_s == pytest.approx(20.0)
 
 
-def test_the_gravest_comes_first_and_all_of_it_is_plain(machine: Machine, thresholds: Thresholds) -> None:
+def test_the_gravest_comes_first_and_all_of_it_is_plain(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     sound = recording(machine)
-    remarks = examine([replace(recording(machine, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)], machine, thresholds)
-    assert [remark.severity for remark in remarks] == sorted((r.severity for r in remarks), key=["bad", "warn", "note"].index)
+    remarks = examine(
+        [replace(recording(machine, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)],
+        machine,
+        thresholds,
+    )
+    assert [remark.severity for remark in remarks] == sorted(
+        (r.severity for r in remarks), key=["bad", "warn", "note"].index
+    )
     for remark in remarks:
-        assert remark.plain()["name"] in TEXTS and remark.plain()["advice"] and remark.to_s >= remark.from_s
+        assert (
+            remark.plain()["name"] in TEXTS
+            and remark.plain()["advice"]
+            and remark.to_s >= remark.from_s
+        )

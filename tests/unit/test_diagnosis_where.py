@@ -29,7 +29,10 @@ def recordings(machine: Machine, count: int, seed: int) -> list[Recording]:
         for begin in range(0, 1200, 40):
             u[begin : begin + 40, rng.integers(5)] = rng.choice([-0.6, -0.2, 0.0, 0.2, 0.6])
         q = machine.home + np.zeros_like(u)
-        metadata = {"run": f"{seed}-{number}", "created": f"2026-11-20T10:{number:02d}:00.000+00:00"}
+        metadata = {
+            "run": f"{seed}-{number}",
+            "created": f"2026-11-20T10:{number:02d}:00.000+00:00",
+        }
         found.append(
             Recording(
                 machine="brokk170",
@@ -57,9 +60,16 @@ def runs(machine: Machine, count: int, seed: int, size: float = 0.0003) -> FreeR
 
 def planted(base: FreeRuns, machine: Machine, joint: int, regime: str, speed: float) -> FreeRuns:
     """Returns free runs in which one joint is simulated too fast, by `speed` rad/s, in one regime."""
-    label = base.cut([regimes(in_force(r.u, np.full(5, DELAY_S), PERIOD_S), r.q, machine, 20.0) for r in base.recordings])
+    label = base.cut(
+        [
+            regimes(in_force(r.u, np.full(5, DELAY_S), PERIOD_S), r.q, machine, 20.0)
+            for r in base.recordings
+        ]
+    )
     added = np.zeros_like(base.simulated)
-    added[..., joint] = np.cumsum((label[..., joint] == REGIMES.index(regime)) * speed * PERIOD_S, 1)
+    added[..., joint] = np.cumsum(
+        (label[..., joint] == REGIMES.index(regime)) * speed * PERIOD_S, 1
+    )
     return replace(base, simulated=base.simulated + added)
 
 
@@ -68,8 +78,12 @@ def located(field: FreeRuns, reference: FreeRuns | None, machine: Machine) -> Lo
 
 
 @pytest.mark.parametrize("regime", ["creep", "cruise", "after a reversal", "hold", "stop"])
-def test_an_error_that_arises_in_one_regime_of_one_joint_is_found_there(machine: Machine, regime: str) -> None:
-    found = located(planted(runs(machine, 6, 0), machine, 2, regime, 0.05), runs(machine, 12, 1), machine)
+def test_an_error_that_arises_in_one_regime_of_one_joint_is_found_there(
+    machine: Machine, regime: str
+) -> None:
+    found = located(
+        planted(runs(machine, 6, 0), machine, 2, regime, 0.05), runs(machine, 12, 1), machine
+    )
     assert found.joints["q3"].gap > 0.9 and found.joints["q3"].is_sure and found.has_gap
     first = found.largest()[0]
     assert (first.joint, first.category) == ("q3", regime)
@@ -78,10 +92,14 @@ def test_an_error_that_arises_in_one_regime_of_one_joint_is_found_there(machine:
 
 def test_two_errors_share_the_gap_as_their_squares_do(machine: Machine) -> None:
     quiet = runs(machine, 4, 0, size=0.0)
-    one, other = (planted(quiet, machine, joint, "cruise", speed) for joint, speed in ((1, 0.02), (3, 0.04)))
+    one, other = (
+        planted(quiet, machine, joint, "cruise", speed) for joint, speed in ((1, 0.02), (3, 0.04))
+    )
     both = replace(quiet, simulated=one.simulated + other.simulated - quiet.simulated)
     squares = [np.nansum(runs.error**2) for runs in (one, other)]
-    found = located(both, None, machine)  # with a floor, one standard error of chance would be taken off
+    found = located(
+        both, None, machine
+    )  # with a floor, one standard error of chance would be taken off
     assert found.joints["q2"].gap == pytest.approx(squares[0] / sum(squares))
     assert found.joints["q4"].gap == pytest.approx(squares[1] / sum(squares))
     parts = {(p.joint, p.category): p.gap for p in found.parts["regime"]}
@@ -93,14 +111,23 @@ def test_every_way_of_sorting_adds_up_to_the_whole(machine: Machine, has_floor: 
     field = planted(runs(machine, 6, 0), machine, 2, "creep", 0.05)
     field = replace(field, row=field.row + 30)  # the last windows reach beyond the end
     found = located(field, runs(machine, 12, 1) if has_floor else None, machine)
-    assert set(found.parts) == {"regime", "direction", "load", "frequency", "running time", "recording"}
+    assert set(found.parts) == {
+        "regime",
+        "direction",
+        "load",
+        "frequency",
+        "running time",
+        "recording",
+    }
     for name, parts in found.parts.items():
         assert sum(part.error for part in parts) == pytest.approx(1.0), name
         assert sum(part.gap for part in parts) == pytest.approx(1.0), name
         assert all(part.gap >= 0.0 for part in parts)
     assert sum(joint.error for joint in found.joints.values()) == pytest.approx(1.0)
     assert found.has_gap
-    assert all((part.p is None) == (not has_floor) or part.time == 0.0 for part in found.parts["regime"])
+    assert all(
+        (part.p is None) == (not has_floor) or part.time == 0.0 for part in found.parts["regime"]
+    )
 
 
 def test_an_error_is_traced_to_the_samples_that_added_to_it() -> None:
@@ -117,7 +144,9 @@ def test_a_slow_and_a_fast_error_lie_in_their_bands(machine: Machine) -> None:
     t_s = np.arange(STEPS) * PERIOD_S
     wave = np.zeros_like(quiet.simulated)
     wave[..., 0] = 0.01 * np.sin(2 * np.pi * 0.6 * t_s) + 0.02 * np.sin(2 * np.pi * 4.0 * t_s)
-    found = located(replace(quiet, simulated=quiet.simulated + wave), None, machine).totals("frequency")
+    found = located(replace(quiet, simulated=quiet.simulated + wave), None, machine).totals(
+        "frequency"
+    )
     assert found["0.3 to 1 Hz"] == pytest.approx(0.2, abs=1e-6)
     assert found["above 3 Hz"] == pytest.approx(0.8, abs=1e-6)
 
@@ -128,8 +157,17 @@ def test_each_sample_has_the_regime_that_its_command_makes(machine: Machine) -> 
     u[100:110, 3] = 0.6
     q = np.tile(machine.home, (200, 1))
     names = np.array(REGIMES)[regimes(u, q, machine, 20.0)]
-    assert names[10, 2] == "hold" and names[22, 2] == "start" and names[40, 2] == "creep" and names[70, 2] == "cruise"
-    assert names[85, 2] == "after a reversal" and names[105, 2] == "several joints at once" and names[115, 2] == "cruise"
+    assert (
+        names[10, 2] == "hold"
+        and names[22, 2] == "start"
+        and names[40, 2] == "creep"
+        and names[70, 2] == "cruise"
+    )
+    assert (
+        names[85, 2] == "after a reversal"
+        and names[105, 2] == "several joints at once"
+        and names[115, 2] == "cruise"
+    )
     assert names[122, 2] == "stop" and names[150, 2] == "hold" and names[165, 2] == "start"
     q[:, 2] = machine.upper[2] - 0.01
     names = np.array(REGIMES)[regimes(u, q, machine, 20.0)]
@@ -182,5 +220,7 @@ def test_p_is_that_of_all_ways_to_swap_sides() -> None:
     sums = np.array([[5.0], [6.0], [7.0], [1.0], [2.0], [3.0]])
     p = excess_p((sums[:3], np.ones((3, 1))), (sums[3:], np.ones((3, 1))), np.random.default_rng(0))
     assert p[0] == pytest.approx(1 / 20, abs=0.015)
-    nowhere = excess_p((sums[:3], np.zeros((3, 1))), (sums[3:], np.ones((3, 1))), np.random.default_rng(0))
+    nowhere = excess_p(
+        (sums[:3], np.zeros((3, 1))), (sums[3:], np.ones((3, 1))), np.random.default_rng(0)
+    )
     assert np.isnan(nowhere[0])

@@ -40,12 +40,23 @@ def effect(name: str, **changes: Any) -> Any:
 
 def neutral(name: str) -> Any:
     numbers = shipped("effect", name).numbers
-    return effect(name, **{key: number.none for key, number in numbers.items() if number.none is not None})
+    return effect(
+        name, **{key: number.none for key, number in numbers.items() if number.none is not None}
+    )
 
 
 def commands(machine: Machine, steps: int, num: int, seed: int = 0) -> torch.Tensor:
     """Returns random commands that hold for five periods, `(T, N, J)`, some of them zero and some full."""
-    u = torch.rand(math.ceil(steps / 5), num, machine.num_joints, generator=torch.Generator().manual_seed(seed)) * 3.0 - 1.5
+    u = (
+        torch.rand(
+            math.ceil(steps / 5),
+            num,
+            machine.num_joints,
+            generator=torch.Generator().manual_seed(seed),
+        )
+        * 3.0
+        - 1.5
+    )
     u = u.clamp(-1.0, 1.0) * (u.abs() > 0.2)
     return u.repeat_interleave(5, 0)[:steps]
 
@@ -103,12 +114,17 @@ def test_an_effect_says_what_a_diagnosis_must_know(name: str, machine: Machine) 
 @pytest.mark.parametrize("name", FIXED)
 @pytest.mark.parametrize("actuator", ["ideal", "lag", "hydraulic", "mlp"])
 @pytest.mark.parametrize("moving", [False, True])
-def test_the_neutral_value_changes_nothing(name: str, actuator: str, moving: bool, machine: Machine) -> None:
+def test_the_neutral_value_changes_nothing(
+    name: str, actuator: str, moving: bool, machine: Machine
+) -> None:
     build = shipped("actuator", actuator).build
     u = commands(machine, 25, 2, seed=3)
     model = neutral(name).wrap(build(machine, 2, CPU), machine, 2, CPU)
     with torch.no_grad():
-        expected, path = roll(build(machine, 2, CPU), machine, u, moving), roll(model, machine, u, moving)
+        expected, path = (
+            roll(build(machine, 2, CPU), machine, u, moving),
+            roll(model, machine, u, moving),
+        )
     assert torch.equal(path, expected)
     assert torch.equal(model.measure(path[-1]), path[-1])
     assert torch.equal(model.truth(path[-1]), path[-1])
@@ -120,30 +136,54 @@ def test_the_neutral_value_changes_nothing(name: str, actuator: str, moving: boo
 def test_the_typical_value_changes_something(name: str, machine: Machine) -> None:
     build = shipped("actuator", "ideal").build
     u = commands(machine, 60, 2)
-    seldom = {"frame_loss": {"probability": 0.5}, "stiction": {"start": 0.5}}  # seldom seen at their typical size
+    seldom = {
+        "frame_loss": {"probability": 0.5},
+        "stiction": {"start": 0.5},
+    }  # seldom seen at their typical size
     model = effect(name, **seldom.get(name, {})).wrap(build(machine, 2, CPU), machine, 2, CPU)
     expected, path = roll(build(machine, 2, CPU), machine, u), roll(model, machine, u)
     seen = model.measure(path[-1])
-    moved = [(path - expected).abs().amax(), (seen - path[-1]).abs().amax(), (places(model, path[-1]) - 1.0).abs().amax()]
-    acting = {"command": 0, "speed": 0, "joints": 0, "measurement": 1, "kinematics": 2}[model.effect.side]
+    moved = [
+        (path - expected).abs().amax(),
+        (seen - path[-1]).abs().amax(),
+        (places(model, path[-1]) - 1.0).abs().amax(),
+    ]
+    acting = {"command": 0, "speed": 0, "joints": 0, "measurement": 1, "kinematics": 2}[
+        model.effect.side
+    ]
     assert [float(size) > 1e-5 for size in moved] == [place == acting for place in range(3)]
 
 
-@pytest.mark.parametrize("name", [name for name in FIXED if name not in ("base_tilt", "extrinsics")])
+@pytest.mark.parametrize(
+    "name", [name for name in FIXED if name not in ("base_tilt", "extrinsics")]
+)
 def test_only_the_named_joints_have_it(name: str, machine: Machine) -> None:
-    model = effect(name, joints=["q3"]).wrap(shipped("actuator", "ideal").build(machine, 3, CPU), machine, 3, CPU)
+    model = effect(name, joints=["q3"]).wrap(
+        shipped("actuator", "ideal").build(machine, 3, CPU), machine, 3, CPU
+    )
     for key, number in model.effect.numbers.items():
-        expected = torch.full((3, machine.num_joints), number.typical if number.none is None else number.none)
+        expected = torch.full(
+            (3, machine.num_joints), number.typical if number.none is None else number.none
+        )
         expected[:, 2] = number.typical
         assert torch.equal(model.parameters[key], expected)
 
 
 @pytest.mark.parametrize("name", FIXED)
-def test_ranges_are_drawn_anew_at_each_reset_for_each_environment(name: str, machine: Machine) -> None:
+def test_ranges_are_drawn_anew_at_each_reset_for_each_environment(
+    name: str, machine: Machine
+) -> None:
     spec = shipped("effect", name)
-    ranges = {key: (number.typical, max(2.0 * number.typical, number.bounds[0])) for key, number in spec.numbers.items()}
-    ranges = {key: (low, min(high, spec.numbers[key].bounds[1])) for key, (low, high) in ranges.items()}
-    model = replace(spec, **ranges).wrap(shipped("actuator", "ideal").build(machine, 400, CPU), machine, 400, CPU)
+    ranges = {
+        key: (number.typical, max(2.0 * number.typical, number.bounds[0]))
+        for key, number in spec.numbers.items()
+    }
+    ranges = {
+        key: (low, min(high, spec.numbers[key].bounds[1])) for key, (low, high) in ranges.items()
+    }
+    model = replace(spec, **ranges).wrap(
+        shipped("actuator", "ideal").build(machine, 400, CPU), machine, 400, CPU
+    )
     before = {key: value.clone() for key, value in model.parameters.items()}
     mask = torch.arange(400) < 200
     model.reset(mask)
@@ -154,20 +194,31 @@ def test_ranges_are_drawn_anew_at_each_reset_for_each_environment(name: str, mac
         if low < high:
             assert (value[:200] != before[key][:200]).float().mean() > 0.99
             assert value.mean().item() == pytest.approx((low + high) / 2, abs=0.15 * (high - low))
-            assert value.std().item() == pytest.approx((high - low) / math.sqrt(12), rel=0.2)  # uniform
+            assert value.std().item() == pytest.approx(
+                (high - low) / math.sqrt(12), rel=0.2
+            )  # uniform
             assert len(value.unique()) > 0.99 * value.numel()
 
 
 def test_effects_draw_independently_of_each_other(machine: Machine) -> None:
     inner = shipped("actuator", "ideal").build(machine, 2000, CPU)
-    outer = stack(machine, inner, [effect("flow_gain", gain=(0.5, 1.5)), effect("lag", time_constant_s=(0.0, 1.0))], 2000)
-    pairs = torch.stack((outer.parameters["time_constant_s"][:, 0], outer.inner.parameters["gain"][:, 0]))
+    outer = stack(
+        machine,
+        inner,
+        [effect("flow_gain", gain=(0.5, 1.5)), effect("lag", time_constant_s=(0.0, 1.0))],
+        2000,
+    )
+    pairs = torch.stack(
+        (outer.parameters["time_constant_s"][:, 0], outer.inner.parameters["gain"][:, 0])
+    )
     assert abs(torch.corrcoef(pairs)[0, 1].item()) < 0.08
 
 
 def test_a_table_gives_values_and_ranges_joint_by_joint(machine: Machine) -> None:
     spec = effect("backlash", gap_rad={"q2": [0.01, 0.02], "q3": 0.05, "other": 0})
-    value = spec.wrap(shipped("actuator", "ideal").build(machine, 50, CPU), machine, 50, CPU).parameters["gap_rad"]
+    value = spec.wrap(
+        shipped("actuator", "ideal").build(machine, 50, CPU), machine, 50, CPU
+    ).parameters["gap_rad"]
     assert value[:, 1].min() >= 0.01 and value[:, 1].max() <= 0.02 and value[:, 1].std() > 0.001
     assert torch.equal(value[:, [0, 2, 3, 4]], torch.tensor([0.0, 0.05, 0.0, 0.0]).expand(50, 4))
 
@@ -175,24 +226,44 @@ def test_a_table_gives_values_and_ranges_joint_by_joint(machine: Machine) -> Non
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        ("backlash", {"gap_rad": -0.1}, r"effect\.backlash\.gap_rad: expected 0 to 0\.2 rad, got -0\.1"),
+        (
+            "backlash",
+            {"gap_rad": -0.1},
+            r"effect\.backlash\.gap_rad: expected 0 to 0\.2 rad, got -0\.1",
+        ),
         ("backlash", {"gap_rad": [0.1, 0.05]}, r"effect\.backlash\.gap_rad: .*low <= high"),
-        ("backlash", {"joints": ["q33"]}, r"effect\.backlash\.joints: 'q33' is no joint.*did you mean 'q3'"),
+        (
+            "backlash",
+            {"joints": ["q33"]},
+            r"effect\.backlash\.joints: 'q33' is no joint.*did you mean 'q3'",
+        ),
         ("dead_band", {"extend": 0.9}, r"effect\.dead_band\.extend: expected 0 to 0\.85, got"),
         ("flow_gain", {"gain": {"q1": 1.1}}, r"effect\.flow_gain\.gain: no value for q2"),
-        ("base_tilt", {"roll_rad": {"q1": 0.1, "other": 0}}, r"effect\.base_tilt\.roll_rad: .*joints do not differ"),
+        (
+            "base_tilt",
+            {"roll_rad": {"q1": 0.1, "other": 0}},
+            r"effect\.base_tilt\.roll_rad: .*joints do not differ",
+        ),
         ("lag", {"time_constant_s": "slow"}, r"Lag\.time_constant_s"),
     ],
 )
-def test_what_makes_no_sense_is_refused(name: str, changes: dict[str, Any], message: str, machine: Machine) -> None:
+def test_what_makes_no_sense_is_refused(
+    name: str, changes: dict[str, Any], message: str, machine: Machine
+) -> None:
     with pytest.raises(ConfigError, match=message):
-        effect(name, **changes).wrap(shipped("actuator", "ideal").build(machine, 1, CPU), machine, 1, CPU)
+        effect(name, **changes).wrap(
+            shipped("actuator", "ideal").build(machine, 1, CPU), machine, 1, CPU
+        )
 
 
 @pytest.mark.parametrize("actuator", ["lag", "hydraulic"])
 def test_all_effects_together_make_an_actuator_model(actuator: str, machine: Machine) -> None:
-    specs = [shipped("effect", name) for name in FIXED if name not in ("sensor_noise", "quantisation")]
-    model = stack(machine, shipped("actuator", actuator).build(machine, NUM_ENVS, CPU), specs, NUM_ENVS)
+    specs = [
+        shipped("effect", name) for name in FIXED if name not in ("sensor_noise", "quantisation")
+    ]
+    model = stack(
+        machine, shipped("actuator", actuator).build(machine, NUM_ENVS, CPU), specs, NUM_ENVS
+    )
     check_actuator_model(model, machine, CPU)
     assert model.sides == {"command", "speed", "joints", "measurement", "kinematics"}
 
@@ -200,7 +271,9 @@ def test_all_effects_together_make_an_actuator_model(actuator: str, machine: Mac
 @pytest.mark.parametrize("name", FIXED)
 def test_a_run_goes_on_exactly_from_its_state(name: str, machine: Machine) -> None:
     def fresh() -> Any:
-        return shipped("effect", name).wrap(shipped("actuator", "lag").build(machine, 2, CPU), machine, 2, CPU)
+        return shipped("effect", name).wrap(
+            shipped("actuator", "lag").build(machine, 2, CPU), machine, 2, CPU
+        )
 
     torch.manual_seed(0)
     model, u = fresh(), commands(machine, 30, 2)
@@ -218,7 +291,10 @@ def test_a_run_goes_on_exactly_from_its_state(name: str, machine: Machine) -> No
 
 @pytest.mark.parametrize("name", FIXED)
 def test_reset_reaches_the_masked_environments_only(name: str, machine: Machine) -> None:
-    model, untouched = (effect(name).wrap(shipped("actuator", "lag").build(machine, 3, CPU), machine, 3, CPU) for _ in range(2))
+    model, untouched = (
+        effect(name).wrap(shipped("actuator", "lag").build(machine, 3, CPU), machine, 3, CPU)
+        for _ in range(2)
+    )
     u = commands(machine, 20, 3)
     roll(model, machine, u), roll(untouched, machine, u)
     place = {key: value.data_ptr() for key, value in model.state.items()}
@@ -239,16 +315,28 @@ def test_gradients_agree_with_candidates_side_by_side(name: str, machine: Machin
     spec, u = effect(name), commands(machine, 30, 1).expand(-1, 3, -1)
     for key, number in spec.numbers.items():
         step = 0.02 * abs(number.typical) or 5.0
-        middle = number.typical + 3.0 * step * (number.none is not None)  # beside grid points such as whole periods
+        middle = number.typical + 3.0 * step * (
+            number.none is not None
+        )  # beside grid points such as whole periods
         model = spec.wrap(shipped("actuator", "ideal").build(machine, 3, CPU), machine, 3, CPU)
         if "draw" in model.state:
             model.state["draw"].fill_(7)  # the same chances for all candidates
         width = model.parameters[key].shape[1]
-        wanted = (middle + step * torch.tensor([-1.0, 0.0, 1.0])[:, None]).expand(3, width).clone().requires_grad_()
+        wanted = (
+            (middle + step * torch.tensor([-1.0, 0.0, 1.0])[:, None])
+            .expand(3, width)
+            .clone()
+            .requires_grad_()
+        )
         model.parameters[key] = wanted
         path = roll(model, machine, u)
         by_side = {"measurement": model.measure(path[-1]), "kinematics": places(model, path[-1])}
-        figure = by_side.get(spec.side, path).double().square().sum(dim=(0, 2) if spec.side not in by_side else 1)
+        figure = (
+            by_side.get(spec.side, path)
+            .double()
+            .square()
+            .sum(dim=(0, 2) if spec.side not in by_side else 1)
+        )
         (gradient,) = torch.autograd.grad(figure[1], wanted)
         slope = (figure[2] - figure[0]).item() / (2.0 * step)
         assert gradient[1].sum().item() == pytest.approx(slope, rel=0.05, abs=2e-3)
@@ -257,7 +345,10 @@ def test_gradients_agree_with_candidates_side_by_side(name: str, machine: Machin
 
 def test_a_number_is_found_by_gradient_over_several_runs(machine: Machine) -> None:
     u, inner = commands(machine, 40, 1), shipped("actuator", "ideal").build
-    for spec, key, value in ((effect("flow_gain", gain=0.7), "gain", 0.7), (effect("backlash", gap_rad=0.03), "gap_rad", 0.03)):
+    for spec, key, value in (
+        (effect("flow_gain", gain=0.7), "gain", 0.7),
+        (effect("backlash", gap_rad=0.03), "gap_rad", 0.03),
+    ):
         measured = roll(spec.wrap(inner(machine, 1, CPU), machine, 1, CPU), machine, u)
         model = spec.wrap(inner(machine, 1, CPU), machine, 1, CPU)
         guess = torch.full((1, 5), 1.4 * value).requires_grad_()
@@ -272,7 +363,9 @@ def test_a_number_is_found_by_gradient_over_several_runs(machine: Machine) -> No
 
 
 def test_a_replaced_parameter_is_not_drawn_again(machine: Machine) -> None:
-    model = effect("flow_gain", gain=[0.5, 0.9]).wrap(shipped("actuator", "ideal").build(machine, 2, CPU), machine, 2, CPU)
+    model = effect("flow_gain", gain=[0.5, 0.9]).wrap(
+        shipped("actuator", "ideal").build(machine, 2, CPU), machine, 2, CPU
+    )
     model.parameters["gain"] = torch.full((2, 5), 1.5)
     model.reset(torch.ones(2, dtype=torch.bool))
     path = roll(model, machine, torch.ones(1, 2, 5))
@@ -283,11 +376,13 @@ def test_the_first_effect_is_nearest_to_the_machine(machine: Machine) -> None:
     inner = shipped("actuator", "ideal").build
     band, cut = effect("dead_band", extend=0.2, retract=0.2), effect("saturation", level=0.6)
     full = torch.ones(1, 1, 5)
-    # cut first: (0.6 - 0.2) / 0.8 = 0.5 of 0.02 rad; band first leaves a full command, of which 0.6 remain
+    # cut first: (0.6 - 0.2) / 0.8 = 0.5 of 0.02 rad; band first leaves a full command, of which 0.6
+    # remain
     for specs, share in (([band, cut], 0.5), ([cut, band], 0.6)):
         path = roll(stack(machine, inner(machine, 1, CPU), specs, 1), machine, full)
         assert (path[1] - path[0])[0, 0].item() == pytest.approx(share * 0.02, abs=1e-7)
-    # a gain of a half before a play of 0.02, half of it open, uses up 0.01 of 0.01; behind it 0.5 of 0.02 - 0.01
+    # a gain of a half before a play of 0.02, half of it open, uses up 0.01 of 0.01; behind it 0.5
+    # of 0.02 - 0.01
     half, play = effect("flow_gain", gain=0.5), effect("backlash", gap_rad=0.02)
     for specs, moved in (([half, play], 0.0), ([play, half], 0.005)):
         path = roll(stack(machine, inner(machine, 1, CPU), specs, 1), machine, full)
@@ -295,7 +390,9 @@ def test_the_first_effect_is_nearest_to_the_machine(machine: Machine) -> None:
     biased, coarse = effect("encoder_bias", bias_rad=0.006), effect("quantisation", step_rad=0.01)
     q = torch.full((1, 5), 0.1)
     for specs, shown in (([biased, coarse], 0.11), ([coarse, biased], 0.106)):
-        assert stack(machine, inner(machine, 1, CPU), specs, 1).measure(q)[0, 0].item() == pytest.approx(shown, abs=1e-6)
+        assert stack(machine, inner(machine, 1, CPU), specs, 1).measure(q)[
+            0, 0
+        ].item() == pytest.approx(shown, abs=1e-6)
 
 
 @pytest.mark.gpu
@@ -328,7 +425,11 @@ def test_all_effects_can_be_captured_in_a_cuda_graph(those: list[str], machine: 
             history.push_q(model.step(history))
             history.reset(mask, home)
             model.reset(mask)
-            seen.copy_(torch.cat((model.measure(history.q[:, -1]), model.misplacement(history.q[:, -1])), 1))
+            seen.copy_(
+                torch.cat(
+                    (model.measure(history.q[:, -1]), model.misplacement(history.q[:, -1])), 1
+                )
+            )
 
         start = {key: value.clone() for key, value in model.state.items()}
         graph = torch.cuda.CUDAGraph()

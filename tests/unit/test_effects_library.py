@@ -36,7 +36,11 @@ def library(share: float | dict[str, float], *specs: Any) -> Library:
 
 def commands(machine: Machine, steps: int, num: int) -> torch.Tensor:
     """Returns random commands that hold for five periods, `(T, N, J)`, some of them zero and some full."""
-    u = torch.rand(steps // 5, num, machine.num_joints, generator=torch.Generator().manual_seed(1)) * 3.0 - 1.5
+    u = (
+        torch.rand(steps // 5, num, machine.num_joints, generator=torch.Generator().manual_seed(1))
+        * 3.0
+        - 1.5
+    )
     return (u.clamp(-1.0, 1.0) * (u.abs() > 0.2)).repeat_interleave(5, 0)
 
 
@@ -59,7 +63,9 @@ def test_it_holds_the_effects_on_actuation_and_sensing(machine: Machine) -> None
     assert list(option("effect", "library").effects) == EFFECTS
 
 
-@pytest.mark.parametrize("name", [name for name in EFFECTS if name not in ("frame_loss", "delay_jitter", "sensor_noise")])
+@pytest.mark.parametrize(
+    "name", [name for name in EFFECTS if name not in ("frame_loss", "delay_jitter", "sensor_noise")]
+)
 def test_an_effect_does_in_the_library_what_it_does_alone(name: str, machine: Machine) -> None:
     build, u, spec = option("actuator", "lag").build, commands(machine, 60, 3), fixed(name)
     alone = spec.wrap(build(machine, 3, CPU), machine, 3, CPU)
@@ -71,12 +77,18 @@ def test_an_effect_does_in_the_library_what_it_does_alone(name: str, machine: Ma
 
 def test_all_together_are_one_around_the_other(machine: Machine) -> None:
     chance = ("frame_loss", "delay_jitter", "sensor_noise")
-    build, u, specs = option("actuator", "lag").build, commands(machine, 100, 3), [fixed(n) for n in EFFECTS if n not in chance]
+    build, u, specs = (
+        option("actuator", "lag").build,
+        commands(machine, 100, 3),
+        [fixed(n) for n in EFFECTS if n not in chance],
+    )
     stacked = build(machine, 3, CPU)
     for spec in specs:
         stacked = spec.wrap(stacked, machine, 3, CPU)
     together = library(1.0, *specs).wrap(build(machine, 3, CPU), machine, 3, CPU)
-    torch.testing.assert_close(roll(together, machine, u), roll(stacked, machine, u), rtol=0, atol=2e-6)
+    torch.testing.assert_close(
+        roll(together, machine, u), roll(stacked, machine, u), rtol=0, atol=2e-6
+    )
     torch.testing.assert_close(together.measure(u[7]), stacked.measure(u[7]), rtol=0, atol=1e-6)
     assert together.sides == {"speed", "measurement"}
 
@@ -84,29 +96,41 @@ def test_all_together_are_one_around_the_other(machine: Machine) -> None:
 @pytest.mark.parametrize("actuator", ["mlp", "lag"])
 def test_where_no_effect_is_there_nothing_changes(actuator: str, machine: Machine) -> None:
     build, u = option("actuator", actuator).build, commands(machine, 60, 3)
-    model = replace(option("effect", "library"), share=0.0).wrap(build(machine, 3, CPU), machine, 3, CPU)
+    model = replace(option("effect", "library"), share=0.0).wrap(
+        build(machine, 3, CPU), machine, 3, CPU
+    )
     assert torch.equal(roll(model, machine, u), roll(build(machine, 3, CPU), machine, u))
     assert torch.equal(model.measure(u[0]), u[0])
 
 
-def test_each_effect_is_there_in_its_share_of_environments_independently_of_the_others(machine: Machine) -> None:
+def test_each_effect_is_there_in_its_share_of_environments_independently_of_the_others(
+    machine: Machine,
+) -> None:
     shipped = option("effect", "library")
     model = shipped.wrap(option("actuator", "ideal").build(machine, 6000, CPU), machine, 6000, CPU)
     there = {}
     for name, spec in shipped.effects.items():
-        off = [(model.parameters[f"{name}.{key}"] == n.none).all(1) for key, n in spec.numbers.items() if n.none is not None]
+        off = [
+            (model.parameters[f"{name}.{key}"] == n.none).all(1)
+            for key, n in spec.numbers.items()
+            if n.none is not None
+        ]
         there[name] = ~torch.stack(off).all(0)
     assert there.pop("dead_time").all()
     shares = torch.stack(list(there.values())).float()
     assert shares.mean(1).tolist() == pytest.approx([0.15] * len(there), abs=0.015)
     assert torch.corrcoef(shares).fill_diagonal_(0).abs().max() < 0.06
     gain = model.parameters["flow_gain.gain"][there["flow_gain"]]
-    assert 0.85 <= gain.min() < 0.87 and 1.13 < gain.max() <= 1.15, "where it is there its range is drawn"
+    assert 0.85 <= gain.min() < 0.87 and 1.13 < gain.max() <= 1.15, (
+        "where it is there its range is drawn"
+    )
     before = torch.stack(list(there.values()))
     model.reset(torch.arange(6000) < 3000)
     after = model.parameters["flow_gain.gain"] != 1.0
     assert torch.equal(after[3000:].all(1), before[EFFECTS.index("flow_gain") - 1, 3000:])
-    assert (after[:3000].all(1) != before[EFFECTS.index("flow_gain") - 1, :3000]).any(), "another machine"
+    assert (after[:3000].all(1) != before[EFFECTS.index("flow_gain") - 1, :3000]).any(), (
+        "another machine"
+    )
 
 
 def test_a_run_goes_on_exactly_from_its_state(machine: Machine) -> None:
@@ -129,7 +153,9 @@ def test_a_run_goes_on_exactly_from_its_state(machine: Machine) -> None:
 
 def test_chances_of_one_effect_are_not_those_of_another(machine: Machine) -> None:
     specs = [fixed("frame_loss", probability=0.5), fixed("delay_jitter", jitter_s=0.05)]
-    model = library(1.0, *specs).wrap(option("actuator", "ideal").build(machine, 3000, CPU), machine, 3000, CPU)
+    model = library(1.0, *specs).wrap(
+        option("actuator", "ideal").build(machine, 3000, CPU), machine, 3000, CPU
+    )
     roll(model, machine, torch.ones(1, 3000, 5))
     lost = (model.state["frame_loss.sent"][:, -1, 0] == 0).float()
     pair = torch.stack((lost, model.state["delay_jitter.delay"][:, 0]))
@@ -141,7 +167,10 @@ def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: 
     u = commands(machine, 20, 4)
     torch.manual_seed(0)
     plain, traced = (
-        option("effect", "library").wrap(option("actuator", "lag").build(machine, 4, CPU), machine, 4, CPU) for _ in "ab"
+        option("effect", "library").wrap(
+            option("actuator", "lag").build(machine, 4, CPU), machine, 4, CPU
+        )
+        for _ in "ab"
     )
     step = torch.compile(traced.step, backend="eager", fullgraph=True, dynamic=False)
     reset = torch.compile(traced.reset, backend="eager", fullgraph=True, dynamic=False)
@@ -158,15 +187,24 @@ def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: 
 
 @pytest.mark.parametrize("actuator", ["mlp", "coupled"])
 @pytest.mark.parametrize("shift_s", [-0.05, -0.02, 0.03, 0.05])
-def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(actuator: str, shift_s: float, machine: Machine) -> None:
+def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(
+    actuator: str, shift_s: float, machine: Machine
+) -> None:
     """Measured as from recordings of the machine; its resolution is 0.01 s."""
     found = []
     for added in (0.0, shift_s):
         model = option("actuator", actuator).build(machine, 4, CPU)
         model = library(1.0, fixed("dead_time", dead_time_s=added)).wrap(model, machine, 4, CPU)
         generator = torch.Generator().manual_seed(0)
-        u = (torch.rand(150, 4, 5, generator=generator) * 1.4 - 0.7).repeat_interleave(8, 0) * (torch.arange(5) == 0)
-        q = torch.cat((torch.as_tensor(machine.home, dtype=torch.float32).expand(1, 4, 5), roll(model, machine, u)[:-1]))
+        u = (torch.rand(150, 4, 5, generator=generator) * 1.4 - 0.7).repeat_interleave(8, 0) * (
+            torch.arange(5) == 0
+        )
+        q = torch.cat(
+            (
+                torch.as_tensor(machine.home, dtype=torch.float32).expand(1, 4, 5),
+                roll(model, machine, u)[:-1],
+            )
+        )
         t_s = machine.period_s * np.arange(len(u))
         recordings = [
             Recording(

@@ -48,7 +48,11 @@ class Glide(Probe):
     """Keeps half of the increment that it sees in the history, as a learned model might."""
 
     def step(self, history: History) -> torch.Tensor:
-        return history.q[:, -1] + 0.5 * (history.q[:, -1] - history.q[:, -2]) + 0.5 * history.u[:, -1] * self._step
+        return (
+            history.q[:, -1]
+            + 0.5 * (history.q[:, -1] - history.q[:, -2])
+            + 0.5 * history.u[:, -1] * self._step
+        )
 
 
 @cache
@@ -57,15 +61,27 @@ def shipped(group: str, name: str) -> Any:
 
 
 def wrapped(name: str, machine: Machine, num: int = 1, inner: Any = None, **numbers: Any) -> Any:
-    return replace(shipped("effect", name), **numbers).wrap(inner or Probe(machine), machine, num, CPU)
+    return replace(shipped("effect", name), **numbers).wrap(
+        inner or Probe(machine), machine, num, CPU
+    )
 
 
 def roll(
-    model: Any, machine: Machine, levels: list[float], joints: tuple[int, ...] = (0,), num: int = 1, at: Any = None
+    model: Any,
+    machine: Machine,
+    levels: list[float],
+    joints: tuple[int, ...] = (0,),
+    num: int = 1,
+    at: Any = None,
 ) -> torch.Tensor:
     """Returns positions `(T + 1, N, J)` from rest at home, or `at`, with the same levels for all of `joints`."""
-    q = torch.as_tensor(machine.home if at is None else at, dtype=torch.float32).expand(num, machine.num_joints)
-    history = History(q=q[:, None].repeat(1, machine.num_history, 1), u=torch.zeros(num, machine.num_history, machine.num_joints))
+    q = torch.as_tensor(machine.home if at is None else at, dtype=torch.float32).expand(
+        num, machine.num_joints
+    )
+    history = History(
+        q=q[:, None].repeat(1, machine.num_history, 1),
+        u=torch.zeros(num, machine.num_history, machine.num_joints),
+    )
     path = [q]
     for level in levels:
         u = torch.zeros_like(q)
@@ -90,23 +106,35 @@ def seen(name: str, machine: Machine, levels: list[float], **numbers: Any) -> li
 
 def test_dead_time_between_samples_is_the_mean_over_the_period(machine: Machine) -> None:
     # 75 ms are one and a half periods: nothing, then half a period of full speed, then all of it
-    assert seen("dead_time", machine, [1, 1, 1, 0, 0, 0], dead_time_s=0.075) == pytest.approx([0, 0.5, 1, 1, 0.5, 0])
+    assert seen("dead_time", machine, [1, 1, 1, 0, 0, 0], dead_time_s=0.075) == pytest.approx(
+        [0, 0.5, 1, 1, 0.5, 0]
+    )
 
 
 def test_dead_time_adds_to_that_of_the_model_beyond_the_history(machine: Machine) -> None:
     inner = shipped("actuator", "lag")
-    inner = replace(inner, dead_time_s=0.55, dead_band_extend=0.0, dead_band_retract=0.0, time_constant_s=0.0).build(
-        machine, 1, CPU
-    )
-    path = roll(wrapped("dead_time", machine, inner=inner, dead_time_s=0.5), machine, [1.0] + [0.0] * 24)[:, 0, 0]
+    inner = replace(
+        inner, dead_time_s=0.55, dead_band_extend=0.0, dead_band_retract=0.0, time_constant_s=0.0
+    ).build(machine, 1, CPU)
+    path = roll(
+        wrapped("dead_time", machine, inner=inner, dead_time_s=0.5), machine, [1.0] + [0.0] * 24
+    )[:, 0, 0]
     # 1.05 s are 21 periods, more than the 13 samples of the history
     np.testing.assert_allclose(path[[21, 22, 25]], [0, FULL, FULL], atol=1e-6)
 
 
 def test_clock_offset_goes_both_ways(machine: Machine) -> None:
-    inner = replace(shipped("actuator", "lag"), dead_time_s=0.55, dead_band_extend=0.0, dead_band_retract=0.0, time_constant_s=0.0)
+    inner = replace(
+        shipped("actuator", "lag"),
+        dead_time_s=0.55,
+        dead_band_extend=0.0,
+        dead_band_retract=0.0,
+        time_constant_s=0.0,
+    )
     for offset_s, first in ((0.1, 13), (0.0, 11), (-0.1, 9)):
-        model = wrapped("clock_offset", machine, inner=inner.build(machine, 1, CPU), offset_s=offset_s)
+        model = wrapped(
+            "clock_offset", machine, inner=inner.build(machine, 1, CPU), offset_s=offset_s
+        )
         path = roll(model, machine, [1.0] * 20)[:, 0, 0]
         np.testing.assert_allclose(path[[first, first + 1]], [0, FULL], atol=1e-6)
 
@@ -132,39 +160,53 @@ def test_frame_loss_holds_the_command_for_all_joints_at_once(machine: Machine) -
     num = 4000
     model = wrapped("frame_loss", machine, num=num, probability=0.25)
     path = roll(model, machine, [0.4, 0.8], joints=(0, 4), num=num)
-    q1, q5 = (path[:, :, j].diff(dim=0) / torch.as_tensor(machine.max_speed * 0.05)[j] for j in (0, 4))
+    q1, q5 = (
+        path[:, :, j].diff(dim=0) / torch.as_tensor(machine.max_speed * 0.05)[j] for j in (0, 4)
+    )
     torch.testing.assert_close(q1.float(), q5.float(), rtol=0, atol=1e-4)
     first, second = q1
     assert (first.abs() < 1e-4).float().mean().item() == pytest.approx(0.25, abs=0.03)
     assert ((second - 0.8).abs() < 1e-4).float().mean().item() == pytest.approx(0.75, abs=0.03)
-    assert (second.abs() < 1e-4).float().mean().item() == pytest.approx(0.0625, abs=0.015)  # both lost
+    assert (second.abs() < 1e-4).float().mean().item() == pytest.approx(
+        0.0625, abs=0.015
+    )  # both lost
 
 
 def test_dead_band_on_each_side_leaves_the_full_command(machine: Machine) -> None:
     # (0.55 - 0.1) / 0.9 and (0.6 - 0.2) / 0.8
     levels = [1, 0.55, 0.1, 0, -0.2, -0.6, -1]
-    assert seen("dead_band", machine, levels, extend=0.1, retract=0.2) == pytest.approx([1, 0.5, 0, 0, 0, -0.5, -1])
+    assert seen("dead_band", machine, levels, extend=0.1, retract=0.2) == pytest.approx(
+        [1, 0.5, 0, 0, 0, -0.5, -1]
+    )
 
 
 def test_effects_without_memory_hold_for_the_whole_history(machine: Machine) -> None:
     model = wrapped("saturation", machine, level=0.5)
-    history = History(q=torch.zeros(1, 13, 5), u=torch.linspace(-1, 1, 13)[None, :, None].expand(1, 13, 5))
+    history = History(
+        q=torch.zeros(1, 13, 5), u=torch.linspace(-1, 1, 13)[None, :, None].expand(1, 13, 5)
+    )
     model.step(history)
     torch.testing.assert_close(model.inner.history.u, history.u.clamp(-0.5, 0.5))
 
 
 def test_saturation_cuts_both_ways(machine: Machine) -> None:
-    assert seen("saturation", machine, [1, 0.6, -0.8, -1], level=0.7) == pytest.approx([0.7, 0.6, -0.7, -0.7])
+    assert seen("saturation", machine, [1, 0.6, -0.8, -1], level=0.7) == pytest.approx(
+        [0.7, 0.6, -0.7, -0.7]
+    )
 
 
 def test_rate_limit_bounds_the_slope(machine: Machine) -> None:
     # a full stroke in 0.2 s is a quarter a period
-    assert seen("rate_limit", machine, [1, 1, 0.6, 0.6, -1], stroke_s=0.2) == pytest.approx([0.25, 0.5, 0.6, 0.6, 0.35])
+    assert seen("rate_limit", machine, [1, 1, 0.6, 0.6, -1], stroke_s=0.2) == pytest.approx(
+        [0.25, 0.5, 0.6, 0.6, 0.35]
+    )
 
 
 @given(levels=LEVELS, stroke_s=st.floats(0.01, 2.0))
 @few
-def test_rate_limit_never_exceeds_its_slope_nor_the_command(machine: Machine, levels: list[float], stroke_s: float) -> None:
+def test_rate_limit_never_exceeds_its_slope_nor_the_command(
+    machine: Machine, levels: list[float], stroke_s: float
+) -> None:
     got = seen("rate_limit", machine, levels, stroke_s=stroke_s)
     assert np.abs(np.diff([0.0, *got])).max() <= 0.05 / stroke_s + 1e-5
     assert np.abs(got).max() <= np.abs(levels).max() + 1e-6
@@ -177,7 +219,9 @@ def test_stiction_starts_later_than_it_stops(machine: Machine) -> None:
 
 
 def test_flow_gain_scales_both_ways(machine: Machine) -> None:
-    assert steps(wrapped("flow_gain", machine, gain=0.8), machine, [1, 0.5, -1]) == pytest.approx([0.016, 0.008, -0.016], abs=1e-6)
+    assert steps(wrapped("flow_gain", machine, gain=0.8), machine, [1, 0.5, -1]) == pytest.approx(
+        [0.016, 0.008, -0.016], abs=1e-6
+    )
 
 
 def test_a_gain_does_not_compound_in_a_model_that_goes_on_from_increments(machine: Machine) -> None:
@@ -206,13 +250,17 @@ def test_backlash_is_taken_up_at_reversals(machine: Machine) -> None:
 
 def test_backlash_of_a_moving_joint_is_closed(machine: Machine) -> None:
     model = wrapped("backlash", machine, gap_rad=0.03)
-    history = History(q=0.01 * torch.arange(13.0)[None, :, None].expand(1, 13, 5), u=torch.ones(1, 13, 5))
+    history = History(
+        q=0.01 * torch.arange(13.0)[None, :, None].expand(1, 13, 5), u=torch.ones(1, 13, 5)
+    )
     assert (model.step(history) - history.q[:, -1])[0, 0].item() == pytest.approx(FULL, abs=1e-6)
 
 
 @given(levels=LEVELS, gap=st.floats(0.0, 0.15))
 @few
-def test_backlash_keeps_within_its_gap_and_never_moves_against_the_drive(machine: Machine, levels: list[float], gap: float) -> None:
+def test_backlash_keeps_within_its_gap_and_never_moves_against_the_drive(
+    machine: Machine, levels: list[float], gap: float
+) -> None:
     path = roll(wrapped("backlash", machine, gap_rad=gap), machine, levels)[:, 0, 0].numpy()
     driven = FULL * np.cumsum([0.0, *levels])
     inside = np.abs(driven) < 1.5  # the stops are at 1.6
@@ -221,7 +269,9 @@ def test_backlash_keeps_within_its_gap_and_never_moves_against_the_drive(machine
 
 
 def test_compliance_rings_as_an_oscillator_does(machine: Machine) -> None:
-    path = roll(wrapped("compliance", machine, ringing_s=0.4, damping=0.1), machine, [1.0] * 40)[:, 0, 0]
+    path = roll(wrapped("compliance", machine, ringing_s=0.4, damping=0.1), machine, [1.0] * 40)[
+        :, 0, 0
+    ]
     t_s, w = 0.05 * np.arange(41), 2 * np.pi / 0.4
     ringing = w * np.sqrt(1 - 0.01)
     expected = 0.4 * t_s - 0.4 / ringing * np.exp(-0.1 * w * t_s) * np.sin(ringing * t_s)
@@ -244,10 +294,15 @@ Q2_SHARE = (230 * 0.72 + 150 * 2.1 + 110 * 3.2 + 225 * 4.17) * 9.81 / 30_000
 def test_load_makes_lifting_slower_and_lowering_faster(machine: Machine) -> None:
     level = np.zeros(5)
     model = wrapped("load_dependence", machine, sensitivity=0.5)
-    down, up = (roll(model, machine, [side], joints=(1,), at=level)[-1, 0, 1].item() / 0.009 for side in (1.0, -1.0))
+    down, up = (
+        roll(model, machine, [side], joints=(1,), at=level)[-1, 0, 1].item() / 0.009
+        for side in (1.0, -1.0)
+    )
     assert down == pytest.approx(math.sqrt(1 + 0.5 * Q2_SHARE), rel=1e-3) and down > 1.1
     assert up == pytest.approx(-math.sqrt(1 - 0.5 * Q2_SHARE), rel=1e-3)
-    assert roll(model, machine, [1.0], at=level)[-1, 0, 0].item() == pytest.approx(FULL, abs=1e-7)  # the slew bears no weight
+    assert roll(model, machine, [1.0], at=level)[-1, 0, 0].item() == pytest.approx(
+        FULL, abs=1e-7
+    )  # the slew bears no weight
 
 
 def test_creep_sinks_at_zero_command(machine: Machine) -> None:
@@ -257,7 +312,12 @@ def test_creep_sinks_at_zero_command(machine: Machine) -> None:
 
 
 def test_flow_sharing_slows_joints_in_proportion(machine: Machine) -> None:
-    model = wrapped("flow_sharing", machine, demand={"q3": 0.8, "q4": 0.5, "q5": 0.3, "other": 0.6}, joints=["q3", "q4", "q5"])
+    model = wrapped(
+        "flow_sharing",
+        machine,
+        demand={"q3": 0.8, "q4": 0.5, "q5": 0.3, "other": 0.6},
+        joints=["q3", "q4", "q5"],
+    )
     full = torch.as_tensor(machine.max_speed * 0.05, dtype=torch.float32)
 
     def shares(level: float, *joints: int) -> list[float]:
@@ -267,20 +327,33 @@ def test_flow_sharing_slows_joints_in_proportion(machine: Machine) -> None:
     assert shares(1.0, 2) == pytest.approx([0, 0, 1, 0, 0], abs=1e-4)
     # 0.8 + 0.5 + 0.3 of the pump: 1 / 1.6; q1 is not on it
     assert shares(1.0, 0, 2, 3, 4) == pytest.approx([1, 0, 0.625, 0.625, 0.625], abs=1e-4)
-    assert shares(-0.5, 2, 3, 4) == pytest.approx([0, 0, -0.5, -0.5, -0.5], abs=1e-4)  # 0.8 of it is enough
+    assert shares(-0.5, 2, 3, 4) == pytest.approx(
+        [0, 0, -0.5, -0.5, -0.5], abs=1e-4
+    )  # 0.8 of it is enough
 
 
 def test_no_effect_goes_through_a_stop(machine: Machine) -> None:
     near = machine.home.copy()
     near[0] = machine.upper[0] - 0.01
-    for name, numbers in (("flow_gain", {"gain": 3.0}), ("lag", {"time_constant_s": 1.0}), ("compliance", {"ringing_s": 0.5})):
+    for name, numbers in (
+        ("flow_gain", {"gain": 3.0}),
+        ("lag", {"time_constant_s": 1.0}),
+        ("compliance", {"ringing_s": 0.5}),
+    ):
         inner = shipped("actuator", "ideal").build(machine, 1, CPU)
-        path = roll(wrapped(name, machine, inner=inner, **numbers), machine, [1.0] * 20 + [0.0] * 20, at=near)[:, 0, 0]
+        path = roll(
+            wrapped(name, machine, inner=inner, **numbers),
+            machine,
+            [1.0] * 20 + [0.0] * 20,
+            at=near,
+        )[:, 0, 0]
         assert path.max() <= machine.upper[0] + 1e-6
 
 
 def test_quantisation_rounds_to_steps(machine: Machine) -> None:
-    got = wrapped("quantisation", machine, step_rad=0.01).measure(torch.tensor([[0.104, 0.106, -0.104, 0.0, 1.0]]))
+    got = wrapped("quantisation", machine, step_rad=0.01).measure(
+        torch.tensor([[0.104, 0.106, -0.104, 0.0, 1.0]])
+    )
     np.testing.assert_allclose(got[0], [0.10, 0.11, -0.10, 0.0, 1.0], atol=1e-6)
 
 
@@ -291,7 +364,11 @@ def test_sensor_noise_is_white_and_normal(machine: Machine) -> None:
     assert first[:, 1].std().item() == pytest.approx(0.001, rel=0.04)
     assert abs(first.mean().item()) < 5e-5
     assert (first[:, 0].abs() > 0.00392).float().mean().item() == pytest.approx(0.05, abs=0.012)
-    for a, b in ((first[:, 0], second[:, 0]), (first[:, 0], first[:, 1]), (first[1:, 0], first[:-1, 0])):
+    for a, b in (
+        (first[:, 0], second[:, 0]),
+        (first[:, 0], first[:, 1]),
+        (first[1:, 0], first[:-1, 0]),
+    ):
         assert abs(torch.corrcoef(torch.stack((a, b)))[0, 1].item()) < 0.06
 
 
@@ -318,25 +395,35 @@ def test_a_free_run_with_sensors_stays_in_measured_positions(machine: Machine) -
     np.testing.assert_allclose(path[:, 0, 0], [0.11, 0.132, 0.154, 0.176], atol=1e-6)
     coarse = affected("ideal", quantisation={"step_rad": 0.05}).build(machine, 1, CPU)
     path = roll(coarse, machine, [0.3] * 10, at=np.zeros(5))
-    assert path[-1, 0, 0].item() == pytest.approx(0.05)  # 0.06 in truth: steps too small to see still add up
+    assert path[-1, 0, 0].item() == pytest.approx(
+        0.05
+    )  # 0.06 in truth: steps too small to see still add up
 
 
 def test_candidates_run_side_by_side(machine: Machine) -> None:
-    model = affected("ideal", flow_gain={"gain": 1.0}, encoder_bias={"bias_rad": 0.1}).build(machine, 3, CPU)
+    model = affected("ideal", flow_gain={"gain": 1.0}, encoder_bias={"bias_rad": 0.1}).build(
+        machine, 3, CPU
+    )
     model.effects["flow_gain"].parameters["gain"][:] = torch.tensor([0.5, 1.0, 2.0])[:, None]
     path = roll(model, machine, [1.0], num=3, at=np.zeros(5))
     np.testing.assert_allclose(path[1, :, 0], [0.01, 0.02, 0.04], atol=1e-6)
 
 
-@pytest.mark.parametrize("effects", [{}, {"encoder_bias": {}, "sensor_noise": {}, "quantisation": {}, "backlash": {}}])
-def test_an_actuator_with_its_effects_is_an_actuator(machine: Machine, effects: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "effects", [{}, {"encoder_bias": {}, "sensor_noise": {}, "quantisation": {}, "backlash": {}}]
+)
+def test_an_actuator_with_its_effects_is_an_actuator(
+    machine: Machine, effects: dict[str, Any]
+) -> None:
     check_actuator(affected("lag", **effects), machine)
 
 
 def test_a_longer_link_moves_the_tool_along_it(machine: Machine) -> None:
     q = torch.zeros(1, 5)  # stretched out level: every link behind q2 points ahead
     tip_m = Kinematics(machine).pose(q).tip_in_base_m
-    model = wrapped("link_length", machine, extra_m={"q2": 0.01, "q4": -0.02, "q5": 0.005, "other": 0})
+    model = wrapped(
+        "link_length", machine, extra_m={"q2": 0.01, "q4": -0.02, "q5": 0.005, "other": 0}
+    )
     np.testing.assert_allclose(model.tool(tip_m, q) - tip_m, [[-0.005, 0, 0]], atol=1e-6)
     q[0, 3] = math.pi / 2  # the third arm and the tool hang down
     np.testing.assert_allclose(model.tool(tip_m, q) - tip_m, [[0.01, 0, 0.015]], atol=1e-6)
@@ -346,11 +433,16 @@ def test_a_longer_link_moves_the_tool_along_it(machine: Machine) -> None:
 def test_a_longer_link_is_what_longer_origins_are(machine: Machine) -> None:
     joints = list(machine.joints)
     x, y, z = machine.bodies[3].origin_m
-    joints[3] = replace(joints[3], body=replace(machine.bodies[3], origin_m=(replace(x, value=x.value + 0.03), y, z)))
+    joints[3] = replace(
+        joints[3],
+        body=replace(machine.bodies[3], origin_m=(replace(x, value=x.value + 0.03), y, z)),
+    )
     q = torch.rand(4, 5, generator=torch.Generator().manual_seed(2)) - 0.5
     tip_m = Kinematics(machine).pose(q).tip_in_base_m
     expected = Kinematics(replace(machine, joints=tuple(joints))).pose(q).tip_in_base_m
-    model = wrapped("link_length", machine, num=4, extra_m={"q3": 0.03, "other": 0})  # from q3 to q4
+    model = wrapped(
+        "link_length", machine, num=4, extra_m={"q3": 0.03, "other": 0}
+    )  # from q3 to q4
     torch.testing.assert_close(model.tool(tip_m, q), expected, rtol=0, atol=2e-6)
 
 
@@ -358,18 +450,24 @@ def test_tilt_turns_the_tool_with_the_base(machine: Machine) -> None:
     point_m, q = torch.tensor([[3.0, 1.0, 0.5]]), torch.zeros(1, 5)
     nose_down = wrapped("base_tilt", machine, roll_rad=0.0, pitch_rad=0.1).tool(point_m, q)
     cos, sin = math.cos(0.1), math.sin(0.1)
-    np.testing.assert_allclose(nose_down, [[3 * cos + 0.5 * sin, 1, 0.5 * cos - 3 * sin]], atol=1e-6)
+    np.testing.assert_allclose(
+        nose_down, [[3 * cos + 0.5 * sin, 1, 0.5 * cos - 3 * sin]], atol=1e-6
+    )
     left_up = wrapped("base_tilt", machine, roll_rad=0.1, pitch_rad=0.0).tool(point_m, q)
     np.testing.assert_allclose(left_up, [[3, cos - 0.5 * sin, 0.5 * cos + sin]], atol=1e-6)
     both = wrapped("base_tilt", machine, roll_rad=0.1, pitch_rad=-0.2)
-    np.testing.assert_allclose(both.target(both.tool(point_m, q)), point_m, atol=1e-6)  # the camera stands on the base
+    np.testing.assert_allclose(
+        both.target(both.tool(point_m, q)), point_m, atol=1e-6
+    )  # the camera stands on the base
 
 
 def test_extrinsics_turn_and_displace_what_the_camera_sees(machine: Machine) -> None:
     numbers = dict.fromkeys(("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad"), 0.0)
     model = wrapped("extrinsics", machine, **numbers | {"z_m": 0.02, "yaw_rad": 0.1})
     np.testing.assert_allclose(
-        model.target(torch.tensor([[2.0, 0.0, 0.7]])), [[2 * math.cos(0.1), 2 * math.sin(0.1), 0.72]], atol=1e-6
+        model.target(torch.tensor([[2.0, 0.0, 0.7]])),
+        [[2 * math.cos(0.1), 2 * math.sin(0.1), 0.72]],
+        atol=1e-6,
     )
     tip_m = Kinematics(machine).pose(torch.zeros(1, 5)).tip_in_base_m
     torch.testing.assert_close(model.misplacement(torch.zeros(1, 5)), model.target(tip_m) - tip_m)

@@ -51,7 +51,10 @@ def test_kinds_have_their_shares_and_effects_come_round_evenly(mix: Mix, machine
     }  # fmt: skip
     single = Counter(one.faults[0].effect for one in found if one.kind == "one")
     assert set(single.values()) <= {1, 2, 3} and len(single) >= 20
-    assert Counter(one.ailment.kind for one in found if one.ailment) == {"fading": 10, "interlock": 10}
+    assert Counter(one.ailment.kind for one in found if one.ailment) == {
+        "fading": 10,
+        "interlock": 10,
+    }
 
 
 def test_a_case_holds_what_its_kind_says(mix: Mix, machine: Machine) -> None:
@@ -61,23 +64,35 @@ def test_a_case_holds_what_its_kind_says(mix: Mix, machine: Machine) -> None:
         if one.kind == "several":
             assert count in (2, 3)
             names = {fault.effect for fault in one.faults}
-            assert len(names) == count and not any(len(names & set(group)) > 1 for group in mix.classes)
-        assert all((0.03 <= size <= 0.1) if one.kind == "faint" else (0.4 <= size <= 1.0) for size in sizes)
+            assert len(names) == count and not any(
+                len(names & set(group)) > 1 for group in mix.classes
+            )
+        assert all(
+            (0.03 <= size <= 0.1) if one.kind == "faint" else (0.4 <= size <= 1.0) for size in sizes
+        )
         assert one.tracked or not any(mix.troubles[fault.effect].needs_tool for fault in one.faults)
 
 
-def test_the_same_seed_gives_the_same_cases_and_another_one_others(mix: Mix, machine: Machine) -> None:
+def test_the_same_seed_gives_the_same_cases_and_another_one_others(
+    mix: Mix, machine: Machine
+) -> None:
     first, again, other = (repr(questions(mix, machine, seed)) for seed in (5, 5, 6))
     assert first == again != other
 
 
-def test_parameters_lie_at_their_size_between_nothing_and_typical(mix: Mix, machine: Machine) -> None:
+def test_parameters_lie_at_their_size_between_nothing_and_typical(
+    mix: Mix, machine: Machine
+) -> None:
     for one in questions(mix, machine, 7):
         for fault in one.faults:
             for name, nothing in fault.drawn.items():
                 typical = mix.troubles[fault.effect].numbers[name][1]
-                values = fault.parameters[name][[joint in fault.joints for joint in machine.joint_names]]
-                assert np.abs(values - nothing) == pytest.approx(np.full(len(values), fault.size * abs(typical - nothing)))
+                values = fault.parameters[name][
+                    [joint in fault.joints for joint in machine.joint_names]
+                ]
+                assert np.abs(values - nothing) == pytest.approx(
+                    np.full(len(values), fault.size * abs(typical - nothing))
+                )
 
 
 @pytest.fixture
@@ -90,9 +105,13 @@ def exam(brokk: Callable[..., Any], tmp_path: Path) -> Path:
 def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: Machine) -> None:
     labels = exam / seal.LABELS
     assert labels.stat().st_mode & 0o777 == 0o600
-    assert (exam / seal.HASH).read_text().split()[0] == hashlib.sha256(labels.read_bytes()).hexdigest()
+    assert (exam / seal.HASH).read_text().split()[0] == hashlib.sha256(
+        labels.read_bytes()
+    ).hexdigest()
     files = sorted((exam / paper.CASES).rglob("*.parquet"))
-    assert len(files) == 2 * 3 and {file.stat().st_mtime for file in files} == {files[0].stat().st_mtime}
+    assert len(files) == 2 * 3 and {file.stat().st_mtime for file in files} == {
+        files[0].stat().st_mtime
+    }
     for file in files:
         assert set(pq.read_schema(file).metadata) == {
             b"brokk.schema", b"brokk.machine", b"brokk.rate_hz", b"brokk.created", b"brokk.fingerprint"
@@ -102,7 +121,12 @@ def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: M
         exclusive = machine.is_exclusive
         assert not (moving[:, exclusive].any(1) & moving[:, ~exclusive].any(1)).any()
         assert (found.q >= machine.lower - 0.05).all() and (found.q <= machine.upper + 0.05).all()
-    names = {name for case in json.loads(labels.read_text())["cases"] for one in case["effects"] for name in [one["effect"]]}
+    names = {
+        name
+        for case in json.loads(labels.read_text())["cases"]
+        for one in case["effects"]
+        for name in [one["effect"]]
+    }
     assert names and not any(name.encode() in file.read_bytes() for file in files for name in names)
 
 
@@ -117,19 +141,45 @@ def test_labels_that_were_changed_are_not_scored(tmp_path: Path) -> None:
         seal.seal(tmp_path, {"cases": []}, "salt")
 
 
-def test_an_exam_is_made_sat_and_scored_from_the_command_line(exam: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_an_exam_is_made_sat_and_scored_from_the_command_line(
+    exam: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     answers, marks, ledger = tmp_path / "answers", tmp_path / "marks", tmp_path / "ledger.jsonl"
     about = ("mode=exam", f"exam.folder={exam}")
-    assert brokk(*about, "exam.do=run", "exam_candidate=always_none", f"session.out={answers}").code == 0
-    again = brokk(*about, "exam.do=run", "exam_candidate=always_none", f"session.out={answers}", f"resume={answers}")
+    assert (
+        brokk(*about, "exam.do=run", "exam_candidate=always_none", f"session.out={answers}").code
+        == 0
+    )
+    again = brokk(
+        *about,
+        "exam.do=run",
+        "exam_candidate=always_none",
+        f"session.out={answers}",
+        f"resume={answers}",
+    )
     assert again.code == 0 and brokk(*about, "exam.do=run", f"session.out={answers}").code != 0
-    done = brokk(*about, "exam.do=score", f"+exam.answers.none={answers}", f"exam.ledger={ledger}", f"session.out={marks}")
+    done = brokk(
+        *about,
+        "exam.do=score",
+        f"+exam.answers.none={answers}",
+        f"exam.ledger={ledger}",
+        f"session.out={marks}",
+    )
     assert done.code == 0, done.err
     found = json.loads((marks / "marks.json").read_text())["candidates"]["none"]
-    assert found["false_alarms"]["value"] == 0.0 and found["top1"]["value"] == 0.0 and found["failed"] == 0
-    assert (marks / "exam.html").stat().st_size > 10_000 and (marks / "confusion_none.png").is_file()
+    assert (
+        found["false_alarms"]["value"] == 0.0
+        and found["top1"]["value"] == 0.0
+        and found["failed"] == 0
+    )
+    assert (marks / "exam.html").stat().st_size > 10_000 and (
+        marks / "confusion_none.png"
+    ).is_file()
     (line,) = [json.loads(text) for text in ledger.read_text().splitlines()]
-    assert line["candidate"] == "none" and line["labels_sha256"] == (exam / seal.HASH).read_text().split()[0]
+    assert (
+        line["candidate"] == "none"
+        and line["labels_sha256"] == (exam / seal.HASH).read_text().split()[0]
+    )
 
 
 def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
@@ -138,53 +188,99 @@ def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
     first, second = sorted((exam / paper.CASES).iterdir())
     answers, marks = tmp_path / "answers", tmp_path / "marks"
     answers.mkdir()
-    assert sitting.sit(Recorder(ValueError("ran away")), [first], answers, machine, 1, lambda: None) == 1
+    assert (
+        sitting.sit(Recorder(ValueError("ran away")), [first], answers, machine, 1, lambda: None)
+        == 1
+    )
     sitting.sit(Always(effect=None, probability=0.5), [second], answers, machine, 1, lambda: None)
     score = ("mode=exam", "exam.do=score", f"exam.folder={exam}", f"+exam.answers.it={answers}")
     for expected, missed in (({"value": 2, "of": 2}, 1), ({"value": 1, "of": 2}, 0)):
         done = brokk(*score, f"session.out={marks}_{missed}")
         assert done.code == 0, done.err
-        found = json.loads((tmp_path / f"marks_{missed}" / "marks.json").read_text())["candidates"]["it"]
+        found = json.loads((tmp_path / f"marks_{missed}" / "marks.json").read_text())["candidates"][
+            "it"
+        ]
         assert found["sat"] == expected and found["failed"] == missed
         shutil.rmtree(answers / first.name, ignore_errors=True)  # from then on nobody has begun it
 
 
-def test_baselines_sit_and_are_scored_by_one_command(exam: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
-    about = ("mode=exam", "exam.do=baselines", f"exam.folder={exam}", "~exam.baselines.greedy", "~exam.baselines.bic")
-    done = brokk(*about, f"exam.baselines.trees.exam={exam}", "exam.baselines.trees.trees=20", f"session.out={tmp_path / 'b'}")
+def test_baselines_sit_and_are_scored_by_one_command(
+    exam: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    about = (
+        "mode=exam",
+        "exam.do=baselines",
+        f"exam.folder={exam}",
+        "~exam.baselines.greedy",
+        "~exam.baselines.bic",
+    )
+    done = brokk(
+        *about,
+        f"exam.baselines.trees.exam={exam}",
+        "exam.baselines.trees.trees=20",
+        f"session.out={tmp_path / 'b'}",
+    )
     assert done.code == 0, done.err
     marks = json.loads((tmp_path / "b" / "marks.json").read_text())["candidates"]
-    assert (tmp_path / "b" / "exam.md").read_text().startswith("|  | most_frequent | trees |\n| --- | --- | --- |\n| one effect: ")
-    assert set(marks) == {"most_frequent", "trees"} and not any(table["failed"] for table in marks.values())
+    assert (
+        (tmp_path / "b" / "exam.md")
+        .read_text()
+        .startswith("|  | most_frequent | trees |\n| --- | --- | --- |\n| one effect: ")
+    )
+    assert set(marks) == {"most_frequent", "trees"} and not any(
+        table["failed"] for table in marks.values()
+    )
 
 
-def test_seeds_of_exams_need_to_be_sealed_and_those_of_development_not(brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_seeds_of_exams_need_to_be_sealed_and_those_of_development_not(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     for seed, sealed in ((1000, "false"), (1, "true")):
-        done = brokk(*SMALL, f"session.seed={seed}", f"exam.sealed={sealed}", f"session.out={tmp_path / 'x'}")
+        done = brokk(
+            *SMALL, f"session.seed={seed}", f"exam.sealed={sealed}", f"session.out={tmp_path / 'x'}"
+        )
         assert done.code != 0 and "exam.sealed=" in done.err and not (tmp_path / "x").exists()
 
 
-def test_cases_of_an_exam_hang_on_the_salt_and_those_of_development_on_the_seed_alone(tmp_path: Path) -> None:
+def test_cases_of_an_exam_hang_on_the_salt_and_those_of_development_on_the_seed_alone(
+    tmp_path: Path,
+) -> None:
     def drawn(seed: int, salt: str) -> str:
         with initialize_config_module("conf", version_base="1.3"):
             sealed = "true" if seed >= 1000 else "false"
-            cfg = compose("config", [*SMALL, f"session.out={tmp_path}", f"session.seed={seed}", f"exam.sealed={sealed}"])
+            cfg = compose(
+                "config",
+                [
+                    *SMALL,
+                    f"session.out={tmp_path}",
+                    f"session.seed={seed}",
+                    f"exam.sealed={sealed}",
+                ],
+            )
         return repr(instantiate(cfg, _convert_="all").questions(salt))
 
     assert drawn(1000, "a") == drawn(1000, "a") != drawn(1000, "b")
     assert drawn(1, "a") == drawn(1, "b")
 
 
-def test_a_forest_learns_from_development_cases_only_and_answers(exam: Path, machine: Machine, tmp_path: Path) -> None:
+def test_a_forest_learns_from_development_cases_only_and_answers(
+    exam: Path, machine: Machine, tmp_path: Path
+) -> None:
     trees = Trees(exam=str(exam), trees=20, least=0.3, seed=0)
     trees.answer(exam / paper.CASES / "0000", tmp_path / "out", machine)
     found = answer.read(tmp_path / "out" / FILE)
-    assert all(0 <= one.probability <= 1 for one in found.ranking) and found.verdict in ("effects", "none", "unknown")
+    assert all(0 <= one.probability <= 1 for one in found.ranking) and found.verdict in (
+        "effects",
+        "none",
+        "unknown",
+    )
     sealed = tmp_path / "sealed"
     sealed.mkdir()
     (sealed / "exam.json").write_text('{"sealed": true}')
     with pytest.raises(ConfigError, match="development seeds only"):
-        replace(trees, exam=str(sealed)).answer(exam / paper.CASES / "0000", tmp_path / "out", machine)
+        replace(trees, exam=str(sealed)).answer(
+            exam / paper.CASES / "0000", tmp_path / "out", machine
+        )
 
 
 class Recorder:
@@ -201,7 +297,9 @@ class Recorder:
         Always(effect=None, probability=0.5).answer(case, out, machine)
 
 
-def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_again(machine: Machine, tmp_path: Path) -> None:
+def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_again(
+    machine: Machine, tmp_path: Path
+) -> None:
     case, answers = tmp_path / "exam" / paper.CASES / "0000", tmp_path / "answers"
     (case / "field").mkdir(parents=True)
     (case / "field" / "00.parquet").touch()
@@ -212,8 +310,16 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     assert sitting.sit(second, [case], answers, machine, 1, lambda: None) == 0
     assert sitting.sit(third, [case], answers, machine, 1, lambda: None) == 0
     given, content = second.given[0]
-    assert content == ["field", "field/00.parquet"] and tmp_path not in given.parents and "0000" not in str(given)
-    assert third.given == [] and (answers / "0000" / FILE).is_file() and sitting.seconds(answers / "0000") is not None
+    assert (
+        content == ["field", "field/00.parquet"]
+        and tmp_path not in given.parents
+        and "0000" not in str(given)
+    )
+    assert (
+        third.given == []
+        and (answers / "0000" / FILE).is_file()
+        and sitting.seconds(answers / "0000") is not None
+    )
 
 
 def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_path: Path) -> None:
@@ -222,7 +328,9 @@ def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_pa
         (("sleep", "9", "#{case}{out}"), 0.2, "within"),
     ):
         command = sitting.Command(
-            command=words if words[0] == "false" else ("sh", "-c", "sleep 9 #{case}{out}"), limit_s=limit_s, threads=1
+            command=words if words[0] == "false" else ("sh", "-c", "sleep 9 #{case}{out}"),
+            limit_s=limit_s,
+            threads=1,
         )
         with pytest.raises(RecordingError, match=message):
             command.answer(tmp_path, tmp_path / "out", machine)

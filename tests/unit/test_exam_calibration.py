@@ -43,7 +43,10 @@ def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findi
     for j in range(machine.num_joints):
         columns = random.standard_normal((2, 800))
         z = random.standard_normal(800) + (strength * columns[0] if j == 0 else 0.0)
-        shapes = {name: [Shape(SIZES, SIZES[:, None] * c)] for name, c in zip(("lag", "dead_band"), columns, strict=True)}
+        shapes = {
+            name: [Shape(SIZES, SIZES[:, None] * c)]
+            for name, c in zip(("lag", "dead_band"), columns, strict=True)
+        }
         tables.append(Table(plain(z, []), shapes, block))
         tables[-1].explore({"lag": 2.0, "dead_band": 2.0}, 2)
 
@@ -78,15 +81,29 @@ def test_what_was_weighed_is_chosen_from_again_as_it_was(machine: Machine, price
 
 
 def label(kind: str, effects: list[dict[str, Any]]) -> dict[str, Any]:
-    return {"case": "0000", "kind": kind, "effects": effects, "outside": None, "moved_rad": {"q1": 0.0}}
+    return {
+        "case": "0000",
+        "kind": kind,
+        "effects": effects,
+        "outside": None,
+        "moved_rad": {"q1": 0.0},
+    }
 
 
-def test_prices_are_found_that_name_what_is_there_and_nothing_else(machine: Machine, prices: Prices, weights: Certainty) -> None:
+def test_prices_are_found_that_name_what_is_there_and_nothing_else(
+    machine: Machine, prices: Prices, weights: Certainty
+) -> None:
     cheap = dataclasses.replace(prices, joint=2.0, name=2.0, reference=0.5)
     lag = {"effect": "lag", "joints": ["q1"], "size": 1.0, "parameters": {}, "nothing": {}}
     cases = [
-        *(Item(label("none", []), weighing.weighed(found(machine, cheap, 0.14, seed), cheap)) for seed in range(3)),
-        *(Item(label("one", [lag]), weighing.weighed(found(machine, cheap, 0.4, seed), cheap)) for seed in range(3)),
+        *(
+            Item(label("none", []), weighing.weighed(found(machine, cheap, 0.14, seed), cheap))
+            for seed in range(3)
+        ),
+        *(
+            Item(label("one", [lag]), weighing.weighed(found(machine, cheap, 0.4, seed), cheap))
+            for seed in range(3)
+        ),
     ]
     fit = Calibration(machine, library.load(machine), [], [], trials=8, seed=0, workers=1)
     assert fit.value(cases, cheap, weights) < 0.8
@@ -97,10 +114,17 @@ def test_prices_are_found_that_name_what_is_there_and_nothing_else(machine: Mach
 def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothing_stands_above_it(
     machine: Machine, prices: Prices, weights: Certainty
 ) -> None:
-    outside = {**dict.fromkeys(weights.outside, 0.0), "constant": float(np.log(0.4 / 0.6))}  # odds of 2 to 3, whatever is seen
-    weights = dataclasses.replace(weights, outside=outside, none={"constant": 2.0, "nearest": 0.0, "outside": 0.0})
+    outside = {
+        **dict.fromkeys(weights.outside, 0.0),
+        "constant": float(np.log(0.4 / 0.6)),
+    }  # odds of 2 to 3, whatever is seen
+    weights = dataclasses.replace(
+        weights, outside=outside, none={"constant": 2.0, "nearest": 0.0, "outside": 0.0}
+    )
     named, silent = found(machine, prices, 0.5, 0), found(machine, prices, 0.0, 1)
-    assert verdict.is_unknown(named, prices, weights), "a fifth of causes lies outside, so few are missed only so"
+    assert verdict.is_unknown(named, prices, weights), (
+        "a fifth of causes lies outside, so few are missed only so"
+    )
     assert not verdict.is_unknown(silent, prices, weights)
     rows = verdict.ranking(named, [], prices, weights, machine, 0.4)
     assert max(rows, key=lambda row: row.probability).probability == pytest.approx(0.4)

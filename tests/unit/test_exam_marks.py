@@ -17,12 +17,20 @@ from brokk_rl.diagnosis.sizes import Shape
 CLASSES = (("dead_time", "clock_offset"), ("flow_gain", "encoder_scale"))
 
 
-def label(kind: str, *effects: tuple[str, str, float], outside: str | None = None) -> dict[str, Any]:
+def label(
+    kind: str, *effects: tuple[str, str, float], outside: str | None = None
+) -> dict[str, Any]:
     return {
         "case": "0000",
         "kind": kind,
         "effects": [
-            {"effect": name, "joints": [joint], "size": 0.5, "parameters": {"number": {joint: value}}, "nothing": {"number": 0.0}}
+            {
+                "effect": name,
+                "joints": [joint],
+                "size": 0.5,
+                "parameters": {"number": {joint: value}},
+                "nothing": {"number": 0.0},
+            }
             for name, joint, value in effects
         ],
         "outside": None if outside is None else {"ailment": outside, "joints": ["q1"], "size": 0.7},
@@ -30,12 +38,27 @@ def label(kind: str, *effects: tuple[str, str, float], outside: str | None = Non
     }
 
 
-def chosen(effect: str, joint: str = "q3", probability: float = 0.9, said: float = 1.0, same_as: tuple[str, ...] = ()) -> Selected:
+def chosen(
+    effect: str,
+    joint: str = "q3",
+    probability: float = 0.9,
+    said: float = 1.0,
+    same_as: tuple[str, ...] = (),
+) -> Selected:
     number = {"number": {joint: Estimate(said, (said - 0.196, said + 0.196))}}
-    return Selected(effect=effect, joints=(joint,), probability=probability, parameters=number, gap_closed=None, same_as=same_as)
+    return Selected(
+        effect=effect,
+        joints=(joint,),
+        probability=probability,
+        parameters=number,
+        gap_closed=None,
+        same_as=same_as,
+    )
 
 
-def answered(*selected: Selected, verdict: str | None = None, unknown: float | None = None) -> Answer:
+def answered(
+    *selected: Selected, verdict: str | None = None, unknown: float | None = None
+) -> Answer:
     ranking = [Ranked(one.effect, one.joints, one.probability) for one in selected]
     if unknown is not None:
         ranking.append(Ranked("unknown", (), unknown))
@@ -58,7 +81,12 @@ def test_a_name_of_the_class_is_right_but_not_strictly() -> None:
     truth = label("one", ("dead_time", "q3", 1.0))
     for said in (chosen("clock_offset"), chosen("lag", same_as=("dead_time",))):
         found = marked(truth, answered(said))
-        assert found.first and not found.first_strictly and found.joints_right == (True,) and found.numbers == ()
+        assert (
+            found.first
+            and not found.first_strictly
+            and found.joints_right == (True,)
+            and found.numbers == ()
+        )
     assert not marked(truth, answered(chosen("lag"))).first
 
 
@@ -79,7 +107,9 @@ def test_intervals_and_errors_of_parameters_are_relative_to_the_size_of_the_effe
     assert number.error == pytest.approx(0.25)  # 0.2 of 0.8
     assert not number.in_95 and not number.in_90  # 0.8 lies just outside 0.804 to 1.196
     (number,) = marked(label("one", ("lag", "q3", 0.82)), answered(chosen("lag", said=1.0))).numbers
-    assert number.in_95 and not number.in_90  # the 90 % interval begins at 1 - 0.196 * 0.839 = 0.8355
+    assert (
+        number.in_95 and not number.in_90
+    )  # the 90 % interval begins at 1 - 0.196 * 0.839 = 0.8355
 
 
 def test_an_effect_below_the_noise_counts_as_no_gap() -> None:
@@ -91,17 +121,30 @@ def test_an_effect_below_the_noise_counts_as_no_gap() -> None:
 
 def test_a_missing_answer_is_wrong_everywhere() -> None:
     found = marked(label("one", ("lag", "q3", 1.0)), None, None)
-    assert found.verdict == "failed" and not found.first and found.claims == () and found.unknown == 0.0
+    assert (
+        found.verdict == "failed"
+        and not found.first
+        and found.claims == ()
+        and found.unknown == 0.0
+    )
 
 
 def table() -> list[Mark]:
     """Eight cases: 2 of 3 single effects right, 1 of 2 sets, 1 of 2 quiet ones, the one outside."""
     return [
         marked(label("one", ("lag", "q3", 1.0)), answered(chosen("lag"))),
-        marked(label("one", ("lag", "q1", 1.0)), answered(chosen("lag", "q3", 0.7))),  # right effect, wrong joint
+        marked(
+            label("one", ("lag", "q1", 1.0)), answered(chosen("lag", "q3", 0.7))
+        ),  # right effect, wrong joint
         marked(label("one", ("creep", "q3", 1.0)), answered(chosen("backlash", probability=0.6))),
-        marked(label("several", ("lag", "q3", 1.0), ("creep", "q2", 1.0)), answered(chosen("lag"), chosen("creep", "q2"))),
-        marked(label("several", ("lag", "q3", 1.0), ("creep", "q2", 1.0)), answered(chosen("lag"), chosen("backlash"))),
+        marked(
+            label("several", ("lag", "q3", 1.0), ("creep", "q2", 1.0)),
+            answered(chosen("lag"), chosen("creep", "q2")),
+        ),
+        marked(
+            label("several", ("lag", "q3", 1.0), ("creep", "q2", 1.0)),
+            answered(chosen("lag"), chosen("backlash")),
+        ),
         marked(label("none"), answered()),
         marked(label("none"), answered(chosen("lag", probability=0.5))),
         marked(label("outside", outside="fading"), answered(verdict="unknown", unknown=0.8)),
@@ -137,14 +180,19 @@ def test_calibration_error_is_that_worked_by_hand() -> None:
 
 def test_auroc_counts_ties_half() -> None:
     quiet, outside = label("none"), label("outside", outside="fading")
-    marks = [marked(quiet, answered(unknown=p)) for p in (0.1, 0.4)] + [marked(outside, answered(unknown=p)) for p in (0.4, 0.9)]
+    marks = [marked(quiet, answered(unknown=p)) for p in (0.1, 0.4)] + [
+        marked(outside, answered(unknown=p)) for p in (0.4, 0.9)
+    ]
     assert tally.auroc(marks) == pytest.approx(3.5 / 4)  # 0.4 > 0.1, 0.4 = 0.4, 0.9 > both
     assert tally.auroc(marks[:2]) is None
 
 
 def test_the_gap_closed_is_held_against_what_the_oracle_closes() -> None:
     truth = label("one", ("lag", "q3", 1.0))
-    marks = [mark(truth, answered(chosen("lag")), CLASSES, (), 1.0, oracle) for oracle in (1.0, 0.8, 0.01)]
+    marks = [
+        mark(truth, answered(chosen("lag")), CLASSES, (), 1.0, oracle)
+        for oracle in (1.0, 0.8, 0.01)
+    ]
     # each closes 0.9, so 0.9 and 1.125 of it; where nothing can be closed nobody is asked
     assert tally.closed_of_oracle(marks) == pytest.approx((0.9 + 1.125) / 2)
     assert tally.closed_of_oracle([mark(truth, None, CLASSES, (), None, 0.9)]) == 0.0
@@ -163,7 +211,10 @@ def test_forward_selection_takes_what_is_there_and_bic_leaves_what_does_not_pay(
     generator, fold = np.random.default_rng(0), np.arange(600) // 100 % 2
     form, other = generator.standard_normal((2, 600))
     sizes = np.array([0.0, 1.0, 2.0])
-    shapes = {name: [Shape(sizes, np.outer(sizes, ray))] for name, ray in (("lag", form), ("creep", other))}
+    shapes = {
+        name: [Shape(sizes, np.outer(sizes, ray))]
+        for name, ray in (("lag", form), ("creep", other))
+    }
     errors = Errors(1.2 * form + 0.5 * generator.standard_normal(600), shapes, fold)
     assert set(rules.grown(errors, rules.bic)) == {"lag"}
     assert next(iter(rules.grown(errors, rules.held_out))) == "lag"
@@ -172,12 +223,29 @@ def test_forward_selection_takes_what_is_there_and_bic_leaves_what_does_not_pay(
 
 def test_a_number_that_all_joints_share_counts_once() -> None:
     joints = ("q1", "q2", "q3")
-    label = {"effect": "frame_loss", "parameters": {"probability": dict.fromkeys(joints, 0.1)}, "nothing": {"probability": 0.0}}
+    label = {
+        "effect": "frame_loss",
+        "parameters": {"probability": dict.fromkeys(joints, 0.1)},
+        "nothing": {"probability": 0.0},
+    }
     shared: dict[str, Any] = {"probability": dict.fromkeys(joints, Estimate(0.11, (0.09, 0.13)))}
-    own: dict[str, Any] = {"probability": {joint: Estimate(0.11 + 0.001 * n, (0.09, 0.13)) for n, joint in enumerate(joints)}}
+    own: dict[str, Any] = {
+        "probability": {
+            joint: Estimate(0.11 + 0.001 * n, (0.09, 0.13)) for n, joint in enumerate(joints)
+        }
+    }
     counts = [
         len(
-            marking._numbers(label, Selected(effect="frame_loss", joints=joints, probability=1.0, parameters=said, gap_closed=None))
+            marking._numbers(
+                label,
+                Selected(
+                    effect="frame_loss",
+                    joints=joints,
+                    probability=1.0,
+                    parameters=said,
+                    gap_closed=None,
+                ),
+            )
         )
         for said in (shared, own)
     ]

@@ -25,8 +25,16 @@ Q3 = 2
 
 def clean(machine: Machine, make: str) -> Anatomy:
     """A machine of this make without nuisances, noise or lever arms, so that numbers can be worked by hand."""
-    numbers = next(found for seed in range(100) if (found := drawn(machine, seed, 0.0))[0] == make)[1]
-    for name, value in {"noise_rad": 0.0, "lever": 0.0, "notch": 0.0, "speed_scale": 1.0, "retract_ratio": 1.0}.items():
+    numbers = next(found for seed in range(100) if (found := drawn(machine, seed, 0.0))[0] == make)[
+        1
+    ]
+    for name, value in {
+        "noise_rad": 0.0,
+        "lever": 0.0,
+        "notch": 0.0,
+        "speed_scale": 1.0,
+        "retract_ratio": 1.0,
+    }.items():
         numbers[name] = np.full(machine.num_joints, value)
     for name, value in {
         "overlap_extend": 0.1,
@@ -44,13 +52,23 @@ def size(machine: Machine, none: float, value: float) -> np.ndarray:
 
 
 def played(
-    machine: Machine, make: str, runs: list[tuple[Anatomy, np.ndarray]], ailments: Sequence[str | None] | None = None
+    machine: Machine,
+    make: str,
+    runs: list[tuple[Anatomy, np.ndarray]],
+    ailments: Sequence[str | None] | None = None,
 ) -> np.ndarray:
     """Returns the positions of several machines of one make side by side, `(T + 1, N, J)`, each under commands `(T, J)`."""
     numbers, commands = [numbers for numbers, _ in runs], np.stack([u for _, u in runs], 1)
     count = len(runs)
     plant = Plant(
-        machine, make, numbers, ailments or [None] * count, [0] * count, np.full(count, 900.0), [False] * count, len(commands)
+        machine,
+        make,
+        numbers,
+        ailments or [None] * count,
+        [0] * count,
+        np.full(count, 900.0),
+        [False] * count,
+        len(commands),
     )
     path = [plant.read().q]
     for u in commands:
@@ -65,14 +83,20 @@ def step(machine: Machine, level: float, steps: int = 50, joint: int = Q3) -> np
     return u
 
 
-def speeds(machine: Machine, make: str, runs: list[tuple[Anatomy, float]], joint: int = Q3) -> np.ndarray:
+def speeds(
+    machine: Machine, make: str, runs: list[tuple[Anatomy, float]], joint: int = Q3
+) -> np.ndarray:
     """Steady speeds at commands, of `max_speed`."""
-    q = played(machine, make, [(numbers, step(machine, level, joint=joint)) for numbers, level in runs])[:, :, joint]
+    q = played(
+        machine, make, [(numbers, step(machine, level, joint=joint)) for numbers, level in runs]
+    )[:, :, joint]
     return (q[50] - q[40]) / (10 * machine.period_s) / machine.max_speed[joint]
 
 
 @pytest.mark.parametrize("make", MAKES)
-def test_a_clean_machine_goes_at_full_speed_and_in_proportion_beyond_its_overlap(machine: Machine, make: str) -> None:
+def test_a_clean_machine_goes_at_full_speed_and_in_proportion_beyond_its_overlap(
+    machine: Machine, make: str
+) -> None:
     numbers = clean(machine, make)
     found = speeds(machine, make, [(numbers, level) for level in (1.0, -1.0, 0.55, 0.08)])
     assert found == pytest.approx([1.0, -1.0, 0.5, 0.0], abs=0.05)
@@ -80,7 +104,11 @@ def test_a_clean_machine_goes_at_full_speed_and_in_proportion_beyond_its_overlap
 
 
 STEADY = {
-    "dead_band": ({"extend": (0.0, 0.2), "retract": (0.0, 0.0)}, 0.64, 0.5),  # opens at 0.1 + 0.9 * 0.2 = 0.28
+    "dead_band": (
+        {"extend": (0.0, 0.2), "retract": (0.0, 0.0)},
+        0.64,
+        0.5,
+    ),  # opens at 0.1 + 0.9 * 0.2 = 0.28
     "flow_gain": ({"gain": (1.0, 0.8)}, 1.0, 0.8),
     "asymmetry": ({"extend_gain": (1.0, 0.7), "retract_gain": (1.0, 1.0)}, 1.0, 0.7),
     "saturation": ({"level": (1.0, 0.55)}, 1.0, 0.5),  # (0.55 - 0.1) / 0.9
@@ -91,13 +119,20 @@ STEADY = {
 
 
 @pytest.mark.parametrize("make", MAKES)
-def test_a_fault_changes_the_steady_speed_of_its_joint_as_it_says(machine: Machine, make: str) -> None:
+def test_a_fault_changes_the_steady_speed_of_its_joint_as_it_says(
+    machine: Machine, make: str
+) -> None:
     well = clean(machine, make)
     ill = [
-        (afflicted(well, {effect: {name: size(machine, *pair) for name, pair in sizes.items()}}), level)
+        (
+            afflicted(well, {effect: {name: size(machine, *pair) for name, pair in sizes.items()}}),
+            level,
+        )
         for effect, (sizes, level, _) in STEADY.items()
     ]
-    found, full, others = (speeds(machine, make, *runs) for runs in ((ill,), ([(well, 1.0)],), (ill, 3)))
+    found, full, others = (
+        speeds(machine, make, *runs) for runs in ((ill,), ([(well, 1.0)],), (ill, 3))
+    )
     for effect, value in zip(STEADY, found / full, strict=True):
         assert value == pytest.approx(STEADY[effect][2], abs=0.05), effect
     there = speeds(machine, make, [(well, level) for _, level in ill], 3)
@@ -107,7 +142,15 @@ def test_a_fault_changes_the_steady_speed_of_its_joint_as_it_says(machine: Machi
 @pytest.mark.parametrize("make", MAKES)
 def test_one_direction_is_spared_by_an_asymmetry(machine: Machine, make: str) -> None:
     well = clean(machine, make)
-    ill = afflicted(well, {"asymmetry": {"extend_gain": size(machine, 1.0, 0.7), "retract_gain": size(machine, 1.0, 1.0)}})
+    ill = afflicted(
+        well,
+        {
+            "asymmetry": {
+                "extend_gain": size(machine, 1.0, 0.7),
+                "retract_gain": size(machine, 1.0, 1.0),
+            }
+        },
+    )
     found = speeds(machine, make, [(ill, -1.0), (well, -1.0)])
     assert found[0] == pytest.approx(found[1], abs=1e-9)
 
@@ -115,10 +158,19 @@ def test_one_direction_is_spared_by_an_asymmetry(machine: Machine, make: str) ->
 @pytest.mark.parametrize("make", MAKES)
 def test_a_fault_in_time_costs_the_way_of_that_time(machine: Machine, make: str) -> None:
     well = clean(machine, make)
-    # a filter of time constant T keeps the overlap (0.1) closed for T ln(1 / 0.9) and then costs T; a ramp of 0.5 s costs 0.05 s
-    # before the land opens and half of 0.45 s after it, of which the spool's own 0.04 to 0.08 s are not lost twice
-    late = {"dead_time": ("dead_time_s", 0.08, 0.08), "lag": ("time_constant_s", 0.1, 0.11), "rate_limit": ("stroke_s", 0.5, 0.215)}
-    runs = [well] + [afflicted(well, {effect: {name: size(machine, 0.0, value)}}) for effect, (name, value, _) in late.items()]
+    # a filter of time constant T keeps the overlap (0.1) closed for T ln(1 / 0.9) and then costs T;
+    # a ramp of 0.5 s costs 0.05 s before the land opens and half of 0.45 s after it, of which the
+    # spool's own 0.04 to 0.08 s are
+    # not lost twice
+    late = {
+        "dead_time": ("dead_time_s", 0.08, 0.08),
+        "lag": ("time_constant_s", 0.1, 0.11),
+        "rate_limit": ("stroke_s", 0.5, 0.215),
+    }
+    runs = [well] + [
+        afflicted(well, {effect: {name: size(machine, 0.0, value)}})
+        for effect, (name, value, _) in late.items()
+    ]
     q = played(machine, make, [(numbers, step(machine, 1.0)) for numbers in runs])[:, :, Q3]
     lost_s = (q[-1, 0] - q[-1, 1:]) / ((q[50, 0] - q[40, 0]) / (10 * machine.period_s))
     assert lost_s == pytest.approx([expected for _, _, expected in late.values()], abs=0.03)
@@ -128,13 +180,21 @@ def test_a_fault_in_time_costs_the_way_of_that_time(machine: Machine, make: str)
 def test_backlash_takes_its_gap_at_each_reversal(machine: Machine, make: str) -> None:
     u = np.concatenate([step(machine, 0.6, 30), step(machine, -0.6, 30), step(machine, 0.0, 20)])
     faults = {"backlash": {"gap_rad": size(machine, 0.0, 0.02)}}
-    before, after = played(machine, make, [(afflicted(clean(machine, make), found), u) for found in ({}, faults)])[:, :, Q3].T
-    assert before.max() - after.max() == pytest.approx(0.01, abs=0.001)  # half of it from the middle
-    assert after[-1] - before[-1] == pytest.approx(0.01, abs=0.002)  # then the other half, less what the oil springs back
+    before, after = played(
+        machine, make, [(afflicted(clean(machine, make), found), u) for found in ({}, faults)]
+    )[:, :, Q3].T
+    assert before.max() - after.max() == pytest.approx(
+        0.01, abs=0.001
+    )  # half of it from the middle
+    assert after[-1] - before[-1] == pytest.approx(
+        0.01, abs=0.002
+    )  # then the other half, less what the oil springs back
 
 
 @pytest.mark.parametrize("make", MAKES)
-def test_a_leak_lets_a_heavy_joint_sink_in_proportion_to_its_load(machine: Machine, make: str) -> None:
+def test_a_leak_lets_a_heavy_joint_sink_in_proportion_to_its_load(
+    machine: Machine, make: str
+) -> None:
     numbers = afflicted(clean(machine, make), {"creep": {"sink_rad_s": size(machine, 0.0, 0.05)}})
     arm = Arm(machine, {name: value[None] for name, value in numbers.items()})
     load = arm.load(machine.home[None])[0, Q3]
@@ -158,39 +218,67 @@ def test_a_worn_pump_slows_joints_that_move_together_only(machine: Machine, make
 def test_stiction_asks_for_more_command_to_start_than_to_go_on(machine: Machine, make: str) -> None:
     numbers = afflicted(clean(machine, make), {"stiction": {"start": size(machine, 0.0, 0.2)}})
     pushed = np.concatenate([step(machine, 0.25, 30), step(machine, 0.15, 50)])
-    below, after = played(machine, make, [(numbers, step(machine, 0.15, 80)), (numbers, pushed)])[:, :, Q3].T
+    below, after = played(machine, make, [(numbers, step(machine, 0.15, 80)), (numbers, pushed)])[
+        :, :, Q3
+    ].T
     assert abs(below[80] - below[0]) < 0.002
     assert after[75] - after[50] > 0.01  # the same command keeps it moving
 
 
 @pytest.mark.parametrize("make", MAKES)
-def test_what_is_soft_rings_at_its_period_and_what_is_not_does_not(machine: Machine, make: str) -> None:
+def test_what_is_soft_rings_at_its_period_and_what_is_not_does_not(
+    machine: Machine, make: str
+) -> None:
     u = np.concatenate([step(machine, 0.8, 30), step(machine, 0.0, 50)])
-    faults = {"compliance": {"ringing_s": size(machine, 0.0, 0.5), "damping": size(machine, 0.1, 0.1)}}
+    faults = {
+        "compliance": {"ringing_s": size(machine, 0.0, 0.5), "damping": size(machine, 0.1, 0.1)}
+    }
 
-    q = played(machine, make, [(afflicted(clean(machine, make), found), u) for found in ({}, faults)])[42:, :, Q3]
+    q = played(
+        machine, make, [(afflicted(clean(machine, make), found), u) for found in ({}, faults)]
+    )[42:, :, Q3]
     stiff, soft = np.abs(np.diff(q, axis=0)).sum(0) - np.abs(q[-1] - q[0])
     assert soft > 5.0 * stiff and soft > 0.004
 
 
 @pytest.mark.parametrize("make", MAKES)
 def test_a_loose_compensator_lifts_slower_than_it_lowers(machine: Machine, make: str) -> None:
-    numbers = afflicted(clean(machine, make), {"load_dependence": {"sensitivity": size(machine, 0.0, 0.6)}})
+    numbers = afflicted(
+        clean(machine, make), {"load_dependence": {"sensitivity": size(machine, 0.0, 0.6)}}
+    )
     well = clean(machine, make)
-    down, up, *even = np.abs(speeds(machine, make, [(n, level) for n in (numbers, well) for level in (1.0, -1.0)]))
+    down, up, *even = np.abs(
+        speeds(machine, make, [(n, level) for n in (numbers, well) for level in (1.0, -1.0)])
+    )
     assert down / up > 1.05 * even[0] / even[1]  # positive lowers
 
 
 def test_lost_frames_hold_the_command_before_and_late_ones_keep_their_order() -> None:
-    numbers = {"transport_s": np.full((1, 1), 0.1), "jitter_s": np.full((1, 1), 0.1), "loss": np.full((1, 1), 0.5)}
+    numbers = {
+        "transport_s": np.full((1, 1), 0.1),
+        "jitter_s": np.full((1, 1), 0.1),
+        "loss": np.full((1, 1), 0.5),
+    }
     line = Line(numbers, 0.05)
-    frames = [(1.0, 0.9, 0.0), (2.0, 0.4, 0.0), (3.0, 0.9, 1.0), (4.0, 0.9, 0.0)]  # command, luck, lateness
+    frames = [
+        (1.0, 0.9, 0.0),
+        (2.0, 0.4, 0.0),
+        (3.0, 0.9, 1.0),
+        (4.0, 0.9, 0.0),
+    ]  # command, luck, lateness
     seen = []
     for k, (u, luck, late) in enumerate(frames):
-        line.send(np.full((1, 1), u), 0.05 * k, np.full((1, 1), luck), np.full((1, 1), late), np.zeros((1, 1)))
+        line.send(
+            np.full((1, 1), u),
+            0.05 * k,
+            np.full((1, 1), luck),
+            np.full((1, 1), late),
+            np.zeros((1, 1)),
+        )
     for i in range(31):
         seen.append(float(line.at(0.01 * i + 1e-9)[0, 0]))
-    # 1 arrives at 0.10; 2 is lost; 3 is sent at 0.10 and comes at 0.30; 4 would come at 0.25 and waits for it
+    # 1 arrives at 0.10; 2 is lost; 3 is sent at 0.10 and comes at 0.30; 4 would come at 0.25 and
+    # waits for it
     assert seen[:10] == [0.0] * 10 and set(seen[10:30]) == {1.0}
     line.at(0.301)
     assert float(line.at(0.302)[0, 0]) == 4.0
@@ -211,9 +299,14 @@ def test_weight_and_tool_are_those_of_the_machine(machine: Machine) -> None:
     from brokk_rl.gravity import Gravity
 
     q = np.random.default_rng(0).uniform(machine.lower, machine.upper, (6, machine.num_joints))
-    arm = Arm(machine, {name: np.zeros((6, machine.num_joints)) for name in ("extra_m", "roll_rad", "pitch_rad")})
+    arm = Arm(
+        machine,
+        {name: np.zeros((6, machine.num_joints)) for name in ("extra_m", "roll_rad", "pitch_rad")},
+    )
     yields = np.array([body.yield_force.value for body in machine.bodies])
-    torque = Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
+    torque = (
+        Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
+    )
     assert arm.load(q) == pytest.approx(torque / yields, abs=1e-4)
     tip_m, pitch_rad = arm.tool(q)
     pose = Kinematics(machine).pose(torch.as_tensor(q, dtype=torch.float32))
@@ -225,13 +318,19 @@ def test_a_longer_link_and_a_tilted_base_move_the_tool_as_geometry_says(machine:
     zero = np.zeros((1, machine.num_joints))
     straight = np.zeros((1, machine.num_joints))  # all along x
     tips = []
-    for change in ({}, {"extra_m": np.array([[0.0, 0.0, 0.02, 0.0, 0.0]])}, {"pitch_rad": zero + 0.03}):
+    for change in (
+        {},
+        {"extra_m": np.array([[0.0, 0.0, 0.02, 0.0, 0.0]])},
+        {"pitch_rad": zero + 0.03},
+    ):
         numbers = dict.fromkeys(("extra_m", "roll_rad", "pitch_rad"), zero) | change
         tips.append(Arm(machine, numbers).tool(straight)[0][0])
     assert tips[1] - tips[0] == pytest.approx([0.02, 0.0, 0.0], abs=1e-9)
     x, y, z = tips[0]
     cos, sin = np.cos(0.03), np.sin(0.03)
-    assert tips[2] == pytest.approx([cos * x + sin * z, y, -sin * x + cos * z], abs=1e-9)  # the front goes down
+    assert tips[2] == pytest.approx(
+        [cos * x + sin * z, y, -sin * x + cos * z], abs=1e-9
+    )  # the front goes down
 
 
 def test_a_run_is_the_same_whatever_runs_beside_it_and_machines_differ(machine: Machine) -> None:
@@ -241,7 +340,14 @@ def test_a_run_is_the_same_whatever_runs_beside_it_and_machines_differ(machine: 
 
     def paths(numbers: list[Anatomy], seeds: list[int]) -> np.ndarray:
         plant = Plant(
-            machine, "throttled", numbers, [None] * len(numbers), seeds, np.zeros(len(numbers)), [False] * len(numbers), 40
+            machine,
+            "throttled",
+            numbers,
+            [None] * len(numbers),
+            seeds,
+            np.zeros(len(numbers)),
+            [False] * len(numbers),
+            40,
         )
         for command in u:
             plant.send(Command(np.repeat(command[None], len(numbers), 0)))
@@ -252,16 +358,36 @@ def test_a_run_is_the_same_whatever_runs_beside_it_and_machines_differ(machine: 
     assert np.abs(together[0] - together[1]).max() > 0.005
 
 
-@pytest.mark.parametrize(("roughness", "low_rad", "high_rad"), [("mild", 0.005, 0.011), ("strong", 0.011, 0.025)])
-def test_chance_alone_leaves_most_of_the_stated_floor(machine: Machine, roughness: str, low_rad: float, high_rad: float) -> None:
+@pytest.mark.parametrize(
+    ("roughness", "low_rad", "high_rad"), [("mild", 0.005, 0.011), ("strong", 0.011, 0.025)]
+)
+def test_chance_alone_leaves_most_of_the_stated_floor(
+    machine: Machine, roughness: str, low_rad: float, high_rad: float
+) -> None:
     # the same machines twice under the same commands: what differs over 5 s no model can know
     rough = option("exam_plants", "valves").roughness[roughness]
-    numbers = [found for seed in range(24) for make, found in [drawn(machine, seed, rough)] if make == "throttled"]
+    numbers = [
+        found
+        for seed in range(24)
+        for make, found in [drawn(machine, seed, rough)]
+        if make == "throttled"
+    ]
     count, steps = len(numbers), 1200
     none, zeros = [None] * 2 * count, np.zeros(2 * count)
-    twice = Plant(machine, "throttled", numbers * 2, none, list(range(2 * count)), zeros, [False] * 2 * count, steps)
+    twice = Plant(
+        machine,
+        "throttled",
+        numbers * 2,
+        none,
+        list(range(2 * count)),
+        zeros,
+        [False] * 2 * count,
+        steps,
+    )
     generator, shape = np.random.default_rng(0), (steps // 30, count, machine.num_joints)
-    levels = generator.uniform(-1.0, 1.0, shape) * (generator.random(shape) > 0.3)  # as excitation=levels: 0.3 of them rest
+    levels = generator.uniform(-1.0, 1.0, shape) * (
+        generator.random(shape) > 0.3
+    )  # as excitation=levels: 0.3 of them rest
     levels *= exclusive_mask(machine.is_exclusive, generator.random(shape[:2]) < 0.3)
     path = []
     for u in np.repeat(levels, 30, 0):
@@ -277,7 +403,12 @@ def test_each_ailment_shows_and_a_machine_of_severity_zero_is_well(machine: Mach
     u = np.concatenate([step(machine, level, 60) for level in (0.8, 0.8, 0.8, -0.8, 0.3, -0.3)])
     u[:, 3] = np.where(u[:, Q3] > 0, 0.5, 0.0)
     ill, kinds = well | {"stranger": size(machine, 0.0, 1.0)}, list(strangers.KINDS)
-    q = played(machine, "throttled", [(ill, u)] * len(kinds) + [(well, u)] * (len(kinds) + 1), [*kinds, *kinds, None])[:, :, Q3]
+    q = played(
+        machine,
+        "throttled",
+        [(ill, u)] * len(kinds) + [(well, u)] * (len(kinds) + 1),
+        [*kinds, *kinds, None],
+    )[:, :, Q3]
     apart = np.abs(q - q[:, -1:]).max(0)
     assert dict(zip(kinds, apart[: len(kinds)] > 0.01, strict=True)) == dict.fromkeys(kinds, True)
     assert not apart[len(kinds) :].any()
@@ -289,8 +420,12 @@ def test_every_fault_is_neutral_where_a_joint_has_not_got_it(
     numbers = clean(machine, "compensated")
     for effect in FAULTS:
         found = afflicted(numbers, {effect: mix_sizes(effect)})
-        differing = [name for name in numbers if not np.array_equal(found[name][:2], numbers[name][:2])]
-        assert not set(differing) - {"drift_s", "soft_damping"}, effect  # these count where their size is above 0 only
+        differing = [
+            name for name in numbers if not np.array_equal(found[name][:2], numbers[name][:2])
+        ]
+        assert not set(differing) - {"drift_s", "soft_damping"}, (
+            effect
+        )  # these count where their size is above 0 only
 
 
 @pytest.fixture

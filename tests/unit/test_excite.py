@@ -16,7 +16,9 @@ from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 
 
-def segments(name: str, machine: Machine, duration_s: float, seed: int = 0, **fields: object) -> list[Segment]:
+def segments(
+    name: str, machine: Machine, duration_s: float, seed: int = 0, **fields: object
+) -> list[Segment]:
     excitation = replace(option("excitation", name), **fields)
     return excitation.segments(machine, duration_s, np.random.default_rng(seed), [])
 
@@ -26,23 +28,34 @@ def moved(segment: Segment) -> set[int]:
 
 
 def by_joints_only(machine: Machine) -> Machine:
-    return replace(machine, joints=tuple(replace(joint, body=None) for joint in machine.joints), tool_m=None, mjcf=None)
+    return replace(
+        machine,
+        joints=tuple(replace(joint, body=None) for joint in machine.joints),
+        tool_m=None,
+        mjcf=None,
+    )
 
 
 def test_the_weight_is_that_of_the_plant(machine: Machine) -> None:
     q = np.random.default_rng(0).uniform(machine.lower, machine.upper, (50, 5))
-    expected = Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
+    expected = (
+        Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
+    )
     np.testing.assert_allclose(load(machine, q), expected, rtol=1e-3, atol=0.5)
 
 
 def test_start_poses_load_each_joint_from_both_sides_where_gravity_can(machine: Machine) -> None:
     generator = np.random.default_rng(0)
-    anywhere = np.sign(np.round(load(machine, generator.uniform(machine.lower, machine.upper, (500, 5)))))
+    anywhere = np.sign(
+        np.round(load(machine, generator.uniform(machine.lower, machine.upper, (500, 5))))
+    )
     chosen = poses(machine, 0.06, generator)
     for _ in range(5):
         four = np.sign(np.round(load(machine, np.stack([next(chosen) for _ in range(4)]))))
         for joint in range(5):
-            assert set(np.unique(anywhere[:, joint])) == set(np.unique(four[:, joint])), "four poses show every sign there is"
+            assert set(np.unique(anywhere[:, joint])) == set(np.unique(four[:, joint])), (
+                "four poses show every sign there is"
+            )
 
 
 def test_a_machine_without_bodies_starts_anywhere_within_its_margins(machine: Machine) -> None:
@@ -50,12 +63,20 @@ def test_a_machine_without_bodies_starts_anywhere_within_its_margins(machine: Ma
     for name in ("levels", "holds", "ramps"):
         for segment in segments(name, bare, 300.0):
             margin = segment.stop_margin * (bare.upper - bare.lower)
-            assert (segment.start >= bare.lower + margin).all() and (segment.start <= bare.upper - margin).all()
+            assert (segment.start >= bare.lower + margin).all() and (
+                segment.start <= bare.upper - margin
+            ).all()
 
 
 def test_sines_are_one_segment_a_joint_of_whole_waves_from_home(machine: Machine) -> None:
     found = segments("sine", machine, 900.0)
-    assert sorted(segment.name for segment in found) == ["sine_q1", "sine_q2", "sine_q3", "sine_q4", "sine_q5"]
+    assert sorted(segment.name for segment in found) == [
+        "sine_q1",
+        "sine_q2",
+        "sine_q3",
+        "sine_q4",
+        "sine_q5",
+    ]
     for segment in found:
         (joint,) = moved(segment)
         assert segment.name.endswith(machine.joint_names[joint]) and segment.stops == "home"
@@ -66,14 +87,18 @@ def test_sines_are_one_segment_a_joint_of_whole_waves_from_home(machine: Machine
 
 
 def test_the_waves_keep_to_their_band(machine: Machine) -> None:
-    (segment, *_) = segments("sine", machine, 600.0, lowest_hz=0.2, highest_hz=0.25, smallest=0.5, largest=0.6)
+    (segment, *_) = segments(
+        "sine", machine, 600.0, lowest_hz=0.2, highest_hz=0.25, smallest=0.5, largest=0.6
+    )
     u = segment.u[:, moved(segment).pop()]
     rising = np.flatnonzero((u[:-1] < 0) & (u[1:] >= 0))
     assert 0.45 < np.abs(u).max() <= 0.6
     assert np.median(np.diff(rising)) == pytest.approx(20 / 0.225, rel=0.15)
 
 
-def test_levels_move_several_joints_at_once_and_exclusive_ones_by_themselves(machine: Machine) -> None:
+def test_levels_move_several_joints_at_once_and_exclusive_ones_by_themselves(
+    machine: Machine,
+) -> None:
     found = segments("levels", machine, 600.0)
     assert len(found) == 10 and all(len(segment.u) == 1200 for segment in found)
     u = np.concatenate([segment.u for segment in found])
@@ -81,7 +106,9 @@ def test_levels_move_several_joints_at_once_and_exclusive_ones_by_themselves(mac
     assert not ((u[:, 1] != 0) & (others != 0).any(1)).any()
     assert ((others != 0).sum(1) >= 2).mean() > 0.4
     assert 0.15 < (u[:, 1] != 0).mean() < 0.35  # 0.3 of the turns, 0.7 of the levels
-    assert all((segment.u[:, 1] != 0).any() for segment in found), "each pose has its exclusive turn"
+    assert all((segment.u[:, 1] != 0).any() for segment in found), (
+        "each pose has its exclusive turn"
+    )
 
 
 def test_ramps_cross_zero_at_each_slope_in_both_directions(machine: Machine) -> None:
@@ -97,7 +124,9 @@ def test_ramps_cross_zero_at_each_slope_in_both_directions(machine: Machine) -> 
         assert way <= 0.32 * (machine.upper - machine.lower)[joint]
     assert set(slopes) == set(range(5))
     seen = set().union(*slopes.values())
-    assert {round(abs(slope), 2) for slope in seen} == {0.05, 0.1, 0.2} and min(seen) < 0 < max(seen)
+    assert {round(abs(slope), 2) for slope in seen} == {0.05, 0.1, 0.2} and min(seen) < 0 < max(
+        seen
+    )
 
 
 def test_a_staircase_goes_up_and_down_each_step_to_and_fro(machine: Machine) -> None:
@@ -111,7 +140,9 @@ def test_a_staircase_goes_up_and_down_each_step_to_and_fro(machine: Machine) -> 
 
 def test_holds_are_still_in_poses_of_different_load(machine: Machine) -> None:
     found = segments("holds", machine, 100.0)
-    assert [len(segment.u) for segment in found] == [500] * 4 and not any(segment.u.any() for segment in found)
+    assert [len(segment.u) for segment in found] == [500] * 4 and not any(
+        segment.u.any() for segment in found
+    )
     assert len({tuple(segment.start) for segment in found}) == 4
 
 
@@ -128,7 +159,9 @@ def test_a_repeat_is_the_same_again_under_another_name(machine: Machine) -> None
     again = repeat.segments(machine, 0.0, np.random.default_rng(3), before)
     assert [segment.repeat_of for segment in again] == [segment.name for segment in before]
     for one, other in zip(before, again, strict=True):
-        assert one.name != other.name and (one.u == other.u).all() and (one.start == other.start).all()
+        assert (
+            one.name != other.name and (one.u == other.u).all() and (one.start == other.start).all()
+        )
     assert repeat.weight(2.5) == 2.5
     with pytest.raises(ConfigError, match="nothing before it"):
         repeat.weight(0.0)
@@ -144,6 +177,9 @@ def test_an_excitation_that_finds_no_room_says_so(machine: Machine) -> None:
 def test_another_seed_draws_others(name: str, machine: Machine) -> None:
     one, other = (segments(name, machine, 300.0, seed) for seed in (1, 2))
     assert any(
-        a.name != b.name or a.u.shape != b.u.shape or (a.u != b.u).any() or (a.start != b.start).any()
+        a.name != b.name
+        or a.u.shape != b.u.shape
+        or (a.u != b.u).any()
+        or (a.start != b.start).any()
         for a, b in zip(one, other, strict=False)
     )

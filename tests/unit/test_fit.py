@@ -28,14 +28,20 @@ TINY: dict[str, Any] = {
 }  # fmt: skip
 
 
-def recording(machine: Machine, seed: int = 0, minutes: float = 1.0, noise: float = 3e-4) -> Recording:
+def recording(
+    machine: Machine, seed: int = 0, minutes: float = 1.0, noise: float = 3e-4
+) -> Recording:
     """Returns a recording of joints that follow their commands after 0.5 s, each slowed down by the commands of all."""
     generator = np.random.default_rng(seed)
     count = round(minutes * 60.0 / machine.period_s)
-    levels = generator.uniform(-1.0, 1.0, (count // 20 + 1, machine.num_joints)) * (generator.random((count // 20 + 1, 1)) > 0.3)
+    levels = generator.uniform(-1.0, 1.0, (count // 20 + 1, machine.num_joints)) * (
+        generator.random((count // 20 + 1, 1)) > 0.3
+    )
     u = np.repeat(levels, 20, 0)[:count]
     speed = (
-        0.2 * np.vstack([np.zeros((10, machine.num_joints)), u])[:count] / np.maximum(1.0, np.abs(u).sum(1, keepdims=True) / 2.0)
+        0.2
+        * np.vstack([np.zeros((10, machine.num_joints)), u])[:count]
+        / np.maximum(1.0, np.abs(u).sum(1, keepdims=True) / 2.0)
     )
     middle, half = (machine.lower + machine.upper) / 2.0, (machine.upper - machine.lower) / 2.0
     q = middle + half * np.sin(np.cumsum(speed, 0) * machine.period_s / half) * 0.9
@@ -66,7 +72,12 @@ class KilledError(Exception):
 
 @pytest.mark.parametrize(("name", "after"), [("mlp", 17), ("coupled", 41), ("mlp", 70)])
 def test_an_interrupted_fit_goes_on_as_if_it_had_not_stopped(
-    name: str, after: int, machine: Machine, runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    after: int,
+    machine: Machine,
+    runs: Runs,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = tiny(name)
     config.fit(machine, *runs, tmp_path / "whole", 3, CPU)
@@ -113,7 +124,10 @@ def test_an_interrupted_fit_with_other_settings_or_data_says_what_differs(
             tiny("mlp").fit(machine, *runs, tmp_path, 0, CPU)
     partial = tmp_path / "mlp.partial.safetensors"
     before = partial.read_bytes()
-    with pytest.raises(CheckpointError, match=r"these differ: fit\.batch \(was 8, is 9\); seed \(was 0, is 1\)\. Fit with"):
+    with pytest.raises(
+        CheckpointError,
+        match=r"these differ: fit\.batch \(was 8, is 9\); seed \(was 0, is 1\)\. Fit with",
+    ):
         tiny("mlp", batch=9).fit(machine, *runs, tmp_path, 1, CPU)
     with pytest.raises(CheckpointError, match=r"these differ: train \(was"):
         tiny("mlp").fit(machine, runs[0][:1], runs[1], tmp_path, 0, CPU)
@@ -125,7 +139,10 @@ def test_an_interrupted_fit_with_other_settings_or_data_says_what_differs(
 
 def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine: Machine) -> None:
     parts = [recording(machine, seed, minutes=0.2) for seed in range(3)]
-    marked = [dataclasses.replace(part, q=np.full_like(part.q, number)) for number, part in enumerate(parts)]
+    marked = [
+        dataclasses.replace(part, q=np.full_like(part.q, number))
+        for number, part in enumerate(parts)
+    ]
     windows = Windows(marked, machine, 7, CPU)
     draws = [windows.draw(64, 0.25, 0.25, torch.tensor(key)) for key in (5, 5, 6)]
     assert draws[0][0].shape == draws[0][1].shape == (5, 64, 13 + 7)
@@ -141,7 +158,9 @@ def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine
 def test_windows_drawn_together_are_the_same_times_for_all_joints(machine: Machine) -> None:
     part = recording(machine)
     clock = np.repeat(np.arange(part.num_samples, dtype=np.float32)[:, None], 5, 1)
-    _, q = Windows([dataclasses.replace(part, q=clock)], machine, 7, CPU).draw(16, 0.2, 0.2, torch.tensor(1), together=True)
+    _, q = Windows([dataclasses.replace(part, q=clock)], machine, 7, CPU).draw(
+        16, 0.2, 0.2, torch.tensor(1), together=True
+    )
     assert q.shape == (5, 80, 20)
     assert (q == q[:1]).all()
     assert len(q[0, :, 0].unique()) > 60
@@ -157,7 +176,9 @@ def test_busy_windows_are_those_in_which_most_is_commanded_at_once(machine: Mach
 
 
 @pytest.mark.parametrize(("noise", "step"), [(3e-4, 0.0), (1e-5, 0.002), (0.0, 0.004)])
-def test_the_noise_of_a_resting_joint_is_that_of_its_sensor(machine: Machine, noise: float, step: float) -> None:
+def test_the_noise_of_a_resting_joint_is_that_of_its_sensor(
+    machine: Machine, noise: float, step: float
+) -> None:
     made = recording(machine, minutes=10.0, noise=noise)
     u = made.u.copy()
     u[: u.shape[0] // 2] = 0.0
@@ -174,7 +195,8 @@ def test_too_little_data_says_how_much_and_of_which_joint(machine: Machine) -> N
     u = part.u.copy()
     u[:, 2] = np.minimum(u[:, 2], 0.0)
     with pytest.raises(
-        RecordingError, match=r"too little data: q3 0\.0 min forth and 0\.\d min back commanded .* needed are 0\.25 min"
+        RecordingError,
+        match=r"too little data: q3 0\.0 min forth and 0\.\d min back commanded .* needed are 0\.25 min",
     ):
         survey.check_enough([dataclasses.replace(part, u=u)], machine)
 
@@ -189,7 +211,9 @@ def test_thin_data_is_warned_of(machine: Machine, caplog: pytest.LogCaptureFixtu
     assert not caplog.text
 
 
-def test_joints_that_never_move_together_are_warned_of(machine: Machine, caplog: pytest.LogCaptureFixture) -> None:
+def test_joints_that_never_move_together_are_warned_of(
+    machine: Machine, caplog: pytest.LogCaptureFixture
+) -> None:
     part = recording(machine, minutes=8.0)
     u = np.zeros_like(part.u)
     u[:, 1] = part.u[:, 1]

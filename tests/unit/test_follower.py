@@ -55,7 +55,9 @@ def q1(machine: Machine, values: list[float], **numbers: Any) -> list[float]:
     return found[:, 0].tolist()
 
 
-def exclusive_proposals(machine: Machine, num_steps: int, num: int = 1, seed: int = 0) -> torch.Tensor:
+def exclusive_proposals(
+    machine: Machine, num_steps: int, num: int = 1, seed: int = 0
+) -> torch.Tensor:
     """Returns random proposals under the masks, `(T, N, J)`."""
     generator = torch.Generator().manual_seed(seed)
     proposed = torch.rand((num_steps, num, 5), generator=generator) * 2 - 1
@@ -72,7 +74,9 @@ def test_the_delay_is_exact_to_the_fraction_of_a_period(machine: Machine) -> Non
     steps = [0.8] * 3 + [0.0] * 9
     assert q1(machine, steps, delay_s=0.3) == pytest.approx([0.0] * 6 + [0.8] * 3 + [0.0] * 3)
     # 0.22 s are 4.4 periods: of the fifth period 0.6 have the new command
-    assert q1(machine, steps, delay_s=0.22) == pytest.approx([0.0] * 4 + [0.48, 0.8, 0.8, 0.32] + [0.0] * 4, abs=1e-6)
+    assert q1(machine, steps, delay_s=0.22) == pytest.approx(
+        [0.0] * 4 + [0.48, 0.8, 0.8, 0.32] + [0.0] * 4, abs=1e-6
+    )
 
 
 def test_the_hand_lags_exactly_as_a_first_order_system_does(machine: Machine) -> None:
@@ -100,17 +104,25 @@ def test_delay_and_lag_together_are_those_of_continuous_time(machine: Machine) -
 
 def test_a_person_looks_every_so_often_and_goes_on_with_what_was_seen(machine: Machine) -> None:
     shown = [0.1 * k for k in range(1, 9)]
-    assert q1(machine, shown, attention_s=0.15) == pytest.approx([0.1, 0.1, 0.1, 0.4, 0.4, 0.4, 0.7, 0.7])
+    assert q1(machine, shown, attention_s=0.15) == pytest.approx(
+        [0.1, 0.1, 0.1, 0.4, 0.4, 0.4, 0.7, 0.7]
+    )
     # every 2.5 periods: two and three in turn
-    assert q1(machine, shown, attention_s=0.125) == pytest.approx([0.1, 0.1, 0.1, 0.4, 0.4, 0.6, 0.6, 0.6])
+    assert q1(machine, shown, attention_s=0.125) == pytest.approx(
+        [0.1, 0.1, 0.1, 0.4, 0.4, 0.6, 0.6, 0.6]
+    )
 
 
 def test_gain_and_dead_zone_shape_the_deflection(machine: Machine) -> None:
     shown = [0.05, 0.5, -0.5, 1.0]
     assert q1(machine, shown, gain=0.8) == pytest.approx([0.04, 0.4, -0.4, 0.8])
-    assert q1(machine, shown, gain=1.5) == pytest.approx([0.075, 0.75, -0.75, 1.0]), "a lever has a stop"
+    assert q1(machine, shown, gain=1.5) == pytest.approx([0.075, 0.75, -0.75, 1.0]), (
+        "a lever has a stop"
+    )
     assert q1(machine, shown, dead_zone=0.1) == pytest.approx([0.0, 0.4 / 0.9, -0.4 / 0.9, 1.0])
-    assert q1(machine, shown, dead_zone={"q1": 0.2, "other": 0.0}) == pytest.approx([0.0, 0.375, -0.375, 1.0])
+    assert q1(machine, shown, dead_zone={"q1": 0.2, "other": 0.0}) == pytest.approx(
+        [0.0, 0.375, -0.375, 1.0]
+    )
 
 
 def test_tremor_is_in_proportion_to_the_deflection_and_has_no_mean(machine: Machine) -> None:
@@ -120,44 +132,68 @@ def test_tremor_is_in_proportion_to_the_deflection_and_has_no_mean(machine: Mach
     again = model.step(proposed)
     assert found.std(0).tolist() == pytest.approx([0.02, 0.0, 0.04, 0.0, 0.06], rel=0.05)
     assert found.mean(0).tolist() == pytest.approx([0.2, 0.0, 0.4, 0.0, 0.6], abs=0.005)
-    assert not torch.equal(found, again) and torch.corrcoef(torch.stack((found[:, 0], again[:, 0])))[0, 1].abs() < 0.1
-    assert torch.corrcoef(found[:, [0, 2, 4]].T).fill_diagonal_(0).abs().max() < 0.1, "each hand trembles by itself"
+    assert (
+        not torch.equal(found, again)
+        and torch.corrcoef(torch.stack((found[:, 0], again[:, 0])))[0, 1].abs() < 0.1
+    )
+    assert torch.corrcoef(found[:, [0, 2, 4]].T).fill_diagonal_(0).abs().max() < 0.1, (
+        "each hand trembles by itself"
+    )
 
 
 def test_few_levers_are_moved_at_once_the_largest_first(machine: Machine) -> None:
-    proposed = torch.tensor([[0.3, 0.0, -0.5, 0.4, 0.2], [0.5, 0.0, 0.5, 0.5, 0.5], [0.1, 0.0, 0.0, 0.0, 0.0]])
+    proposed = torch.tensor(
+        [[0.3, 0.0, -0.5, 0.4, 0.2], [0.5, 0.0, 0.5, 0.5, 0.5], [0.1, 0.0, 0.0, 0.0, 0.0]]
+    )
     one = follow(machine, proposed, joints_at_once=1)
-    assert torch.equal(one, torch.tensor([[0, 0, -0.5, 0, 0], [0, 0, 0.5, 0, 0], [0.1, 0, 0, 0, 0]])), "of equals the one in hand"
+    assert torch.equal(
+        one, torch.tensor([[0, 0, -0.5, 0, 0], [0, 0, 0.5, 0, 0], [0.1, 0, 0, 0, 0]])
+    ), "of equals the one in hand"
     two = follow(machine, proposed, joints_at_once=2)
-    assert torch.equal(two, torch.tensor([[0, 0, -0.5, 0.4, 0], [0, 0, 0.5, 0.5, 0], [0.1, 0, 0, 0, 0]]))
+    assert torch.equal(
+        two, torch.tensor([[0, 0, -0.5, 0.4, 0], [0, 0, 0.5, 0.5, 0], [0.1, 0, 0, 0, 0]])
+    )
     assert torch.equal(follow(machine, proposed, joints_at_once=9), proposed)
 
 
-def test_a_lever_once_taken_is_kept_for_a_while_as_long_as_it_is_asked_for(machine: Machine) -> None:
+def test_a_lever_once_taken_is_kept_for_a_while_as_long_as_it_is_asked_for(
+    machine: Machine,
+) -> None:
     proposed = torch.zeros(8, 5)
     proposed[:, 0], proposed[1:, 2] = 0.4, 0.8
     moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
-    assert moved[:, 0].tolist() == [True] * 4 + [False] * 4 and moved[:, 2].tolist() == [False] * 4 + [True] * 4
+    assert (
+        moved[:, 0].tolist() == [True] * 4 + [False] * 4
+        and moved[:, 2].tolist() == [False] * 4 + [True] * 4
+    )
     proposed[2, 0] = 0.0
     moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
     assert moved[:, 0].tolist() == [True] * 2 + [False] * 6, "what is no longer asked for is let go"
     proposed[3:] = torch.tensor([0.0, 0.2, 0.0, 0.0, 0.0])
     moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
-    assert moved[3:, 1].all() and not moved[3:, [0, 2, 3, 4]].any(), "nor is an exclusive joint kept waiting"
+    assert moved[3:, 1].all() and not moved[3:, [0, 2, 3, 4]].any(), (
+        "nor is an exclusive joint kept waiting"
+    )
 
 
 def test_how_many_levers_is_drawn_evenly(machine: Machine) -> None:
     model = person(joints_at_once=(1, 4)).build(machine, 4000, CPU)
     moved = (model.step(torch.tensor([0.5, 0.0, 0.4, 0.3, 0.2]).expand(4000, 5)) != 0).sum(1)
-    assert [int((moved == count).sum()) for count in range(1, 5)] == pytest.approx([1000] * 4, rel=0.1)
+    assert [int((moved == count).sum()) for count in range(1, 5)] == pytest.approx(
+        [1000] * 4, rel=0.1
+    )
 
 
 def test_the_hand_changes_over_when_the_person_sees_it(machine: Machine) -> None:
     """From q2 to q1 and q3 after three periods: until the reaction has passed q2 goes on, then it is let go at once."""
-    proposed = torch.tensor([[0.0, 0.6, 0.0, 0.0, 0.0]] * 3 + [[0.4, 0.0, 0.8, 0.0, 0.0]] * 3 + [[0.0] * 5] * 3)
+    proposed = torch.tensor(
+        [[0.0, 0.6, 0.0, 0.0, 0.0]] * 3 + [[0.4, 0.0, 0.8, 0.0, 0.0]] * 3 + [[0.0] * 5] * 3
+    )
     found = follow(machine, proposed, delay_s=0.1, lag_s=0.1)
     assert (found[2:5, 1] > 0).all() and not found[5:, 1].any() and not found[:5, [0, 2]].any()
-    assert (found[5:8, [0, 2]] > 0).all() and (found[8, [0, 2]] > 0).all(), "the hand comes back as it went, with its lag"
+    assert (found[5:8, [0, 2]] > 0).all() and (found[8, [0, 2]] > 0).all(), (
+        "the hand comes back as it went, with its lag"
+    )
 
 
 @settings(max_examples=30, deadline=None)
@@ -169,14 +205,18 @@ def test_the_hand_changes_over_when_the_person_sees_it(machine: Machine) -> None
 def test_whoever_it_is_no_joint_moves_beside_an_exclusive_one_and_no_more_than_meant(
     machine: Machine, seed: int, **numbers: Any
 ) -> None:
-    proposed = torch.rand((60, 5), generator=torch.Generator().manual_seed(seed)) * 2 - 1  # not even the proposals are exclusive
+    proposed = (
+        torch.rand((60, 5), generator=torch.Generator().manual_seed(seed)) * 2 - 1
+    )  # not even the proposals are exclusive
     moving = follow(machine, proposed, **numbers) != 0
     assert not (moving[:, 1] & moving[:, [0, 2, 3, 4]].any(1)).any()
     assert (moving.sum(1) <= (numbers["joints_at_once"] or 5)).all()
 
 
 @pytest.mark.parametrize("name", NEUTRAL)
-def test_each_part_is_off_at_its_neutral_value_whatever_the_others_are(name: str, machine: Machine) -> None:
+def test_each_part_is_off_at_its_neutral_value_whatever_the_others_are(
+    name: str, machine: Machine
+) -> None:
     shipped = option("follower", "person")
     check_follower(replace(shipped, **{name: NEUTRAL[name]}), machine)
     check_follower(person(**{name: getattr(shipped, name)}), machine)
@@ -185,7 +225,11 @@ def test_each_part_is_off_at_its_neutral_value_whatever_the_others_are(name: str
 def test_each_episode_has_another_person_within_the_ranges(machine: Machine) -> None:
     model = option("follower", "person").build(machine, 2000, CPU)
     delay_s = model.state["drawn.delay_s"].clone()
-    assert 0.2 <= delay_s.min() < 0.21 and 0.39 < delay_s.max() <= 0.4 and float(delay_s.mean()) == pytest.approx(0.3, abs=0.01)
+    assert (
+        0.2 <= delay_s.min() < 0.21
+        and 0.39 < delay_s.max() <= 0.4
+        and float(delay_s.mean()) == pytest.approx(0.3, abs=0.01)
+    )
     model.reset(torch.arange(2000) < 1000)
     assert (model.state["drawn.delay_s"][:1000] != delay_s[:1000]).float().mean() > 0.99
     assert torch.equal(model.state["drawn.delay_s"][1000:], delay_s[1000:])
@@ -201,7 +245,9 @@ def test_each_episode_has_another_person_within_the_ranges(machine: Machine) -> 
         ({"joints_at_once": (3, 2)}, "1 or more"),
     ],
 )
-def test_a_person_that_cannot_be_is_refused(numbers: dict[str, Any], message: str, machine: Machine) -> None:
+def test_a_person_that_cannot_be_is_refused(
+    numbers: dict[str, Any], message: str, machine: Machine
+) -> None:
     with pytest.raises(ConfigError, match=message):
         person(**numbers).build(machine, 1, CPU)
 
@@ -302,20 +348,32 @@ def test_a_loop_behind_a_perfect_person_is_the_loop_without_one(machine: Machine
     assert all(torch.equal(value, behind[name]) for name, value in alone.items())
 
 
-def test_histories_and_recordings_hold_what_was_given_and_not_what_was_proposed(machine: Machine) -> None:
+def test_histories_and_recordings_hold_what_was_given_and_not_what_was_proposed(
+    machine: Machine,
+) -> None:
     loop = loop_with(machine, person(delay_s=0.1, gain=0.5))
     proposed = []
     for _ in range(6):
         action = torch.rand(8, 5)
         positioning = loop.task.state["positioning"].bool()[:, None]
-        proposed.append(torch.where(torch.as_tensor(machine.is_exclusive) == positioning, action, 0.0))
+        proposed.append(
+            torch.where(torch.as_tensor(machine.is_exclusive) == positioning, action, 0.0)
+        )
         loop.step(action)
     torch.testing.assert_close(loop.history.u[:, -4:], 0.5 * torch.stack(proposed[:4], 1))
-    assert torch.equal(loop.end_u, loop.history.u[:, -1]) and torch.equal(loop.truth.u, loop.history.u)
-    assert torch.equal(loop.task.state["u"], proposed[-1]), "the reward is about what the policy asks of the person"
+    assert torch.equal(loop.end_u, loop.history.u[:, -1]) and torch.equal(
+        loop.truth.u, loop.history.u
+    )
+    assert torch.equal(loop.task.state["u"], proposed[-1]), (
+        "the reward is about what the policy asks of the person"
+    )
     given = torch.cat((torch.zeros(8, 2, 5), 0.5 * torch.stack(proposed[:4], 1)), 1)
     travel = (given[:, 1:] - given[:, :-1]).abs().sum((1, 2)) / 0.05 / 6
-    torch.testing.assert_close(loop.task.episode["valve_travel"], travel, msg="the valves' travel is that of what was given")
+    torch.testing.assert_close(
+        loop.task.episode["valve_travel"],
+        travel,
+        msg="the valves' travel is that of what was given",
+    )
 
 
 def test_a_loop_behind_a_person_goes_on_exactly_when_restored(machine: Machine) -> None:
@@ -341,7 +399,9 @@ def test_another_episode_is_another_person_with_the_hands_off(machine: Machine) 
         loop.step(torch.ones(8, 5))
     before = state_of(loop)
     assert before["follower.hand"].any(1).all()
-    loop.episode_length_buf = torch.where(torch.arange(8) < 2, loop.max_episode_length - 1, loop.episode_length_buf)
+    loop.episode_length_buf = torch.where(
+        torch.arange(8) < 2, loop.max_episode_length - 1, loop.episode_length_buf
+    )
     loop.step(torch.ones(8, 5))
     after = state_of(loop)
     assert not after["follower.hand"][:2].any() and not after["follower.seen"][:2].any()
@@ -357,12 +417,21 @@ def test_every_policy_is_evaluated_with_the_same_persons(machine: Machine, tmp_p
         session = Session(out=str(tmp_path / name), seed=0, device="cpu")
         session.folder.mkdir()
         torch.manual_seed(len(name))
-        results, _ = evaluate_policies(plant, how, session, {"first": Classical(), "second": Classical()})
-        assert results["policies"]["first"] == results["policies"]["second"] and results["follower"] == "person"
-    assert (tmp_path / "one" / "evaluation.json").read_text() == (tmp_path / "other" / "evaluation.json").read_text()
+        results, _ = evaluate_policies(
+            plant, how, session, {"first": Classical(), "second": Classical()}
+        )
+        assert (
+            results["policies"]["first"] == results["policies"]["second"]
+            and results["follower"] == "person"
+        )
+    assert (tmp_path / "one" / "evaluation.json").read_text() == (
+        tmp_path / "other" / "evaluation.json"
+    ).read_text()
 
 
 def test_a_policy_says_behind_whom_it_was_trained(tmp_path: Path) -> None:
     assert follower_of(tmp_path) is None
-    (tmp_path / RESOLVED).write_text("follower:\n  _target_: actuators.person.Person\n  delay_s: [0.2, 0.4]\n")
+    (tmp_path / RESOLVED).write_text(
+        "follower:\n  _target_: actuators.person.Person\n  delay_s: [0.2, 0.4]\n"
+    )
     assert follower_of(tmp_path) == {"_target_": "actuators.person.Person", "delay_s": [0.2, 0.4]}

@@ -36,7 +36,13 @@ TRUTH = Lag(
 
 
 def recordings(
-    actuator: Any, machine: Machine, count: int, seconds: float, seed: int = 0, least: float = -0.8, noise: float = 0.0003
+    actuator: Any,
+    machine: Machine,
+    count: int,
+    seconds: float,
+    seed: int = 0,
+    least: float = -0.8,
+    noise: float = 0.0003,
 ) -> list[Recording]:
     """Returns runs under levels of up to 0.8, each held for 0.3 to 1.2 s, turned round before a stop; encoder noise in rad."""
     random = np.random.default_rng(seed)
@@ -51,7 +57,9 @@ def recordings(
         q = history.q[:, -1].numpy()
         level = np.where(left <= 0, random.uniform(least, 0.8, level.shape), level)
         left = np.where(left <= 0, random.uniform(0.3, 1.2, level.shape), left) - machine.period_s
-        level = np.where((q > machine.upper - margin) & (level > 0), -0.5 if least < 0 else 0.0, level)
+        level = np.where(
+            (q > machine.upper - margin) & (level > 0), -0.5 if least < 0 else 0.0, level
+        )
         level = np.where((q < machine.lower + margin) & (level < 0), 0.5, level)
         commands.append(level)
         positions.append(q + noise * random.standard_normal(q.shape))
@@ -69,7 +77,14 @@ def recordings(
 
 def quick(name: str, **changes: Any) -> GreyBoxFit:
     """The shipped fit with less to do."""
-    less = {"windows": 16, "validation_windows": 6, "candidates": 24, "starts": 2, "iterations": 8, "horizon_s": 3.0}
+    less = {
+        "windows": 16,
+        "validation_windows": 6,
+        "candidates": 24,
+        "starts": 2,
+        "iterations": 8,
+        "horizon_s": 3.0,
+    }
     return dataclasses.replace(option("fit", name), **(less | changes))
 
 
@@ -78,13 +93,23 @@ def runs(machine: Machine) -> list[Recording]:
     return recordings(TRUTH, machine, 5, 30.0)
 
 
-def test_known_numbers_of_a_lag_are_found_within_their_intervals(machine: Machine, runs: list[Recording], tmp_path: Path) -> None:
+def test_known_numbers_of_a_lag_are_found_within_their_intervals(
+    machine: Machine, runs: list[Recording], tmp_path: Path
+) -> None:
     fitted = quick("lag").fit(machine, runs[:4], runs[4:], tmp_path, 0, CPU)
     facts = json.loads((tmp_path / "lag.json").read_text())
     inside = []
-    for name, near in (("dead_time_s", 0.01), ("dead_band_extend", 0.01), ("dead_band_retract", 0.01), ("gain", 0.01)):
+    for name, near in (
+        ("dead_time_s", 0.01),
+        ("dead_band_extend", 0.01),
+        ("dead_band_retract", 0.01),
+        ("gain", 0.01),
+    ):
         for joint in machine.joint_names:
-            true, cell = getattr(TRUTH, name).get(joint, getattr(TRUTH, name)["other"]), facts["parameters"][name][joint]
+            true, cell = (
+                getattr(TRUTH, name).get(joint, getattr(TRUTH, name)["other"]),
+                facts["parameters"][name][joint],
+            )
             assert getattr(fitted, name)[joint] == cell["value"] == pytest.approx(true, abs=near)
             assert cell["told"] and not cell["at_bound"] and cell["runs"] == 4
             inside.append(cell["ci95"][0] <= true <= cell["ci95"][1])
@@ -92,7 +117,9 @@ def test_known_numbers_of_a_lag_are_found_within_their_intervals(machine: Machin
     assert max(facts["validation_rmse"].values()) < 0.003
 
 
-def test_what_a_fit_leaves_is_an_option(machine: Machine, runs: list[Recording], tmp_path: Path, brokk: Callable[..., Any]) -> None:
+def test_what_a_fit_leaves_is_an_option(
+    machine: Machine, runs: list[Recording], tmp_path: Path, brokk: Callable[..., Any]
+) -> None:
     fitted = quick("lag", iterations=2, starts=1).fit(machine, runs[:4], runs[4:], tmp_path, 0, CPU)
     text = (tmp_path / "lag.yaml").read_text()
     assert "4 recordings (4 runs, 2 min)" in text and "95 % intervals" in text
@@ -104,10 +131,22 @@ def test_what_a_fit_leaves_is_an_option(machine: Machine, runs: list[Recording],
 
 def test_known_numbers_of_the_plant_are_found(machine: Machine, tmp_path: Path) -> None:
     shipped = option("actuator", "hydraulic")
-    changed = {"transport_s": 0.44, "overlap_extend": 0.13, "speed_scale": {"q3": 0.8, "other": 0.9}}
+    changed = {
+        "transport_s": 0.44,
+        "overlap_extend": 0.13,
+        "speed_scale": {"q3": 0.8, "other": 0.9},
+    }
     data = recordings(dataclasses.replace(shipped, **changed), machine, 4, 12.0)
     free = {"transport_s": (0.2, 0.6), "overlap_extend": (0.0, 0.3), "speed_scale": (0.5, 1.5)}
-    fit = quick("hydraulic", free=free, windows=6, validation_windows=2, candidates=16, starts=1, iterations=5)
+    fit = quick(
+        "hydraulic",
+        free=free,
+        windows=6,
+        validation_windows=2,
+        candidates=16,
+        starts=1,
+        iterations=5,
+    )
     fitted = fit.fit(machine, data[:3], data[3:], tmp_path, 0, CPU)
     for joint in machine.joint_names:
         assert fitted.transport_s[joint] == pytest.approx(0.44, abs=0.01)
@@ -149,7 +188,9 @@ def test_what_was_left_by_other_settings_is_not_gone_on_from(
     assert "other settings or recordings" in caplog.text
 
 
-def test_what_the_recordings_do_not_show_is_said(machine: Machine, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_the_recordings_do_not_show_is_said(
+    machine: Machine, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     forward = recordings(TRUTH, machine, 4, 8.0, least=0.0)  # no joint ever retracts
     fit = quick("lag", horizon_s=2.0)
     fit.fit(machine, forward[:3], forward[3:], tmp_path, 0, CPU)
@@ -177,7 +218,10 @@ def test_independent_joints_may_be_varied_together(machine: Machine, runs: list[
     active = np.ones((len(cut.q), 5), dtype=bool)
     free = {"gain": (0.2, 2.0), "dead_time_s": (0.0, 0.6)}
     x = np.full((2, 5), 0.45)
-    together, apart = (FreeRuns(TRUTH, free, coupled, machine, cut, active, CPU).jacobian(x) for coupled in (False, True))
+    together, apart = (
+        FreeRuns(TRUTH, free, coupled, machine, cut, active, CPU).jacobian(x)
+        for coupled in (False, True)
+    )
     np.testing.assert_allclose(together[0], apart[0], atol=1e-6)
     np.testing.assert_allclose(together[1], apart[1], atol=1e-3)
     assert np.abs(together[1]).max() > 0.05
@@ -212,7 +256,10 @@ def test_a_lag_can_be_fitted_by_gradient_too(machine: Machine) -> None:
         model.parameters["gain"] = gain
         model.reset(torch.ones(2, dtype=torch.bool))
         history = History(*(torch.zeros(2, machine.num_history, 5) for _ in range(2)))
-        history.reset(torch.ones(2, dtype=torch.bool), torch.as_tensor(machine.home, dtype=torch.float32).expand(2, -1))
+        history.reset(
+            torch.ones(2, dtype=torch.bool),
+            torch.as_tensor(machine.home, dtype=torch.float32).expand(2, -1),
+        )
         for command in u:
             history.push_u(command)
             history.push_q(model.step(history))
@@ -245,11 +292,20 @@ def test_a_free_run_that_begins_in_motion_goes_on_with_it(name: str, machine: Ma
     ("changes", "told"),
     [
         ({"free": {"gian": (0.2, 2.0)}}, r"'gian' is no number of LagModel; did you mean 'gain'"),
-        ({"free": {"gain": (2.0, 0.2)}}, r"fit\.free\.gain: expected \[low, high\] with low < high"),
+        (
+            {"free": {"gain": (2.0, 0.2)}},
+            r"fit\.free\.gain: expected \[low, high\] with low < high",
+        ),
         ({"free": {}}, "at least one number"),
-        ({"free": {"dead_time_s": (0.0, 2.0)}}, r"upper bound: actuator\.dead_time_s.*does not fit"),
+        (
+            {"free": {"dead_time_s": (0.0, 2.0)}},
+            r"upper bound: actuator\.dead_time_s.*does not fit",
+        ),
         ({"actuator": option("actuator", "ideal")}, "IdealModel has no numbers to fit"),
-        ({"actuator": dataclasses.replace(TRUTH, spread={"gain": 0.1})}, r"fit\.actuator\.spread: expected \{\}"),
+        (
+            {"actuator": dataclasses.replace(TRUTH, spread={"gain": 0.1})},
+            r"fit\.actuator\.spread: expected \{\}",
+        ),
         ({"starts": 60}, r"fit\.starts"),
     ],
 )
@@ -261,7 +317,12 @@ def test_a_fit_that_makes_no_sense_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_joint_that_never_moves_is_too_little_data(machine: Machine, runs: list[Recording], tmp_path: Path) -> None:
-    still = [dataclasses.replace(run, u=run.u * np.array([1, 1, 0, 1, 1], dtype=np.float32)) for run in runs]
+def test_a_joint_that_never_moves_is_too_little_data(
+    machine: Machine, runs: list[Recording], tmp_path: Path
+) -> None:
+    still = [
+        dataclasses.replace(run, u=run.u * np.array([1, 1, 0, 1, 1], dtype=np.float32))
+        for run in runs
+    ]
     with pytest.raises(RecordingError, match="joint q3 is never commanded in the 4 recordings"):
         quick("lag").fit(machine, still[:4], still[4:], tmp_path, 0, CPU)

@@ -25,7 +25,14 @@ from brokk_rl.record import Recording
 from brokk_rl.session import Session
 
 CPU = torch.device("cpu")
-PLANT = Lag(dead_time_s=0.55, dead_band_extend=0.1, dead_band_retract=0.1, gain=0.6, time_constant_s=0.0, spread={})
+PLANT = Lag(
+    dead_time_s=0.55,
+    dead_band_extend=0.1,
+    dead_band_retract=0.1,
+    gain=0.6,
+    time_constant_s=0.0,
+    spread={},
+)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +51,9 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
         history.push_u(torch.as_tensor(u[:, k]))
         q = model.step(history)
         history.push_q(q)
-    positions = np.stack(path, 1) + 0.0003 * generator.standard_normal((6, 600, 5)).astype(np.float32)
+    positions = np.stack(path, 1) + 0.0003 * generator.standard_normal((6, 600, 5)).astype(
+        np.float32
+    )
     for run in range(6):
         for part in range(2):
             rows = slice(300 * part, 300 * part + 300)
@@ -69,7 +78,13 @@ class Fit:
         return "Fit"
 
     def fit(
-        self, machine: Machine, train: Sequence[Recording], validation: Sequence[Recording], folder: Path, seed: int, device: Any
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        validation: Sequence[Recording],
+        folder: Path,
+        seed: int,
+        device: Any,
     ) -> Any:
         if len(self.fitted_to) == self.interrupted_at:
             raise KeyboardInterrupt
@@ -83,8 +98,17 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page, "write", lambda *arguments: None)
 
 
-def identify(machine: Machine, out: Path, folder: Path, fit: Any, resume: bool = False, **options: Any) -> Identify:
-    settings = {"recordings": f"{folder}/*", "test": None, "folds": None, "hold_out": 3, "stride_s": 1.0, "threads": 1} | options
+def identify(
+    machine: Machine, out: Path, folder: Path, fit: Any, resume: bool = False, **options: Any
+) -> Identify:
+    settings = {
+        "recordings": f"{folder}/*",
+        "test": None,
+        "folds": None,
+        "hold_out": 3,
+        "stride_s": 1.0,
+        "threads": 1,
+    } | options
     return Identify(
         session=Session(out=str(out), seed=0, device="cpu"), machine=machine, fit=fit,
         baselines={"hold": option("fit", "hold"), "arx": option("fit", "arx")},
@@ -99,7 +123,9 @@ def run(mode: Identify) -> dict[str, Any]:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_each_run_is_judged_once_by_a_model_that_has_not_seen_it(machine: Machine, recordings: Path, tmp_path: Path) -> None:
+def test_each_run_is_judged_once_by_a_model_that_has_not_seen_it(
+    machine: Machine, recordings: Path, tmp_path: Path
+) -> None:
     fit = Fit()
     result = run(identify(machine, tmp_path / "out", recordings, fit, folds=3))
     every = {f"run {n}" for n in range(6)}
@@ -111,11 +137,17 @@ def test_each_run_is_judged_once_by_a_model_that_has_not_seen_it(machine: Machin
     assert stages[-1]["test"] == [] and len(stages) == 4
     assert result["data"]["test"]["runs"] == 6 and len(result["fold_seconds"]) == 3
     # 15 s files: 1 s windows up to those of 10 s
-    assert result["joints"]["q1"]["plant"]["10"]["percent"] < 0.1 < result["joints"]["q1"]["hold"]["10"]["percent"]
+    assert (
+        result["joints"]["q1"]["plant"]["10"]["percent"]
+        < 0.1
+        < result["joints"]["q1"]["hold"]["10"]["percent"]
+    )
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_an_interrupted_identification_goes_on_and_does_no_fit_twice(machine: Machine, recordings: Path, tmp_path: Path) -> None:
+def test_an_interrupted_identification_goes_on_and_does_no_fit_twice(
+    machine: Machine, recordings: Path, tmp_path: Path
+) -> None:
     whole = run(identify(machine, tmp_path / "whole", recordings, Fit(), folds=3))
     broken = Fit(interrupted_at=2)
     with pytest.raises(KeyboardInterrupt):
@@ -123,12 +155,20 @@ def test_an_interrupted_identification_goes_on_and_does_no_fit_twice(machine: Ma
     again = Fit()
     parts = run(identify(machine, tmp_path / "parts", recordings, again, resume=True, folds=3))
     assert len(broken.fitted_to) == 2 and len(again.fitted_to) == 2
-    assert all(parts[key] == whole[key] for key in ("joints", "overall", "against", "regimes", "delay_s"))
+    assert all(
+        parts[key] == whole[key] for key in ("joints", "overall", "against", "regimes", "delay_s")
+    )
     with pytest.raises(StorageError, match="is of another fit, or of other recordings or windows"):
-        run(identify(machine, tmp_path / "parts", recordings, Fit(), resume=True, folds=3, stride_s=2.0))
+        run(
+            identify(
+                machine, tmp_path / "parts", recordings, Fit(), resume=True, folds=3, stride_s=2.0
+            )
+        )
 
 
-def test_going_on_needs_the_folder_itself_and_a_run_in_it(machine: Machine, recordings: Path, tmp_path: Path) -> None:
+def test_going_on_needs_the_folder_itself_and_a_run_in_it(
+    machine: Machine, recordings: Path, tmp_path: Path
+) -> None:
     mode = identify(machine, tmp_path / "none", recordings, Fit(), resume=True)
     with pytest.raises(ConfigError, match="there is no run to go on with"):
         run(mode)
@@ -137,20 +177,36 @@ def test_going_on_needs_the_folder_itself_and_a_run_in_it(machine: Machine, reco
         run(elsewhere)
 
 
-def test_a_run_is_refused_as_test_when_it_was_fitted_to(machine: Machine, recordings: Path, tmp_path: Path) -> None:
+def test_a_run_is_refused_as_test_when_it_was_fitted_to(
+    machine: Machine, recordings: Path, tmp_path: Path
+) -> None:
     first = {"recordings": f"{recordings}/*_0.parquet"}
     with pytest.raises(RecordingError, match=r"run 0 is also among identify\.recordings"):
-        run(identify(machine, tmp_path / "a", recordings, Fit(), test=f"{recordings}/run0_1.parquet", **first))
+        run(
+            identify(
+                machine,
+                tmp_path / "a",
+                recordings,
+                Fit(),
+                test=f"{recordings}/run0_1.parquet",
+                **first,
+            )
+        )
     with pytest.raises(ConfigError, match="folds and test are two ways"):
         identify(machine, tmp_path / "a", recordings, Fit(), test="x", folds=2)
 
 
-def test_the_report_of_a_good_model_says_so(machine: Machine, recordings: Path, tmp_path: Path) -> None:
+def test_the_report_of_a_good_model_says_so(
+    machine: Machine, recordings: Path, tmp_path: Path
+) -> None:
     result = run(identify(machine, tmp_path / "out", recordings, Fit()))
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {
         "identification.json", "identification.html", "prediction.png", "error_over_horizon.png", "regimes.png", "dead_time.png",
     }  # fmt: skip
-    assert result["verdict"][0]["tone"] == "good" and "Better beyond doubt on all 5 joints" in result["verdict"][0]["text"]
+    assert (
+        result["verdict"][0]["tone"] == "good"
+        and "Better beyond doubt on all 5 joints" in result["verdict"][0]["text"]
+    )
     assert any("inside the history of 0.65 s" in sentence["text"] for sentence in result["verdict"])
     assert "Judged by 2 runs" in result["verdict"][-1]["text"]
     text = (tmp_path / "out" / "identification.html").read_text()
@@ -158,23 +214,39 @@ def test_the_report_of_a_good_model_says_so(machine: Machine, recordings: Path, 
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_short_recordings_leave_out_the_horizons_that_do_not_fit(machine: Machine, recordings: Path, tmp_path: Path) -> None:
+def test_short_recordings_leave_out_the_horizons_that_do_not_fit(
+    machine: Machine, recordings: Path, tmp_path: Path
+) -> None:
     cut = tmp_path / "short"
     for path in recordings.iterdir():
         whole = record.read(path, machine)
         part = {"t_s": whole.t_s[:100], "u": whole.u[:100], "q": whole.q[:100]}
-        record.write(Recording(**{**vars(whole), **part}), cut / path.name)  # 5 s less 1.65 s: no window of 5 s
+        record.write(
+            Recording(**{**vars(whole), **part}), cut / path.name
+        )  # 5 s less 1.65 s: no window of 5 s
     result = run(identify(machine, tmp_path / "out", cut, Fit()))
-    assert result["joints"]["q1"]["plant"]["5"] is None and result["joints"]["q1"]["plant"]["2"] is not None
+    assert (
+        result["joints"]["q1"]["plant"]["5"] is None
+        and result["joints"]["q1"]["plant"]["2"] is not None
+    )
     assert result["missing"].keys() == {"5", "10"} and "leaves 3.4 s" in result["missing"]["10"]
     assert any("after 2 s" in sentence["text"] for sentence in result["verdict"])
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_model_that_stands_still_is_no_good_news(machine: Machine, recordings: Path, tmp_path: Path) -> None:
+def test_a_model_that_stands_still_is_no_good_news(
+    machine: Machine, recordings: Path, tmp_path: Path
+) -> None:
     result = run(identify(machine, tmp_path / "out", recordings, Fit(Hold())))
-    assert result["verdict"][0]["tone"] == "bad" and "worse on all 5 joints" in result["verdict"][0]["text"]
-    result["data"]["excitation"]["q3"] |= {"commanded_s": 30.0, "largest_command": [-0.9, 0.2], "judged_s": 0.0}
+    assert (
+        result["verdict"][0]["tone"] == "bad"
+        and "worse on all 5 joints" in result["verdict"][0]["text"]
+    )
+    result["data"]["excitation"]["q3"] |= {
+        "commanded_s": 30.0,
+        "largest_command": [-0.9, 0.2],
+        "judged_s": 0.0,
+    }
     result["delay_s"]["q4"] |= {"value": 0.8, "ci95": [0.78, 0.82]}
     texts = [finding.text for finding in verdict(result, machine)]
     for part in (

@@ -20,16 +20,31 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
-PLANT = Lag(dead_time_s=0.43, dead_band_extend=0.06, dead_band_retract=0.09, gain=0.9, time_constant_s=0.0, spread={})
+PLANT = Lag(
+    dead_time_s=0.43,
+    dead_band_extend=0.06,
+    dead_band_retract=0.09,
+    gain=0.9,
+    time_constant_s=0.0,
+    spread={},
+)
 
 
-def drive(machine: Machine, excitation: str, num_runs: int, seconds: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def drive(
+    machine: Machine, excitation: str, num_runs: int, seconds: float, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns commands and positions, each `(N, T, J)`, of `PLANT` under one segment of an excitation; with `sine` of joint `n`."""
     generator, played = np.random.default_rng(seed), []
     for n in range(num_runs):
         spec = option("excitation", excitation)
-        found = spec.segments(machine, seconds * (machine.num_joints if excitation == "sine" else 1), generator, [])
-        played.append(sorted(found, key=lambda segment: segment.name)[n % machine.num_joints if excitation == "sine" else 0])
+        found = spec.segments(
+            machine, seconds * (machine.num_joints if excitation == "sine" else 1), generator, []
+        )
+        played.append(
+            sorted(found, key=lambda segment: segment.name)[
+                n % machine.num_joints if excitation == "sine" else 0
+            ]
+        )
     program = np.stack([segment.u for segment in played])
     model = PLANT.build(machine, num_runs, CPU)
     shape = (num_runs, machine.num_history, machine.num_joints)
@@ -45,7 +60,9 @@ def drive(machine: Machine, excitation: str, num_runs: int, seconds: float, seed
     return program, np.stack(positions, 1)
 
 
-def recordings(machine: Machine, excitation: str, num_runs: int, seconds: float, seed: int = 0) -> list[Recording]:
+def recordings(
+    machine: Machine, excitation: str, num_runs: int, seconds: float, seed: int = 0
+) -> list[Recording]:
     u, q = drive(machine, excitation, num_runs, seconds, seed)
     return [
         Recording(machine=machine.name, joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0,
@@ -55,7 +72,9 @@ def recordings(machine: Machine, excitation: str, num_runs: int, seconds: float,
 
 
 def test_the_dead_time_is_found_to_the_hundredth(machine: Machine) -> None:
-    found = dead_time.delays(recordings(machine, "sine", 10, 60.0), machine, np.random.default_rng(0))
+    found = dead_time.delays(
+        recordings(machine, "sine", 10, 60.0), machine, np.random.default_rng(0)
+    )
     for delay in found.values():
         assert delay is not None
         assert delay.value_s == pytest.approx(0.43, abs=0.011)
@@ -78,17 +97,28 @@ def test_a_linear_machine_is_learned_by_the_linear_model(machine: Machine, tmp_p
     for k in range(12, 399):
         q[k + 1] = q[k] + 0.002 * u[k - 11] + 0.3 * (q[k] - q[k - 1])
     run = Recording(
-        machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(400) * 0.05, u=u, q=q
+        machine="brokk170",
+        joints=machine.joint_names,
+        units=("rad",) * 5,
+        rate_hz=20.0,
+        t_s=np.arange(400) * 0.05,
+        u=u,
+        q=q,
     )
     actuator = ArxFit(name="arx", ridge=1e-8).fit(machine, [run], [run], tmp_path, 0, CPU)
     cut = open_loop.windows([run], machine, 5.0, 1.0)
-    error, still = (np.abs(open_loop.free_run(model, machine, cut, CPU) - cut.measured).max() for model in (actuator, Hold()))
+    error, still = (
+        np.abs(open_loop.free_run(model, machine, cut, CPU) - cut.measured).max()
+        for model in (actuator, Hold())
+    )
     assert error < 0.02 * still
 
 
 def test_too_little_data_is_said(machine: Machine, tmp_path: Path) -> None:
     runs = recordings(machine, "sine", 2, 20.0)
-    with pytest.raises(RecordingError, match=r"too little data: q1 .*q3 0\.0 min forth and 0\.0 min back"):
+    with pytest.raises(
+        RecordingError, match=r"too little data: q1 .*q3 0\.0 min forth and 0\.0 min back"
+    ):
         option("fit", "mlp").fit(machine, runs, runs, tmp_path, 0, CPU)
 
 
@@ -99,11 +129,21 @@ TINY = (
 
 
 @pytest.mark.slow
-def test_collect_and_identify_from_the_command(brokk: Callable[..., object], tmp_path: Path, machine: Machine) -> None:
+def test_collect_and_identify_from_the_command(
+    brokk: Callable[..., object], tmp_path: Path, machine: Machine
+) -> None:
     small = ("collect.run_minutes=1.0", "collect.file_minutes=0.5", "actuator=lag")
     assert brokk("mode=collect", "session.out=sine", "collect.num_runs=10", *small).code == 0
     assert (
-        brokk("mode=collect", "session.out=levels", "excitation=levels", "collect.num_runs=3", "session.seed=1", *small).code == 0
+        brokk(
+            "mode=collect",
+            "session.out=levels",
+            "excitation=levels",
+            "collect.num_runs=3",
+            "session.seed=1",
+            *small,
+        ).code
+        == 0
     )
     files = sorted(Path("sine/recordings").iterdir())
     assert len(files) == 20
@@ -121,9 +161,16 @@ def test_collect_and_identify_from_the_command(brokk: Callable[..., object], tmp
     for rows in result["joints"].values():
         assert rows["mlp"]["5"]["rmse"] < rows["hold"]["5"]["rmse"]
         assert set(rows["arx"]) == {"1", "2", "5", "10"}
-    assert result["delay_s"]["q1"]["value"] == pytest.approx(0.55 + 0.1, abs=0.06)  # with the lag of 0.1 s
+    assert result["delay_s"]["q1"]["value"] == pytest.approx(
+        0.55 + 0.1, abs=0.06
+    )  # with the lag of 0.1 s
     assert Path("fit/prediction.png").stat().st_size > 1000
     assert (
-        brokk("mode=identify", "session.out=again", "identify.recordings=sine/recordings/*", "identify.test=sine/recordings/*").code
+        brokk(
+            "mode=identify",
+            "session.out=again",
+            "identify.recordings=sine/recordings/*",
+            "identify.test=sine/recordings/*",
+        ).code
         == 2
     )

@@ -38,7 +38,11 @@ def sound(machine: Machine, seconds: float = 60.0) -> Recording:
     u[:, 2] = np.repeat([0.0, 0.5, 0.0, -0.5], 80)[np.arange(steps) % 320]
     moved = np.zeros((steps, 5))
     moved[DELAY:] = u[:-DELAY] * machine.max_speed * PERIOD_S
-    q = machine.home + np.cumsum(moved, 0) + NOISE * np.random.default_rng(0).standard_normal((steps, 5))
+    q = (
+        machine.home
+        + np.cumsum(moved, 0)
+        + NOISE * np.random.default_rng(0).standard_normal((steps, 5))
+    )
     return Recording(
         machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(steps) * PERIOD_S,
         u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": "sound", "created": "2026-11-20T10:00:00.000+00:00"},
@@ -49,7 +53,9 @@ def found(recording: Recording, machine: Machine, thresholds: Thresholds) -> lis
     return inspect(recording, machine, thresholds).findings
 
 
-def changed(recording: Recording, u: np.ndarray | None = None, q: np.ndarray | None = None) -> Recording:
+def changed(
+    recording: Recording, u: np.ndarray | None = None, q: np.ndarray | None = None
+) -> Recording:
     return replace(recording, u=recording.u if u is None else u, q=recording.q if q is None else q)
 
 
@@ -71,7 +77,9 @@ def test_its_figures_are_those_it_was_made_with(machine: Machine, thresholds: Th
 
 def test_the_step_of_a_coarse_sensor_is_found(machine: Machine, thresholds: Thresholds) -> None:
     whole = sound(machine)
-    coarse = inspect(changed(whole, q=np.round(whole.q / 0.004) * np.float32(0.004)), machine, thresholds)
+    coarse = inspect(
+        changed(whole, q=np.round(whole.q / 0.004) * np.float32(0.004)), machine, thresholds
+    )
     assert coarse.joints["q3"]["step"] == pytest.approx(0.004, rel=0.01)
 
 
@@ -87,7 +95,9 @@ def test_a_command_that_moves_nothing_is_found(machine: Machine, thresholds: Thr
     assert finding.text == "commanded +0.80, does not move"
 
 
-def test_a_joint_that_is_pressed_against_its_stop_is_no_finding(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_joint_that_is_pressed_against_its_stop_is_no_finding(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     whole = sound(machine)
     u, q = whole.u.copy(), whole.q.copy()
     u[200:280, 3] = 0.8
@@ -96,7 +106,9 @@ def test_a_joint_that_is_pressed_against_its_stop_is_no_finding(machine: Machine
     assert found(changed(whole, u=u, q=q), machine, thresholds) == []
 
 
-def test_a_joint_that_sinks_is_found_with_its_speed(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_joint_that_sinks_is_found_with_its_speed(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     whole = sound(machine)
     q = whole.q.copy()
     q[:, 1] += 0.002 * whole.t_s
@@ -106,7 +118,9 @@ def test_a_joint_that_sinks_is_found_with_its_speed(machine: Machine, thresholds
     assert finding.duration_s == pytest.approx(60.0, abs=2.0)
 
 
-def test_a_frozen_sensor_is_found_amid_motion_and_at_rest(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_frozen_sensor_is_found_amid_motion_and_at_rest(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     whole = sound(machine)
     q = whole.q.copy()
     q[120:126, 2] = q[119, 2]  # q3 is moving
@@ -117,7 +131,9 @@ def test_a_frozen_sensor_is_found_amid_motion_and_at_rest(machine: Machine, thre
     assert (resting.kind, resting.joint, resting.row, resting.num_rows) == ("frozen", "q1", 499, 21)
 
 
-def test_a_coarse_sensor_at_rest_between_motions_is_not_frozen(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_coarse_sensor_at_rest_between_motions_is_not_frozen(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     whole = sound(machine)
     q = np.round((whole.q - machine.home) / 0.004) * np.float32(0.004) + machine.home
     assert found(changed(whole, q=q.astype(np.float32)), machine, thresholds) == []
@@ -128,17 +144,32 @@ def test_lost_frames_are_found(machine: Machine, thresholds: Thresholds) -> None
     q = whole.q.copy()
     for row in (110, 111, 130):
         q[row] = q[row - 1]
-    kinds = [(finding.kind, finding.row, finding.num_rows) for finding in found(changed(whole, q=q), machine, thresholds)]
-    assert [entry for entry in kinds if entry[0] == "repeated rows"] == [("repeated rows", 110, 2), ("repeated rows", 130, 1)]
+    kinds = [
+        (finding.kind, finding.row, finding.num_rows)
+        for finding in found(changed(whole, q=q), machine, thresholds)
+    ]
+    assert [entry for entry in kinds if entry[0] == "repeated rows"] == [
+        ("repeated rows", 110, 2),
+        ("repeated rows", 130, 1),
+    ]
 
 
-def test_positions_beyond_the_limits_and_exclusive_joints_in_company_are_found(machine: Machine, thresholds: Thresholds) -> None:
+def test_positions_beyond_the_limits_and_exclusive_joints_in_company_are_found(
+    machine: Machine, thresholds: Thresholds
+) -> None:
     whole = sound(machine)
     u, q = whole.u.copy(), whole.q.copy()
     u[100:120, 1] = 0.2  # q2 while q3 is commanded
     q[:, 4] += machine.upper[4] + 0.05 - machine.home[4]
-    exclusive, beyond = sorted(found(changed(whole, u=u, q=q), machine, thresholds), key=lambda finding: str(finding.joint))
-    assert (exclusive.kind, exclusive.joint, exclusive.row, exclusive.num_rows) == ("exclusive", "q2", 100, 20)
+    exclusive, beyond = sorted(
+        found(changed(whole, u=u, q=q), machine, thresholds), key=lambda finding: str(finding.joint)
+    )
+    assert (exclusive.kind, exclusive.joint, exclusive.row, exclusive.num_rows) == (
+        "exclusive",
+        "q2",
+        100,
+        20,
+    )
     assert (beyond.kind, beyond.joint, beyond.num_rows) == ("beyond limit", "q5", whole.num_samples)
     assert "up to 0.05" in beyond.text
 
@@ -172,14 +203,22 @@ def test_inspect_from_the_command_lists_every_breach_and_fails_at_none(
         assert Path(f"out/{name}.png").stat().st_size > 1000
 
 
-def test_parts_of_a_run_that_overlap_in_time_are_told(brokk: Callable[..., object], machine: Machine, tmp_path: Path) -> None:
+def test_parts_of_a_run_that_overlap_in_time_are_told(
+    brokk: Callable[..., object], machine: Machine, tmp_path: Path
+) -> None:
     first = sound(machine, 20.0)
     later = record.later(first.metadata["created"], 15.0)
     record.write(first, tmp_path / "a_0.parquet")
-    record.write(replace(first, metadata={**first.metadata, "created": later}), tmp_path / "a_1.parquet")
-    done = brokk("mode=inspect", "inspect.recordings=*.parquet", "session.out=out", "inspect.pictures=0")
+    record.write(
+        replace(first, metadata={**first.metadata, "created": later}), tmp_path / "a_1.parquet"
+    )
+    done = brokk(
+        "mode=inspect", "inspect.recordings=*.parquet", "session.out=out", "inspect.pictures=0"
+    )
     assert done.code == 0, done.err
-    assert "run sound: a_1.parquet begins 5.0 s before a_0.parquet ends; look at the clock" in done.out  # 19.95 s - 15 s
+    assert (
+        "run sound: a_1.parquet begins 5.0 s before a_0.parquet ends; look at the clock" in done.out
+    )  # 19.95 s - 15 s
 
 
 def test_inspecting_nothing_is_an_error(brokk: Callable[..., object]) -> None:

@@ -14,8 +14,12 @@ from brokk_rl.sim.model import compile_model
 
 
 def _random_positions(machine: Machine, count: int) -> torch.Tensor:
-    share = torch.rand(count, machine.num_joints, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return (torch.tensor(machine.lower) + share * torch.tensor(machine.upper - machine.lower)).float()
+    share = torch.rand(
+        count, machine.num_joints, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    return (
+        torch.tensor(machine.lower) + share * torch.tensor(machine.upper - machine.lower)
+    ).float()
 
 
 def _dimensions(*values: float) -> tuple[Dimension, ...]:
@@ -29,11 +33,15 @@ def _chain(machine: Machine, kinds: str, axes: list[tuple[float, float, float]])
             machine.joints[0],
             name=f"j{i}",
             kind="hinge" if kind == "h" else "slide",
-            body=dataclasses.replace(machine.bodies[0], axis=axis, origin_m=_dimensions(0.3, 0.1 * i, 0.2)),
+            body=dataclasses.replace(
+                machine.bodies[0], axis=axis, origin_m=_dimensions(0.3, 0.1 * i, 0.2)
+            ),
         )
         for i, (kind, axis) in enumerate(zip(kinds, axes, strict=True))
     )
-    return dataclasses.replace(machine, joints=joints, exclusive=(), levers=(), tool_m=_dimensions(0.4, 0.1, -0.2))
+    return dataclasses.replace(
+        machine, joints=joints, exclusive=(), levers=(), tool_m=_dimensions(0.4, 0.1, -0.2)
+    )
 
 
 def _mujoco_chain(machine: Machine) -> mujoco.MjModel:
@@ -58,7 +66,9 @@ def test_outstretched_arm_reaches_as_far_as_its_links_add_up_to(machine):
 def test_a_tool_that_points_straight_down_has_the_papers_pitch(machine):
     pose = Kinematics(machine).pose(torch.tensor([math.pi / 2, 0.0, 0.0, 0.0, math.pi / 2]))
     # slewed to the left; 0.25 + 1.50 + 1.25 + 1.00 to the side, 0.9 - 1.2 up
-    torch.testing.assert_close(pose.tip_in_base_m, torch.tensor([0.0, 4.0, -0.3]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        pose.tip_in_base_m, torch.tensor([0.0, 4.0, -0.3]), atol=1e-6, rtol=0
+    )
     torch.testing.assert_close(pose.axis_in_base, torch.tensor([0.0, 0.0, -1.0]), atol=1e-6, rtol=0)
     assert pose.pitch_rad.item() == pytest.approx(math.pi / 2, abs=1e-6)
 
@@ -72,7 +82,11 @@ def test_tip_and_joints_agree_with_mujoco(machine):
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
         np.testing.assert_allclose(pose.tip_in_base_m[i], data.site("tip").xpos, atol=3e-6)
-        np.testing.assert_allclose(pose.joints_in_base_m[i], [data.body(f"{n}_link").xpos for n in machine.joint_names], atol=3e-6)
+        np.testing.assert_allclose(
+            pose.joints_in_base_m[i],
+            [data.body(f"{n}_link").xpos for n in machine.joint_names],
+            atol=3e-6,
+        )
 
 
 @pytest.mark.parametrize(
@@ -111,9 +125,14 @@ def test_jacobians_are_the_derivatives_of_the_pose(machine):
         shift[j] = step
         ahead, behind = kinematics.pose(q + shift), kinematics.pose(q - shift)
         torch.testing.assert_close(
-            jacobian.tip[..., j], (ahead.tip_in_base_m - behind.tip_in_base_m) / (2 * step), atol=3e-4, rtol=0
+            jacobian.tip[..., j],
+            (ahead.tip_in_base_m - behind.tip_in_base_m) / (2 * step),
+            atol=3e-4,
+            rtol=0,
         )
-        turned = torch.remainder(ahead.pitch_rad - behind.pitch_rad + math.pi, 2 * math.pi) - math.pi
+        turned = (
+            torch.remainder(ahead.pitch_rad - behind.pitch_rad + math.pi, 2 * math.pi) - math.pi
+        )
         torch.testing.assert_close(jacobian.pitch[..., j], turned / (2 * step), atol=3e-4, rtol=0)
 
 
@@ -121,6 +140,10 @@ def test_leading_dimensions_are_kept(machine):
     q = _random_positions(machine, 6)
     kinematics = Kinematics(machine)
     pose, jacobian = kinematics.pose(q.view(2, 3, 5)), kinematics.jacobian(q.view(2, 3, 5))
-    assert pose.tip_in_base_m.shape == (2, 3, 3) and pose.pitch_rad.shape == (2, 3) and pose.joints_in_base_m.shape == (2, 3, 5, 3)
+    assert (
+        pose.tip_in_base_m.shape == (2, 3, 3)
+        and pose.pitch_rad.shape == (2, 3)
+        and pose.joints_in_base_m.shape == (2, 3, 5, 3)
+    )
     assert jacobian.tip.shape == (2, 3, 3, 5) and jacobian.pitch.shape == (2, 3, 5)
     torch.testing.assert_close(pose.tip_in_base_m[1, 2], kinematics.pose(q[5]).tip_in_base_m)

@@ -18,21 +18,42 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def unseen(machine: Machine) -> Machine:
-    return replace(machine, name="unseen", mjcf=None, tool_m=None, joints=tuple(replace(j, body=None) for j in machine.joints))
+    return replace(
+        machine,
+        name="unseen",
+        mjcf=None,
+        tool_m=None,
+        joints=tuple(replace(j, body=None) for j in machine.joints),
+    )
 
 
 def test_its_actuators_can_be_modelled(unseen: Machine) -> None:
-    lag = Lag(dead_time_s=None, dead_band_extend=0.1, dead_band_retract=0.1, gain=1.0, time_constant_s=0.1, spread={})
+    lag = Lag(
+        dead_time_s=None,
+        dead_band_extend=0.1,
+        dead_band_retract=0.1,
+        gain=1.0,
+        time_constant_s=0.1,
+        spread={},
+    )
     check_actuator(lag, unseen)
     assert not unseen.has_bodies
 
 
-@pytest.mark.parametrize("use", [lambda m: Kinematics(m), lambda m: Gravity(m, CPU), lambda m: compile_model(m, 0.01)])
+@pytest.mark.parametrize(
+    "use", [lambda m: Kinematics(m), lambda m: Gravity(m, CPU), lambda m: compile_model(m, 0.01)]
+)
 def test_what_needs_its_links_says_what_is_missing(unseen: Machine, use) -> None:
-    with pytest.raises(ConfigError, match=r"machine '?unseen'? (is known by its joints only|has no MJCF)"):
+    with pytest.raises(
+        ConfigError, match=r"machine '?unseen'? (is known by its joints only|has no MJCF)"
+    ):
         use(unseen)
 
 
 def test_bodies_stand_in_the_fingerprint(machine: Machine, unseen: Machine) -> None:
     assert machine.has_bodies
-    assert {key for key in machine.fingerprint() if machine.fingerprint()[key] != unseen.fingerprint()[key]} == {"name", "geometry"}
+    assert {
+        key
+        for key in machine.fingerprint()
+        if machine.fingerprint()[key] != unseen.fingerprint()[key]
+    } == {"name", "geometry"}

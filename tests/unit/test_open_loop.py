@@ -18,7 +18,14 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
-PLANT = Lag(dead_time_s=0.43, dead_band_extend=0.06, dead_band_retract=0.09, gain=0.5, time_constant_s=0.3, spread={})
+PLANT = Lag(
+    dead_time_s=0.43,
+    dead_band_extend=0.06,
+    dead_band_retract=0.09,
+    gain=0.5,
+    time_constant_s=0.3,
+    spread={},
+)
 """A plant with a state of its own: the speed."""
 
 
@@ -26,7 +33,9 @@ def levels(machine: Machine, lengths: Sequence[int], seed: int = 0) -> list[Reco
     """Recordings of `PLANT` under random levels, held for a second, one recording a length."""
     generator, found = np.random.default_rng(seed), []
     for number, length in enumerate(lengths):
-        u = np.repeat(generator.uniform(-0.6, 0.6, (length // 20 + 1, 5)), 20, 0)[:length].astype(np.float32)
+        u = np.repeat(generator.uniform(-0.6, 0.6, (length // 20 + 1, 5)), 20, 0)[:length].astype(
+            np.float32
+        )
         model = PLANT.build(machine, 1, CPU)
         history = History(q=torch.zeros(1, 13, 5), u=torch.zeros(1, 13, 5))
         q = torch.as_tensor(0.5 * (machine.lower + machine.upper), dtype=torch.float32)[None]
@@ -53,13 +62,18 @@ def scores(cut: open_loop.Windows, machine: Machine, **predicted: np.ndarray) ->
     return Scores(predicted, cut, machine, np.random.default_rng(0))
 
 
-def test_a_plant_with_a_state_runs_freely_without_error_wherever_a_window_begins(machine: Machine) -> None:
+def test_a_plant_with_a_state_runs_freely_without_error_wherever_a_window_begins(
+    machine: Machine,
+) -> None:
     cut = open_loop.windows(levels(machine, [600, 600]), machine, 10.0, 5.0)
     # 0.65 s of history, 1 s to warm up, 10 s: windows at 0, 5, 10 and 15 s of each 30 s
     assert (cut.q.shape, cut.u.shape) == ((8, 233, 5), (8, 232, 5))
     assert list(cut.run) == ["run 0"] * 4 + ["run 1"] * 4
     # what is left of the speed at rest after the warm-up: exp(-1 / 0.3) of it, 0.3 s long
-    assert np.abs(open_loop.free_run(PLANT, machine, cut, CPU) - cut.measured).max() < 0.2 * 0.3 * np.exp(-1.0 / 0.3) * 1.5
+    assert (
+        np.abs(open_loop.free_run(PLANT, machine, cut, CPU) - cut.measured).max()
+        < 0.2 * 0.3 * np.exp(-1.0 / 0.3) * 1.5
+    )
 
 
 def test_short_recordings_serve_the_horizons_that_fit(machine: Machine) -> None:
@@ -70,12 +84,15 @@ def test_short_recordings_serve_the_horizons_that_fit(machine: Machine) -> None:
     assert list(left) == [40, 20, 100, 80, 60, 40, 20]
     assert np.isfinite(cut.q[:, :33]).all()
     found = scores(cut, machine, plant=open_loop.free_run(PLANT, machine, cut, CPU))
-    assert found.at("plant", 5.0)[0]["ci95"] is None and found.at("plant", 2.0)[0]["ci95"] is not None
+    assert (
+        found.at("plant", 5.0)[0]["ci95"] is None and found.at("plant", 2.0)[0]["ci95"] is not None
+    )
 
 
 def test_recordings_too_short_for_any_horizon_are_refused(machine: Machine) -> None:
     with pytest.raises(
-        RecordingError, match=r"too little data: a free run of 10 s needs 11\.65 s of recording, the longest of 2 has 5"
+        RecordingError,
+        match=r"too little data: a free run of 10 s needs 11\.65 s of recording, the longest of 2 has 5",
     ):
         open_loop.windows(levels(machine, [100, 100]), machine, 10.0, 1.0)
 
@@ -114,10 +131,14 @@ def test_intervals_come_from_runs_not_from_windows(machine: Machine) -> None:
     assert widths[0] == pytest.approx(widths[1])
 
 
-def test_a_small_difference_that_every_run_shows_is_certain_although_intervals_overlap(machine: Machine) -> None:
+def test_a_small_difference_that_every_run_shows_is_certain_although_intervals_overlap(
+    machine: Machine,
+) -> None:
     runs = [recording(np.zeros((200, 5)), np.zeros((200, 5)), f"run {n}") for n in range(9)]
     cut = open_loop.windows(runs, machine, 1.0, 1.0)
-    size = np.array([0.1 * (1 + int(name[-1])) for name in cut.run])[:, None, None] * np.ones((1, 20, 5))
+    size = np.array([0.1 * (1 + int(name[-1])) for name in cut.run])[:, None, None] * np.ones(
+        (1, 20, 5)
+    )
     found = scores(cut, machine, mine=cut.measured + 0.95 * size, rival=cut.measured + size)
     mine, rival = found.at("mine", 1.0)[0]["ci95"], found.at("rival", 1.0)[0]["ci95"]
     assert mine[1] > rival[0]
@@ -132,7 +153,9 @@ def test_seconds_belong_to_regimes_by_the_commands_that_act_in_them(machine: Mac
     u[40:80, 0], u[80:100, 0], u[60:, 2] = 0.5, -0.9, 0.1
     q = np.tile(0.5 * (machine.lower + machine.upper), (140, 1))
     q[100:, 0] = machine.upper[0]
-    cut = open_loop.windows([recording(u, q, "a")], machine, 5.0, 100.0)  # from 1.65 s on: 33 samples before
+    cut = open_loop.windows(
+        [recording(u, q, "a")], machine, 5.0, 100.0
+    )  # from 1.65 s on: 33 samples before
     drift = np.linspace(0.05, 5.0, 100)[None, :, None] * np.array([0.1, 0.0, 0.2, 0.0, 0.0])
     found = scores(cut, machine, model=cut.measured + drift)
     members = {name: inside[0] for name, inside in memberships(found, np.zeros(5)).items()}
@@ -152,4 +175,6 @@ def test_seconds_belong_to_regimes_by_the_commands_that_act_in_them(machine: Mac
         assert table["q1"][regime]["models"]["model"]["drift_per_s"] == pytest.approx(0.1, rel=1e-5)
     assert table["q1"]["with others"]["time"] == pytest.approx(0.6)
     assert table["q1"]["with others"]["models"]["model"]["share"] == pytest.approx(0.6, rel=1e-5)
-    assert table["q3"]["small commands"]["models"]["model"]["drift_per_s"] == pytest.approx(0.2, rel=1e-5)
+    assert table["q3"]["small commands"]["models"]["model"]["drift_per_s"] == pytest.approx(
+        0.2, rel=1e-5
+    )

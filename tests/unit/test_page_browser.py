@@ -44,13 +44,20 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
     """Opens pages; what the browser complains about fails the test."""
     contexts, complaints = [], []
 
-    def open_page(port: int, token: str | None = TOKEN, scene: bool = False, query: str = "", **how: Any) -> Any:
+    def open_page(
+        port: int, token: str | None = TOKEN, scene: bool = False, query: str = "", **how: Any
+    ) -> Any:
         contexts.append(browser.new_context(viewport=SIZE, locale="en-GB", **how))
         page = contexts[-1].new_page()
         if not scene:
-            page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))
+            page.route(
+                "**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body="")
+            )
         page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("requestfinished", lambda request: None if f":{port}/" in request.url else complaints.append(request.url))
+        page.on(
+            "requestfinished",
+            lambda request: None if f":{port}/" in request.url else complaints.append(request.url),
+        )
         page.goto(f"http://localhost:{port}/{query}" + (f"#token={token}" if token else ""))
         until(page, "() => window.measured?.drawn > 0")
         if token:  # what is wished before the page was let in is refused
@@ -88,9 +95,14 @@ def drawn(page: Any) -> dict[str, tuple[float, float]]:
     return found
 
 
-def test_levers_are_drawn_where_they_are_and_should_be(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_levers_are_drawn_where_they_are_and_should_be(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port)
-    feed.now = replace(feed.now, own=replace(LEVERS, left_theta=0.5, left_psi=-0.25, right_theta=-1.0, right_psi=1.0))
+    feed.now = replace(
+        feed.now,
+        own=replace(LEVERS, left_theta=0.5, left_psi=-0.25, right_theta=-1.0, right_psi=1.0),
+    )
     feed.advise(2, left_theta=-0.75, left_psi=1.0, right_theta=0.1, right_psi=-0.6)
     eventually(lambda: drawn(page)["left advised"] != (0.0, 0.0))
     found = drawn(page)
@@ -109,7 +121,9 @@ def test_pixels_are_green_where_the_lever_should_be_and_blue_where_it_is(
     feed.advise(2, left_psi=advised[0], left_theta=advised[1])
     eventually(lambda: drawn(page)["left advised"] != (0.0, 0.0))
     box = page.locator("#left").bounding_box()
-    picture = np.asarray(Image.open(io.BytesIO(page.locator("#left").screenshot())).convert("RGB")).astype(int)
+    picture = np.asarray(
+        Image.open(io.BytesIO(page.locator("#left").screenshot())).convert("RGB")
+    ).astype(int)
     scale = min(box["width"], box["height"]) / 260
     middle = np.array([picture.shape[1] / 2, picture.shape[0] / 2])
 
@@ -121,12 +135,16 @@ def test_pixels_are_green_where_the_lever_should_be_and_blue_where_it_is(
         assert len(near) > 30
         return (near.min(0) + near.max(0)) / 2
 
-    np.testing.assert_allclose(center(GREEN, 0.31, advised), advised, atol=0.02)  # the diamond, without what leads to it
+    np.testing.assert_allclose(
+        center(GREEN, 0.31, advised), advised, atol=0.02
+    )  # the diamond, without what leads to it
     blue = center(BLUE, 0.155, own)
     np.testing.assert_allclose(blue, own, atol=0.03)
 
 
-def test_the_button_is_announced_and_then_green(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_the_button_is_announced_and_then_green(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port)
     button = page.locator("#button")
     assert "q2: Release button" in button.inner_text()
@@ -139,44 +157,65 @@ def test_the_button_is_announced_and_then_green(feed: Scripted, port: int, opene
     assert time.monotonic() - began_s < 2.0
     assert button.evaluate("node => getComputedStyle(node).backgroundColor") == "rgb(0, 117, 43)"
     assert "HOLD" in button.inner_text()
-    assert page.locator("#right text", has_text="q2").count() == 1, "the shared axis bears the name of the joint that is meant"
-
-
-def test_what_is_stale_is_grey_and_says_so(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
-    page = opened(port)
-    feed.advise(2, due_s=0.0, button_right=True, right_theta=0.5)
-    page.wait_for_selector("#button.now")
-    old = tuple(replace(one, age_s=0.4, limit_s=0.15) if one.name == "advice" else one for one in SHOWN.streams)
-    feed.now = replace(feed.now, streams=old)
-    page.wait_for_selector("#left.stale")
-    page.wait_for_selector("#button.stale:not(.now)")
-    stroke = page.locator("#left .advised .target").evaluate("node => getComputedStyle(node).stroke")
-    assert stroke == "rgb(118, 118, 118)"
-    assert page.locator("#streams li.stale").get_attribute("data-stream") == "advice"
-    assert page.locator("#right .own circle").evaluate("node => getComputedStyle(node).fill") == "rgb(10, 75, 209)", (
-        "the rest stays"
+    assert page.locator("#right text", has_text="q2").count() == 1, (
+        "the shared axis bears the name of the joint that is meant"
     )
 
 
-def test_a_stream_that_stops_grows_old_by_itself(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_what_is_stale_is_grey_and_says_so(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
+    page = opened(port)
+    feed.advise(2, due_s=0.0, button_right=True, right_theta=0.5)
+    page.wait_for_selector("#button.now")
+    old = tuple(
+        replace(one, age_s=0.4, limit_s=0.15) if one.name == "advice" else one
+        for one in SHOWN.streams
+    )
+    feed.now = replace(feed.now, streams=old)
+    page.wait_for_selector("#left.stale")
+    page.wait_for_selector("#button.stale:not(.now)")
+    stroke = page.locator("#left .advised .target").evaluate(
+        "node => getComputedStyle(node).stroke"
+    )
+    assert stroke == "rgb(118, 118, 118)"
+    assert page.locator("#streams li.stale").get_attribute("data-stream") == "advice"
+    assert (
+        page.locator("#right .own circle").evaluate("node => getComputedStyle(node).fill")
+        == "rgb(10, 75, 209)"
+    ), "the rest stays"
+
+
+def test_a_stream_that_stops_grows_old_by_itself(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
     feed.now = replace(feed.now, streams=(Stream("positions", 0.0, 0.1), *SHOWN.streams[1:]))
     page = opened(port)
     page.wait_for_selector("#streams li[data-stream=positions]:not(.stale)")
     # a clock that gains 0.2 s whenever it is asked: whatever came is that old when it is drawn
-    page.evaluate("performance.now = ((real, ahead) => () => real() + (ahead += 200))(performance.now.bind(performance), 0)")
+    page.evaluate(
+        "performance.now = ((real, ahead) => () => real() + (ahead += 200))(performance.now.bind(performance), 0)"
+    )
     page.wait_for_selector("body.lost, #streams li.stale[data-stream=positions]")
 
 
-def test_together_within_the_tolerance_is_said_by_more_than_colour(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_together_within_the_tolerance_is_said_by_more_than_colour(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port)
     feed.now = replace(feed.now, own=replace(LEVERS, left_psi=0.45, right_psi=0.3))
     feed.advise(2, left_psi=0.5, right_psi=0.5)
     page.wait_for_selector("#left.together")
-    assert page.locator("#left .tick").evaluate("node => getComputedStyle(node).visibility") == "visible"
+    assert (
+        page.locator("#left .tick").evaluate("node => getComputedStyle(node).visibility")
+        == "visible"
+    )
     assert page.locator("#right.together").count() == 0
 
 
-def test_the_page_comes_back_after_the_server_was_away(feed: Scripted, opened: Callable[..., Any]) -> None:
+def test_the_page_comes_back_after_the_server_was_away(
+    feed: Scripted, opened: Callable[..., Any]
+) -> None:
     with served(feed) as port:
         page = opened(port)
         page.wait_for_selector("body:not(.lost)")
@@ -186,15 +225,22 @@ def test_the_page_comes_back_after_the_server_was_away(feed: Scripted, opened: C
     with served(feed, port):
         page.wait_for_selector("body:not(.lost)")
         eventually(lambda: drawn(page)["left advised"] == pytest.approx((0.9, 0.0), abs=1e-3))
-        eventually(lambda: page.keyboard.press("g") or feed.wishes)  # until then it says that it has no connection
+        eventually(
+            lambda: page.keyboard.press("g") or feed.wishes
+        )  # until then it says that it has no connection
         assert set(feed.wishes) == {Wish("start", "")}
 
 
-def test_safety_and_connection_are_told_apart_in_words(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_safety_and_connection_are_told_apart_in_words(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port)
     assert page.locator("#safety.good").inner_text() == "Listens only"
     assert SHOWN.safety is not None
-    feed.now = replace(SHOWN, safety=replace(SHOWN.safety, commands=True, state="LATCHED", trip="messages corrupted"))
+    feed.now = replace(
+        SHOWN,
+        safety=replace(SHOWN.safety, commands=True, state="LATCHED", trip="messages corrupted"),
+    )
     page.wait_for_selector("#safety.bad")
     assert page.locator("#safety").inner_text() == "LATCHED – messages corrupted"
     feed.now = replace(SHOWN, safety=replace(SHOWN.safety, estop=True, trip="emergency stop"))
@@ -211,14 +257,18 @@ def test_german(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
     assert page.locator("#safety").inner_text() == "Hört nur zu"
     assert "STOPP" in page.locator("#stop").inner_text()
     assert SHOWN.advice is not None
-    feed.now = replace(SHOWN, advice=replace(SHOWN.advice, valid=False, reason="no borehole is known"))
+    feed.now = replace(
+        SHOWN, advice=replace(SHOWN.advice, valid=False, reason="no borehole is known")
+    )
     page.wait_for_selector("#advice.none")
     assert page.locator("#advice").inner_text() == "Kein Bohrloch bekannt"
     page.keyboard.press("l")
     assert page.locator("#stop b").inner_text() == "STOP"
 
 
-def test_everything_is_done_by_keys_and_by_gloves(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_everything_is_done_by_keys_and_by_gloves(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port, query="?lang=de")
     for key, wish in (
         ("g", Wish("start", "")),
@@ -228,17 +278,29 @@ def test_everything_is_done_by_keys_and_by_gloves(feed: Scripted, port: int, ope
     ):
         page.keyboard.press(key)
         eventually(lambda wish=wish: feed.wishes[-1:] == [wish])
-    for name, wish in (("#start", Wish("start", "")), ("#stop", Wish("stop", "")), ("#record", Wish("record", "on"))):
+    for name, wish in (
+        ("#start", Wish("start", "")),
+        ("#stop", Wish("stop", "")),
+        ("#record", Wish("record", "on")),
+    ):
         page.click(name)
         eventually(lambda wish=wish: feed.wishes[-1] == wish)
     for button in page.locator("button").all():
         box = button.bounding_box()
-        assert min(box["width"], box["height"]) >= 15 / 25.4 * 96, button.inner_text()  # 15 mm by CSS
-        assert box["x"] >= 0 and box["x"] + box["width"] <= SIZE["width"] and box["y"] + box["height"] <= SIZE["height"]
+        assert min(box["width"], box["height"]) >= 15 / 25.4 * 96, (
+            button.inner_text()
+        )  # 15 mm by CSS
+        assert (
+            box["x"] >= 0
+            and box["x"] + box["width"] <= SIZE["width"]
+            and box["y"] + box["height"] <= SIZE["height"]
+        )
     reached = set()
     for _ in range(10):
         page.keyboard.press("Tab")
-        reached.add(page.evaluate("document.activeElement.id || document.activeElement.dataset.target"))
+        reached.add(
+            page.evaluate("document.activeElement.id || document.activeElement.dataset.target")
+        )
     assert {"language", "scene", "A", "B", "start", "stop", "record"} <= reached
 
 
@@ -271,7 +333,9 @@ def test_the_token_leaves_the_address_bar(port: int, opened: Callable[..., Any])
     until(page, "document.getElementById('answer').textContent === ''")
 
 
-def test_two_pages_show_the_same_and_say_when(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_two_pages_show_the_same_and_say_when(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
     pages = [opened(port), opened(port)]
     began_s = time.monotonic()
     feed.advise(41, left_psi=0.3)
@@ -284,10 +348,14 @@ def test_two_pages_show_the_same_and_say_when(feed: Scripted, port: int, opened:
         assert began_s - one.round_trip_s <= one.t_s <= time.monotonic() + one.round_trip_s
 
 
-def test_the_scene_shows_machine_points_and_picture(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_the_scene_shows_machine_points_and_picture(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
     color = np.zeros((90, 160, 3), np.uint8)
     color[:] = (230, 20, 200)  # nothing else on the page is magenta
-    pose = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.6], [0, 0, 0, 1]])
+    pose = np.array(
+        [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.6], [0, 0, 0, 1]]
+    )
     matrix = np.array([[120.0, 0, 79.5], [0, 120.0, 44.5], [0, 0, 1.0]])
     feed.now = replace(SHOWN, streams=(*SHOWN.streams, Stream("camera", 0.0, 1e6)))
     page = opened(port, scene=True)
@@ -301,11 +369,15 @@ def test_the_scene_shows_machine_points_and_picture(feed: Scripted, port: int, o
 
 
 def _share(page: Any, name: str, color: list[int], within: int = 25) -> float:
-    picture = np.asarray(Image.open(io.BytesIO(page.locator(name).screenshot())).convert("RGB")).astype(int)
+    picture = np.asarray(
+        Image.open(io.BytesIO(page.locator(name).screenshot())).convert("RGB")
+    ).astype(int)
     return float((np.abs(picture - color) < within).all(-1).mean())
 
 
-def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
     feed.now = replace(SHOWN, streams=(*SHOWN.streams, Stream("camera", 0.0, 1e6)))
     page = opened(port)
     until(page, "!document.getElementById('camera').hidden")
@@ -313,4 +385,6 @@ def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(feed: Scripte
     page.locator("#picture").click(position={"x": 0.25 * box["width"], "y": 0.6 * box["height"]})
     eventually(lambda: bool(feed.wishes))
     wish = feed.wishes[-1]
-    assert wish.kind == "point" and [float(part) for part in wish.value.split(",")] == pytest.approx([0.25, 0.6], abs=0.01)
+    assert wish.kind == "point" and [
+        float(part) for part in wish.value.split(",")
+    ] == pytest.approx([0.25, 0.6], abs=0.01)

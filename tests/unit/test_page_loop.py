@@ -36,7 +36,18 @@ def exchange() -> Iterator[Exchange]:
 @pytest.fixture
 def feed(exchange: Exchange, tmp_path: Path) -> LoopFeed:
     session = Session(out=str(tmp_path), seed=1, device="cpu")
-    return LoopFeed(Beside(option("page", "local"), MACHINE, option("guidance", "machine"), session, 0.15, 0.15, 600.0), exchange)
+    return LoopFeed(
+        Beside(
+            option("page", "local"),
+            MACHINE,
+            option("guidance", "machine"),
+            session,
+            0.15,
+            0.15,
+            600.0,
+        ),
+        exchange,
+    )
 
 
 def say(exchange: Exchange, **changes: Any) -> None:
@@ -44,7 +55,9 @@ def say(exchange: Exchange, **changes: Any) -> None:
     record, now_s = exchange.state.new(), time.monotonic()
     record["t_s"] = record["q_t_s"] = record["levers_t_s"] = now_s
     record["q"], record["lever"] = MACHINE.home, [0.1, -0.2, 0.3, -0.4]
-    record["q_plausible"] = record["trusted"] = record["alone"] = record["bus_up"] = record["deadman"] = True
+    record["q_plausible"] = record["trusted"] = record["alone"] = record["bus_up"] = record[
+        "deadman"
+    ] = True
     record["guard"], record["trip"] = State.SILENT.value, TRIPS.index(TRIPS[0])
     for name, value in changes.items():
         record[name] = value
@@ -78,7 +91,9 @@ def test_levers_are_parts_of_full(exchange: Exchange, feed: LoopFeed) -> None:
     assert shown.alive and shown.deadman
 
 
-def test_the_button_is_announced_while_the_levers_go_through_neutral(exchange: Exchange, feed: LoopFeed) -> None:
+def test_the_button_is_announced_while_the_levers_go_through_neutral(
+    exchange: Exchange, feed: LoopFeed
+) -> None:
     say(exchange)
     wants_q2 = [0.0, 0.7, 0.0, 0.0, 0.0]
     advise(exchange, u=wants_q2, lever_rad=[0.3, 0.0, 0.0, 0.0])
@@ -99,14 +114,23 @@ def test_old_things_are_old(exchange: Exchange, feed: LoopFeed) -> None:
     target = exchange.target.new()
     target["t_s"], target["center_in_base_m"] = now_s - 700.0, [2.6, 0.0, 0.75]
     exchange.target.write(target)
-    assert {stream.name for stream in feed.shown().streams if stream.stale} == {"positions", "levers", "advice", "borehole"}
+    assert {stream.name for stream in feed.shown().streams if stream.stale} == {
+        "positions",
+        "levers",
+        "advice",
+        "borehole",
+    }
     assert not feed.shown().deadman, "a dead-man of which nothing was heard is not held"
 
 
 def test_the_borehole_and_the_way_to_it(exchange: Exchange, feed: LoopFeed) -> None:
     say(exchange)
     target = exchange.target.new()
-    target["t_s"], target["center_in_base_m"], target["std_m"] = time.monotonic(), [2.6, 0.0, 0.75], 0.003
+    target["t_s"], target["center_in_base_m"], target["std_m"] = (
+        time.monotonic(),
+        [2.6, 0.0, 0.75],
+        0.003,
+    )
     exchange.target.write(target)
     shown = feed.shown()
     assert shown.targets[0].center_in_base_m == (2.6, 0.0, 0.75) and shown.targets[0].std_m == 0.003
@@ -142,7 +166,9 @@ class Process:
         return 0
 
 
-def wanted(exchange: Exchange, tmp_path: Path, commands: bool = True) -> tuple[Wanted, list[Process]]:
+def wanted(
+    exchange: Exchange, tmp_path: Path, commands: bool = True
+) -> tuple[Wanted, list[Process]]:
     started: list[Process] = []
 
     def start(folder: Path) -> Any:
@@ -150,7 +176,9 @@ def wanted(exchange: Exchange, tmp_path: Path, commands: bool = True) -> tuple[W
         return started[-1]
 
     aim = Aim(File(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes)
-    return Wanted(exchange, Recorder(exchange, tmp_path, start), aim, armed=False, commands=commands), started
+    return Wanted(
+        exchange, Recorder(exchange, tmp_path, start), aim, armed=False, commands=commands
+    ), started
 
 
 def controls(exchange: Exchange) -> Any:
@@ -173,14 +201,18 @@ def test_start_arms_and_stop_disarms(exchange: Exchange, feed: LoopFeed, tmp_pat
     assert not controls(exchange)["armed"], "the last word counts"
 
 
-def test_nothing_is_armed_where_nothing_is_ever_sent(exchange: Exchange, feed: LoopFeed, tmp_path: Path) -> None:
+def test_nothing_is_armed_where_nothing_is_ever_sent(
+    exchange: Exchange, feed: LoopFeed, tmp_path: Path
+) -> None:
     supervisor, _ = wanted(exchange, tmp_path, commands=False)
     feed.wish(Wish("start", ""))
     supervisor.refresh()
     assert not controls(exchange)["armed"]
 
 
-def test_recordings_begin_and_end_one_at_a_time(exchange: Exchange, feed: LoopFeed, tmp_path: Path) -> None:
+def test_recordings_begin_and_end_one_at_a_time(
+    exchange: Exchange, feed: LoopFeed, tmp_path: Path
+) -> None:
     supervisor, started = wanted(exchange, tmp_path)
     exchange.bus_log.put(b"old")
     supervisor.refresh()
@@ -203,7 +235,9 @@ def test_recordings_begin_and_end_one_at_a_time(exchange: Exchange, feed: LoopFe
     assert feed.shown().recording.on
 
 
-def test_a_log_that_died_is_not_started_again_in_secret(exchange: Exchange, feed: LoopFeed, tmp_path: Path) -> None:
+def test_a_log_that_died_is_not_started_again_in_secret(
+    exchange: Exchange, feed: LoopFeed, tmp_path: Path
+) -> None:
     supervisor, started = wanted(exchange, tmp_path)
     feed.wish(Wish("record", "on"))
     supervisor.refresh()
@@ -213,11 +247,17 @@ def test_a_log_that_died_is_not_started_again_in_secret(exchange: Exchange, feed
     assert len(started) == 1 and not feed.shown().recording.on
 
 
-def test_other_lever_patterns_have_their_own_full_angles(exchange: Exchange, tmp_path: Path) -> None:
+def test_other_lever_patterns_have_their_own_full_angles(
+    exchange: Exchange, tmp_path: Path
+) -> None:
     session = Session(out=str(tmp_path), seed=1, device="cpu")
     guidance = option("guidance", "iso")
-    wide = replace(guidance, levers=tuple(replace(one, max_angle_rad=0.5) for one in guidance.levers))
-    feed = LoopFeed(Beside(option("page", "local"), MACHINE, wide, session, 0.15, 0.15, 600.0), exchange)
+    wide = replace(
+        guidance, levers=tuple(replace(one, max_angle_rad=0.5) for one in guidance.levers)
+    )
+    feed = LoopFeed(
+        Beside(option("page", "local"), MACHINE, wide, session, 0.15, 0.15, 600.0), exchange
+    )
     say(exchange)
     advise(exchange, lever_rad=[0.25, 0.0, 0.0, 0.0])
     advice = feed.shown().advice

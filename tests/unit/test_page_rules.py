@@ -44,7 +44,10 @@ def test_a_page_of_this_server_may_connect(host: str) -> None:
         ("https://localhost:8170", "localhost:8170"),
         ("http://127.0.0.1:8170", "localhost:8170"),
         ("null", "localhost:8170"),
-        ("http://evil.example:8170", "evil.example:8170"),  # DNS rebinding: its own origin, but not our name
+        (
+            "http://evil.example:8170",
+            "evil.example:8170",
+        ),  # DNS rebinding: its own origin, but not our name
         (None, "evil.example:8170"),
         (None, None),
     ],
@@ -61,7 +64,10 @@ def test_in_a_network_the_names_are_those_of_the_configuration() -> None:
 
 def test_only_the_whole_token_fits() -> None:
     assert access.token_fits(TOKEN, TOKEN)
-    assert not any(access.token_fits(given, TOKEN) for given in (None, 7, "", TOKEN[:-1], TOKEN + " ", [TOKEN], "ключ"))
+    assert not any(
+        access.token_fits(given, TOKEN)
+        for given in (None, 7, "", TOKEN[:-1], TOKEN + " ", [TOKEN], "ключ")
+    )
 
 
 def test_wishes_are_read() -> None:
@@ -71,7 +77,9 @@ def test_wishes_are_read() -> None:
 
 @given(
     st.text(max_size=300)
-    | st.recursive(st.none() | st.floats() | st.text(), lambda v: st.lists(v) | st.dictionaries(st.text(), v)).map(json.dumps)
+    | st.recursive(
+        st.none() | st.floats() | st.text(), lambda v: st.lists(v) | st.dictionaries(st.text(), v)
+    ).map(json.dumps)
 )
 def test_nonsense_is_no_wish_and_no_error(text: str) -> None:
     assert access.read_wish(text) is None
@@ -101,7 +109,12 @@ def test_without_the_dead_man_only_stop_goes_through() -> None:
     old = replace(SHOWN, streams=(Stream("levers", 0.2, 0.15),))
     dead, unknown = replace(SHOWN, alive=False), replace(SHOWN, safety=None)
     for shown in (released, stopped, old, dead, unknown):
-        for wish in (Wish("start", ""), Wish("record", "on"), Wish("record", "off"), Wish("target", "A")):
+        for wish in (
+            Wish("start", ""),
+            Wish("record", "on"),
+            Wish("record", "off"),
+            Wish("target", "A"),
+        ):
             assert access.refusal(wish, shown) == "deadman"
         assert access.refusal(Wish("stop", ""), shown) is None
     assert access.refusal(Wish("start", ""), SHOWN) is None
@@ -114,7 +127,9 @@ def frame(height: int, width: int) -> Frame:
     depth_m = chance.uniform(0.3, 9.0, (height, width)).astype(np.float32)
     depth_m[chance.random((height, width)) < 0.2] = np.nan
     color = np.full((height, width, 3), (200, 30, 60), np.uint8)
-    return Frame(color, depth_m, np.array([[400.0, 0, 50.0], [0, 410.0, 30.0], [0, 0, 1]]), np.eye(4), 4.5)
+    return Frame(
+        color, depth_m, np.array([[400.0, 0, 50.0], [0, 410.0, 30.0], [0, 0, 1]]), np.eye(4), 4.5
+    )
 
 
 def test_depth_comes_back_to_the_millimetre_and_unknown_stays_unknown() -> None:
@@ -122,10 +137,16 @@ def test_depth_comes_back_to_the_millimetre_and_unknown_stays_unknown() -> None:
     message = cloud.encode(sent, 640, 90)
     length = int.from_bytes(message[:4], "little")
     header = json.loads(message[4 : 4 + length])
-    back_m = cloud.depth_m(message[4 + length : 4 + length + header["depth_bytes"]], header["width"], header["height"])
+    back_m = cloud.depth_m(
+        message[4 + length : 4 + length + header["depth_bytes"]], header["width"], header["height"]
+    )
     np.testing.assert_array_equal(np.isnan(back_m), np.isnan(sent.depth_m))
     assert np.nanmax(np.abs(back_m - sent.depth_m)) <= 0.00051
-    assert (header["focal_px"], header["center_px"], header["t_s"]) == ([400.0, 410.0], [50.0, 30.0], 4.5)
+    assert (header["focal_px"], header["center_px"], header["t_s"]) == (
+        [400.0, 410.0],
+        [50.0, 30.0],
+        4.5,
+    )
 
 
 def test_the_picture_is_a_jpeg_in_the_right_colours() -> None:
@@ -145,7 +166,9 @@ def test_a_frame_is_shrunk_and_its_camera_with_it() -> None:
 
 def test_what_is_too_far_or_infinite_is_unknown() -> None:
     low, high = cloud.planes(np.array([[np.inf, 70.0, -1.0, 0.5, np.nan]], np.float32)).astype(int)
-    assert (low + 256 * high).tolist() == [[0, 0, 0, 1000, 999]], "0 mm, 0, 0, then 500 up and 500 down"
+    assert (low + 256 * high).tolist() == [[0, 0, 0, 1000, 999]], (
+        "0 mm, 0, 0, then 500 up and 500 down"
+    )
 
 
 def test_depth_and_colour_of_different_sizes_are_refused() -> None:
@@ -153,8 +176,15 @@ def test_depth_and_colour_of_different_sizes_are_refused() -> None:
         cloud.encode(replace(frame(16, 32), depth_m=np.ones((8, 8), np.float32)), 640, 80)
 
 
-@given(ahead_s=st.floats(-1e5, 1e5), out_s=st.floats(0.0001, 0.05), back_s=st.floats(0.0001, 0.05), drawing_s=st.floats(0, 0.1))
-def test_draw_times_are_right_within_half_the_round_trip(ahead_s: float, out_s: float, back_s: float, drawing_s: float) -> None:
+@given(
+    ahead_s=st.floats(-1e5, 1e5),
+    out_s=st.floats(0.0001, 0.05),
+    back_s=st.floats(0.0001, 0.05),
+    drawing_s=st.floats(0, 0.1),
+)
+def test_draw_times_are_right_within_half_the_round_trip(
+    ahead_s: float, out_s: float, back_s: float, drawing_s: float
+) -> None:
     clock = PageClock()
     clock.sent(1, 7, 100.0)
     came_s = 100.0 + out_s
@@ -177,7 +207,17 @@ def test_an_advice_becomes_visible_once() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "[9, 0, 0, 0]", "[1, null, 0, 0]", "[1, 2, 3, 1]", '["1", 0, 0, 0]', "[[1], 0, 0, 0]", "[1, 0, NaN, 0]"]
+    "text",
+    [
+        "",
+        "[]",
+        "[9, 0, 0, 0]",
+        "[1, null, 0, 0]",
+        "[1, 2, 3, 1]",
+        '["1", 0, 0, 0]',
+        "[[1], 0, 0, 0]",
+        "[1, 0, NaN, 0]",
+    ],
 )
 def test_nonsense_about_draw_times_is_noticed(text: str) -> None:
     clock = PageClock()
@@ -197,8 +237,12 @@ def test_a_page_has_no_more_undrawn_messages_than_the_limit() -> None:
 
 def test_the_way_leads_over_the_rim_and_then_down_the_axis() -> None:
     center_m, up = np.array([2.0, 0.0, 0.5]), np.array([0.0, 0.0, 1.0])
-    assert np.allclose(approach(np.array([1.0, 1.0, 1.0]), center_m, up), [(1, 1, 1), (2, 0, 0.8), (2, 0, 0.4)])
-    assert np.allclose(approach(np.array([2.0, 0.01, 0.6]), center_m, up), [(2.0, 0.01, 0.6), (2, 0, 0.4)])
+    assert np.allclose(
+        approach(np.array([1.0, 1.0, 1.0]), center_m, up), [(1, 1, 1), (2, 0, 0.8), (2, 0, 0.4)]
+    )
+    assert np.allclose(
+        approach(np.array([2.0, 0.01, 0.6]), center_m, up), [(2.0, 0.01, 0.6), (2, 0, 0.4)]
+    )
 
 
 def test_the_demo_keeps_to_the_machine() -> None:
@@ -222,7 +266,12 @@ def test_the_demo_keeps_to_the_machine() -> None:
     assert np.max(speeds) <= 1.0
     import torch
 
-    tip = Kinematics(machine).pose(torch.tensor([shown.q], dtype=torch.float32)).tip_in_base_m[0].numpy()
+    tip = (
+        Kinematics(machine)
+        .pose(torch.tensor([shown.q], dtype=torch.float32))
+        .tip_in_base_m[0]
+        .numpy()
+    )
     np.testing.assert_allclose(shown.path_in_base_m[0], tip, atol=1e-4)
 
 
@@ -233,7 +282,10 @@ def test_the_link_carries_the_token_where_browsers_keep_it_to_themselves() -> No
     assert TOKEN not in json.dumps(page.setup(option("machine", "brokk170")))
 
 
-@pytest.mark.parametrize("change", [{"token": "short"}, {"port": 70000}, {"rate_hz": 0.0}, {"jpeg_quality": 0}, {"clients": 0}])
+@pytest.mark.parametrize(
+    "change",
+    [{"token": "short"}, {"port": 70000}, {"rate_hz": 0.0}, {"jpeg_quality": 0}, {"clients": 0}],
+)
 def test_settings_that_make_no_sense_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match="page"):
         replace(option("page", "local"), **change)

@@ -27,14 +27,18 @@ def port(feed: Scripted) -> Iterator[int]:
         yield found
 
 
-def talk(port: int, path: str, said: list[str], origin: str | None = "own", host: str | None = None) -> Any:
+def talk(
+    port: int, path: str, said: list[str], origin: str | None = "own", host: str | None = None
+) -> Any:
     """Says `said` on a WebSocket; returns the answers, or the refusal."""
 
     async def run() -> Any:
         headers = {"Host": host} if host else {}
         try:
             own = f"http://localhost:{port}" if origin == "own" else origin
-            async with connect(f"ws://localhost:{port}{path}", origin=own, additional_headers=headers, proxy=None) as socket:  # type: ignore[arg-type]
+            async with connect(
+                f"ws://localhost:{port}{path}", origin=own, additional_headers=headers, proxy=None
+            ) as socket:  # type: ignore[arg-type]
                 answers = []
                 for text in said:
                     await socket.send(text)
@@ -56,7 +60,10 @@ def test_strangers_are_refused(feed: Scripted, port: int) -> None:
     assert talk(port, "/state", ["x"], origin="http://evil.example") == 403
     assert talk(port, "/control", ['{"token": "wrong"}']) == "token"
     assert talk(port, "/control", ["[]"]) == "token"
-    assert talk(port, "/control", [ours, "nonsense"]) == [{"ready": True}, {"refused": "malformed", "kind": ""}]
+    assert talk(port, "/control", [ours, "nonsense"]) == [
+        {"ready": True},
+        {"refused": "malformed", "kind": ""},
+    ]
     assert talk(port, "/elsewhere", ["x"]) == 404
     assert feed.wishes == []
 

@@ -20,7 +20,9 @@ from perception import augment, jpeg, training_report
 from perception.training_data import Crop, Samples, Views, cut
 
 SHIPPED: dict[str, Any] = instantiate(
-    yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())["training"]["augment"],
+    yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())[
+        "training"
+    ]["augment"],
     _convert_="all",
 )
 
@@ -39,7 +41,9 @@ def chance(seed: int) -> torch.Generator:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_each_changes_each_picture_its_own_way_and_the_same_for_the_same_seed(name: str) -> None:
     step = {name: replace(SHIPPED[name], probability=1.0)}
-    one, same, other = (augment.augmented(picture(), step, chance(seed), chance(seed)) for seed in (1, 1, 2))
+    one, same, other = (
+        augment.augmented(picture(), step, chance(seed), chance(seed)) for seed in (1, 1, 2)
+    )
     assert one.shape == (2, 3, 64, 96) and one.dtype == torch.float32
     assert one.min() >= 0.0 and one.max() <= 1.0
     assert torch.equal(one, same)
@@ -51,12 +55,17 @@ def test_each_changes_each_picture_its_own_way_and_the_same_for_the_same_seed(na
 def test_each_happens_as_often_as_its_probability_says(name: str) -> None:
     off = {name: replace(SHIPPED[name], probability=0.0)}
     assert torch.equal(augment.augmented(picture(), off, chance(0), chance(0)), picture())
-    half, many = {name: replace(SHIPPED[name], probability=0.5)}, picture()[:1, :, :16, :16].repeat(200, 1, 1, 1)
+    half, many = (
+        {name: replace(SHIPPED[name], probability=0.5)},
+        picture()[:1, :, :16, :16].repeat(200, 1, 1, 1),
+    )
     changed = (augment.augmented(many, half, chance(0), chance(0)) != many).flatten(1).any(1)
     assert 0.35 < changed.float().mean() < 0.65
 
 
-@pytest.mark.parametrize("name", sorted(SHIPPED.keys() - {"shadow", "haze"}))  # those change the light from place to place
+@pytest.mark.parametrize(
+    "name", sorted(SHIPPED.keys() - {"shadow", "haze"})
+)  # those change the light from place to place
 def test_nothing_moves_in_the_picture(name: str) -> None:
     step, bright = {name: replace(SHIPPED[name], probability=1.0)}, torch.zeros(8, 3, 64, 96)
     bright[:, :, 28:36, 44:52] = 0.6
@@ -69,7 +78,10 @@ def test_nothing_moves_in_the_picture(name: str) -> None:
 
 
 def test_contrast_gamma_exposure_and_haze_follow_their_formulas() -> None:
-    flat, close = torch.full((1, 3, 8, 8), 0.25), functools.partial(torch.testing.assert_close, rtol=1e-5, atol=1e-6)
+    flat, close = (
+        torch.full((1, 3, 8, 8), 0.25),
+        functools.partial(torch.testing.assert_close, rtol=1e-5, atol=1e-6),
+    )
     gamma = augment.Gamma(probability=1.0, exponent=(2.0, 2.0))
     close(gamma.changed(flat, chance(0)), flat * 0.25)
     exposure = augment.Exposure(probability=1.0, gain=(2.0, 2.0), tint=0.0)
@@ -78,7 +90,9 @@ def test_contrast_gamma_exposure_and_haze_follow_their_formulas() -> None:
     stretched = contrast.changed(picture(), chance(0))
     close(stretched.mean(), picture().mean())
     close(stretched.std(), 0.5 * picture().std())
-    haze = augment.Haze(probability=1.0, transmission=(0.25, 0.25), brightness=(0.8, 0.8), unevenness=0.0)
+    haze = augment.Haze(
+        probability=1.0, transmission=(0.25, 0.25), brightness=(0.8, 0.8), unevenness=0.0
+    )
     far, near = haze.changed(0 * flat, chance(0)), haze.changed(0 * flat + 1.0, chance(0))
     close(near - far, flat)  # what is left of the contrast
     assert far.min() >= 0.75 * 0.8 * 0.85 and far.max() <= 0.75 * 0.8
@@ -87,17 +101,25 @@ def test_contrast_gamma_exposure_and_haze_follow_their_formulas() -> None:
 def test_noise_has_the_strength_it_is_given_whatever_its_grain() -> None:
     flat = torch.full((1, 3, 200, 200), 0.5)
     for grain_px in (0.0, 0.3, 1.0):
-        noise = augment.Noise(probability=1.0, constant=(0.03, 0.03), photon=(0.0, 0.0), grain_px=(grain_px, grain_px))
+        noise = augment.Noise(
+            probability=1.0, constant=(0.03, 0.03), photon=(0.0, 0.0), grain_px=(grain_px, grain_px)
+        )
         assert float(noise.changed(flat, chance(0)).std()) == pytest.approx(0.03, rel=0.05)
 
 
 def test_a_shadow_only_darkens_and_motion_smears_as_far_as_it_says() -> None:
-    shadow = augment.Shadow(probability=1.0, depth=(0.3, 0.3), width=(0.3, 0.3), softness=(0.05, 0.05))
+    shadow = augment.Shadow(
+        probability=1.0, depth=(0.3, 0.3), width=(0.3, 0.3), softness=(0.05, 0.05)
+    )
     dark = shadow.changed(picture(), chance(4)) / picture()
     assert dark.max() <= 1.0 and float(dark.min()) == pytest.approx(0.3, abs=0.01)
     point = torch.zeros(1, 3, 41, 41)
     point[:, :, 20, 20] = 1.0
-    smear = augment.MotionBlur(probability=1.0, length_px=(9.0, 9.0)).changed(point, chance(2))[0, 0].numpy()
+    smear = (
+        augment.MotionBlur(probability=1.0, length_px=(9.0, 9.0))
+        .changed(point, chance(2))[0, 0]
+        .numpy()
+    )
     rows, columns = np.nonzero(smear > 0.02)
     assert smear.sum() == pytest.approx(1.0, abs=1e-4)
     assert 7.0 <= np.hypot(np.ptp(rows), np.ptp(columns)) <= 11.0
@@ -112,12 +134,27 @@ def test_a_blur_is_that_of_opencv() -> None:
 @pytest.mark.parametrize("quality", [20, 60])
 def test_what_jpeg_leaves_is_what_opencv_writes_into_a_file(quality: int) -> None:
     level = np.random.default_rng(0).uniform(30, 220, (9, 13, 3)).astype(np.float32)
-    written = cv2.resize(level, (100, 68), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
-    full = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    theirs = np.asarray(cv2.imdecode(cv2.imencode(".jpg", written[..., ::-1], full)[1], cv2.IMREAD_COLOR), float)[..., ::-1]
+    written = (
+        cv2.resize(level, (100, 68), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
+    )
+    full = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        quality,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    ]
+    theirs = np.asarray(
+        cv2.imdecode(cv2.imencode(".jpg", written[..., ::-1], full)[1], cv2.IMREAD_COLOR), float
+    )[..., ::-1]
     pictures = torch.from_numpy(written.transpose(2, 0, 1).copy())[None] / 255.0
-    ours = jpeg.recompressed(pictures, torch.full((1, 1, 1, 1), float(quality)))[0].numpy().transpose(1, 2, 0) * 255.0
-    # their steps are whole numbers: most pixels are theirs but for rounding, and all is much nearer to theirs than what was written
+    ours = (
+        jpeg.recompressed(pictures, torch.full((1, 1, 1, 1), float(quality)))[0]
+        .numpy()
+        .transpose(1, 2, 0)
+        * 255.0
+    )
+    # their steps are whole numbers: most pixels are theirs but for rounding, and all is much nearer
+    # to theirs than what was written
     assert np.median(np.abs(ours - theirs)) < 1.0
     assert np.abs(ours - theirs).mean() < 0.35 * np.abs(written - theirs).mean()
 
@@ -139,8 +176,12 @@ def test_a_crop_keeps_picture_and_mask_together() -> None:
 def test_a_sample_that_nothing_is_done_to_is_what_the_segmenter_would_see(closer: float) -> None:
     plain = Crop(width=(1.0, 1.0), shift=0.0, roll_rad=0.0, mirror=0.0)
     down, across = np.mgrid[0:72, 0:120]
-    layers = np.stack([across, down, 127 + 60 * np.sin(across / 9.0), 0 * down, 0 * down]).astype(np.uint8)
-    views = Views(torch.from_numpy(np.stack([layers, layers[:, ::-1].copy()])[None]), ("clean",), ("one",))
+    layers = np.stack([across, down, 127 + 60 * np.sin(across / 9.0), 0 * down, 0 * down]).astype(
+        np.uint8
+    )
+    views = Views(
+        torch.from_numpy(np.stack([layers, layers[:, ::-1].copy()])[None]), ("clean",), ("one",)
+    )
     seen, _ = training_report.looked_at(views, (80, 48))
     sample, _ = Samples(views, plain, {}, (80, 48), closer, 0, torch.device("cpu")).batch(0, 1)
     assert float((255.0 * sample[0] - seen[0, int(closer)].float()).abs().mean()) < 2.0
@@ -156,12 +197,24 @@ def test_a_crop_is_the_part_that_opencv_cuts_out() -> None:
     into = np.array([[2 / 80, 0, 1 / 80 - 1], [0, 2 / 48, 1 / 48 - 1], [0, 0, 1]])
     out = np.array([[120, 0, 119.5], [0, 72, 71.5], [0, 0, 1]])
     matrix = out @ np.vstack([window[0].numpy(), [0, 0, 1]]) @ into
-    theirs = cv2.warpAffine(view.astype(np.float32), matrix[:2], (80, 48), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP) / 255.0
-    assert matrix[0, 0] == pytest.approx(1.5 * np.cos(np.arctan2(matrix[1, 0], matrix[0, 0])), rel=1e-4)  # half of 240 px on 80
+    theirs = (
+        cv2.warpAffine(
+            view.astype(np.float32),
+            matrix[:2],
+            (80, 48),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        )
+        / 255.0
+    )
+    assert matrix[0, 0] == pytest.approx(
+        1.5 * np.cos(np.arctan2(matrix[1, 0], matrix[0, 0])), rel=1e-4
+    )  # half of 240 px on 80
     assert np.abs(seen - theirs).max() < 0.03
 
 
-@pytest.mark.parametrize("bad", [{"probability": 1.5}, {"sigma_px": (2.0, 1.0)}, {"sigma_px": (-1.0, 1.0)}])
+@pytest.mark.parametrize(
+    "bad", [{"probability": 1.5}, {"sigma_px": (2.0, 1.0)}, {"sigma_px": (-1.0, 1.0)}]
+)
 def test_ranges_that_make_no_sense_are_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="Blur"):
         replace(SHIPPED["blur"], **bad)

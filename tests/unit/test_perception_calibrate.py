@@ -32,7 +32,10 @@ EXACT = np.diag([0.0005, 0.0005, 0.001, 0.001, 0.001, 0.0005]) ** 2
 def drawn(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Returns camera, board and poses of link and board that fit exactly: `A Y = X B`."""
     chance = np.random.default_rng(seed)
-    x, y = (rigid.pose(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 1, 3)) for _ in range(2))
+    x, y = (
+        rigid.pose(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 1, 3))
+        for _ in range(2)
+    )
     a = rigid.pose(Rotation.random(count, rng=chance).as_matrix(), chance.normal(0, 1, (count, 3)))
     return x, y, a, rigid.inverse(x) @ a @ y
 
@@ -54,11 +57,17 @@ def test_links_move_as_their_motions_say(machine: Machine) -> None:
         there = arm.links(machine, q + step * np.eye(5)[joint]).base_from_link[0]
         motion = here.joints[0, joint] * step
         tip = here.tip_in_base_m[0]
-        np.testing.assert_allclose(there[:3, 3], tip + motion[:3] + np.cross(motion[3:], tip), atol=5e-6)
         np.testing.assert_allclose(
-            there[:3, :3], Rotation.from_rotvec(motion[3:]).as_matrix() @ here.base_from_link[0, :3, :3], atol=5e-6
+            there[:3, 3], tip + motion[:3] + np.cross(motion[3:], tip), atol=5e-6
         )
-    np.testing.assert_allclose(np.linalg.norm(here.base_from_link[0, :3, :3], axis=0), 1.0, atol=1e-6)
+        np.testing.assert_allclose(
+            there[:3, :3],
+            Rotation.from_rotvec(motion[3:]).as_matrix() @ here.base_from_link[0, :3, :3],
+            atol=5e-6,
+        )
+    np.testing.assert_allclose(
+        np.linalg.norm(here.base_from_link[0, :3, :3], axis=0), 1.0, atol=1e-6
+    )
 
 
 def off(found: np.ndarray) -> tuple[float, float]:
@@ -71,19 +80,31 @@ def opencv(views: Any) -> np.ndarray:
     """Returns the camera as OpenCV finds it (Park and Martin): the same equations, all poses alike."""
     back, seen = rigid.inverse(views.base_from_link), views.camera_from_board[:, 0]
     turn, shift = cv2.calibrateHandEye(
-        list(back[:, :3, :3]), list(back[:, :3, 3]), list(seen[:, :3, :3]), list(seen[:, :3, 3]), method=cv2.CALIB_HAND_EYE_PARK
+        list(back[:, :3, :3]),
+        list(back[:, :3, 3]),
+        list(seen[:, :3, :3]),
+        list(seen[:, :3, 3]),
+        method=cv2.CALIB_HAND_EYE_PARK,
     )
     return rigid.pose(turn, shift[:, 0])
 
 
-@pytest.mark.parametrize(("zero_deg", "count", "wrong"), [(0.1, 30, 0.0), (0.1, 30, 0.15), (0.5, 60, 0.15)])
-def test_a_poor_arm_and_wrong_sights_leave_millimetres(zero_deg: float, count: int, wrong: float, machine: Machine) -> None:
+@pytest.mark.parametrize(
+    ("zero_deg", "count", "wrong"), [(0.1, 30, 0.0), (0.1, 30, 0.15), (0.5, 60, 0.15)]
+)
+def test_a_poor_arm_and_wrong_sights_leave_millimetres(
+    zero_deg: float, count: int, wrong: float, machine: Machine
+) -> None:
     ours, theirs, surprise = [], [], []
     for seed in range(6):
-        poses = board.posed(machine, count, seed, np.radians(zero_deg), own_rad=0.001, wobble_m=0.0005)
+        poses = board.posed(
+            machine, count, seed, np.radians(zero_deg), own_rad=0.001, wobble_m=0.0005
+        )
         views, bad = board.views(machine, poses, EXACT, seed, wrong)
         found = hand_eye.solve(views)
-        assert found is not None and not (bad & found.used).any() and (~bad & ~found.used).sum() <= 1
+        assert (
+            found is not None and not (bad & found.used).any() and (~bad & ~found.used).sum() <= 1
+        )
         ours.append(off(found.guess.base_from_camera))
         if hasattr(cv2, "calibrateHandEye"):  # OpenCV 5.0.0 has forgotten it
             theirs.append(off(opencv(views)))
@@ -92,23 +113,36 @@ def test_a_poor_arm_and_wrong_sights_leave_millimetres(zero_deg: float, count: i
     mm, degrees = np.median(ours, axis=0)
     assert mm <= 3.7 and degrees <= 0.58 and np.max(ours, axis=0)[0] < 8.0
     assert not theirs or mm < (0.2 if wrong else 1.0) * np.median(theirs, axis=0)[0]
-    assert 2.0 < np.mean(surprise) < 12.0  # six degrees of freedom: 6, and 1.4 is the standard deviation of a mean of six
+    assert (
+        2.0 < np.mean(surprise) < 12.0
+    )  # six degrees of freedom: 6, and 1.4 is the standard deviation of a mean of six
 
 
 @settings(deadline=None, max_examples=5)
-@given(seed=st.integers(0, 10_000), count=st.integers(4, 30), wrong=st.floats(0.0, 1.0), size=st.floats(0.0, 0.3))
-def test_whatever_was_recorded_the_answer_is_a_place(seed: int, count: int, wrong: float, size: float) -> None:
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.integers(4, 30),
+    wrong=st.floats(0.0, 1.0),
+    size=st.floats(0.0, 0.3),
+)
+def test_whatever_was_recorded_the_answer_is_a_place(
+    seed: int, count: int, wrong: float, size: float
+) -> None:
     machine = option("machine", "brokk170")
     chance = np.random.default_rng(seed)
     poses = board.posed(machine, count, seed, 0.0087, 0.0017, 0.001)
-    poses = replace(poses, q=board.MIDDLE + size * (poses.q - board.MIDDLE))  # the arm hardly moves, or so it says
+    poses = replace(
+        poses, q=board.MIDDLE + size * (poses.q - board.MIDDLE)
+    )  # the arm hardly moves, or so it says
     views, _ = board.views(machine, poses, EXACT * 10 ** chance.uniform(-2, 2), seed, wrong)
     found = hand_eye.solve(views)
     assert found is not None
     place = found.guess.base_from_camera
     assert np.isfinite(place).all() and np.isfinite(found.cov).all()
     spread = np.linalg.eigvalsh(found.cov)
-    assert spread[0] > -1e-12 * max(1.0, spread[-1])  # an arm that does not move leaves 1e12 square metres open: rounding
+    assert spread[0] > -1e-12 * max(
+        1.0, spread[-1]
+    )  # an arm that does not move leaves 1e12 square metres open: rounding
     np.testing.assert_allclose(place[:3, :3] @ place[:3, :3].T, np.eye(3), atol=1e-9)
     assert found.used.sum() >= min(hand_eye.FEWEST, count)
 
@@ -123,10 +157,14 @@ def test_of_two_poses_that_fit_the_corners_the_arm_chooses(machine: Machine) -> 
     mirrored = replace(views, camera_from_board=both, seen_cov=np.repeat(views.seen_cov, 2, 1))
     alone, found = hand_eye.solve(views), hand_eye.solve(mirrored)
     assert alone is not None and found is not None and found.used.all()
-    np.testing.assert_allclose(found.guess.base_from_camera, alone.guess.base_from_camera, atol=1e-4)
+    np.testing.assert_allclose(
+        found.guess.base_from_camera, alone.guess.base_from_camera, atol=1e-4
+    )
 
 
-def swing(machine: Machine, offset_s: float, moving: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def swing(
+    machine: Machine, offset_s: float, moving: bool = True
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Returns times and turns of frames, times and positions of a recording in which the arm starts and stops."""
     t_s = np.arange(0.0, 20.0, 0.05)
     phase = np.clip(np.sin(0.9 * t_s) * 1.6, -1, 1)  # goes, rests at the ends
@@ -137,44 +175,76 @@ def swing(machine: Machine, offset_s: float, moving: bool = True) -> tuple[np.nd
 
 
 @pytest.mark.parametrize("offset_s", [-0.31, 0.0, 0.08, 0.64])
-def test_the_offset_of_the_clocks_is_found_to_a_few_milliseconds(offset_s: float, machine: Machine) -> None:
+def test_the_offset_of_the_clocks_is_found_to_a_few_milliseconds(
+    offset_s: float, machine: Machine
+) -> None:
     frame_s, turns, t_s, q = swing(machine, offset_s)
     chance = np.random.default_rng(0)
-    elsewhere = Rotation.from_rotvec([0.4, 1.0, -0.3]).as_matrix()  # nobody knows how the camera and the board are turned
-    turns = elsewhere @ turns @ Rotation.from_rotvec(0.002 * chance.standard_normal((len(turns), 3))).as_matrix()
-    found = clock.offset(frame_s, turns, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0, 0.4)
+    elsewhere = Rotation.from_rotvec(
+        [0.4, 1.0, -0.3]
+    ).as_matrix()  # nobody knows how the camera and the board are turned
+    turns = (
+        elsewhere
+        @ turns
+        @ Rotation.from_rotvec(0.002 * chance.standard_normal((len(turns), 3))).as_matrix()
+    )
+    found = clock.offset(
+        frame_s, turns, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0, 0.4
+    )
     assert found is not None and found.correlation > 0.6
     assert found.offset_s == pytest.approx(offset_s, abs=0.02)
 
 
 def test_an_arm_that_rests_tells_nothing_about_clocks(machine: Machine) -> None:
     frame_s, turns, t_s, q = swing(machine, 0.1, moving=False)
-    noisy = turns @ Rotation.from_rotvec(0.002 * np.random.default_rng(0).standard_normal((len(turns), 3))).as_matrix()
-    found = clock.offset(frame_s, noisy, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0, 0.4)
+    noisy = (
+        turns
+        @ Rotation.from_rotvec(
+            0.002 * np.random.default_rng(0).standard_normal((len(turns), 3))
+        ).as_matrix()
+    )
+    found = clock.offset(
+        frame_s, noisy, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0, 0.4
+    )
     assert found is None or found.correlation < 0.4
-    assert clock.offset(frame_s[:9], turns[:9], t_s, turns[:1].repeat(len(t_s), 0), 1.0, 0.4) is None
+    assert (
+        clock.offset(frame_s[:9], turns[:9], t_s, turns[:1].repeat(len(t_s), 0), 1.0, 0.4) is None
+    )
 
 
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 10_000), count=st.integers(6, 20), wrong=st.integers(0, 2))
-def test_touched_points_give_the_camera_though_some_are_wrong(seed: int, count: int, wrong: int) -> None:
+def test_touched_points_give_the_camera_though_some_are_wrong(
+    seed: int, count: int, wrong: int
+) -> None:
     chance = np.random.default_rng(seed)
     there = np.array([2.3, 0.0, 0.5]) + chance.uniform(-1, 1, (count, 3)) * [0.6, 0.7, 0.4]
-    there[:4] = np.array([[1.8, -0.7, 0.2], [2.8, 0.7, 0.2], [1.9, 0.6, 0.9], [2.8, -0.6, 0.8]])  # well apart
-    seen = (there - board.CAMERA[:3, 3]) @ board.CAMERA[:3, :3] + 0.002 * chance.standard_normal((count, 3))
+    there[:4] = np.array(
+        [[1.8, -0.7, 0.2], [2.8, 0.7, 0.2], [1.9, 0.6, 0.9], [2.8, -0.6, 0.8]]
+    )  # well apart
+    seen = (there - board.CAMERA[:3, 3]) @ board.CAMERA[:3, :3] + 0.002 * chance.standard_normal(
+        (count, 3)
+    )
     there = there + 0.002 * chance.standard_normal(there.shape)
     there[-wrong or count :] += chance.normal(0, 0.2, (wrong, 3)) + 0.1
-    found = touched.fit(touched.Points(seen, there, np.broadcast_to(0.002**2 * np.eye(3), (count, 3, 3))), 0.002)
+    found = touched.fit(
+        touched.Points(seen, there, np.broadcast_to(0.002**2 * np.eye(3), (count, 3, 3))), 0.002
+    )
     assert found is not None
     if count - wrong >= 6:
         assert not found.used[count - wrong :].any()
         away = rigid.apart(found.base_from_camera, board.CAMERA)
-        assert away @ np.linalg.solve(found.cov, away) < 45.0  # one in ten million of six degrees of freedom, were they normal
-    np.testing.assert_allclose(found.base_from_camera[:3, :3] @ found.base_from_camera[:3, :3].T, np.eye(3), atol=1e-9)
+        assert (
+            away @ np.linalg.solve(found.cov, away) < 45.0
+        )  # one in ten million of six degrees of freedom, were they normal
+    np.testing.assert_allclose(
+        found.base_from_camera[:3, :3] @ found.base_from_camera[:3, :3].T, np.eye(3), atol=1e-9
+    )
 
 
 def test_uncertainty_at_a_distance_is_that_worked_by_hand() -> None:
-    # 3 mm in each direction, and turns of 1 mrad about x and y that move a point 2 m ahead by 2 mm each, about z by nothing
+    # 3 mm in each direction, and turns of 1 mrad about x and y that move a point 2 m ahead by 2 mm
+    # each, about z by nothing
     cov = np.diag([0.003**2] * 3 + [0.001**2] * 3)
     assert point_std_m(cov, 2.0) == pytest.approx(np.sqrt(3 * 0.003**2 + 2 * 0.002**2))
 
@@ -193,7 +263,9 @@ def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_command_finds_the_camera_and_sources_take_its_file(brokk: Callable[..., Any], footage: Path) -> None:
+def test_the_command_finds_the_camera_and_sources_take_its_file(
+    brokk: Callable[..., Any], footage: Path
+) -> None:
     command = ("mode=calibrate", f"calibration.source.folder={footage}")
     done = brokk(*command, f"calibration.joints={footage / 'joints.yaml'}", "session.out=run")
     assert done.code == 0, done.err
@@ -217,16 +289,30 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(brokk: Callable[
     assert frame.camera_cov is not None
     np.testing.assert_allclose(frame.camera_cov, np.array(told["covariance"]), atol=1e-12)
     Path("other.yaml").write_text("schema: 7\n")
-    lost = brokk("mode=perceive", f"perceive.input={footage}", "source.base_from_camera=other.yaml", "session.out=look")
+    lost = brokk(
+        "mode=perceive",
+        f"perceive.input={footage}",
+        "source.base_from_camera=other.yaml",
+        "session.out=look",
+    )
     assert lost.code == 2 and "no calibration of schema 1" in lost.err
 
 
-def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(brokk: Callable[..., Any], footage: Path) -> None:
-    same = {f"{number:03d}": (board.MIDDLE + 0.02 * number * np.eye(5)[4]).tolist() for number in range(20)}
+def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(
+    brokk: Callable[..., Any], footage: Path
+) -> None:
+    same = {
+        f"{number:03d}": (board.MIDDLE + 0.02 * number * np.eye(5)[4]).tolist()
+        for number in range(20)
+    }
     Path("same.yaml").write_text(yaml.safe_dump(same))
     command = ("mode=calibrate", f"calibration.source.folder={footage}", "session.out=run")
     done = brokk(*command, "calibration.joints=same.yaml")
-    assert done.code == 2 and "do not tell where the camera is" in done.err and "q1 stays within" in done.err
+    assert (
+        done.code == 2
+        and "do not tell where the camera is" in done.err
+        and "q1 stays within" in done.err
+    )
     assert not Path("run/calibration.yaml").exists()
     Path("few").mkdir()
     for name in ("camera.yaml", "000.color.png"):
@@ -239,13 +325,23 @@ def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(brok
 
 
 @pytest.mark.slow
-def test_a_board_filmed_while_the_arm_moves_is_enough(brokk: Callable[..., Any], machine: Machine, tmp_path: Path) -> None:
+def test_a_board_filmed_while_the_arm_moves_is_enough(
+    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
+) -> None:
     poses = board.posed(machine, 12, 1)
     t_s, knots = np.arange(0.0, 14.0, 0.05), np.arange(12.0)
-    eased = np.floor(t_s) + np.clip((t_s % 1.0 - 0.2) / 0.6, 0.0, 1.0)  # of each second, 0.6 s on the way to the next pose
+    eased = np.floor(t_s) + np.clip(
+        (t_s % 1.0 - 0.2) / 0.6, 0.0, 1.0
+    )  # of each second, 0.6 s on the way to the next pose
     q = np.stack([np.interp(eased, knots, column) for column in poses.q.T], 1)
     recording = Recording(
-        machine=machine.name, joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=t_s, u=np.zeros_like(q), q=q
+        machine=machine.name,
+        joints=machine.joint_names,
+        units=("rad",) * 5,
+        rate_hz=20.0,
+        t_s=t_s,
+        u=np.zeros_like(q),
+        q=q,
     )
     record.write(recording, tmp_path / "run.parquet")
     frame_s, late_s, chance = np.arange(0.5, 11.5, 0.3), 0.12, np.random.default_rng(0)
@@ -267,7 +363,9 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(brokk: Callable[..., Any],
     assert mm < 4.0 and degrees < 0.1
 
 
-def test_the_command_takes_touched_points(brokk: Callable[..., Any], machine: Machine, tmp_path: Path) -> None:
+def test_the_command_takes_touched_points(
+    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
+) -> None:
     chance, points = np.random.default_rng(4), []
     height, width = 360, 640
     matrix = board.MATRIX / 2
@@ -282,18 +380,29 @@ def test_the_command_takes_touched_points(brokk: Callable[..., Any], machine: Ma
             if seen[2] > 0.8 and 20 < pixel[0] < width - 20 and 20 < pixel[1] < height - 20:
                 break
         # a wall through the touched point, square to the sight of the camera's axis
-        depth = np.full((height, width), seen[2], np.float32) + 0.002 * chance.standard_normal((height, width)).astype(np.float32)
-        dataset.write_frame(tmp_path / f"{number:02d}", np.zeros((height, width, 3), np.uint8), depth)
+        depth = np.full((height, width), seen[2], np.float32) + 0.002 * chance.standard_normal(
+            (height, width)
+        ).astype(np.float32)
+        dataset.write_frame(
+            tmp_path / f"{number:02d}", np.zeros((height, width, 3), np.uint8), depth
+        )
         points.append({"frame": f"{number:02d}", "pixel": pixel.tolist(), "q": q.tolist()})
     points[3]["pixel"] = [50, 50]
     (tmp_path / "points.yaml").write_text(yaml.safe_dump({"points": points}))
-    command = ("mode=calibrate", "calibration=touched", f"calibration.source.folder={tmp_path}", "calibration.click_px=0.5")
+    command = (
+        "mode=calibrate",
+        "calibration=touched",
+        f"calibration.source.folder={tmp_path}",
+        "calibration.click_px=0.5",
+    )
     done = brokk(*command, f"calibration.points={tmp_path / 'points.yaml'}", "session.out=run")
     assert done.code == 0, done.err
     told = yaml.safe_load(Path("run/calibration.yaml").read_text())
     mm, degrees = off(np.array(told["T_base_cam"]))
     assert mm < 6.0 and degrees < 0.3 and told["num_left_out"] == 1
-    line = [{"camera_m": [0.1 * k, 0.2 * k, 2.0], "base_m": [2.0, 0.1 * k, 0.2 * k]} for k in range(6)]
+    line = [
+        {"camera_m": [0.1 * k, 0.2 * k, 2.0], "base_m": [2.0, 0.1 * k, 0.2 * k]} for k in range(6)
+    ]
     (tmp_path / "line.yaml").write_text(yaml.safe_dump({"points": line}))
     done = brokk(*command, f"calibration.points={tmp_path / 'line.yaml'}", "session.out=other")
     assert done.code == 2 and "of a line" in done.err
@@ -303,22 +412,39 @@ def test_the_command_takes_touched_points(brokk: Callable[..., Any], machine: Ma
 
 
 def log_of(path: Path, t_s: np.ndarray, poses: np.ndarray, named: bool = True) -> str:
-    table = np.concatenate([t_s[:, None], poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()], 1)
-    np.savetxt(path, table, delimiter=",", header="t_s,x_m,y_m,z_m,qx,qy,qz,qw" if named else "", comments="")
+    table = np.concatenate(
+        [t_s[:, None], poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()], 1
+    )
+    np.savetxt(
+        path,
+        table,
+        delimiter=",",
+        header="t_s,x_m,y_m,z_m,qx,qy,qz,qw" if named else "",
+        comments="",
+    )
     return str(path)
 
 
 @pytest.mark.parametrize("camera_on", ["base", "link"])
-def test_logs_of_poses_of_any_arm_are_enough(camera_on: str, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_logs_of_poses_of_any_arm_are_enough(
+    camera_on: str, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     chance = np.random.default_rng(1)
     t_s, eye_s, late_s = np.arange(0.0, 40.0, 0.02), np.arange(1.0, 38.0, 0.1), -0.23
     phase = np.outer(t_s, [0.5, 0.7, 0.9, 0.4, 0.6, 0.8])
     wave = 0.7 * np.sin(phase + chance.uniform(0, 6, 6)) + 0.2 * np.sin(2.3 * phase)
-    hand = rigid.pose(Rotation.from_rotvec(wave[:, 3:]).as_matrix(), [0.6, 0.0, 0.5] + 0.3 * wave[:, :3])
-    x, y = (rigid.pose(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 0.3, 3)) for _ in range(2))
+    hand = rigid.pose(
+        Rotation.from_rotvec(wave[:, 3:]).as_matrix(), [0.6, 0.0, 0.5] + 0.3 * wave[:, :3]
+    )
+    x, y = (
+        rigid.pose(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 0.3, 3))
+        for _ in range(2)
+    )
     there = hand[np.searchsorted(t_s, eye_s + late_s)]
     seen = rigid.inverse(x) @ (there if camera_on == "base" else rigid.inverse(there)) @ y
-    seen = np.array([rigid.moved(one, np.repeat([0.001, 0.003], 3) * chance.standard_normal(6)) for one in seen])
+    seen = np.array(
+        [rigid.moved(one, np.repeat([0.001, 0.003], 3) * chance.standard_normal(6)) for one in seen]
+    )
     for k in chance.permutation(len(seen))[:40]:
         seen[k] = rigid.moved(seen[k], chance.normal(0, 0.4, 6))
     arm_file = log_of(tmp_path / "arm.csv", t_s, rigid.inverse(hand))
@@ -332,10 +458,16 @@ def test_logs_of_poses_of_any_arm_are_enough(camera_on: str, brokk: Callable[...
     told = yaml.safe_load(Path("run/calibration.yaml").read_text())
     away = rigid.apart(np.array(told[f"T_{camera_on}_cam"]), x)
     assert np.linalg.norm(away[:3]) < 0.0037 and np.linalg.norm(away[3:]) < np.radians(0.58)
-    assert told["clock"]["trusted"] and told["clock"]["offset_s"] == pytest.approx(late_s, abs=0.015)
+    assert told["clock"]["trusted"] and told["clock"]["offset_s"] == pytest.approx(
+        late_s, abs=0.015
+    )
     assert 15 <= told["num_left_out"] <= 28  # of 200 of 371 poses, 40 of which are wrong
     Path("two.csv").write_text("1,0,0,0,0,0,0,1\n2,0,0,0,0,0,0,2\n")
     refused = brokk(
-        "mode=calibrate", "calibration=poses", "calibration.arm=two.csv", "calibration.camera=two.csv", "session.out=no"
+        "mode=calibrate",
+        "calibration=poses",
+        "calibration.arm=two.csv",
+        "calibration.camera=two.csv",
+        "session.out=no",
     )
     assert refused.code == 2 and "line 2: expected numbers and a unit quaternion" in refused.err

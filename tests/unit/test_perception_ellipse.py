@@ -36,7 +36,10 @@ def test_a_fit_returns_the_ellipse_that_opencv_returns() -> None:
     turn = np.linspace(0, 4, 40)
     c, s = np.cos(0.7), np.sin(0.7)
     points = np.column_stack(
-        [50 + 30 * c * np.cos(turn) - 12 * s * np.sin(turn), 80 + 30 * s * np.cos(turn) + 12 * c * np.sin(turn)]
+        [
+            50 + 30 * c * np.cos(turn) - 12 * s * np.sin(turn),
+            80 + 30 * s * np.cos(turn) + 12 * c * np.sin(turn),
+        ]
     )
     found = conic.fit(points[None], np.ones((1, 40)))[0]
     (x, y), axes, _ = cv2.fitEllipseDirect(points.astype(np.float32))
@@ -68,7 +71,8 @@ def test_one_of_the_two_circles_of_a_known_radius_is_the_true_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("condition", "recall"), [("clean", 0.98), ("dark", 0.98), ("haze", 0.98), ("noise_25", 0.9), ("blur", 0.95)]
+    ("condition", "recall"),
+    [("clean", 0.98), ("dark", 0.98), ("haze", 0.98), ("noise_25", 0.9), ("blur", 0.95)],
 )
 def test_patterns_are_found_in_any_light(condition: str, recall: float, detector) -> None:
     picture, truth = bench_patterns.pattern(np.random.default_rng(5), condition, 512, 384)
@@ -98,7 +102,9 @@ def test_shapes_like_parts_of_ellipses_are_none(kind: str, detector) -> None:
 
 def test_hearts_of_curves_are_none(detector) -> None:
     for seed in range(1000, 1008):
-        assert not detector.detect(bench_hidden.shapes(np.random.default_rng(seed), "hearts of curves"), None, None)
+        assert not detector.detect(
+            bench_hidden.shapes(np.random.default_rng(seed), "hearts of curves"), None, None
+        )
 
 
 @pytest.mark.parametrize("style", ["behind", "halves", "covered"])
@@ -107,7 +113,11 @@ def test_ellipses_of_which_half_is_seen_are_found(style: str, detector) -> None:
     for seed in range(3):
         picture, truth = bench_hidden.hidden(np.random.default_rng(seed), style)
         seen = detector.detect(picture, None, None)
-        hits, found, there = hits + bench_patterns.matches(seen, truth), found + len(seen), there + len(truth)
+        hits, found, there = (
+            hits + bench_patterns.matches(seen, truth),
+            found + len(seen),
+            there + len(truth),
+        )
     assert there >= 20 and 2 * hits / (found + there) > 0.78
 
 
@@ -123,7 +133,9 @@ def test_a_round_end_is_no_ellipse_and_as_much_of_a_covered_disc_is(detector) ->
         gray = np.full((240, 320), 210, np.uint8)
         cv2.line(gray, (90, 120), (230, 150), 40, 2 * size, cv2.LINE_AA)
         assert not detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
-        cv2.rectangle(gray, (90 + size // 8, 0), (319, 239), 120, -1)  # hides all but the end, which has sharp corners then
+        cv2.rectangle(
+            gray, (90 + size // 8, 0), (319, 239), 120, -1
+        )  # hides all but the end, which has sharp corners then
         found = detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
         assert len(found) == 1 and np.hypot(found[0].x - 90, found[0].y - 120) < 1.5
 
@@ -133,7 +145,9 @@ def test_what_hides_half_of_a_disc_may_be_as_dark_and_as_wide(detector) -> None:
     cv2.ellipse(gray, (100, 120), (30, 22), 0, 0, 360, 40, -1, cv2.LINE_AA)
     cv2.rectangle(gray, (100, 95), (136, 145), 70, -1)
     found = detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
-    assert [bench_patterns.overlap(row(one), np.array([100.0, 120, 30, 22, 0])) > 0.9 for one in found] == [True]
+    assert [
+        bench_patterns.overlap(row(one), np.array([100.0, 120, 30, 22, 0])) > 0.9 for one in found
+    ] == [True]
 
 
 def test_half_of_an_ellipse_tells_the_whole(detector) -> None:
@@ -141,7 +155,13 @@ def test_half_of_an_ellipse_tells_the_whole(detector) -> None:
     cv2.ellipse(picture, (120, 100), (60, 45), 20, 0, 360, 40, -1, cv2.LINE_AA)
     picture[:, 130:] = np.where(np.arange(110) // 4 % 2, 110, 150)
     found = detector.detect(cv2.GaussianBlur(picture, (0, 0), 0.8), None, SizePrior(45.0, 75.0))
-    assert max(bench_patterns.overlap(row(one), np.array([120, 100, 60, 45, np.radians(20)])) for one in found) > 0.9
+    assert (
+        max(
+            bench_patterns.overlap(row(one), np.array([120, 100, 60, 45, np.radians(20)]))
+            for one in found
+        )
+        > 0.9
+    )
 
 
 def test_centres_are_found_to_a_fraction_of_a_pixel(detector) -> None:
@@ -149,7 +169,9 @@ def test_centres_are_found_to_a_fraction_of_a_pixel(detector) -> None:
     cv2.ellipse(large, (403, 398), (200, 120), 30, 0, 360, 40, -1, cv2.LINE_AA)
     found = detector.detect(cv2.resize(large, (100, 100), interpolation=cv2.INTER_AREA), None, None)
     assert len(found) == 1
-    assert [found[0].x, found[0].y] == pytest.approx([(403 + 0.5) / 8 - 0.5, (398 + 0.5) / 8 - 0.5], abs=0.05)
+    assert [found[0].x, found[0].y] == pytest.approx(
+        [(403 + 0.5) / 8 - 0.5, (398 + 0.5) / 8 - 0.5], abs=0.05
+    )
     assert [found[0].a, found[0].b] == pytest.approx([25, 15], abs=0.3)
 
 
@@ -182,10 +204,18 @@ def test_edge_drawing_is_refused_where_opencv_has_none(monkeypatch: pytest.Monke
         option("perception/ellipse", "edge_drawing").build()
 
 
-def test_what_edge_drawing_proposes_is_judged_like_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = np.array([[[60.0, 50.0, 0.0, 20.0, 30.0, 0.0]], [[120.0, 50.0, 25.0, 0.0, 0.0, 0.0]]])  # the second is not there
-    drawing = SimpleNamespace(setParams=lambda _: None, detectEdges=lambda _: None, detectEllipses=lambda: found)
-    parts = SimpleNamespace(createEdgeDrawing=lambda: drawing, EdgeDrawing=SimpleNamespace(Params=SimpleNamespace))
+def test_what_edge_drawing_proposes_is_judged_like_the_rest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = np.array(
+        [[[60.0, 50.0, 0.0, 20.0, 30.0, 0.0]], [[120.0, 50.0, 25.0, 0.0, 0.0, 0.0]]]
+    )  # the second is not there
+    drawing = SimpleNamespace(
+        setParams=lambda _: None, detectEdges=lambda _: None, detectEllipses=lambda: found
+    )
+    parts = SimpleNamespace(
+        createEdgeDrawing=lambda: drawing, EdgeDrawing=SimpleNamespace(Params=SimpleNamespace)
+    )
     monkeypatch.setattr(cv2, "ximgproc", parts, raising=False)
     picture = np.full((100, 160), 190, np.uint8)
     cv2.ellipse(picture, (60, 50), (20, 30), 0, 0, 360, 40, -1, cv2.LINE_AA)

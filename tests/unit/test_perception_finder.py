@@ -69,11 +69,22 @@ def test_lens_distortion_is_taken_out() -> None:
 
 def test_figures_are_counted_as_by_hand() -> None:
     def circle(x: float, depth_m: float) -> dataset.Circle:
-        return dataset.Circle((x, 0, 2), (0, 0, -1), (x, 0, 2), (0, 0, -1), 0.05, depth_m, 0.0, True)
+        return dataset.Circle(
+            (x, 0, 2), (0, 0, -1), (x, 0, 2), (0, 0, -1), 0.05, depth_m, 0.0, True
+        )
 
     def pose(x: float, z: float = 2.0) -> HolePose:
         axis_cov = np.diag([1e-6, 1e-6, 0])
-        return HolePose(np.array([x, 0, z]), np.array([0, 0, -1.0]), 0.05, np.eye(3) * 1e-6, axis_cov, "camera", 1.0, 0.0)
+        return HolePose(
+            np.array([x, 0, z]),
+            np.array([0, 0, -1.0]),
+            0.05,
+            np.eye(3) * 1e-6,
+            axis_cov,
+            "camera",
+            1.0,
+            0.0,
+        )
 
     truth = dataset.Truth("test", {}, (circle(0.0, 0.3), circle(0.5, 0.3)), (circle(1.0, 0.0),), {})
     tally = Tally()
@@ -87,24 +98,32 @@ def test_figures_are_counted_as_by_hand() -> None:
 
 def test_a_frame_that_is_refused_counts_as_one_in_which_nothing_was_found() -> None:
     frame, masks, _ = drawn()
-    hole = dataset.Circle(tuple(CENTER), tuple(AXIS), tuple(CENTER), tuple(AXIS), 0.05, 0.3, 0.0, True)
+    hole = dataset.Circle(
+        tuple(CENTER), tuple(AXIS), tuple(CENTER), tuple(AXIS), 0.05, 0.3, 0.0, True
+    )
     truth = dataset.Truth("test", {}, (hole,), (), {})
     seen, _ = judge(finder_with(masks), frame, truth)
     assert seen.is_perfect and seen.row()["position_mm_median"] < 2.0
     blind = option("perception", "plane_conic").build()
-    missed, sighting = judge(blind, replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), truth)
+    missed, sighting = judge(
+        blind, replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), truth
+    )
     assert (missed.refused, missed.true, missed.found, missed.is_perfect) == (1, 1, 0, False)
     assert not sighting.holes
 
 
 def test_beside_an_arm_a_face_is_searched_where_nobody_knows_its_depth() -> None:
     depth_m = np.full((480, 640), 2.0, np.float32)
-    depth_m[:, 300:360], depth_m[:, 360:] = np.nan, 0.8  # what the arm hides from the right camera, and the arm
+    depth_m[:, 300:360], depth_m[:, 360:] = (
+        np.nan,
+        0.8,
+    )  # what the arm hides from the right camera, and the arm
     mask = np.zeros(depth_m.shape, bool)
     mask[100:400, 100:300] = True
     frame = replace(drawn()[0], depth_m=depth_m)
     (level,) = search.levels(frame, mask, 0.05, 0.25, 8.0)
-    # a hole has 13 px there, 17 at most: the whole strip is searched, the arm no farther than a rim reaches, the ground likewise
+    # a hole has 13 px there, 17 at most: the whole strip is searched, the arm no farther than a rim
+    # reaches, the ground likewise
     seen = np.repeat(np.repeat(level.region > 0, search.STEP, 0), search.STEP, 1)
     assert seen[110:390, 300:360].all() and not seen[:, 390:].any() and not seen[:, :70].any()
 
@@ -116,7 +135,9 @@ class Drawn:
         self.ellipses = ellipses
         self.roi = np.empty((0, 0), bool)
 
-    def detect(self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None) -> list[Ellipse]:
+    def detect(
+        self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None
+    ) -> list[Ellipse]:
         """Returns them, and keeps where it was to look."""
         self.roi = self.roi if roi is None else roi
         return self.ellipses
@@ -125,8 +146,15 @@ class Drawn:
 def test_an_ellipse_that_is_too_large_where_it_lies_is_none() -> None:
     depth_m = np.full((480, 640), 2.0, np.float32)
     depth_m[:, 320:] = 3.2  # two faces: holes of 26 and 16 px
-    frame = replace(drawn()[0], depth_m=depth_m, camera_matrix=np.array([[1056.0, 0, 319.5], [0, 1056.0, 239.5], [0, 0, 1]]))
-    seen = [Ellipse(x, 240.0, 25.0, 20.0, 0.0, rms_px=0.1, coverage=1.0, score=0.8) for x in (150.0, 500.0)]
+    frame = replace(
+        drawn()[0],
+        depth_m=depth_m,
+        camera_matrix=np.array([[1056.0, 0, 319.5], [0, 1056.0, 239.5], [0, 0, 1]]),
+    )
+    seen = [
+        Ellipse(x, 240.0, 25.0, 20.0, 0.0, rms_px=0.1, coverage=1.0, score=0.8)
+        for x in (150.0, 500.0)
+    ]
     found = [
         one
         for level in search.levels(frame, np.ones(depth_m.shape, bool), 0.05, 0.35, 10.0)
@@ -140,12 +168,16 @@ def test_the_rim_of_a_mouth_that_something_of_unknown_depth_cuts_is_looked_at() 
     depth_m = np.full((480, 640), 1.0, np.float32)
     mouth = np.hypot(columns - 320, rows - 250) < 53
     depth_m[mouth] = 1.3
-    depth_m[rows > 260] = np.nan  # beside the mouth's lower half nothing is in reach of it but its own depth
+    depth_m[rows > 260] = (
+        np.nan
+    )  # beside the mouth's lower half nothing is in reach of it but its own depth
     mask = (columns > 120) & (columns < 520) & (rows > 80) & (rows <= 260)
     matrix = np.array([[1056.0, 0.0, 320.0], [0.0, 1056.0, 240.0], [0.0, 0.0, 1.0]])
     frame = replace(drawn()[0], depth_m=depth_m, camera_matrix=matrix)
     found = search.levels(frame, mask, 0.05, 0.35, 6.5)
-    assert found and not any(level.nearest_m is None or level.nearest_m.any() for level in found)  # nothing stands before the face
+    assert found and not any(
+        level.nearest_m is None or level.nearest_m.any() for level in found
+    )  # nothing stands before the face
 
 
 def test_the_edge_of_what_stands_before_a_face_is_no_rim_and_beside_it_one_looks_closer() -> None:
@@ -165,7 +197,9 @@ def test_the_edge_of_what_stands_before_a_face_is_no_rim_and_beside_it_one_looks
         where = np.zeros(mask.shape, bool)
         top, left = (np.flatnonzero(level.region.any(1 - k))[0] * search.STEP for k in (0, 1))
         part = np.kron(detector.roi, np.ones((level.shrink, level.shrink))) > 0
-        where[top : top + part.shape[0], left : left + part.shape[1]] = part[: 480 - top, : 640 - left]
+        where[top : top + part.shape[0], left : left + part.shape[1]] = part[
+            : 480 - top, : 640 - left
+        ]
         return level.shrink, where
 
     plain, everywhere = looked(1 / inverse)

@@ -31,8 +31,12 @@ def footage(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[cuboid
     folder = tmp_path_factory.mktemp("footage")
     views, poses = [], {}
     for number, eye in enumerate(EYES_M):
-        view = cuboid.seen(cuboid.looking(eye, (0.1, 0.0, 0.3)), SIZE_PX, 0.003, BALL_M, seed=number)
-        dataset.write_frame(folder / "frames" / f"{number:02d}", view.frame.color, view.frame.depth_m)
+        view = cuboid.seen(
+            cuboid.looking(eye, (0.1, 0.0, 0.3)), SIZE_PX, 0.003, BALL_M, seed=number
+        )
+        dataset.write_frame(
+            folder / "frames" / f"{number:02d}", view.frame.color, view.frame.depth_m
+        )
         poses[f"{number:02d}"] = view.world_from_camera.tolist()
         views.append(view)
     dataset.write_camera(folder / "frames", views[0].frame.camera_matrix, None, None)
@@ -47,7 +51,9 @@ def clicked(view: cuboid.View, points_m: np.ndarray, miss_px: float) -> list[lis
     return (pixels + np.random.default_rng(3).choice([-miss_px, miss_px], pixels.shape)).tolist()
 
 
-def labelled(brokk: Callable[..., Any], folder: Path, placing: dict[str, Any], *overrides: str) -> tuple[Any, Path]:
+def labelled(
+    brokk: Callable[..., Any], folder: Path, placing: dict[str, Any], *overrides: str
+) -> tuple[Any, Path]:
     out = folder / f"out{len(list(folder.glob('out*')))}"
     (folder / "placing.yaml").write_text(yaml.safe_dump(placing))
     done = brokk(
@@ -66,7 +72,12 @@ def test_labels_from_three_sloppy_clicks_are_those_of_the_renderer(
         "frame": "01",
         "corners_px": clicked(views[1], CORNERS_M, 2.5),
         "thickness_m": 1.2,
-        "mouths": [{"center_px": clicked(views[1], cuboid.HOLE_M[None], 2.0)[0], "radius_m": cuboid.RADIUS_M}],
+        "mouths": [
+            {
+                "center_px": clicked(views[1], cuboid.HOLE_M[None], 2.0)[0],
+                "radius_m": cuboid.RADIUS_M,
+            }
+        ],
     }
     done, out = labelled(brokk, folder, placing)
     assert done.code == 0, done.err
@@ -94,13 +105,19 @@ def test_a_block_in_the_wrong_place_is_left_out_and_said(
 
 
 def test_a_placing_that_says_too_little_shows_how_it_should_look(tmp_path: Path) -> None:
-    for told in ({}, {"corners_px": [[1, 2], [3, 4], [5, 6]], "thickness_m": 1.0}, {"corners_m": [[1, 2]], "thickness_m": 1}):
+    for told in (
+        {},
+        {"corners_px": [[1, 2], [3, 4], [5, 6]], "thickness_m": 1.0},
+        {"corners_m": [[1, 2]], "thickness_m": 1},
+    ):
         (tmp_path / "placing.yaml").write_text(yaml.safe_dump(told))
         with pytest.raises(ConfigError, match="expected YAML such as"):
             label_placing.read(tmp_path / "placing.yaml")
 
 
-def test_rays_meet_a_cuboid_where_a_second_renderer_says(footage: tuple[Path, list[cuboid.View]]) -> None:
+def test_rays_meet_a_cuboid_where_a_second_renderer_says(
+    footage: tuple[Path, list[cuboid.View]],
+) -> None:
     view = cuboid.seen(cuboid.looking(EYES_M[0], (0.1, 0.0, 0.3)), SIZE_PX)
     placing = label_placing.Placing(None, CORNERS_M, 1.2, ((cuboid.HOLE_M, cuboid.RADIUS_M),))
     block = label_placing.placed(placing, view.frame, view.world_from_camera)
@@ -119,13 +136,23 @@ def test_a_board_tells_where_the_camera_was(name: str) -> None:
     pose = spec.build().locate(view)
     assert pose.error_px < 0.6
     assert view.base_from_camera is not None
-    np.testing.assert_allclose(pose.world_from_camera[:3, 3], view.base_from_camera[:3, 3], atol=0.01)
-    np.testing.assert_allclose(pose.world_from_camera[:3, :3], view.base_from_camera[:3, :3], atol=0.01)
+    np.testing.assert_allclose(
+        pose.world_from_camera[:3, 3], view.base_from_camera[:3, 3], atol=0.01
+    )
+    np.testing.assert_allclose(
+        pose.world_from_camera[:3, :3], view.base_from_camera[:3, :3], atol=0.01
+    )
 
 
 def test_a_frame_without_board_is_refused() -> None:
     gray = np.full((200, 300, 3), 128, np.uint8)
-    frame = Frame(color=gray, depth_m=gray[..., 0].astype(np.float32), camera_matrix=np.eye(3), base_from_camera=None, t_s=0.0)
+    frame = Frame(
+        color=gray,
+        depth_m=gray[..., 0].astype(np.float32),
+        camera_matrix=np.eye(3),
+        base_from_camera=None,
+        t_s=0.0,
+    )
     with pytest.raises(FrameError, match="0 corners of the board are seen"):
         option("perception/camera_pose", "charuco").build().locate(frame)
     with pytest.raises(FrameError, match="no pose of the camera"):
@@ -136,10 +163,14 @@ def board_view(spec: Charuco | TagGrid) -> Frame:
     """Returns a picture of a board as a pinhole sees it; `base_from_camera` is its pose in the board's frame."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     if isinstance(spec, Charuco):
-        board: Any = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_m, spec.marker_m, dictionary)
+        board: Any = cv2.aruco.CharucoBoard(
+            (spec.columns, spec.rows), spec.square_m, spec.marker_m, dictionary
+        )
         extent = np.array([spec.columns, spec.rows]) * spec.square_m
     else:
-        board = cv2.aruco.GridBoard((spec.columns, spec.rows), spec.marker_m, spec.gap_m, dictionary)
+        board = cv2.aruco.GridBoard(
+            (spec.columns, spec.rows), spec.marker_m, spec.gap_m, dictionary
+        )
         extent = np.array([spec.columns, spec.rows]) * (spec.marker_m + spec.gap_m) - spec.gap_m
     drawn = board.generateImage((np.rint(extent * 1000).astype(int)).tolist(), marginSize=0)
     eye, at = np.array([0.9, -0.6, -1.1]), np.array([*(extent / 2), 0.0])
@@ -149,9 +180,17 @@ def board_view(spec: Charuco | TagGrid) -> Frame:
     matrix = np.array([[700.0, 0.0, 479.5], [0.0, 700.0, 269.5], [0.0, 0.0, 1.0]])
     # the board's pixels, 1 mm each, to the picture: a homography, pixel centres half a pixel in
     metres = np.array([[1e-3, 0.0, 0.5e-3], [0.0, 1e-3, 0.5e-3], [0.0, 0.0, 1.0]])
-    flat = matrix @ np.column_stack([rotation.T[:, 0], rotation.T[:, 1], -rotation.T @ eye]) @ metres
+    flat = (
+        matrix @ np.column_stack([rotation.T[:, 0], rotation.T[:, 1], -rotation.T @ eye]) @ metres
+    )
     picture = cv2.warpPerspective(drawn, flat, (960, 540), flags=cv2.INTER_AREA, borderValue=200)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, eye
     color = np.repeat(picture[..., None], 3, 2)
-    return Frame(color=color, depth_m=np.ones((540, 960), np.float32), camera_matrix=matrix, base_from_camera=pose, t_s=0.0)
+    return Frame(
+        color=color,
+        depth_m=np.ones((540, 960), np.float32),
+        camera_matrix=matrix,
+        base_from_camera=pose,
+        t_s=0.0,
+    )

@@ -20,7 +20,9 @@ def folder(tmp_path: Path) -> Path:
     place.mkdir()
     dataset.write_camera(place, K, np.eye(4), None)
     frame, masks, _ = drawn()
-    label = dataset.Label(masks.block > 0.5, np.zeros(masks.block.shape, bool), np.zeros(masks.block.shape, bool))
+    label = dataset.Label(
+        masks.block > 0.5, np.zeros(masks.block.shape, bool), np.zeros(masks.block.shape, bool)
+    )
     for number in range(3):
         dataset.write_frame(place / f"{number:05d}", frame.color, frame.depth_m, label=label)
     cut = (place / "00001.color.png").read_bytes()
@@ -41,7 +43,10 @@ def test_holes_overlays_and_refusals_are_written(folder: Path, brokk: Callable) 
     assert hole["center_m"] == pytest.approx(CENTER.tolist(), abs=1e-3)
     assert hole["frame"] == "base" and np.array(hole["cov_m2"]).shape == (3, 3)
     assert frames[2]["target"]["num_frames"] == 2
-    assert cv2.imread("out/overlays/00000.png") is not None and not Path("out/overlays/00001.png").exists()
+    assert (
+        cv2.imread("out/overlays/00000.png") is not None
+        and not Path("out/overlays/00001.png").exists()
+    )
     assert "1 hole" in Path("out/explain.txt").read_text()
 
 
@@ -51,9 +56,13 @@ def test_ellipses_of_any_pictures_need_no_depth(tmp_path: Path, brokk: Callable)
     (tmp_path / "photos").mkdir()
     cv2.imwrite(str(tmp_path / "photos" / "grey.pgm"), picture)
     (tmp_path / "photos" / "empty.jpg").write_bytes(b"")
-    done = brokk("mode=perceive", "perceive.input=photos", "perceive.until=ellipses", "session.out=out")
+    done = brokk(
+        "mode=perceive", "perceive.input=photos", "perceive.until=ellipses", "session.out=out"
+    )
     assert done.code == 0, done.err
-    frames = {frame["name"]: frame for frame in json.loads(Path("out/holes.json").read_text())["frames"]}
+    frames = {
+        frame["name"]: frame for frame in json.loads(Path("out/holes.json").read_text())["frames"]
+    }
     found = frames["grey"]["ellipses"]
     assert len(found) == 1
     assert [found[0][key] for key in "xyab"] == pytest.approx([80, 60, 30, 20], abs=0.7)
@@ -62,7 +71,9 @@ def test_ellipses_of_any_pictures_need_no_depth(tmp_path: Path, brokk: Callable)
 
 def test_a_folder_of_nothing_is_refused(tmp_path: Path, brokk: Callable) -> None:
     (tmp_path / "photos").mkdir()
-    done = brokk("mode=perceive", "perceive.input=photos", "perceive.until=ellipses", "session.out=out")
+    done = brokk(
+        "mode=perceive", "perceive.input=photos", "perceive.until=ellipses", "session.out=out"
+    )
     assert done.code != 0 and "no pictures" in done.err + done.out
     assert not Path("out").exists()
 

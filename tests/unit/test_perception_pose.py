@@ -24,7 +24,9 @@ def estimator():
 def test_a_hole_is_where_it_was_drawn(estimator) -> None:
     pose = estimator.estimate(*drawn())
     assert isinstance(pose, HolePose)
-    assert pose.center_m == pytest.approx(CENTER, abs=8e-4)  # 0.3 px: the lit wall beyond the far rim blurs into it
+    assert pose.center_m == pytest.approx(
+        CENTER, abs=8e-4
+    )  # 0.3 px: the lit wall beyond the far rim blurs into it
     assert pose.axis == pytest.approx(AXIS, abs=1e-3)
     assert pose.radius_m == pytest.approx(0.05, abs=6e-4)
 
@@ -34,21 +36,28 @@ def test_a_third_of_a_rim_that_is_hidden_is_not_missed(estimator) -> None:
     color, depth_m = frame.color.copy(), frame.depth_m.copy()
     edge = int(ellipse.x + 0.35 * ellipse.a)
     color[:, edge:], depth_m[:, edge:] = 210, 0.5
-    hidden = replace(ellipse, x=ellipse.x - 1.5, a=ellipse.a - 1.5)  # an ellipse that takes the arm's edge for the rim
+    hidden = replace(
+        ellipse, x=ellipse.x - 1.5, a=ellipse.a - 1.5
+    )  # an ellipse that takes the arm's edge for the rim
     pose = estimator.estimate(replace(frame, color=color, depth_m=depth_m), masks, hidden)
     assert isinstance(pose, HolePose)
     assert pose.center_m == pytest.approx(CENTER, abs=1.5e-3)
     assert float(pose.axis @ AXIS) > np.cos(np.radians(0.2))
 
 
-def both_views(m: np.ndarray, pull_px: float, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def both_views(
+    m: np.ndarray, pull_px: float, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns a plane's grain, of variance one before it is smoothed, as both cameras see it, `(480, 640)` each."""
     grain = cv2.GaussianBlur(generator.normal(0, 1, (480, 900)).astype(np.float32), (0, 0), 1.2)
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
-    # the right camera sees at column x what the left one has at u = x + pull (m . ray(u)), solved for u
+    # the right camera sees at column x what the left one has at u = x + pull (m . ray(u)), solved
+    # for u
     x = u - pull_px * (m[0] * (u - K[0, 2]) / K[0, 0] + m[1] * (v - K[1, 2]) / K[1, 1] + m[2])
     back = (u - x[:, :1]) / (1 - pull_px * m[0] / K[0, 0])
-    return grain[:, 200:840], cv2.remap(grain, (back + 200).astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC)
+    return grain[:, 200:840], cv2.remap(
+        grain, (back + 200).astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC
+    )
 
 
 def as_color(gray: np.ndarray) -> np.ndarray:
@@ -66,7 +75,9 @@ def test_in_noise_a_face_is_aligned_without_bias_and_as_surely_as_is_claimed() -
     for _ in range(16):
         views = both_views(m, pull_px, generator)
         # dust: grain of four grey levels, noise of six
-        color, partner = (as_color(120 + 16 * one + generator.normal(0, 6, one.shape)) for one in views)
+        color, partner = (
+            as_color(120 + 16 * one + generator.normal(0, 6, one.shape)) for one in views
+        )
         seen = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
         both = alignment.pair(seen, gray_of(seen), begin.m, row, begin.extent)
         assert both is not None
@@ -84,9 +95,14 @@ def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() ->
     m, row = AXIS / (AXIS @ CENTER), pose_row(ellipse)
     pull_px = K[0, 0] * 0.12
     left, right = both_views(m, pull_px, generator)
-    color, partner = as_color(120 + 60 * left), as_color(0.9 * np.clip(120 + 60 * right, 0, 255) + 8)
+    color, partner = (
+        as_color(120 + 60 * left),
+        as_color(0.9 * np.clip(120 + 60 * right, 0, 255) + 8),
+    )
     off = 0.1 / pull_px  # a tenth of a pixel
-    depth = (1.0 / (RAYS @ m + off + generator.normal(0, 0.3, (480, 640)) / pull_px)).astype(np.float32)
+    depth = (1.0 / (RAYS @ m + off + generator.normal(0, 0.3, (480, 640)) / pull_px)).astype(
+        np.float32
+    )
     frame = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
     allowed = masks.block > 0.5
     points = plane.support(depth, allowed, K, row, 0.05, 1.25, 2.6, 7.0, 8000, 24)
@@ -98,7 +114,9 @@ def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() ->
     shifted = replace(frame, right=np.roll(partner, 7, 0))
     other = alignment.pair(shifted, gray_of(frame), face.m, row, face.extent)
     assert other is not None
-    assert alignment.aligned(other, face, shifted, allowed, row, 1.25, 24, 1e-3) is None  # rows that belong to others
+    assert (
+        alignment.aligned(other, face, shifted, allowed, row, 1.25, 24, 1e-3) is None
+    )  # rows that belong to others
     ray = CENTER / CENTER[2]
     assert mended is not None
     assert (face.m - m) @ ray == pytest.approx(off, rel=0.2)
@@ -107,9 +125,16 @@ def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() ->
 
 
 @pytest.mark.parametrize(
-    ("hole", "reason"), [({"radius_m": 0.035}, "radius"), ({"radius_m": 0.07}, "radius"), ({"depth_m": 0.0}, "evidence of depth")]
+    ("hole", "reason"),
+    [
+        ({"radius_m": 0.035}, "radius"),
+        ({"radius_m": 0.07}, "radius"),
+        ({"depth_m": 0.0}, "evidence of depth"),
+    ],
 )
-def test_what_is_no_hole_of_this_kind_is_refused(hole: dict[str, float], reason: str, estimator) -> None:
+def test_what_is_no_hole_of_this_kind_is_refused(
+    hole: dict[str, float], reason: str, estimator
+) -> None:
     refused = estimator.estimate(*drawn(**hole))
     assert isinstance(refused, Rejection)
     assert refused.reason.startswith(reason)
@@ -117,13 +142,19 @@ def test_what_is_no_hole_of_this_kind_is_refused(hole: dict[str, float], reason:
 
 def test_an_ellipse_that_is_no_circle_on_the_face_is_refused(estimator) -> None:
     frame, masks, ellipse = drawn()
-    refused = estimator.estimate(frame, masks, replace(ellipse, a=ellipse.a * 1.25, b=ellipse.b / 1.25))
+    refused = estimator.estimate(
+        frame, masks, replace(ellipse, a=ellipse.a * 1.25, b=ellipse.b / 1.25)
+    )
     assert isinstance(refused, Rejection) and refused.reason == "axis ratio on the face"
 
 
-def test_in_dust_a_disc_may_be_a_hole_for_half_the_score_and_in_clear_air_a_pale_one_is_none(estimator) -> None:
+def test_in_dust_a_disc_may_be_a_hole_for_half_the_score_and_in_clear_air_a_pale_one_is_none(
+    estimator,
+) -> None:
     frame, masks, ellipse = drawn(depth_m=0.0)  # a flat dark disc
-    pale = (0.3 * frame.color.astype(float) + 0.7 * 150).astype(np.uint8)  # three quarters as bright as the face
+    pale = (0.3 * frame.color.astype(float) + 0.7 * 150).astype(
+        np.uint8
+    )  # three quarters as bright as the face
     dusty = estimator.estimate(replace(frame, color=pale), masks, ellipse)
     assert isinstance(dusty, HolePose) and dusty.score == pytest.approx(0.5 * ellipse.score)
     shaded = pale.copy()
@@ -132,9 +163,13 @@ def test_in_dust_a_disc_may_be_a_hole_for_half_the_score_and_in_clear_air_a_pale
     assert isinstance(stain, Rejection) and stain.reason == "brightness inside over outside"
 
 
-def test_in_dust_a_spot_no_darker_than_the_grain_is_a_hole_if_two_cameras_see_it_deep(estimator) -> None:
+def test_in_dust_a_spot_no_darker_than_the_grain_is_a_hole_if_two_cameras_see_it_deep(
+    estimator,
+) -> None:
     _, masks, ellipse = drawn()
-    faint = appearance.Interior(darkness=0.9, slope=0.0, deeper=0.2, unknown=0.4, around=0.9, contrast=2.0)
+    faint = appearance.Interior(
+        darkness=0.9, slope=0.0, deeper=0.2, unknown=0.4, around=0.9, contrast=2.0
+    )
     for inside, parallax, passes in (
         (faint, 1.0, True),
         (faint, float("nan"), False),  # depth by one camera's guess
@@ -142,13 +177,23 @@ def test_in_dust_a_spot_no_darker_than_the_grain_is_a_hole_if_two_cameras_see_it
         (replace(faint, deeper=0.0), 1.0, False),
         (replace(faint, deeper=0.0, contrast=3.0), 1.0, True),
     ):
-        assert (estimator._looks(inside, parallax, masks, pose_row(ellipse), ellipse, True) is None) == passes
+        assert (
+            estimator._looks(inside, parallax, masks, pose_row(ellipse), ellipse, True) is None
+        ) == passes
 
 
 @pytest.mark.parametrize("arm", [True, False])
-def test_an_arc_may_be_taken_for_a_smaller_rim_where_something_hides_the_rest(arm: bool, estimator) -> None:
+def test_an_arc_may_be_taken_for_a_smaller_rim_where_something_hides_the_rest(
+    arm: bool, estimator
+) -> None:
     frame, masks, ellipse = drawn()
-    smaller = replace(ellipse, x=ellipse.x - 0.24 * ellipse.a, a=0.75 * ellipse.a, b=0.75 * ellipse.b, coverage=0.65)
+    smaller = replace(
+        ellipse,
+        x=ellipse.x - 0.24 * ellipse.a,
+        a=0.75 * ellipse.a,
+        b=0.75 * ellipse.b,
+        coverage=0.65,
+    )
     if arm:
         color, depth_m = frame.color.copy(), frame.depth_m.copy()
         edge = int(ellipse.x + 0.4 * ellipse.a)
@@ -161,7 +206,9 @@ def test_an_arc_may_be_taken_for_a_smaller_rim_where_something_hides_the_rest(ar
 
 
 @pytest.mark.parametrize("arm", [True, False])
-def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(arm: bool, estimator) -> None:
+def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(
+    arm: bool, estimator
+) -> None:
     frame, masks, ellipse = drawn()
     m, row, pull_px = AXIS / (AXIS @ CENTER), pose_row(ellipse), K[0, 0] * 0.12
     left, right = (120 + 60 * one for one in both_views(m, pull_px, np.random.default_rng(5)))
@@ -172,16 +219,26 @@ def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(arm
     depth_m = (1.0 / (RAYS @ m)).astype(np.float32)
     if arm:  # from 5 px beside it on, 0.5 m away: 127 px of disparity where the face has 53
         edge = int(ellipse.x + ellipse.a + 5)
-        left[:, edge : edge + 90], right[:, edge - 127 : edge - 37], depth_m[:, edge : edge + 90] = 60, 60, 0.5
+        (
+            left[:, edge : edge + 90],
+            right[:, edge - 127 : edge - 37],
+            depth_m[:, edge : edge + 90],
+        ) = 60, 60, 0.5
         depth_m[:, edge - 74 : edge] = np.nan
-    frame = replace(frame, color=as_color(left), right=as_color(right), baseline_m=0.12, depth_m=depth_m)
+    frame = replace(
+        frame, color=as_color(left), right=as_color(right), baseline_m=0.12, depth_m=depth_m
+    )
     found = estimator.estimate(frame, masks, ellipse)
     if arm:
         assert isinstance(found, HolePose) and found.score == pytest.approx(0.5 * ellipse.score)
     else:
         assert isinstance(found, Rejection) and found.reason == "evidence of depth inside"
-        learned = estimator.estimate(frame, replace(masks, mouth=np.ones_like(masks.block)), ellipse)
-        assert isinstance(learned, Rejection) and learned.reason == found.reason, "no network overrules two cameras"
+        learned = estimator.estimate(
+            frame, replace(masks, mouth=np.ones_like(masks.block)), ellipse
+        )
+        assert isinstance(learned, Rejection) and learned.reason == found.reason, (
+            "no network overrules two cameras"
+        )
 
 
 def test_the_edge_of_a_shadow_across_the_face_is_no_grain() -> None:
@@ -190,7 +247,8 @@ def test_the_edge_of_a_shadow_across_the_face_is_no_grain() -> None:
     half = np.concatenate([even[:2000], even[2000:] - 40])
     # the darker part lies 30 above what is inside, five standard deviations of its grain
     assert appearance._contrast(half, 80.0) == pytest.approx(5.0, rel=0.25)
-    # even grain, as far: its darker half lies 0.67 standard deviations nearer, and varies half as much
+    # even grain, as far: its darker half lies 0.67 standard deviations nearer, and varies half as
+    # much
     assert appearance._contrast(even, 120.0) == pytest.approx((5.0 - 0.67) / 0.5, rel=0.25)
 
 
@@ -211,13 +269,21 @@ def test_a_rim_knows_its_centre_by_what_is_seen_of_it(seen_rad: float) -> None:
     edges = np.full((72, rim.PEAKS, 2), np.nan)
     on = np.abs(angles) <= seen_rad
     edges[on, 0] = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])[on]
-    found, cov, rms_px, coverage = rim._fitted(np.array([0.0, 0.0, 0.05]), edges, np.full(72, 0.002), 0.03, 0.06)
-    assert found is not None and rms_px == pytest.approx(0.0, abs=1e-6) and coverage == pytest.approx(on.mean())
+    found, cov, rms_px, coverage = rim._fitted(
+        np.array([0.0, 0.0, 0.05]), edges, np.full(72, 0.002), 0.03, 0.06
+    )
+    assert (
+        found is not None
+        and rms_px == pytest.approx(0.0, abs=1e-6)
+        and coverage == pytest.approx(on.mean())
+    )
     if on.all():
-        # a pixel is 2 mm long: 0.03 px are 60 um, in every direction; no other wave than the first moves the centre of a whole rim
+        # a pixel is 2 mm long: 0.03 px are 60 um, in every direction; no other wave than the first
+        # moves the centre of a whole rim
         assert cov == pytest.approx(np.eye(2) * (0.03 * 0.002) ** 2, abs=1e-12)
     else:
-        # towards the part that is hidden, radius and centre are told apart by what bends: much worse than across it
+        # towards the part that is hidden, radius and centre are told apart by what bends: much
+        # worse than across it
         assert cov[0, 0] > 2.5 * cov[1, 1] > 3.0 * (0.03 * 0.002) ** 2
 
 
@@ -225,13 +291,19 @@ def test_edges_beside_what_hides_the_rest_of_a_rim_do_not_draw_its_circle() -> N
     angles = np.linspace(-np.pi, np.pi, 144, endpoint=False)
     edges = np.full((144, rim.PEAKS, 2), np.nan)
     on = np.abs(angles) <= 0.75 * np.pi
-    inward_px = 0.5 * np.exp(-np.arange(144) / 2.0)  # as the blur across profiles draws them, most at the ends of the arc
+    inward_px = 0.5 * np.exp(
+        -np.arange(144) / 2.0
+    )  # as the blur across profiles draws them, most at the ends of the arc
     beside = np.minimum(np.arange(on.sum()), np.arange(on.sum())[::-1])
     radius = 0.05 - 0.002 * inward_px[beside]
     edges[on, 0] = radius[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])[on]
-    found, _, rms_px, coverage = rim._fitted(np.array([0.0, 0.0, 0.05]), edges, np.full(144, 0.002), 0.03, 0.06)
+    found, _, rms_px, coverage = rim._fitted(
+        np.array([0.0, 0.0, 0.05]), edges, np.full(144, 0.002), 0.03, 0.06
+    )
     assert found is not None and coverage == pytest.approx(on.mean())
-    assert np.hypot(*found[:2]) < 0.02 * 0.002 and rms_px < 0.02, "a fiftieth of a pixel; the end profiles are off by half of one"
+    assert np.hypot(*found[:2]) < 0.02 * 0.002 and rms_px < 0.02, (
+        "a fiftieth of a pixel; the end profiles are off by half of one"
+    )
 
 
 def test_the_mouth_channel_is_believed(estimator) -> None:
@@ -246,9 +318,17 @@ def test_without_depth_the_known_radius_tells_the_pose(estimator) -> None:
     turn[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # up is -y of the camera
     blind = replace(frame, depth_m=np.full_like(frame.depth_m, np.nan), base_from_camera=turn)
     pose = option("perception/pose", "mono_circle").build().estimate(blind, masks, ellipse)
-    refused = replace(option("perception/pose", "mono_circle"), normal_rad=0.1).build().estimate(blind, masks, ellipse)
+    refused = (
+        replace(option("perception/pose", "mono_circle"), normal_rad=0.1)
+        .build()
+        .estimate(blind, masks, ellipse)
+    )
     assert isinstance(refused, Rejection) and refused.reason.startswith("angle")
-    loose = replace(option("perception/pose", "mono_circle"), normal_rad=1.2).build().estimate(blind, masks, ellipse)
+    loose = (
+        replace(option("perception/pose", "mono_circle"), normal_rad=1.2)
+        .build()
+        .estimate(blind, masks, ellipse)
+    )
     assert isinstance(loose, HolePose) and isinstance(pose, (HolePose, Rejection))
     assert loose.center_m == pytest.approx(CENTER, abs=1e-3)
     no_place = estimator.estimate(replace(blind, base_from_camera=None), masks, ellipse)
@@ -262,7 +342,9 @@ def test_the_papers_estimate_looks_into_the_hole() -> None:
     assert pose.axis == pytest.approx(AXIS, abs=0.05)
 
 
-@pytest.mark.parametrize("rings", [(3.0,), (2.0, 3.0)])  # found with a reach of 4.7 standard deviations; grown with one of 3
+@pytest.mark.parametrize(
+    "rings", [(3.0,), (2.0, 3.0)]
+)  # found with a reach of 4.7 standard deviations; grown with one of 3
 def test_the_covariance_of_a_plane_is_that_of_its_repetitions(rings: tuple[float, ...]) -> None:
     generator = np.random.default_rng(1)
     rays = np.column_stack([generator.uniform(-0.1, 0.1, (2000, 2)), np.ones(2000)])
@@ -274,15 +356,23 @@ def test_the_covariance_of_a_plane_is_that_of_its_repetitions(rings: tuple[float
         found = plane.fit(support, rings, 1e-5, generator)
         assert found is not None
         fits.append(found)
-    spread, claimed = np.std([fit.m for fit in fits], axis=0), np.mean([np.sqrt(np.diag(fit.cov)) for fit in fits], axis=0)
+    spread, claimed = (
+        np.std([fit.m for fit in fits], axis=0),
+        np.mean([np.sqrt(np.diag(fit.cov)) for fit in fits], axis=0),
+    )
     assert claimed == pytest.approx(spread, rel=0.2)
 
 
 def test_what_few_cells_say_of_a_plane_is_not_taken_for_sure() -> None:
     generator = np.random.default_rng(7)
-    x, y = (some.ravel() for some in np.meshgrid(np.linspace(-0.1, 0.1, 40), np.linspace(-0.03, 0.03, 12)))
+    x, y = (
+        some.ravel()
+        for some in np.meshgrid(np.linspace(-0.1, 0.1, 40), np.linspace(-0.03, 0.03, 12))
+    )
     rays = np.column_stack([x, y, np.ones_like(x)])
-    cell = (np.clip((x + 0.1) / 0.2, 0, 0.99) * 5).astype(int) * 10 + (y > 0)  # ten cells, in each of which the error is the same
+    cell = (np.clip((x + 0.1) / 0.2, 0, 0.99) * 5).astype(int) * 10 + (
+        y > 0
+    )  # ten cells, in each of which the error is the same
     bread = np.linalg.inv(rays.T @ rays)
     fits, claims = [], []
     for _ in range(400):
@@ -303,17 +393,31 @@ def test_points_on_a_line_or_of_one_patch_alone_determine_no_plane() -> None:
         support = plane.Support(rays, rays @ m, np.full(400, 2.0), np.arange(400) // 20, 1.0)
         assert plane.fit(support, (2.6,), 2e-4, generator) is None
     rays = np.column_stack([generator.uniform(-0.1, 0.1, (400, 2)), np.ones(400)])
-    lonely = np.where(np.arange(400) < 240, rays @ m, rays @ m + generator.uniform(1.0, 9.0, 400))  # the rest agrees with nothing
+    lonely = np.where(
+        np.arange(400) < 240, rays @ m, rays @ m + generator.uniform(1.0, 9.0, 400)
+    )  # the rest agrees with nothing
     cell = np.maximum(np.arange(400) - 240, 0) // 10
-    assert plane.fit(plane.Support(rays, lonely, np.full(400, 2.0), cell, 1.0), (2.6,), 2e-4, generator) is None
+    assert (
+        plane.fit(
+            plane.Support(rays, lonely, np.full(400, 2.0), cell, 1.0), (2.6,), 2e-4, generator
+        )
+        is None
+    )
 
 
 def test_a_plane_ignores_another_face() -> None:
     generator = np.random.default_rng(2)
     rays = np.column_stack([generator.uniform(-0.3, 0.3, (4000, 2)), np.ones(4000)])
     m = np.array([0.0, 0.4, 0.7])
-    inverse = np.where(rays[:, 0] < 0.15, rays @ m, rays @ np.array([1.5, 0.4, 0.475])) + generator.normal(0, 0.002, 4000)
+    inverse = np.where(
+        rays[:, 0] < 0.15, rays @ m, rays @ np.array([1.5, 0.4, 0.475])
+    ) + generator.normal(0, 0.002, 4000)
     radii = 1.25 + 30 * np.linalg.norm(rays[:, :2], axis=1)
-    found = plane.fit(plane.Support(rays, inverse, radii, np.arange(4000) // 10, 1.0), (2.6, 4.0, 7.0, 12.0), 2e-4, generator)
+    found = plane.fit(
+        plane.Support(rays, inverse, radii, np.arange(4000) // 10, 1.0),
+        (2.6, 4.0, 7.0, 12.0),
+        2e-4,
+        generator,
+    )
     assert found is not None
     assert found.m == pytest.approx(m, abs=2e-3)

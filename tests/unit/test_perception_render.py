@@ -36,7 +36,9 @@ FACING = np.diag([1.0, -1.0, -1.0])
 """A block's pose with its drilled face towards the camera."""
 
 
-def drilled(rotation: np.ndarray, center_m: np.ndarray, material: Material = GREY, **extra: Any) -> Block:
+def drilled(
+    rotation: np.ndarray, center_m: np.ndarray, material: Material = GREY, **extra: Any
+) -> Block:
     """Returns a block, 1 x 0.8 x 0.6 m, with one hole of 50 mm, 0.3 m deep, in the middle of the face, which lies at `center_m`."""
     half = np.array([0.5, 0.4, 0.3])
     hole = Hole(np.array([0.0, 0.0, half[2]]), 0.05, 0.3)
@@ -60,7 +62,9 @@ def kind(name: str) -> Scenes:
 
 
 def studio(name: str, rig: Rig, depth: str = "exact") -> Studio:
-    return Studio(rig=rig, scene=kind(name), stereo=option("stereo", "sgbm"), depth=depth, pair=True)  # type: ignore[arg-type]
+    return Studio(
+        rig=rig, scene=kind(name), stereo=option("stereo", "sgbm"), depth=depth, pair=True
+    )  # type: ignore[arg-type]
 
 
 def test_a_wall_that_fills_the_picture_is_drawn_though_no_edge_crosses_it() -> None:
@@ -71,12 +75,25 @@ def test_a_wall_that_fills_the_picture_is_drawn_though_no_edge_crosses_it() -> N
 
 
 def test_depths_into_a_hole_are_those_worked_by_hand() -> None:
-    # f = 400 px: the pixel 8 px right of the axis looks along x / z = 0.02. The face is at z = 2 m, so x = 0.04 m there: inside the
-    # rim of 0.05 m. It would meet the wall at z = 0.05 / 0.02 = 2.5 m, and meets the floor at 2.3 m before. 9.6 px: x / z = 0.024,
-    # the wall at z = 0.05 / 0.024 = 2.0833 m. 12 px: x = 0.06 m, on the face.
+    # f = 400 px: the pixel 8 px right of the axis looks along x / z = 0.02. The face is at z = 2 m,
+    # so x = 0.04 m there: inside the rim of 0.05 m. It would meet the wall at z = 0.05 / 0.02 = 2.5
+    # m, and meets the floor at 2.3 m
+    # before. 9.6 px: x / z = 0.024, the wall at z = 0.05 / 0.024 = 2.0833 m. 12 px: x = 0.06 m, on
+    # the face.
     camera = Pinhole(321, 241, 400.0, np.zeros(3))  # its axis goes through pixel (160, 120)
     tracer = Tracer([drilled(FACING, np.array([0.0, 0.0, 2.0]))], NOON, (0.0, 0.0, 0.0))
-    rays = camera.rays(np.array([[160.0, 120.0], [168.0, 120.0], [169.6, 120.0], [172.0, 120.0], [160.0, 129.6], [160.0, 20.0]]))
+    rays = camera.rays(
+        np.array(
+            [
+                [160.0, 120.0],
+                [168.0, 120.0],
+                [169.6, 120.0],
+                [172.0, 120.0],
+                [160.0, 129.6],
+                [160.0, 20.0],
+            ]
+        )
+    )
     depth, _, part = tracer.first(np.zeros(3), rays)
     np.testing.assert_allclose(depth[:5], [2.3, 2.3, 0.05 / 0.024, 2.0, 0.05 / 0.024], atol=1e-5)
     assert part[0] == part[1] == 7 and part[2] == part[4] == 6 and part[3] == 5  # floor, wall, face
@@ -85,13 +102,22 @@ def test_depths_into_a_hole_are_those_worked_by_hand() -> None:
 
 @pytest.mark.parametrize("obliquity", [0.0, 0.61, 1.05])
 def test_the_mouth_is_the_projected_circle(obliquity: float) -> None:
-    rotation = FACING @ cv2.Rodrigues(np.array([obliquity, 0.0, 0.0]))[0] @ cv2.Rodrigues(np.array([0.0, 0.0, 0.4]))[0]
+    rotation = (
+        FACING
+        @ cv2.Rodrigues(np.array([obliquity, 0.0, 0.0]))[0]
+        @ cv2.Rodrigues(np.array([0.0, 0.0, 0.4]))[0]
+    )
     center = np.array([0.05, -0.03, 0.8])
     view = seen([drilled(rotation, center)])
     angle = np.linspace(0, 2 * np.pi, 2000)
     rim = center + 0.05 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) @ rotation.T
-    pixels = cv2.projectPoints(rim, np.zeros(3), np.zeros(3), SMALL.matrix, None)[0][:, 0].astype(np.float32)
-    inside = [[cv2.pointPolygonTest(pixels, (float(x), float(y)), False) > 0 for x in range(320)] for y in range(240)]
+    pixels = cv2.projectPoints(rim, np.zeros(3), np.zeros(3), SMALL.matrix, None)[0][:, 0].astype(
+        np.float32
+    )
+    inside = [
+        [cv2.pointPolygonTest(pixels, (float(x), float(y)), False) > 0 for x in range(320)]
+        for y in range(240)
+    ]
     wrong = np.array(inside) != view.mouth
     assert view.mouth.sum() > 500
     assert wrong.sum() <= 2  # the polygon of 2000 points against the circle
@@ -102,41 +128,59 @@ def test_a_tilted_face_has_the_depth_of_its_plane() -> None:
     view = seen([drilled(rotation, center)])
     normal = rotation[:, 2]
     y, x = np.mgrid[:240, :320]
-    plane = (center @ normal) / (((x - 159.5) * normal[0] + (y - 119.5) * normal[1]) / 400.0 + normal[2])
+    plane = (center @ normal) / (
+        ((x - 159.5) * normal[0] + (y - 119.5) * normal[1]) / 400.0 + normal[2]
+    )
     on_face = (view.solid == 0) & ~view.mouth & (np.abs(x - 176) < 25) & (np.abs(y - 125) < 25)
     assert on_face.sum() > 1000
     np.testing.assert_allclose(view.depth_m[on_face], plane[on_face], atol=2e-6)
 
 
 def test_a_ray_goes_through_a_chip_into_the_hole_and_out_of_neither() -> None:
-    chip = Chip(np.array([0.05, 0.0, 0.31]), 0.025)  # on the rim, 1 cm above the face: a bowl 22.9 mm wide, 15 mm deep
-    plain, chipped = (drilled(FACING, np.array([0.0, 0.0, 1.0]), chips=chips) for chips in ((), (chip,)))
+    chip = Chip(
+        np.array([0.05, 0.0, 0.31]), 0.025
+    )  # on the rim, 1 cm above the face: a bowl 22.9 mm wide, 15 mm deep
+    plain, chipped = (
+        drilled(FACING, np.array([0.0, 0.0, 1.0]), chips=chips) for chips in ((), (chip,))
+    )
     before, after = seen([plain]), seen([chipped])
     np.testing.assert_array_equal(before.mouth, after.mouth)  # the drilled circle stays what it is
     deeper = after.depth_m - before.depth_m
     assert np.nanmin(deeper) > -1e-6
-    # straight ahead through the bowl beside the rim: at x = 0.06 m the ball ends sqrt(25^2 - 10^2) - 10 = 12.91 mm below the face
-    t, _, part = Tracer([chipped], NOON, (0, 0, 0)).first(np.array([0.06, 0.0, 0.0]), np.array([[0.0, 0.0, 1.0]], np.float32))
+    # straight ahead through the bowl beside the rim: at x = 0.06 m the ball ends sqrt(25^2 - 10^2)
+    # - 10 = 12.91 mm below the face
+    t, _, part = Tracer([chipped], NOON, (0, 0, 0)).first(
+        np.array([0.06, 0.0, 0.0]), np.array([[0.0, 0.0, 1.0]], np.float32)
+    )
     assert t[0] == pytest.approx(1.0 + 0.01291, abs=1e-5) and part[0] == chipped.break_part
 
 
 def test_a_bar_in_the_concrete_is_seen_through_the_hole_alone() -> None:
     # the bar, 10 mm thick, lies 50 mm below the face across the whole block
-    bar = Cylinder("block", Pose(np.eye(3)[:, [1, 2, 0]], np.array([0.0, 0.0, 1.05])), 0.005, 0.4, (GREY,))
+    bar = Cylinder(
+        "block", Pose(np.eye(3)[:, [1, 2, 0]], np.array([0.0, 0.0, 1.05])), 0.005, 0.4, (GREY,)
+    )
     view = seen([drilled(FACING, np.array([0.0, 0.0, 1.0])), bar])
     assert (view.solid == 1).sum() > 100 and view.mouth[view.solid == 1].all()
     # half a pixel beside its middle: 0.5 / 400 of 1.045 m, 1.3 mm
-    assert view.depth_m[120, 160] == pytest.approx(1.05 - np.sqrt(0.005**2 - 0.0013065**2), abs=1e-5)
+    assert view.depth_m[120, 160] == pytest.approx(
+        1.05 - np.sqrt(0.005**2 - 0.0013065**2), abs=1e-5
+    )
     assert view.depth_m[120, 160 + 25] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_cylinder_and_a_box_are_where_they_should_be() -> None:
-    post = Cylinder("arm", Pose(np.eye(3)[:, [2, 0, 1]], np.array([0.1, 0.0, 1.0])), 0.05, 0.2, (GREY,))  # upright
-    crate = Box("clutter", Pose(np.eye(3), np.array([-0.2, 0.0, 1.0])), np.array([0.1, 0.1, 0.1]), (GREY,))
+    post = Cylinder(
+        "arm", Pose(np.eye(3)[:, [2, 0, 1]], np.array([0.1, 0.0, 1.0])), 0.05, 0.2, (GREY,)
+    )  # upright
+    crate = Box(
+        "clutter", Pose(np.eye(3), np.array([-0.2, 0.0, 1.0])), np.array([0.1, 0.1, 0.1]), (GREY,)
+    )
     t, solid, _ = Tracer([post, crate], NOON, (0, 0, 0)).first(
         np.zeros(3), np.array([[0.1, 0.0, 1.0], [-0.2, 0.0, 1.0], [0.0, 0.0, 1.0]], np.float32)
     )
-    # along (0.1, 0, 1) s the post's axis is hit at s = 1, its skin 0.05 / |(0.1, 1)| of the way before
+    # along (0.1, 0, 1) s the post's axis is hit at s = 1, its skin 0.05 / |(0.1, 1)| of the way
+    # before
     assert t[0] == pytest.approx(1.0 - 0.05 / np.hypot(0.1, 1.0), abs=1e-5)
     assert t[1] == pytest.approx(0.9, abs=1e-6)
     assert solid.tolist() == [0, 1, -1]
@@ -144,11 +188,17 @@ def test_a_cylinder_and_a_box_are_where_they_should_be() -> None:
 
 def test_a_shadow_lies_where_the_light_is_blocked() -> None:
     wall = Plane("ground", Pose(FACING, np.array([0.0, 0.0, 2.0])), (GREY,))
-    board = Box("arm", Pose(np.eye(3), np.array([0.5, 0.0, 1.0])), np.array([0.1, 0.1, 0.01]), (GREY,))
-    to_sun = np.array([1.0, 0.0, -2.0]) / np.sqrt(5)  # from x = 0 on the wall through x = 0.5, z = 1: the middle of the board
+    board = Box(
+        "arm", Pose(np.eye(3), np.array([0.5, 0.0, 1.0])), np.array([0.1, 0.1, 0.01]), (GREY,)
+    )
+    to_sun = np.array([1.0, 0.0, -2.0]) / np.sqrt(
+        5
+    )  # from x = 0 on the wall through x = 0.5, z = 1: the middle of the board
     view = seen([wall, board], light=Light(to_sun, 1.0, 0.5))
     lit, dark = 0.5 * (0.5 + 2 / np.sqrt(5)), 0.5 * 0.5
-    np.testing.assert_allclose(view.radiance[120, 160], dark, rtol=1e-3)  # the shadow is 0.2 m wide: 20 px about x = 0
+    np.testing.assert_allclose(
+        view.radiance[120, 160], dark, rtol=1e-3
+    )  # the shadow is 0.2 m wide: 20 px about x = 0
     np.testing.assert_allclose(view.radiance[120, 160 + 30], lit, rtol=1e-3)
     np.testing.assert_allclose(view.radiance[120, 160 - 30], lit, rtol=1e-3)
 
@@ -156,7 +206,10 @@ def test_a_shadow_lies_where_the_light_is_blocked() -> None:
 def test_it_grows_darker_down_a_hole_and_stays_even_on_a_painted_disc() -> None:
     shade = Light(np.array([0.0, 0.0, 1.0]), 0.0, 1.0)  # light from everywhere alone
     paint = Disc(np.array([-0.2, 0.0, 0.3]), 0.05, "paint")
-    rotation, center = FACING @ cv2.Rodrigues(np.array([0.7, 0.0, 0.0]))[0], np.array([0.1, 0.0, 0.8])
+    rotation, center = (
+        FACING @ cv2.Rodrigues(np.array([0.7, 0.0, 0.0]))[0],
+        np.array([0.1, 0.0, 0.8]),
+    )
     view = seen([drilled(rotation, center, discs=(paint,))], light=shade)
     inside = np.flatnonzero(view.mouth[:, int(SMALL.project(center)[0])])
     column = view.radiance[inside[2:-2], int(SMALL.project(center)[0]), 0]
@@ -168,16 +221,24 @@ def test_it_grows_darker_down_a_hole_and_stays_even_on_a_painted_disc() -> None:
 
 def test_both_pictures_show_the_same_texture() -> None:
     camera, partner = SMALL, Pinhole(320, 240, 400.0, np.array([0.12, 0.0, 0.0]))
-    tracer = Tracer([drilled(frame_of(np.array([0.2, -0.4, -0.9]), 0.0), np.array([0.1, 0.0, 1.2]), STONE)], NOON, (0, 0, 0))
+    tracer = Tracer(
+        [drilled(frame_of(np.array([0.2, -0.4, -0.9]), 0.0), np.array([0.1, 0.0, 1.2]), STONE)],
+        NOON,
+        (0, 0, 0),
+    )
     left, right = tracer.view(camera), tracer.view(partner)
     y, x = np.mgrid[:240, :320].astype(np.float32)
-    moved = cv2.remap(right.radiance, (x - 400.0 * 0.12 / left.depth_m).astype(np.float32), y, cv2.INTER_CUBIC)
+    moved = cv2.remap(
+        right.radiance, (x - 400.0 * 0.12 / left.depth_m).astype(np.float32), y, cv2.INTER_CUBIC
+    )
     inner = cv2.erode(((left.solid == 0) & ~cv2.dilate(left.mouth.astype(np.uint8), np.ones((9, 9))).astype(bool)).astype(np.uint8),
                       np.ones((9, 9))).astype(bool)  # fmt: skip
     inner[:, :90] = False  # out of the right picture
     error, contrast = (moved - left.radiance)[inner][:, 0], left.radiance[inner][:, 0].std()
     assert inner.sum() > 5000
-    assert error.std() < 0.35 * contrast  # resampling of grain as fine as a pixel; unrelated textures would give 1.4
+    assert (
+        error.std() < 0.35 * contrast
+    )  # resampling of grain as fine as a pixel; unrelated textures would give 1.4
     assert abs(error.mean()) < 0.01 * left.radiance[inner].mean()
 
 
@@ -185,11 +246,22 @@ def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Rig) -
     full = replace(rig, width=960, height=540, focal_px=1056.0)  # the middle of a 1080p picture
     rotation, center = frame_of(np.array([0.1, -0.57, -0.82]), 0.3), np.array([0.0, 0.0, 2.5])
     tracer = Tracer(
-        [drilled(rotation, center, STONE), Plane("ground", Pose(FACING, np.array([0.0, 0.0, 5.0])), (STONE,))], NOON, (0, 0, 0)
+        [
+            drilled(rotation, center, STONE),
+            Plane("ground", Pose(FACING, np.array([0.0, 0.0, 5.0])), (STONE,)),
+        ],
+        NOON,
+        (0, 0, 0),
     )
-    exposure, chance = Exposure(1.0, 0.0, 0.0, 0.0, 0.5, 8000.0, 8.0, 1.0, 0.0), np.random.default_rng(0)
+    exposure, chance = (
+        Exposure(1.0, 0.0, 0.0, 0.0, 0.5, 8000.0, 8.0, 1.0, 0.0),
+        np.random.default_rng(0),
+    )
     views = [tracer.view(camera) for camera in (full.left, full.right)]
-    left, right = (photograph(view.radiance, view.depth_m, exposure, dust(0.0, chance), chance) for view in views)
+    left, right = (
+        photograph(view.radiance, view.depth_m, exposure, dust(0.0, chance), chance)
+        for view in views
+    )
     stereo = option("stereo", "sgbm")
     face = cv2.erode((views[0].solid == 0).astype(np.uint8), np.ones((21, 21))).astype(bool)
     face &= ~cv2.dilate(views[0].mouth.astype(np.uint8), np.ones((21, 21))).astype(bool)
@@ -202,14 +274,22 @@ def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Rig) -
     assert abs(np.median(error["refined"])) < 0.02 < abs(np.median(error["plain"]))
     spread = 1.48 * np.median(np.abs(error["refined"] - np.median(error["refined"])))
     assert 0.03 < spread < 0.35  # 0.29 px on real pairs with dense truth
-    assert np.isnan(stereo.depth_m(left, right, 1056.0, 0.12)[:, :20]).all()  # what the right camera does not see
+    assert np.isnan(
+        stereo.depth_m(left, right, 1056.0, 0.12)[:, :20]
+    ).all()  # what the right camera does not see
 
 
 def test_dust_takes_contrast_as_it_says() -> None:
     depth = np.full((40, 60), 2.0, np.float32)
-    light = np.where(np.arange(60) < 30, 0.2, 0.8).astype(np.float32)[None, :, None] * np.ones((40, 1, 3), np.float32)
-    thick = Exposure(1.0, np.log(4.0) / 2.0, 0.6, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0)  # a quarter is left after 2 m
-    taken = photograph(light, depth, thick, dust(0.0, np.random.default_rng(0)), np.random.default_rng(0))
+    light = np.where(np.arange(60) < 30, 0.2, 0.8).astype(np.float32)[None, :, None] * np.ones(
+        (40, 1, 3), np.float32
+    )
+    thick = Exposure(
+        1.0, np.log(4.0) / 2.0, 0.6, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0
+    )  # a quarter is left after 2 m
+    taken = photograph(
+        light, depth, thick, dust(0.0, np.random.default_rng(0)), np.random.default_rng(0)
+    )
     assert taken[0, 0, 0] == pytest.approx(255 * (0.2 / 4 + 0.6 * 3 / 4), abs=1)
     assert taken[0, -1, 0] == pytest.approx(255 * (0.8 / 4 + 0.6 * 3 / 4), abs=1)
 
@@ -217,8 +297,11 @@ def test_dust_takes_contrast_as_it_says() -> None:
 def test_noise_in_the_dark_is_that_of_the_electrons() -> None:
     light, depth = np.full((200, 200, 3), 0.5, np.float32), np.ones((200, 200), np.float32)
     dim = Exposure(0.15, 0.0, 0.0, 0.0, 0.0, 8000.0, 8.0, 1.0, 0.0)
-    taken = photograph(light, depth, dim, dust(0.0, np.random.default_rng(0)), np.random.default_rng(1)).astype(float)
-    # 0.075 of 8000 electrons are 600; their noise sqrt(600 + 8^2) is 25.8 electrons or 0.82 of 255 steps, rounding adds 1 / 12
+    taken = photograph(
+        light, depth, dim, dust(0.0, np.random.default_rng(0)), np.random.default_rng(1)
+    ).astype(float)
+    # 0.075 of 8000 electrons are 600; their noise sqrt(600 + 8^2) is 25.8 electrons or 0.82 of 255
+    # steps, rounding adds 1 / 12
     assert taken.mean() == pytest.approx(0.075 * 255, abs=0.1)
     assert taken.std() == pytest.approx(np.hypot(25.77 / 8000 * 255, np.sqrt(1 / 12)), rel=0.05)
 
@@ -229,25 +312,38 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(name: str, rig: Rig) -> No
     for _ in range(1 if name != "varied" else 3):
         shot = studio(name, rig).shot(compose(kind(name), rig, chance), chance)
         assert shot.color.shape == shot.right.shape == (270, 480, 3)
-        assert not (shot.label.mouth & ~shot.label.block).any() and not (shot.label.arm & shot.label.block).any()
+        assert (
+            not (shot.label.mouth & ~shot.label.block).any()
+            and not (shot.label.arm & shot.label.block).any()
+        )
         if not any(hole.hidden < 1 for hole in shot.truth.holes):
             assert not shot.label.mouth.any()
         for hole in shot.truth.holes[:1]:
             center, base = np.array(hole.center_m), rig.base_from_camera
             assert np.array(hole.axis) @ center < 0  # out of the hole, towards the camera
-            np.testing.assert_allclose(base[:3, :3] @ center + base[:3, 3], hole.center_in_base_m, atol=1e-9)
+            np.testing.assert_allclose(
+                base[:3, :3] @ center + base[:3, 3], hole.center_in_base_m, atol=1e-9
+            )
             x, y = rig.left.project(center)
             if hole.hidden == 0:
                 assert shot.label.mouth[round(y), round(x)]
-                assert shot.exact_depth_m[round(y), round(x)] > center[2] - 0.06  # the rim or deeper
+                assert (
+                    shot.exact_depth_m[round(y), round(x)] > center[2] - 0.06
+                )  # the rim or deeper
             assert hole.in_view
 
 
 def test_the_conditions_of_the_benchmark_are_what_they_are_called(rig: Rig) -> None:
     chance = np.random.default_rng(5)
-    scenes = {name: [compose(kind(name), rig, chance) for _ in range(4)] for name in ("hidden", "decoy", "empty", "dark", "haze")}
+    scenes = {
+        name: [compose(kind(name), rig, chance) for _ in range(4)]
+        for name in ("hidden", "decoy", "empty", "dark", "haze")
+    }
     assert all(abs(scene.hidden[0] - 0.3) < 0.02 for scene in scenes["hidden"])
-    assert all(scene.block and len(scene.block.discs) >= 1 and scene.hidden[0] == 0 for scene in scenes["decoy"])
+    assert all(
+        scene.block and len(scene.block.discs) >= 1 and scene.hidden[0] == 0
+        for scene in scenes["decoy"]
+    )
     assert all(not scene.hidden for scene in scenes["empty"])
     assert {scene.block is None for scene in scenes["empty"]} == {True, False}
     assert all(scene.conditions["light"] == pytest.approx(0.15) for scene in scenes["dark"])
@@ -262,32 +358,53 @@ def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: Rig
         scene = compose(near, large, chance)
         shot = studio("hidden", large).shot(scene, chance)
         assert scene.block is not None
-        pixel = np.round(large.left.project(rim_points(scene.block, scene.block.holes[0]))).astype(int)
+        pixel = np.round(large.left.project(rim_points(scene.block, scene.block.holes[0]))).astype(
+            int
+        )
         covered = shot.label.arm[pixel[:, 1], pixel[:, 0]].mean()
         assert covered == pytest.approx(scene.hidden[0], abs=0.05)
         assert hidden_part([], scene.block, scene.block.holes[0]) == 0.0
 
 
 def digests(folder: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.iterdir())
+    }
 
 
-def test_the_command_renders_the_same_bytes_again_and_goes_on_where_it_stopped(brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_command_renders_the_same_bytes_again_and_goes_on_where_it_stopped(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
     size = ("rig.width=320", "rig.height=180", "rig.focal_px=176.0", "render.count=3")
     done = brokk("mode=render", "scene=varied", "session.out=one", *size)
     assert done.code == 0, done.err
     first = digests(tmp_path / "one" / "frames")
     assert len(first) == 1 + 3 * 5
-    (tmp_path / "one" / "frames" / "00001.truth.json").unlink()  # as if stopped while writing this one
-    assert brokk("mode=render", "scene=varied", "session.out=one", *size).code == 2  # without resume it is somebody's run
+    (
+        tmp_path / "one" / "frames" / "00001.truth.json"
+    ).unlink()  # as if stopped while writing this one
+    assert (
+        brokk("mode=render", "scene=varied", "session.out=one", *size).code == 2
+    )  # without resume it is somebody's run
     assert brokk("mode=render", "scene=varied", "session.out=one", "resume=one", *size).code == 0
     assert digests(tmp_path / "one" / "frames") == first
-    assert brokk("mode=render", "scene=varied", "session.out=two", "session.seed=1", *size).code == 0
+    assert (
+        brokk("mode=render", "scene=varied", "session.out=two", "session.seed=1", *size).code == 0
+    )
     assert digests(tmp_path / "two" / "frames")["00000.color.png"] != first["00000.color.png"]
 
 
-def test_the_left_picture_alone_is_that_of_a_pair(brokk: Callable[..., Any], tmp_path: Path) -> None:
-    size = ("rig.width=160", "rig.height=90", "rig.focal_px=88.0", "render.count=1", "studio.depth=none")
+def test_the_left_picture_alone_is_that_of_a_pair(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    size = (
+        "rig.width=160",
+        "rig.height=90",
+        "rig.focal_px=88.0",
+        "render.count=1",
+        "studio.depth=none",
+    )
     assert brokk("mode=render", "session.out=pair", *size).code == 0
     assert brokk("mode=render", "session.out=alone", "studio.pair=false", *size).code == 0
     pair, alone = (digests(tmp_path / name / "frames") for name in ("pair", "alone"))
@@ -302,7 +419,9 @@ def test_truth_and_masks_come_back_as_they_were_written(rig: Rig, tmp_path: Path
     shot = maker.shot(compose(kind("decoy"), rig, chance), chance)
     dataset.write_frame(stem, shot.color, shot.depth_m, shot.right, shot.label, shot.truth)
     again = dataset.read_truth(stem)
-    assert again.holes[0].radius_m == shot.truth.holes[0].radius_m and len(again.decoys) == len(shot.truth.decoys)
+    assert again.holes[0].radius_m == shot.truth.holes[0].radius_m and len(again.decoys) == len(
+        shot.truth.decoys
+    )
     np.testing.assert_allclose(again.holes[0].center_m, shot.truth.holes[0].center_m)
     np.testing.assert_array_equal(dataset.read_label(stem).mouth, shot.label.mouth)
     assert dataset.stems(tmp_path) == [stem]
@@ -321,7 +440,9 @@ def test_truth_and_masks_come_back_as_they_were_written(rig: Rig, tmp_path: Path
         ("light", {"transmission": (0.0, 1.0)}, "transmission"),
     ],
 )
-def test_ranges_that_make_no_scene_are_refused(part: str, change: dict[str, Any], told: str) -> None:
+def test_ranges_that_make_no_scene_are_refused(
+    part: str, change: dict[str, Any], told: str
+) -> None:
     clean = kind("clean")
     with pytest.raises(ConfigError, match=told):
         replace(clean, **{part: replace(getattr(clean, part), **change)})

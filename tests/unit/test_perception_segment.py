@@ -29,7 +29,9 @@ SIZE_PX = (640, 360)
 
 @pytest.mark.parametrize("distance_m", [1.3, 2.0, 3.0, 4.0])
 @pytest.mark.parametrize("around_rad", [0.2, 0.7, 1.2])
-def test_planes_before_their_surroundings_are_the_block(distance_m: float, around_rad: float) -> None:
+def test_planes_before_their_surroundings_are_the_block(
+    distance_m: float, around_rad: float
+) -> None:
     eye = (-distance_m * np.cos(around_rad), -distance_m * np.sin(around_rad), 1.1)
     view = cuboid.seen(cuboid.looking(eye, (0.1, 0.0, 0.3)), SIZE_PX, noise_per_m=0.0024)
     masks = option("perception/segmenter", "depth_plane").build().segment(view.frame)
@@ -38,20 +40,31 @@ def test_planes_before_their_surroundings_are_the_block(distance_m: float, aroun
     assert masks.block.min() >= 0.0 and masks.block.max() <= 1.0
     found = masks.block > 0.5
     assert (found & view.block).sum() > 0.97 * found.sum()
-    front_and_side = 0.8 if distance_m < 3 else 0.7  # a top seen at a grazing angle is thinner than a matcher's noise
+    front_and_side = (
+        0.8 if distance_m < 3 else 0.7
+    )  # a top seen at a grazing angle is thinner than a matcher's noise
     assert cuboid.overlap(found, view.block) > front_and_side
 
 
 def test_ground_alone_is_no_block_and_the_same_frame_gives_the_same_mask() -> None:
     segmenter = option("perception/segmenter", "depth_plane").build()
-    empty = cuboid.seen(cuboid.looking((-2.0, 0.4, 1.0), (0.0, 0.0, 0.3)), SIZE_PX, 0.0024, with_box=False)
+    empty = cuboid.seen(
+        cuboid.looking((-2.0, 0.4, 1.0), (0.0, 0.0, 0.3)), SIZE_PX, 0.0024, with_box=False
+    )
     assert segmenter.segment(empty.frame).block.max() < 0.5
     view = cuboid.seen(cuboid.looking((-2.0, 0.4, 1.0), (0.0, 0.0, 0.3)), SIZE_PX, 0.0024)
-    np.testing.assert_array_equal(segmenter.segment(view.frame).block, segmenter.segment(view.frame).block)
+    np.testing.assert_array_equal(
+        segmenter.segment(view.frame).block, segmenter.segment(view.frame).block
+    )
 
 
 def test_what_stands_before_a_face_is_not_part_of_it_and_a_mouth_is() -> None:
-    view = cuboid.seen(cuboid.looking((-1.6, -0.3, 0.8), (0.1, 0.0, 0.3)), SIZE_PX, 0.0024, occluder_m=(-0.4, -0.2, 0.45))
+    view = cuboid.seen(
+        cuboid.looking((-1.6, -0.3, 0.8), (0.1, 0.0, 0.3)),
+        SIZE_PX,
+        0.0024,
+        occluder_m=(-0.4, -0.2, 0.45),
+    )
     found = option("perception/segmenter", "depth_plane").build().segment(view.frame).block > 0.5
     assert view.occluder.sum() > 1000
     assert (found & view.occluder).mean() < 0.1 * view.occluder.mean()
@@ -60,8 +73,13 @@ def test_what_stands_before_a_face_is_not_part_of_it_and_a_mouth_is() -> None:
 
 def test_a_frame_without_depth_is_refused_by_name() -> None:
     view = cuboid.seen(cuboid.looking((-2.0, 0.0, 1.0), (0.0, 0.0, 0.3)), (320, 180))
-    blind = replace(view.frame, depth_m=np.full_like(view.frame.depth_m, np.nan), name="folder/0007")
-    with pytest.raises(FrameError, match=r"folder/0007: depth is known in 0\.0% of the pixels, depth_plane needs 5%"):
+    blind = replace(
+        view.frame, depth_m=np.full_like(view.frame.depth_m, np.nan), name="folder/0007"
+    )
+    with pytest.raises(
+        FrameError,
+        match=r"folder/0007: depth is known in 0\.0% of the pixels, depth_plane needs 5%",
+    ):
         option("perception/segmenter", "depth_plane").build().segment(blind)
 
 
@@ -77,7 +95,9 @@ def test_a_sloppy_edge_moves_onto_that_of_the_picture() -> None:
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(-80, 200), st.integers(-60, 150), st.integers(40, 400), st.data())
-def test_a_window_brings_back_what_it_took(left: int, top: int, width: int, data: st.DataObject) -> None:
+def test_a_window_brings_back_what_it_took(
+    left: int, top: int, width: int, data: st.DataObject
+) -> None:
     size_px = (80, 48)
     window = Window(left, top, width, round(width * 48 / 80))
     picture = np.zeros((120, 160), np.float32)
@@ -87,7 +107,9 @@ def test_a_window_brings_back_what_it_took(left: int, top: int, width: int, data
     back = np.full_like(picture, -1.0)
     window.put(window.take(picture, size_px), back)
     covered = back >= 0
-    inside = (columns >= left) & (columns < left + width) & (rows >= top) & (rows < top + window.height)
+    inside = (
+        (columns >= left) & (columns < left + width) & (rows >= top) & (rows < top + window.height)
+    )
     assert (covered & ~inside).sum() == 0
     if covered.sum() > 400:
         # a pixel of the window may be several of the picture
@@ -121,7 +143,9 @@ def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
     def infer(picture: np.ndarray) -> np.ndarray:
         shown.append(picture)
         bright = picture[0]
-        return np.stack([bright > 0.3, (bright > 0.95) & ((bright > 0.95).sum() > 20)]).astype(np.float32)
+        return np.stack([bright > 0.3, (bright > 0.95) & ((bright > 0.95).sum() > 20)]).astype(
+            np.float32
+        )
 
     once = NetworkSegmenter(infer, (160, 96), None).segment(frame)
     assert once.mouth is not None and once.mouth.max() == 0.0
@@ -132,7 +156,9 @@ def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
     assert cuboid.overlap(twice.block > 0.5, true_block) > 0.95
 
 
-def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts_and_again_where_more_of_it_is() -> None:
+def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts_and_again_where_more_of_it_is() -> (
+    None
+):
     frame = Frame(
         color=np.zeros((360, 640, 3), np.uint8), depth_m=np.ones((360, 640), np.float32), camera_matrix=np.eye(3),
         base_from_camera=None, t_s=0.0,
@@ -150,17 +176,23 @@ def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts_and_again_
         return np.stack([bright, 0.0 * bright]).astype(np.float32)
 
     masks = NetworkSegmenter(infer, (160, 96), 0.15).segment(frame)
-    assert len(shown) == 9, "the whole, six parts, and two closer looks, since the first of them changed the box"
+    assert len(shown) == 9, (
+        "the whole, six parts, and two closer looks, since the first of them changed the box"
+    )
     assert cuboid.overlap(masks.block > 0.5, frame.color[..., 0] > 0) > 0.9
     shown.clear()
-    empty = NetworkSegmenter(lambda picture: np.zeros((2, 96, 160), np.float32), (160, 96), 0.15).segment(frame)
+    empty = NetworkSegmenter(
+        lambda picture: np.zeros((2, 96, 160), np.float32), (160, 96), 0.15
+    ).segment(frame)
     assert not empty.block.any() and empty.mouth is not None and not empty.mouth.any()
 
 
 def test_the_truth_is_what_lies_beside_the_frame(tmp_path: Path) -> None:
     view = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90))
     stem = tmp_path / "0001"
-    dataset.write_frame(stem, view.frame.color, None, label=Label(view.block, view.mouth, view.occluder))
+    dataset.write_frame(
+        stem, view.frame.color, None, label=Label(view.block, view.mouth, view.occluder)
+    )
     truth = option("perception/segmenter", "truth").build()
     masks = truth.segment(replace(view.frame, name=str(stem)))
     np.testing.assert_array_equal(masks.block > 0.5, view.block)
@@ -182,13 +214,17 @@ def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path:
     view = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90))
     found = []
     for name, file in (("unet", "a.safetensors"), ("onnx", "a.onnx")):
-        segmenter = replace(option("perception/segmenter", name), weights=str(tmp_path / file)).build()
+        segmenter = replace(
+            option("perception/segmenter", name), weights=str(tmp_path / file)
+        ).build()
         found.append(segmenter.segment(view.frame))
     np.testing.assert_allclose(found[0].block, found[1].block, atol=1e-4)
     np.testing.assert_allclose(found[0].mouth, found[1].mouth, atol=1e-4)
 
 
-def test_a_network_that_ships_is_loaded_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_network_that_ships_is_loaded_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     torch.manual_seed(0)
     network = UNet((4, 8)).eval().requires_grad_(False)
     header = export.header_of(network, (64, 32), {})
@@ -198,7 +234,9 @@ def test_a_network_that_ships_is_loaded_by_its_name(tmp_path: Path, monkeypatch:
     export.write(tmp_path / export.TENSORS, network, header)
     export.write_onnx(tmp_path / export.ONNX, network, header, torch.rand(1, 3, 32, 64))
     frame = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90)).frame
-    one, other = (option("perception/segmenter", name).build().segment(frame) for name in ("onnx", "unet"))
+    one, other = (
+        option("perception/segmenter", name).build().segment(frame) for name in ("onnx", "unet")
+    )
     np.testing.assert_allclose(one.block, other.block, atol=1e-4)
 
 
@@ -208,13 +246,23 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
     shared, either = np.zeros(2), np.zeros(2)
     for seed in (101, 102, 103):
         chance, kind = np.random.default_rng(seed), option("scene", "clean")
-        studio = Studio(rig=rig, scene=kind, stereo=option("stereo", "sgbm"), depth="none", pair=False)
+        studio = Studio(
+            rig=rig, scene=kind, stereo=option("stereo", "sgbm"), depth="none", pair=False
+        )
         shot = studio.shot(compose(kind, rig, chance), chance)
-        frame = Frame(color=shot.color, depth_m=shot.exact_depth_m, camera_matrix=rig.left.matrix, base_from_camera=None, t_s=0.0)
+        frame = Frame(
+            color=shot.color,
+            depth_m=shot.exact_depth_m,
+            camera_matrix=rig.left.matrix,
+            base_from_camera=None,
+            t_s=0.0,
+        )
         masks, again = (segmenter.segment(frame) for segmenter in segmenters)
         np.testing.assert_allclose(masks.block, again.block, atol=0.01)
         assert masks.mouth is not None
-        for k, (said, known) in enumerate(((masks.block > 0.5, shot.label.block), (masks.mouth > 0.5, shot.label.mouth))):
+        for k, (said, known) in enumerate(
+            ((masks.block > 0.5, shot.label.block), (masks.mouth > 0.5, shot.label.mouth))
+        ):
             shared[k] += (said & known).sum()
             either[k] += (said | known).sum()
     assert (shared / either > [0.9, 0.6]).all()

@@ -25,7 +25,9 @@ from perception.sources.live import Capture, Freshness, Lens, LiveSource
 
 HEIGHT, WIDTH = 90, 160
 MATRIX = np.array([[88.0, 0.0, 79.5], [0.0, 88.0, 44.5], [0.0, 0.0, 1.0]])
-POSE = np.array([[0.0, 0.0, 1.0, 0.3], [-1.0, 0.0, 0.0, 0.4], [0.0, -1.0, 0.0, 1.9], [0.0, 0.0, 0.0, 1.0]])
+POSE = np.array(
+    [[0.0, 0.0, 1.0, 0.3], [-1.0, 0.0, 0.0, 0.4], [0.0, -1.0, 0.0, 1.9], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 @pytest.fixture
@@ -45,7 +47,13 @@ def folder(path: Path, **changes: Any) -> Folder:
     return Folder(
         folder=str(path),
         **(
-            {"rate_hz": 10.0, "least_known": 0.01, "needs": "depth", "base_from_camera": None, "stereo": option("stereo", "sgbm")}
+            {
+                "rate_hz": 10.0,
+                "least_known": 0.01,
+                "needs": "depth",
+                "base_from_camera": None,
+                "stereo": option("stereo", "sgbm"),
+            }
             | changes
         ),
     )
@@ -63,7 +71,11 @@ def test_frames_come_back_as_they_were_written(frames: Path) -> None:
     np.testing.assert_array_equal(first.camera_matrix, MATRIX)
     np.testing.assert_array_equal(first.base_from_camera, POSE)
     assert first.distortion is None and first.right is None and first.baseline_m == 0.12
-    assert np.isnan(first.depth_m[:10]).all() and (first.depth_m[10:] == 2.0).all() and (second.depth_m[10:] == 3.0).all()
+    assert (
+        np.isnan(first.depth_m[:10]).all()
+        and (first.depth_m[10:] == 2.0).all()
+        and (second.depth_m[10:] == 3.0).all()
+    )
     blue_first = cv2.imread(str(frames / "00000.color.png"))
     assert blue_first is not None
     np.testing.assert_array_equal(first.color, blue_first[..., ::-1])
@@ -84,7 +96,9 @@ def test_zero_and_infinity_are_no_depths(frames: Path) -> None:
     depth[0, :4] = [0.0, np.inf, -np.inf, -1.0]
     np.save(frames / "00000.depth.npy", depth)
     found = read(frames)[0].depth_m
-    assert np.isnan(found[0, :4]).all() and (found[0, 4:] == 2.0).all() and found.dtype == np.float32
+    assert (
+        np.isnan(found[0, :4]).all() and (found[0, 4:] == 2.0).all() and found.dtype == np.float32
+    )
 
 
 def camera(frames: Path, **changes: Any) -> None:
@@ -133,13 +147,18 @@ BREACHES: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("breach", BREACHES)
-def test_a_frame_that_breaks_the_format_is_refused_by_name_and_the_next_one_read(breach: str, frames: Path) -> None:
+def test_a_frame_that_breaks_the_format_is_refused_by_name_and_the_next_one_read(
+    breach: str, frames: Path
+) -> None:
     spoil, told = BREACHES[breach]
     spoil(frames)
     with folder(frames).build() as source:
         with pytest.raises(FrameError, match=told):
             source.read_latest()
-        if breach not in ("another resolution", "long lens"):  # these are the camera's, and so every frame's
+        if breach not in (
+            "another resolution",
+            "long lens",
+        ):  # these are the camera's, and so every frame's
             after = source.read_latest()
             assert after is not None and after.name.endswith("00001")
             assert source.read_latest() is None
@@ -163,7 +182,9 @@ def test_a_frame_that_breaks_the_format_is_refused_by_name_and_the_next_one_read
         ({"T_base_cam": np.eye(3).tolist()}, r"shape \(3, 3\)"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(changes: dict[str, Any], told: str, frames: Path) -> None:
+def test_a_camera_that_cannot_be_is_refused(
+    changes: dict[str, Any], told: str, frames: Path
+) -> None:
     camera(frames, **changes)
     with pytest.raises(FrameError, match=rf"(?s)camera.yaml.*{told}"):
         folder(frames).build().__enter__()
@@ -195,7 +216,11 @@ def test_a_camera_without_a_place_or_a_baseline_is_welcome(frames: Path) -> None
 def test_photographs_alone_will_do_for_ellipses(tmp_path: Path) -> None:
     save(tmp_path / "grey.color.png", np.full(SIZE, 90, np.uint8))
     found = read(tmp_path, needs="nothing")[0]
-    assert found.color.shape == (*SIZE, 3) and (found.color == 90).all() and np.isnan(found.depth_m).all()
+    assert (
+        found.color.shape == (*SIZE, 3)
+        and (found.color == 90).all()
+        and np.isnan(found.depth_m).all()
+    )
 
 
 def test_a_pair_without_depth_is_matched(tmp_path: Path) -> None:
@@ -204,7 +229,9 @@ def test_a_pair_without_depth_is_matched(tmp_path: Path) -> None:
     wide = np.repeat(np.clip(128 + 120 * grain, 0, 255).astype(np.uint8)[..., None], 3, 2)
     matrix = np.array([[200.0, 0.0, 119.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
     dataset.write_camera(tmp_path, matrix, None, 0.12)
-    dataset.write_frame(tmp_path / "00000", wide[:, 100:340], None, wide[:, 112:352])  # all of it 12 px: 200 * 0.12 / 12 = 2 m
+    dataset.write_frame(
+        tmp_path / "00000", wide[:, 100:340], None, wide[:, 112:352]
+    )  # all of it 12 px: 200 * 0.12 / 12 = 2 m
     found = read(tmp_path)[0]
     assert np.nanmedian(found.depth_m) == pytest.approx(2.0, abs=0.005)
     camera(tmp_path, dist=[0.1, 0.0, 0.0, 0.0])
@@ -286,17 +313,25 @@ class StubZed:
     def get_camera_information(self) -> Any:
         left = SimpleNamespace(fx=88.0, fy=88.0, cx=79.5, cy=44.5, disto=[-0.04, 0.01, 0, 0, 0])
         calibration = SimpleNamespace(left_cam=left, get_camera_baseline=lambda: 0.11986)
-        return SimpleNamespace(camera_configuration=SimpleNamespace(calibration_parameters=calibration))
+        return SimpleNamespace(
+            camera_configuration=SimpleNamespace(calibration_parameters=calibration)
+        )
 
     def retrieve_image(self, mat: Any, view: str) -> None:
-        mat.values = np.full((*SIZE, 4), {"left": 10, "right": 20}[view], np.uint8) + np.array([0, 1, 2, 0], np.uint8)
+        mat.values = np.full((*SIZE, 4), {"left": 10, "right": 20}[view], np.uint8) + np.array(
+            [0, 1, 2, 0], np.uint8
+        )
 
     def retrieve_measure(self, mat: Any, measure: str) -> None:
         mat.values = np.full(SIZE, 1.5, np.float32)
         mat.values[0, :3] = [np.nan, np.inf, -np.inf]
 
     def get_timestamp(self, reference: str) -> Any:
-        return SimpleNamespace(get_nanoseconds=lambda: 1_700_000_000_000_000_000 + (50_000_000 if reference == "current" else 0))
+        return SimpleNamespace(
+            get_nanoseconds=lambda: (
+                1_700_000_000_000_000_000 + (50_000_000 if reference == "current" else 0)
+            )
+        )
 
     def close(self) -> None:
         StubZed.opened = None
@@ -314,17 +349,27 @@ class Mat:
 def pyzed(monkeypatch: pytest.MonkeyPatch) -> None:
     sl: Any = ModuleType("pyzed.sl")
     sl.Camera, sl.Mat = StubZed, Mat
-    sl.InitParameters = sl.RuntimeParameters = lambda: SimpleNamespace(enable_fill_mode=True, set_from_svo_file=lambda path: None)
+    sl.InitParameters = sl.RuntimeParameters = lambda: SimpleNamespace(
+        enable_fill_mode=True, set_from_svo_file=lambda path: None
+    )
     sl.ERROR_CODE = SimpleNamespace(SUCCESS="SUCCESS", END_OF_SVOFILE_REACHED="END")
-    sl.RESOLUTION, sl.DEPTH_MODE = SimpleNamespace(HD1080="HD1080"), SimpleNamespace(NEURAL="NEURAL")
+    sl.RESOLUTION, sl.DEPTH_MODE = (
+        SimpleNamespace(HD1080="HD1080"),
+        SimpleNamespace(NEURAL="NEURAL"),
+    )
     sl.UNIT, sl.COORDINATE_SYSTEM = SimpleNamespace(METER="metre"), SimpleNamespace(IMAGE="image")
-    sl.VIEW, sl.MEASURE = SimpleNamespace(LEFT="left", RIGHT="right"), SimpleNamespace(DEPTH="depth")
+    sl.VIEW, sl.MEASURE = (
+        SimpleNamespace(LEFT="left", RIGHT="right"),
+        SimpleNamespace(DEPTH="depth"),
+    )
     sl.TIME_REFERENCE = SimpleNamespace(IMAGE="image", CURRENT="current")
     monkeypatch.setitem(sys.modules, "pyzed", ModuleType("pyzed"))
     monkeypatch.setitem(sys.modules, "pyzed.sl", sl)
 
 
-def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     pyzed(monkeypatch)
     with option("perception/source", "zed").build() as source:
         assert StubZed.opened is not None and StubZed.opened.coordinate_units == "metre"
@@ -332,19 +377,31 @@ def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(monkeypa
         assert source._device._camera.fill is False
     assert StubZed.opened is None
     assert frame is not None and frame.right is not None
-    assert frame.color[0, 0].tolist() == [12, 11, 10] and frame.right[0, 0].tolist() == [22, 21, 20]  # the SDK gives BGRA
+    assert frame.color[0, 0].tolist() == [12, 11, 10] and frame.right[0, 0].tolist() == [
+        22,
+        21,
+        20,
+    ]  # the SDK gives BGRA
     assert np.isnan(frame.depth_m[0, :3]).all() and (frame.depth_m[1:] == 1.5).all()
     assert frame.t_s == pytest.approx(1.7e9) and frame.baseline_m == pytest.approx(0.11986)
-    assert frame.distortion is None  # the picture is rectified; the coefficients are those of the raw one
+    assert (
+        frame.distortion is None
+    )  # the picture is rectified; the coefficients are those of the raw one
     np.testing.assert_array_equal(frame.camera_matrix, MATRIX)
 
 
-def test_a_recording_of_a_zed_ends_and_knows_where_the_camera_was(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_recording_of_a_zed_ends_and_knows_where_the_camera_was(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     pyzed(monkeypatch)
     monkeypatch.setattr(StubZed, "left", 1)
-    (tmp_path / "calibration.yaml").write_text(yaml.safe_dump({"schema": 1, "T_base_cam": POSE.tolist()}))
+    (tmp_path / "calibration.yaml").write_text(
+        yaml.safe_dump({"schema": 1, "T_base_cam": POSE.tolist()})
+    )
     place = str(tmp_path / "calibration.yaml")
-    with replace(option("perception/source", "zed"), recording="a.svo", base_from_camera=place).build() as source:
+    with replace(
+        option("perception/source", "zed"), recording="a.svo", base_from_camera=place
+    ).build() as source:
         first = source.read_latest()
         assert first is not None and source.read_latest() is None
     np.testing.assert_allclose(first.base_from_camera, POSE)
@@ -361,7 +418,12 @@ def test_a_lens_whose_inverse_is_told_bends_as_opencv_says() -> None:
     r2, (k1, k2, p1, p2, k3) = x * x + y * y, inverse
     bent = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3  # the library's own deprojection, written down
     ray = np.stack(
-        [x * bent + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * bent + 2 * p2 * x * y + p1 * (r2 + 2 * y * y), 1 + 0 * x], 1
+        [
+            x * bent + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * bent + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+            1 + 0 * x,
+        ],
+        1,
     )
     seen = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
     np.testing.assert_allclose(seen, pixel, atol=0.3)
@@ -387,14 +449,21 @@ def test_depth_that_is_filled_in_is_refused() -> None:
 def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPatch) -> None:
     rs: Any = ModuleType("pyrealsense2")
     streams: list[Any] = []
-    rs.stream, rs.format = SimpleNamespace(depth="depth", color="color"), SimpleNamespace(z16="z16", rgb8="rgb8")
+    rs.stream, rs.format = (
+        SimpleNamespace(depth="depth", color="color"),
+        SimpleNamespace(z16="z16", rgb8="rgb8"),
+    )
     rs.config = lambda: SimpleNamespace(enable_stream=lambda *stream: streams.append(stream))
     rs.distortion = SimpleNamespace(inverse_brown_conrady="inverse")
     rs.timestamp_domain = SimpleNamespace(hardware_clock="own")
     lens = SimpleNamespace(fx=88.0, fy=88.0, ppx=79.5, ppy=44.5, coeffs=[0.0] * 5, model="inverse")
     profile = SimpleNamespace(
-        get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: SimpleNamespace(get_depth_scale=lambda: 0.001)),
-        get_stream=lambda _: SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens)),
+        get_device=lambda: SimpleNamespace(
+            first_depth_sensor=lambda: SimpleNamespace(get_depth_scale=lambda: 0.001)
+        ),
+        get_stream=lambda _: SimpleNamespace(
+            as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens)
+        ),
     )
     z16 = np.full(SIZE, 1500, np.uint16)
     z16[0] = 0
@@ -415,15 +484,23 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
         return frames
 
     stopped: list[bool] = []
-    rs.pipeline = lambda: SimpleNamespace(start=lambda _: profile, wait_for_frames=wait, stop=lambda: stopped.append(True))
+    rs.pipeline = lambda: SimpleNamespace(
+        start=lambda _: profile, wait_for_frames=wait, stop=lambda: stopped.append(True)
+    )
     rs.align = lambda to: SimpleNamespace(process=lambda found: found if to == "color" else None)
     monkeypatch.setitem(sys.modules, "pyrealsense2", rs)
-    with replace(option("perception/source", "realsense"), fresh=FRESH, serial=None).build() as source:
+    with replace(
+        option("perception/source", "realsense"), fresh=FRESH, serial=None
+    ).build() as source:
         frame = source.read_latest()
         with pytest.raises(FrameError, match="no new frame"):
             source.read_latest()
     assert stopped == [True]
-    assert frame is not None and np.isnan(frame.depth_m[0]).all() and frame.depth_m[1, 0] == pytest.approx(1.5)
+    assert (
+        frame is not None
+        and np.isnan(frame.depth_m[0]).all()
+        and frame.depth_m[1, 0] == pytest.approx(1.5)
+    )
     assert ("color", 1280, 720, "rgb8", 15) in streams
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(FrameError, match="not installed"):
@@ -432,9 +509,14 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
 
 def test_the_simulated_camera_sees_the_hole_of_the_task() -> None:
     rig: Rig = replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
-    spec: simulator.Simulated = replace(option("perception/source", "simulator"), rig=rig, num_frames=1)
+    spec: simulator.Simulated = replace(
+        option("perception/source", "simulator"), rig=rig, num_frames=1
+    )
     with spec.build() as source:
-        source.show((2.4, 0.1, 0.7, 0.3, 1.0, 0.06), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 2.6], [2.0, 0.0, 2.4], [2.0, 0.0, 1.6]]))
+        source.show(
+            (2.4, 0.1, 0.7, 0.3, 1.0, 0.06),
+            np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 2.6], [2.0, 0.0, 2.4], [2.0, 0.0, 1.6]]),
+        )
         frame = source.read_latest()
         assert frame is not None and source.read_latest() is None
         shot = source.shot(np.random.default_rng(0))

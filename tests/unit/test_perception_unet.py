@@ -32,23 +32,37 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, generator = tmp_path_factory.mktemp("frames"), np.random.default_rng(0)
     for number in range(14):
         angle, distance_m = generator.uniform(-0.6, 0.6), generator.uniform(1.0, 1.6)
-        eye = (-distance_m * np.cos(angle), -distance_m * np.sin(angle), generator.uniform(0.4, 0.9))
+        eye = (
+            -distance_m * np.cos(angle),
+            -distance_m * np.sin(angle),
+            generator.uniform(0.4, 0.9),
+        )
         view = cuboid.seen(cuboid.looking(eye, (0.0, 0.0, 0.3)), (160, 90), with_box=number != 5)
-        dataset.write_frame(folder / f"{number:02d}", view.frame.color, None, label=Label(view.block, view.mouth, view.occluder))
+        dataset.write_frame(
+            folder / f"{number:02d}",
+            view.frame.color,
+            None,
+            label=Label(view.block, view.mouth, view.occluder),
+        )
     return folder
 
 
 def test_the_loss_of_a_worked_example_is_right() -> None:
     logits = torch.full((1, 2, 1, 2), 0.0)
     target = torch.tensor([[[[1.0, 0.0]], [[0.0, 0.0]]]])
-    # probabilities are one half everywhere: entropy ln 2; Dice (2 * 0.5 + 1) / (2 + 1) and 1 / (1 + 1)
+    # probabilities are one half everywhere: entropy ln 2; Dice (2 * 0.5 + 1) / (2 + 1) and 1 / (1 +
+    # 1)
     expected = np.log(2.0) + 1.0 - (2.0 / 3.0 + 1.0 / 2.0) / 2.0
     assert float(loss(logits, target)) == pytest.approx(expected, rel=1e-6)
 
 
 def test_what_is_trained_by_default_goes_on_from_the_network_that_ships() -> None:
-    default = yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())["training"]
-    network, header = export.read(Path(next(iter(perception.__path__)), "weights/segmenter.safetensors"))
+    default = yaml.safe_load(
+        Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text()
+    )["training"]
+    network, header = export.read(
+        Path(next(iter(perception.__path__)), "weights/segmenter.safetensors")
+    )
     assert default["widths"] == header["widths"] and default["size_px"] == header["size_px"]
     assert 4 * sum(value.numel() for value in network.parameters()) < 4.5e6  # small: bytes
     assert network(torch.zeros(1, 3, 32, 64)).shape == (1, 2, 32, 64)
@@ -63,11 +77,25 @@ def test_figures_of_a_worked_example_are_right() -> None:
     said[0, 1, 1, 3, 3:] = 0.9  # the second mouth, one pixel too much: overlap 2 / 3
     said[1, 1, 1, 0, 0] = 0.9  # a mouth where there is none
     table = training_report.judged(said, known, ["clean", "empty"])
-    assert table["all"] == {"block": pytest.approx(0.8), "mouth": pytest.approx(0.4), "found": 0.5, "false": 0.5, "frames": 2}
-    assert table["empty"] == {"block": None, "mouth": None, "found": None, "false": 1.0, "frames": 1}
+    assert table["all"] == {
+        "block": pytest.approx(0.8),
+        "mouth": pytest.approx(0.4),
+        "found": 0.5,
+        "false": 0.5,
+        "frames": 2,
+    }
+    assert table["empty"] == {
+        "block": None,
+        "mouth": None,
+        "found": None,
+        "false": 1.0,
+        "frames": 1,
+    }
 
 
-def test_a_small_network_learns_the_block_in_seconds(brokk: Callable[..., Any], frames: Path) -> None:
+def test_a_small_network_learns_the_block_in_seconds(
+    brokk: Callable[..., Any], frames: Path
+) -> None:
     done = brokk(
         "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=60", "training.validate_every=30",
         "training.hold_out=4", "session.out=run",
@@ -81,25 +109,51 @@ def test_a_small_network_learns_the_block_in_seconds(brokk: Callable[..., Any], 
     }  # fmt: skip
 
 
-def test_a_training_begins_with_the_network_it_is_given(brokk: Callable[..., Any], frames: Path, tmp_path: Path) -> None:
-    command = ("mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=40", "training.validate_every=40")
+def test_a_training_begins_with_the_network_it_is_given(
+    brokk: Callable[..., Any], frames: Path, tmp_path: Path
+) -> None:
+    command = (
+        "mode=train_perception",
+        f"training.frames={frames}",
+        *SMALL,
+        "training.updates=40",
+        "training.validate_every=40",
+    )
     assert brokk(*command, "session.out=first").code == 0
     slow = [part if "rate" not in part else "training.rate=1e-9" for part in command]
-    again = brokk(*slow, "training.start=first/segmenter.safetensors", "training.updates=1", "session.out=again")
+    again = brokk(
+        *slow,
+        "training.start=first/segmenter.safetensors",
+        "training.updates=1",
+        "session.out=again",
+    )
     assert again.code == 0, again.err
-    one, other = (json.loads(Path(name, "training.json").read_text())["conditions"]["all"] for name in ("first", "again"))
+    one, other = (
+        json.loads(Path(name, "training.json").read_text())["conditions"]["all"]
+        for name in ("first", "again")
+    )
     curve = json.loads(Path("again/training.json").read_text())["curve"]
     assert (curve[0]["update"], curve[0]["loss"]) == (0, None), "what it began with is judged too"
     assert curve[0]["block"] == pytest.approx(one["block"], abs=1e-3)
     assert one["block"] > 0.3 and other["block"] == pytest.approx(one["block"], abs=0.1)
-    refused = brokk(*command, "training.start=first/segmenter.safetensors", "training.widths=[6,12]", "session.out=no")
+    refused = brokk(
+        *command,
+        "training.start=first/segmenter.safetensors",
+        "training.widths=[6,12]",
+        "session.out=no",
+    )
     assert refused.code == 2 and "widths [6, 12, 16]" in refused.err
 
 
 def test_a_training_keeps_the_mean_of_its_last_networks(
     brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command = ("mode=train_perception", f"training.frames={frames}", *SMALL, "training.validate_every=4")
+    command = (
+        "mode=train_perception",
+        f"training.frames={frames}",
+        *SMALL,
+        "training.validate_every=4",
+    )
     assert brokk(*command, "training.updates=1", "session.out=first").code == 0
     seen, step = [], training._Training._step
 
@@ -110,7 +164,11 @@ def test_a_training_keeps_the_mean_of_its_last_networks(
 
     monkeypatch.setattr(training._Training, "_step", watched)
     done = brokk(
-        *command, "training.updates=4", "training.average=0.25", "training.start=first/segmenter.safetensors", "session.out=run"
+        *command,
+        "training.updates=4",
+        "training.average=0.25",
+        "training.start=first/segmenter.safetensors",
+        "session.out=run",
     )
     assert done.code == 0, done.err
     # a quarter of the training is one update here: each one moves the mean by 1 - 1/e of the way
@@ -120,7 +178,9 @@ def test_a_training_keeps_the_mean_of_its_last_networks(
     torch.testing.assert_close(seen[0][0]._mean["head.weight"], mean)
 
 
-def test_an_interrupted_training_goes_on_exactly(brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_training_goes_on_exactly(
+    brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     command = (
         "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=9", "training.validate_every=3",
     )  # fmt: skip
@@ -138,9 +198,14 @@ def test_an_interrupted_training_goes_on_exactly(brokk: Callable[..., Any], fram
         patch.setattr(training._Training, "_step", until_the_fifth)
         assert brokk(*command, "session.out=parts").code == 130
     assert brokk(*command, "session.out=parts", "resume=parts").code == 0
-    one, other = (json.loads(Path(name, "training.json").read_text()) for name in ("whole", "parts"))
+    one, other = (
+        json.loads(Path(name, "training.json").read_text()) for name in ("whole", "parts")
+    )
     assert one["curve"] == other["curve"]
-    assert Path("whole/segmenter.safetensors").read_bytes() == Path("parts/segmenter.safetensors").read_bytes()
+    assert (
+        Path("whole/segmenter.safetensors").read_bytes()
+        == Path("parts/segmenter.safetensors").read_bytes()
+    )
     refused = brokk(*command, "session.out=parts", "resume=parts", "training.rate=0.02")
     assert refused.code == 2 and "its settings differ" in refused.err
 
@@ -149,9 +214,13 @@ def test_a_training_ends_in_time_with_its_rate_at_nothing(
     brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rates, rate = [], training._Training._rate
-    monkeypatch.setattr(training._Training, "_rate", lambda self: rates.append(rate(self)) or rates[-1])
+    monkeypatch.setattr(
+        training._Training, "_rate", lambda self: rates.append(rate(self)) or rates[-1]
+    )
     clock = iter(range(1000))
-    monkeypatch.setattr(training.time, "monotonic", lambda: float(next(clock)))  # a second an update
+    monkeypatch.setattr(
+        training.time, "monotonic", lambda: float(next(clock))
+    )  # a second an update
     done = brokk(
         "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=10000", "training.max_seconds=8",
         "training.validate_every=3", "session.out=run",
@@ -160,19 +229,26 @@ def test_a_training_ends_in_time_with_its_rate_at_nothing(
     result = json.loads(Path("run/training.json").read_text())
     assert (result["updates"], result["seconds"]) == (8, 8.0)
     assert [entry["update"] for entry in result["curve"]] == [3, 6, 8]
-    # the rise, 20 of the part spent, is over after one second; then half a cosine from 1 to 0 over 8
+    # the rise, 20 of the part spent, is over after one second; then half a cosine from 1 to 0 over
+    # 8
     assert rates[1:] == pytest.approx([0.005 * (1 + np.cos(np.pi * k / 8)) for k in range(1, 8)])
 
 
 def test_folders_without_masks_are_refused(brokk: Callable[..., Any], tmp_path: Path) -> None:
     done = brokk("mode=train_perception", f"training.frames={tmp_path}", "session.out=run")
     assert done.code == 2 and "mode=render" in done.err and not Path("run").exists()
-    done = brokk("mode=train_perception", "training.frames=x", "training.size_px=[100,48]", "session.out=run")
+    done = brokk(
+        "mode=train_perception", "training.frames=x", "training.size_px=[100,48]", "session.out=run"
+    )
     assert done.code == 2 and "multiples of 32" in done.err
 
 
-@pytest.mark.parametrize(("side_px", "width_px"), [(200, 1.5 * 1.3 * 200 * 480 / 288), (40, 480 / 1.5)])
-def test_a_small_block_is_not_enlarged_beyond_what_its_frame_shows(side_px: int, width_px: float) -> None:
+@pytest.mark.parametrize(
+    ("side_px", "width_px"), [(200, 1.5 * 1.3 * 200 * 480 / 288), (40, 480 / 1.5)]
+)
+def test_a_small_block_is_not_enlarged_beyond_what_its_frame_shows(
+    side_px: int, width_px: float
+) -> None:
     known = np.zeros((270, 480, 2), np.uint8)
     known[50 : 50 + side_px, 60 : 60 + side_px, 0] = 255
     _, closer = training_data._looks(known, (480, 288), 0.15, np.random.default_rng(0))

@@ -30,7 +30,9 @@ def test_jobs_take_different_gpus_and_leave_them_again() -> None:
 def test_a_gpu_named_twice_has_two_places(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(places.OFFERED, "0,0,cpu")
     with places.taken() as first, places.taken() as second, places.taken() as third:
-        assert (first, second, third) == ("0", "0", "cpu") and os.environ["CUDA_VISIBLE_DEVICES"] == ""
+        assert (first, second, third) == ("0", "0", "cpu") and os.environ[
+            "CUDA_VISIBLE_DEVICES"
+        ] == ""
 
 
 def test_a_job_waits_until_a_place_is_free(monkeypatch: pytest.MonkeyPatch) -> None:

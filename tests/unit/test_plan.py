@@ -40,7 +40,12 @@ def constant(joints: dict[int, float], seconds: float, start: np.ndarray, **fiel
     u = np.zeros((round(seconds * 20), 5))
     for joint, level in joints.items():
         u[:, joint] = level
-    return Segment(**({"name": "a_00", "start": start, "u": u, "stops": "inward", "stop_margin": 0.05} | fields))
+    return Segment(
+        **(
+            {"name": "a_00", "start": start, "u": u, "stops": "inward", "stop_margin": 0.05}
+            | fields
+        )
+    )
 
 
 def played(
@@ -62,52 +67,92 @@ def anywhere(machine: Machine, seed: int) -> np.ndarray:
 
 
 def with_speed(machine: Machine, scale: float) -> Machine:
-    speed = [replace(joint.max_speed, value=joint.max_speed.value * scale) for joint in machine.joints]
-    return replace(machine, joints=tuple(replace(joint, max_speed=s) for joint, s in zip(machine.joints, speed, strict=True)))
+    speed = [
+        replace(joint.max_speed, value=joint.max_speed.value * scale) for joint in machine.joints
+    ]
+    return replace(
+        machine,
+        joints=tuple(
+            replace(joint, max_speed=s) for joint, s in zip(machine.joints, speed, strict=True)
+        ),
+    )
 
 
-def test_a_program_is_played_unchanged_from_its_start_pose(machine: Machine, approach: Approach) -> None:
+def test_a_program_is_played_unchanged_from_its_start_pose(
+    machine: Machine, approach: Approach
+) -> None:
     generator = np.random.default_rng(0)
     start = np.stack([anywhere(machine, seed) for seed in range(4)])
-    runs = [[constant({}, 1.0, s, u=0.05 * generator.uniform(-1, 1, (100, 5)) * (np.arange(5) != 1))] for s in start]
+    runs = [
+        [constant({}, 1.0, s, u=0.05 * generator.uniform(-1, 1, (100, 5)) * (np.arange(5) != 1))]
+        for s in start
+    ]
     track = played(runs, machine, approach)
     for n, (segment,) in enumerate(runs):
         inside = track.stage[:, n] == account.PLAYING
         assert (track.u[inside, n] == segment.u).all()
-        assert (np.abs(track.q[inside, n][0] - segment.start) <= 0.04 * (machine.upper - machine.lower)).all()
+        assert (
+            np.abs(track.q[inside, n][0] - segment.start) <= 0.04 * (machine.upper - machine.lower)
+        ).all()
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 1.5])
 def test_approaches_arrive_on_machines_slower_or_faster_than_their_file(
     scale: float, machine: Machine, approach: Approach, caplog: pytest.LogCaptureFixture
 ) -> None:
-    runs = [[constant({}, 1.0, anywhere(machine, 10 * n + i), name=f"a_{i}") for i in range(3)] for n in range(5)]
+    runs = [
+        [constant({}, 1.0, anywhere(machine, 10 * n + i), name=f"a_{i}") for i in range(3)]
+        for n in range(5)
+    ]
     track = played(runs, machine, approach, link=Nominal(with_speed(machine, scale), 5))
-    assert not caplog.records and (track.stage[-1] == account.PLAYING).any() and track.segment[-1].tolist() == [2] * 5
+    assert (
+        not caplog.records
+        and (track.stage[-1] == account.PLAYING).any()
+        and track.segment[-1].tolist() == [2] * 5
+    )
     for n in range(5):
         for i in range(3):
-            begin = np.flatnonzero((track.segment[:, n] == i) & (track.stage[:, n] == account.PLAYING))[0]
-            assert (np.abs(track.q[begin, n] - runs[n][i].start) < 0.05 * (machine.upper - machine.lower)).all()
+            begin = np.flatnonzero(
+                (track.segment[:, n] == i) & (track.stage[:, n] == account.PLAYING)
+            )[0]
+            assert (
+                np.abs(track.q[begin, n] - runs[n][i].start)
+                < 0.05 * (machine.upper - machine.lower)
+            ).all()
 
 
-def test_exclusive_joints_never_move_together_with_others_on_the_way_either(machine: Machine, approach: Approach) -> None:
-    together = constant({1: 0.5, 3: 0.5}, 2.0, anywhere(machine, 0))  # no excitation may ask for this; the runner drops q2
-    track = played([[constant({}, 1.0, anywhere(machine, n)), together] for n in range(6)], machine, approach)
+def test_exclusive_joints_never_move_together_with_others_on_the_way_either(
+    machine: Machine, approach: Approach
+) -> None:
+    together = constant(
+        {1: 0.5, 3: 0.5}, 2.0, anywhere(machine, 0)
+    )  # no excitation may ask for this; the runner drops q2
+    track = played(
+        [[constant({}, 1.0, anywhere(machine, n)), together] for n in range(6)], machine, approach
+    )
     alone, others = track.u[:, :, 1] != 0, (np.delete(track.u, 1, axis=2) != 0).any(2)
     assert alone.any() and others.any() and not (alone & others).any()
 
 
-def test_the_stops_are_kept_although_the_command_acts_late(machine: Machine, approach: Approach) -> None:
+def test_the_stops_are_kept_although_the_command_acts_late(
+    machine: Machine, approach: Approach
+) -> None:
     for scale in (1.0, 1.4):
         for sign in (-1.0, 1.0):
             segments = [constant({0: sign, 2: sign, 3: sign, 4: sign}, 30.0, machine.home)]
-            track = played([segments], machine, approach, link=Nominal(with_speed(machine, scale), 1))
-            closest = np.minimum(track.q - machine.lower, machine.upper - track.q).min((0, 1)) / (machine.upper - machine.lower)
+            track = played(
+                [segments], machine, approach, link=Nominal(with_speed(machine, scale), 1)
+            )
+            closest = np.minimum(track.q - machine.lower, machine.upper - track.q).min((0, 1)) / (
+                machine.upper - machine.lower
+            )
             assert (np.delete(closest, 1) > 0.0).all(), f"speed x {scale}: {closest}"
             assert (np.delete(closest, 1) < 0.06).all(), "and they are reached"
 
 
-def test_inward_turns_a_joint_back_until_its_program_passes_zero(machine: Machine, approach: Approach) -> None:
+def test_inward_turns_a_joint_back_until_its_program_passes_zero(
+    machine: Machine, approach: Approach
+) -> None:
     u = np.zeros((500, 5))
     u[:, 4] = 0.8
     u[400:, 4] = -0.8
@@ -119,9 +164,13 @@ def test_inward_turns_a_joint_back_until_its_program_passes_zero(machine: Machin
     assert (sent[400:420] == -0.8).all()
 
 
-def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(machine: Machine, approach: Approach) -> None:
+def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(
+    machine: Machine, approach: Approach
+) -> None:
     u = np.zeros((2000, 5))
-    u[:, 2] = np.where(np.arange(2000) // 500 % 2 == 0, 0.9, -0.2)  # drives into the stop, then slowly back
+    u[:, 2] = np.where(
+        np.arange(2000) // 500 % 2 == 0, 0.9, -0.2
+    )  # drives into the stop, then slowly back
     track = played([[constant({}, 0.0, machine.home, u=u, stops="home")]], machine, approach)
     stage = track.stage[:, 0]
     begin = np.flatnonzero(stage != account.BEFORE)[0]
@@ -138,17 +187,27 @@ class Noisy(Nominal):
 
     def read(self) -> JointState:
         state = super().read()
-        return JointState(state.t_s, state.q + 0.0003 * np.random.default_rng(round(state.t_s * 20)).standard_normal(state.q.shape))
+        return JointState(
+            state.t_s,
+            state.q
+            + 0.0003 * np.random.default_rng(round(state.t_s * 20)).standard_normal(state.q.shape),
+        )
 
 
-def test_a_repeat_plays_what_was_sent_although_the_stops_came_in_between(machine: Machine, approach: Approach) -> None:
+def test_a_repeat_plays_what_was_sent_although_the_stops_came_in_between(
+    machine: Machine, approach: Approach
+) -> None:
     levels = option("excitation", "levels").segments(machine, 240.0, np.random.default_rng(0), [])
-    run = [*levels, *option("excitation", "repeat").segments(machine, 240.0, np.random.default_rng(0), levels)]
+    run = [
+        *levels,
+        *option("excitation", "repeat").segments(machine, 240.0, np.random.default_rng(0), levels),
+    ]
     track = played([run], machine, approach, link=Noisy(machine, 1), run_s=900.0)
     turned = 0
     for i, segment in enumerate(levels):
         first, again = (
-            track.u[(track.segment[:, 0] == k) & (track.stage[:, 0] != account.BEFORE), 0] for k in (i, i + len(levels))
+            track.u[(track.segment[:, 0] == k) & (track.stage[:, 0] != account.BEFORE), 0]
+            for k in (i, i + len(levels))
         )
         assert (first == again).all()
         turned += (first != segment.u).any()
@@ -157,14 +216,19 @@ def test_a_repeat_plays_what_was_sent_although_the_stops_came_in_between(machine
 
 def test_commands_keep_to_the_largest(machine: Machine, approach: Approach) -> None:
     guards = Guards(max_command=0.3, max_tool_speed_m_s=None)
-    track = played([[constant({0: 1.0, 3: -1.0}, 3.0, anywhere(machine, 1))]], machine, approach, guards)
+    track = played(
+        [[constant({0: 1.0, 3: -1.0}, 3.0, anywhere(machine, 1))]], machine, approach, guards
+    )
     assert np.abs(track.u).max() == 0.3
 
 
-def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(machine: Machine, approach: Approach) -> None:
+def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(
+    machine: Machine, approach: Approach
+) -> None:
     segment = constant({0: 1.0, 3: 0.5}, 4.0, machine.home)
     free, slow = (
-        played([[segment]], machine, approach, Guards(max_command=1.0, max_tool_speed_m_s=bound)) for bound in (None, 0.4)
+        played([[segment]], machine, approach, Guards(max_command=1.0, max_tool_speed_m_s=bound))
+        for bound in (None, 0.4)
     )
     fast, guarded = (predicted_tool_speed(machine, track.q[:, 0]) for track in (free, slow))
     assert fast is not None and guarded is not None
@@ -176,16 +240,35 @@ def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(machine:
 def test_the_tool_speed_is_that_of_the_kinematics(machine: Machine) -> None:
     import torch
 
-    q = machine.home + np.linspace(0, 0.2, 41)[:, None] * np.array([1.0, 0, 0, 0, 0])  # 0.1 rad/s about the vertical
-    radius_m = float(Kinematics(machine).pose(torch.as_tensor(machine.home, dtype=torch.float32)).tip_in_base_m[:2].norm())
+    q = machine.home + np.linspace(0, 0.2, 41)[:, None] * np.array(
+        [1.0, 0, 0, 0, 0]
+    )  # 0.1 rad/s about the vertical
+    radius_m = float(
+        Kinematics(machine)
+        .pose(torch.as_tensor(machine.home, dtype=torch.float32))
+        .tip_in_base_m[:2]
+        .norm()
+    )
     assert predicted_tool_speed(machine, q) == pytest.approx(np.full(41, 0.1 * radius_m), rel=1e-3)
 
 
-def test_a_machine_without_bodies_has_no_tool_speed_to_bound(machine: Machine, approach: Approach) -> None:
-    bare = replace(machine, joints=tuple(replace(joint, body=None) for joint in machine.joints), tool_m=None, mjcf=None)
+def test_a_machine_without_bodies_has_no_tool_speed_to_bound(
+    machine: Machine, approach: Approach
+) -> None:
+    bare = replace(
+        machine,
+        joints=tuple(replace(joint, body=None) for joint in machine.joints),
+        tool_m=None,
+        mjcf=None,
+    )
     assert predicted_tool_speed(bare, np.zeros((3, 5))) is None
     with pytest.raises(ConfigError, match="max_tool_speed_m_s"):
-        played([[constant({}, 1.0, bare.home)]], bare, approach, Guards(max_command=1.0, max_tool_speed_m_s=0.5))
+        played(
+            [[constant({}, 1.0, bare.home)]],
+            bare,
+            approach,
+            Guards(max_command=1.0, max_tool_speed_m_s=0.5),
+        )
 
 
 class Stuck(Nominal):
@@ -223,29 +306,47 @@ class Broken(Nominal):
         return JointState(state.t_s, state.q * np.nan if state.t_s > 1.0 else state.q)
 
 
-@pytest.mark.parametrize(("link", "message"), [(Silent, "no state after"), (Broken, "finite positions")])
+@pytest.mark.parametrize(
+    ("link", "message"), [(Silent, "no state after"), (Broken, "finite positions")]
+)
 def test_a_link_that_fails_is_an_error(
-    link: type[Nominal], message: str, machine: Machine, approach: Approach, monkeypatch: pytest.MonkeyPatch
+    link: type[Nominal],
+    message: str,
+    machine: Machine,
+    approach: Approach,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("brokk_rl.plan.drive.SILENCE_S", 0.05)
     with pytest.raises(LinkError, match=message):
         played([[constant({0: 0.3}, 5.0, machine.home)]], machine, approach, link=link(machine, 1))
 
 
-def test_a_plan_fills_its_time_and_repeats_with_its_seed(machine: Machine, approach: Approach) -> None:
+def test_a_plan_fills_its_time_and_repeats_with_its_seed(
+    machine: Machine, approach: Approach
+) -> None:
     chosen = {name: option("excitation", name) for name in ("levels", "ramps", "holds", "repeat")}
-    plan, again, other = (schedule(chosen, machine, approach, 2, 600.0, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    plan, again, other = (
+        schedule(chosen, machine, approach, 2, 600.0, np.random.default_rng(seed))
+        for seed in (1, 1, 2)
+    )
     link = Nominal(machine, 2)
     runner = Runner(plan, machine, approach, OPEN)
     track = Track(drive(link, runner, machine, 2, 600.0))
     assert runner.done and len(track.t_s) > 0.75 * 600 * 20, "neither cut nor left empty"
     for run, same in zip(plan.runs, again.runs, strict=True):
         assert [segment.name for segment in run] == [segment.name for segment in same]
-        assert all((a.u == b.u).all() and (a.start == b.start).all() for a, b in zip(run, same, strict=True))
+        assert all(
+            (a.u == b.u).all() and (a.start == b.start).all()
+            for a, b in zip(run, same, strict=True)
+        )
         half = len(run) // 2
-        assert [segment.repeat_of for segment in run[half:]] == [segment.name for segment in run[:half]]
+        assert [segment.repeat_of for segment in run[half:]] == [
+            segment.name for segment in run[:half]
+        ]
         assert {segment.name.split("_")[0] for segment in run} == {"levels", "ramps", "holds"}
-    assert (plan.runs[0][0].start != plan.runs[1][0].start).any() and (plan.runs[0][0].start != other.runs[0][0].start).any()
+    assert (plan.runs[0][0].start != plan.runs[1][0].start).any() and (
+        plan.runs[0][0].start != other.runs[0][0].start
+    ).any()
 
 
 def test_no_excitation_is_an_error(machine: Machine, approach: Approach) -> None:
@@ -259,34 +360,51 @@ def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach
     first = constant({}, 0.0, machine.home, u=u, stops="home")
     second = constant({}, 2.0, anywhere(machine, 3), name="a_01", repeat_of="elsewhere")
     plan = Plan(runs=((first, second),), run_s=120.0, names=("a",))
-    samples = list(drive(Nominal(machine, 1), Runner(plan, machine, approach, OPEN), machine, 1, 120.0))
+    samples = list(
+        drive(Nominal(machine, 1), Runner(plan, machine, approach, OPEN), machine, 1, 120.0)
+    )
     notes = account.notes(Track(samples), 0, plan.runs[0], 0.05)
     assert [(note["name"], note["part"]) for note in notes] == [
         ("a_00", "approach"), ("a_00", "program"), ("a_01", "approach"), ("a_01", "program"),
     ]  # fmt: skip
-    assert notes[0]["start_s"] == 0.0 and notes[1]["end_s"] - notes[1]["start_s"] == pytest.approx(30.0)
+    assert notes[0]["start_s"] == 0.0 and notes[1]["end_s"] - notes[1]["start_s"] == pytest.approx(
+        30.0
+    )
     assert all(one["end_s"] == next_["start_s"] for one, next_ in pairwise(notes))
     ((away, back),) = notes[1]["away_s"]
     assert away < back == pytest.approx(notes[1]["start_s"] + 25.0)
     assert notes[3]["repeat_of"] == "elsewhere"
-    playing = [k for k, sample in enumerate(samples) if sample.phase[0] == PLAY and sample.segment[0] == 0]
+    playing = [
+        k for k, sample in enumerate(samples) if sample.phase[0] == PLAY and sample.segment[0] == 0
+    ]
     later = account.notes(Track(samples[playing[0] + 100 :]), 0, plan.runs[0], 0.05)
     assert later[0]["offset_s"] == 5.0 and later[0]["start_s"] == 0.0
     assert not any(sample.phase[0] == DONE for sample in samples)
 
 
-def test_summary_and_picture_of_a_plan(machine: Machine, approach: Approach, tmp_path: Path) -> None:
-    first, second = constant({0: 0.5}, 4.0, machine.home), constant({1: 0.2}, 100.0, anywhere(machine, 3), name="a_01")
+def test_summary_and_picture_of_a_plan(
+    machine: Machine, approach: Approach, tmp_path: Path
+) -> None:
+    first, second = (
+        constant({0: 0.5}, 4.0, machine.home),
+        constant({1: 0.2}, 100.0, anywhere(machine, 3), name="a_01"),
+    )
     third = constant({}, 1.0, machine.home, name="a_02")
     plan = Plan(runs=((first, second, third),), run_s=60.0, names=("a",))
     track = played(plan.runs, machine, approach, run_s=60.0)
     found = account.summary(plan, track, machine)
     json.dumps(found, allow_nan=False)
     one, two, three = found["runs"][0]
-    assert one["end_s"] - one["start_s"] == pytest.approx(4.0) and one["cut_s"] == 0.0 and one["joints"]["q1"]["commanded"] == 1.0
+    assert (
+        one["end_s"] - one["start_s"] == pytest.approx(4.0)
+        and one["cut_s"] == 0.0
+        and one["joints"]["q1"]["commanded"] == 1.0
+    )
     # 4 s at half of 0.4 rad/s, less what the dead time leaves for later
     assert one["joints"]["q1"]["travel_rad"] == pytest.approx(0.2 * (4.0 - 0.55), abs=0.02)
     assert two["cut_s"] > 40.0 and three["start_s"] is None and three["cut_s"] == 1.0
     assert found["run_time_unused_s"] == [0.0]
-    picture.draw_plan(plan, track, machine, predicted_tool_speed(machine, track.q[:, 0]), tmp_path / "plan.png")
+    picture.draw_plan(
+        plan, track, machine, predicted_tool_speed(machine, track.q[:, 0]), tmp_path / "plan.png"
+    )
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")

@@ -37,7 +37,9 @@ def test_half_an_environment_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
         ranks.own()
 
 
-def test_only_modes_that_share_their_work_run_in_several_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_modes_that_share_their_work_run_in_several_processes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Shares:
         together = True
 
@@ -50,7 +52,9 @@ def test_only_modes_that_share_their_work_run_in_several_processes(monkeypatch: 
         ranks.check_together(Shares, sweep=True)
 
 
-def test_the_first_has_the_streams_of_one_alone_and_the_others_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_has_the_streams_of_one_alone_and_the_others_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     alone = session(tmp_path).stream("starts")
     seeds = []
     for index in range(3):
@@ -80,13 +84,25 @@ def test_each_process_has_its_own_gpu(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_alone_a_group_changes_nothing() -> None:
     with Group(torch.device("cpu")) as group:
-        assert not group.together and group.all(3) == [3] and group.from_first(4) == 4 and group.gathered({"a": 1}) == [{"a": 1}]
-        assert group.pooled({"x": 0.25, "episodes": 8.0, "fault_rate": 0.5}) == {"x": 0.25, "episodes": 8.0, "fault_rate": 0.5}
+        assert (
+            not group.together
+            and group.all(3) == [3]
+            and group.from_first(4) == 4
+            and group.gathered({"a": 1}) == [{"a": 1}]
+        )
+        assert group.pooled({"x": 0.25, "episodes": 8.0, "fault_rate": 0.5}) == {
+            "x": 0.25,
+            "episodes": 8.0,
+            "fault_rate": 0.5,
+        }
 
 
 def test_figures_of_several_weigh_by_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     group = Group(torch.device("cpu"))
-    parts = [{"x": 1.0, "episodes": 3.0, "fault_rate": 0.0}, {"x": 0.0, "episodes": 1.0, "fault_rate": 0.5}]
+    parts = [
+        {"x": 1.0, "episodes": 3.0, "fault_rate": 0.0},
+        {"x": 0.0, "episodes": 1.0, "fault_rate": 0.5},
+    ]
     monkeypatch.setattr(group, "all", lambda figures: parts)
     assert group.pooled(parts[0]) == {"x": 0.75, "episodes": 4.0, "fault_rate": 0.25}
 
@@ -94,4 +110,8 @@ def test_figures_of_several_weigh_by_episodes(monkeypatch: pytest.MonkeyPatch) -
 def test_a_fingerprint_sees_the_last_bit() -> None:
     weights = {"a": torch.ones(3), "b": torch.tensor(2.0)}
     nudged = weights | {"b": torch.nextafter(weights["b"], torch.tensor(3.0))}
-    assert fingerprint(weights) == fingerprint({k: v.clone() for k, v in weights.items()}) != fingerprint(nudged)
+    assert (
+        fingerprint(weights)
+        == fingerprint({k: v.clone() for k, v in weights.items()})
+        != fingerprint(nudged)
+    )

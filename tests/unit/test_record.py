@@ -53,50 +53,92 @@ def test_the_file_is_what_the_format_says(path: Path) -> None:
     assert list(schema) == ["t_s", *(f"u_{j}" for j in JOINTS), *(f"q_{j}_rad" for j in JOINTS)]
     assert schema["t_s"] == "double"
     assert set(list(schema.values())[1:]) == {"float"}
-    metadata = {key: value for key, value in file.schema_arrow.metadata.items() if key.startswith(b"brokk.")}
-    assert metadata == {b"brokk.schema": b"1", b"brokk.machine": b"brokk170", b"brokk.rate_hz": b"20"}
+    metadata = {
+        key: value for key, value in file.schema_arrow.metadata.items() if key.startswith(b"brokk.")
+    }
+    assert metadata == {
+        b"brokk.schema": b"1",
+        b"brokk.machine": b"brokk170",
+        b"brokk.rate_hz": b"20",
+    }
     assert file.metadata.row_group(0).column(0).compression == "ZSTD"
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(num_samples=st.integers(2, 60), jitter=st.floats(0.0, 0.09), seed=st.integers(0, 99), oil=st.booleans())
-def test_what_is_written_is_read(tmp_path: Path, machine: Machine, num_samples: int, jitter: float, seed: int, oil: bool) -> None:
+@settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    num_samples=st.integers(2, 60),
+    jitter=st.floats(0.0, 0.09),
+    seed=st.integers(0, 99),
+    oil=st.booleans(),
+)
+def test_what_is_written_is_read(
+    tmp_path: Path, machine: Machine, num_samples: int, jitter: float, seed: int, oil: bool
+) -> None:
     generator = np.random.default_rng(seed)
     t_s = np.arange(num_samples) * 0.05 + 0.05 * jitter * generator.uniform(-1.0, 1.0, num_samples)
     extra = {"oil_c": generator.uniform(20.0, 60.0, num_samples).astype(np.float32)} if oil else {}
-    before = recording(num_samples, t_s=t_s, extra=extra, metadata={"source": "test", "seed": str(seed)})
+    before = recording(
+        num_samples, t_s=t_s, extra=extra, metadata={"source": "test", "seed": str(seed)}
+    )
     record.write(before, tmp_path / "a.parquet")
     after = record.read(tmp_path / "a.parquet", machine)
     np.testing.assert_array_equal(after.t_s, t_s)
     np.testing.assert_array_equal(after.u, before.u.astype(np.float32))
     np.testing.assert_array_equal(after.q, before.q.astype(np.float32))
-    assert {key: value.tolist() for key, value in after.extra.items()} == {key: value.tolist() for key, value in extra.items()}
+    assert {key: value.tolist() for key, value in after.extra.items()} == {
+        key: value.tolist() for key, value in extra.items()
+    }
     assert (after.metadata, after.rate_hz, after.joints) == (before.metadata, 20.0, JOINTS)
 
 
 @pytest.mark.parametrize(
     ("column", "row", "value", "message"),
     [
-        ("u_q3", 7, 1.2, r"run\.parquet: row 7, column 'u_q3': command 1\.2 lies outside \[-1, 1\]"),
+        (
+            "u_q3",
+            7,
+            1.2,
+            r"run\.parquet: row 7, column 'u_q3': command 1\.2 lies outside \[-1, 1\]",
+        ),
         ("u_q1", 0, np.nan, r"run\.parquet: row 0, column 'u_q1': nan is not a number"),
         ("q_q5_rad", 39, np.inf, r"run\.parquet: row 39, column 'q_q5_rad': inf is not a number"),
-        ("t_s", 5, 0.2, r"run\.parquet: row 5, column 't_s': time does not increase \(0\.2 s, then 0\.2 s\)"),
+        (
+            "t_s",
+            5,
+            0.2,
+            r"run\.parquet: row 5, column 't_s': time does not increase \(0\.2 s, then 0\.2 s\)",
+        ),
         (
             "t_s",
             5,
             0.265,
             r"run\.parquet: row 5, column 't_s': 0\.065 s after the row before, but brokk\.rate_hz = 20 means 0\.05 s",
         ),
-        ("t_s", 39, 9.0, r"run\.parquet: row 39, column 't_s': 7\.1 s after .*split the recording at the gap"),
+        (
+            "t_s",
+            39,
+            9.0,
+            r"run\.parquet: row 39, column 't_s': 7\.1 s after .*split the recording at the gap",
+        ),
     ],
 )
-def test_a_bad_cell_is_refused_by_name(path: Path, machine: Machine, column: str, row: int, value: float, message: str) -> None:
+def test_a_bad_cell_is_refused_by_name(
+    path: Path, machine: Machine, column: str, row: int, value: float, message: str
+) -> None:
     with pytest.raises(RecordingError, match=message):
         record.read(changed(path, column, row, value), machine)
 
 
 def test_every_breach_is_found_with_its_row_and_column(path: Path, machine: Machine) -> None:
-    for column, row, value in [("u_q3", 7, 1.2), ("u_q3", 8, 1.3), ("u_q3", 20, -4.0), ("q_q1_rad", 3, np.nan), ("t_s", 30, 1.45)]:
+    for column, row, value in [
+        ("u_q3", 7, 1.2),
+        ("u_q3", 8, 1.3),
+        ("u_q3", 20, -4.0),
+        ("q_q1_rad", 3, np.nan),
+        ("t_s", 30, 1.45),
+    ]:
         changed(path, column, row, value)
     table = pq.read_table(path)
     pq.write_table(table.drop_columns("q_q5_rad"), path)
@@ -106,14 +148,20 @@ def test_every_breach_is_found_with_its_row_and_column(path: Path, machine: Mach
     assert [(breach.column, breach.row, breach.num_rows) for breach in found] == [
         ("q_q5_rad", None, 1), ("q_q1_rad", 3, 1), ("u_q3", 7, 2), ("u_q3", 20, 1), ("t_s", 30, 1), ("t_s", 31, 1),
     ]  # fmt: skip
-    assert str(found[2]) == "row 7, column 'u_q3': command 1.2 lies outside [-1, 1] (2 such rows on end)"
+    assert (
+        str(found[2])
+        == "row 7, column 'u_q3': command 1.2 lies outside [-1, 1] (2 such rows on end)"
+    )
 
 
 def test_a_missing_column_is_refused_with_the_nearest_names(path: Path, machine: Machine) -> None:
     table = pq.read_table(path)
     names = [name.replace("q_q4_rad", "q_q4_deg") for name in table.column_names]
     pq.write_table(table.rename_columns(names).replace_schema_metadata(table.schema.metadata), path)
-    with pytest.raises(RecordingError, match=r"run\.parquet: column 'q_q4_rad' is missing; did you mean 'q_q\d_\w+'\?"):
+    with pytest.raises(
+        RecordingError,
+        match=r"run\.parquet: column 'q_q4_rad' is missing; did you mean 'q_q\d_\w+'\?",
+    ):
         record.read(path, machine)
 
 
@@ -125,12 +173,23 @@ def test_a_missing_column_is_refused_with_the_nearest_names(path: Path, machine:
             {"brokk.schema": "2", "brokk.machine": "brokk170", "brokk.rate_hz": "20"},
             r"brokk\.schema is '2', this version reads '1'",
         ),
-        ({"brokk.schema": "1", "brokk.machine": "crane", "brokk.rate_hz": "20"}, "unknown machine 'crane', expected 'brokk170'"),
-        ({"brokk.schema": "1", "brokk.machine": "brokk170", "brokk.rate_hz": "fast"}, "'fast', expected a positive number"),
-        ({"brokk.schema": "1", "brokk.machine": "brokk170", "brokk.rate_hz": "100"}, r"row 1, column 't_s': 0\.05 s after"),
+        (
+            {"brokk.schema": "1", "brokk.machine": "crane", "brokk.rate_hz": "20"},
+            "unknown machine 'crane', expected 'brokk170'",
+        ),
+        (
+            {"brokk.schema": "1", "brokk.machine": "brokk170", "brokk.rate_hz": "fast"},
+            "'fast', expected a positive number",
+        ),
+        (
+            {"brokk.schema": "1", "brokk.machine": "brokk170", "brokk.rate_hz": "100"},
+            r"row 1, column 't_s': 0\.05 s after",
+        ),
     ],
 )
-def test_wrong_metadata_is_refused(path: Path, machine: Machine, metadata: dict[str, str], message: str) -> None:
+def test_wrong_metadata_is_refused(
+    path: Path, machine: Machine, metadata: dict[str, str], message: str
+) -> None:
     pq.write_table(pq.read_table(path).replace_schema_metadata(metadata), path)
     with pytest.raises(RecordingError, match=message):
         record.read(path, machine)

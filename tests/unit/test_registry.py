@@ -21,7 +21,8 @@ def option(folder: Path, group: str, text: str) -> Option:
 def test_an_option_is_described_by_its_spec(tmp_path: Path) -> None:
     text = "# Not this.\n_target_: brokk_rl.modes.list.List\n"
     assert (
-        option(tmp_path, "mode", text).summary() == "Prints the options of every config group, those of installed extensions too."
+        option(tmp_path, "mode", text).summary()
+        == "Prints the options of every config group, those of installed extensions too."
     )
 
 
@@ -31,7 +32,10 @@ def test_an_override_is_described_by_the_first_sentence_of_its_comment(tmp_path:
 
 
 def test_a_spec_that_cannot_be_found_does_not_break_the_list(tmp_path: Path) -> None:
-    assert option(tmp_path, "task", "# A comment.\n_target_: nowhere.at.All\n").summary() == "A comment."
+    assert (
+        option(tmp_path, "task", "# A comment.\n_target_: nowhere.at.All\n").summary()
+        == "A comment."
+    )
 
 
 def test_the_list_can_be_narrowed_to_a_group(brokk: Callable[..., Any]) -> None:
@@ -40,7 +44,9 @@ def test_the_list_can_be_narrowed_to_a_group(brokk: Callable[..., Any]) -> None:
     assert "borehole_insertion" not in done.out
 
 
-def examine(monkeypatch: pytest.MonkeyPatch, **probes: Callable[..., Iterator[Finding]]) -> dict[str, Finding]:
+def examine(
+    monkeypatch: pytest.MonkeyPatch, **probes: Callable[..., Iterator[Finding]]
+) -> dict[str, Finding]:
     """Runs the doctor with these probes, all others silent."""
     for name in (
         "python",
@@ -58,7 +64,9 @@ def examine(monkeypatch: pytest.MonkeyPatch, **probes: Callable[..., Iterator[Fi
     return dict(Doctor(doctor=Limits(folder="runs", min_free_gib=0.0)).findings())
 
 
-def test_a_probe_that_breaks_is_a_warning_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_probe_that_breaks_is_a_warning_and_the_others_go_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def breaks() -> Iterator[Finding]:
         raise OSError("no such library")
         yield
@@ -69,7 +77,9 @@ def test_a_probe_that_breaks_is_a_warning_and_the_others_go_on(monkeypatch: pyte
     assert found["extensions"].text == "none"
 
 
-def test_the_doctor_leaves_with_1_when_something_essential_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_doctor_leaves_with_1_when_something_essential_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     examine(monkeypatch, python=lambda: iter([Finding("fail", "too old")]))
     with pytest.raises(SystemExit) as left:
         Doctor(doctor=Limits(folder="runs", min_free_gib=0.0)).run()
@@ -89,5 +99,15 @@ def test_our_import_names_are_ours() -> None:
 def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
     done = brokk("mode=doctor")
     assert done.code == 0, done.out
-    for topic in ("Python", "torch", "CUDA graphs", "Warp", "kernel cache", "rendering", "disk", "import names", "extensions"):
+    for topic in (
+        "Python",
+        "torch",
+        "CUDA graphs",
+        "Warp",
+        "kernel cache",
+        "rendering",
+        "disk",
+        "import names",
+        "extensions",
+    ):
         assert topic in done.out

@@ -65,15 +65,26 @@ def nasty_page() -> Page:
 def test_whatever_is_given_is_text_and_never_markup() -> None:
     read = Reader(nasty_page().html())
     assert not {"script", "link", "iframe"} & {tag for tag, _ in read.tags}
-    assert sum(NASTY in text for text in read.texts) == 16  # once for each place above, and twice for the title
+    assert (
+        sum(NASTY in text for text in read.texts) == 16
+    )  # once for each place above, and twice for the title
     assert [attributes["alt"] for tag, attributes in read.tags if tag == "img"] == [NASTY]
 
 
 def test_a_page_needs_nothing_from_elsewhere() -> None:
     read = Reader(nasty_page().html())
-    addresses = [value for _, attributes in read.tags for key, value in attributes.items() if key in ("src", "href", "srcset")]
+    addresses = [
+        value
+        for _, attributes in read.tags
+        for key, value in attributes.items()
+        if key in ("src", "href", "srcset")
+    ]
     assert addresses and all(value and value.startswith("data:") for value in addresses)
-    policies = [attributes["content"] for _, attributes in read.tags if attributes.get("http-equiv") == "Content-Security-Policy"]
+    policies = [
+        attributes["content"]
+        for _, attributes in read.tags
+        if attributes.get("http-equiv") == "Content-Security-Policy"
+    ]
     assert policies and "default-src 'none'" in str(policies[0])
 
 
@@ -84,12 +95,18 @@ def test_a_picture_file_is_in_the_page_byte_by_byte(tmp_path: Path) -> None:
     (source,) = (attributes["src"] for tag, attributes in Reader(page.html()).tags if tag == "img")
     assert source is not None
     kind, data = source.split(",")
-    assert kind == "data:image/png;base64" and base64.b64decode(data) == (tmp_path / "a.png").read_bytes()
+    assert (
+        kind == "data:image/png;base64"
+        and base64.b64decode(data) == (tmp_path / "a.png").read_bytes()
+    )
 
 
 def test_columns_of_figures_are_aligned_and_the_best_is_marked() -> None:
     page = Page("a")
-    page.table(["joint", "error", "why"], [["q1", Cell(0.012345, best=True), "x"], ["q2", None, "y"], ["q3", "0.50", "z"]])
+    page.table(
+        ["joint", "error", "why"],
+        [["q1", Cell(0.012345, best=True), "x"], ["q2", None, "y"], ["q3", "0.50", "z"]],
+    )
     cells = [attributes.get("class") for tag, attributes in Reader(page.html()).tags if tag == "td"]
     assert cells == ["number best", None, "number", None, "number", None]
     assert ">▸ 0.0123<" in page.html() and ">–<" in page.html()
@@ -106,7 +123,9 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> Non
         page.write(tmp_path / "missing" / "page.html")
     (tmp_path / "page.html").write_text("old")
     page.write(tmp_path / "page.html")
-    assert "new" in (tmp_path / "page.html").read_text() and [p.name for p in tmp_path.iterdir()] == ["page.html"]
+    assert "new" in (tmp_path / "page.html").read_text() and [
+        p.name for p in tmp_path.iterdir()
+    ] == ["page.html"]
 
 
 def test_a_missing_picture_is_said(tmp_path: Path) -> None:

@@ -37,15 +37,28 @@ def state() -> ToolState:
     )
 
 
-@pytest.mark.parametrize(("reach_m", "expected"), [(2.9, 0.25 / 1.5), (2.4, 0.25), (1.7, 0.25), (1.2, 0.25 / 1.5), (3.4, 0.25 / 2)])
-def test_working_distance_falls_off_outside_the_good_range(state: ToolState, reach_m: float, expected: float) -> None:
+@pytest.mark.parametrize(
+    ("reach_m", "expected"),
+    [(2.9, 0.25 / 1.5), (2.4, 0.25), (1.7, 0.25), (1.2, 0.25 / 1.5), (3.4, 0.25 / 2)],
+)
+def test_working_distance_falls_off_outside_the_good_range(
+    state: ToolState, reach_m: float, expected: float
+) -> None:
     positioning = replace(state, positioning=YES, reach_m=torch.tensor([reach_m]))
     assert reward.working_distance(positioning).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_while_positioning_only_the_working_distance_counts(state: ToolState) -> None:
-    positioning = replace(state, positioning=YES, contact_force_n=torch.tensor([900.0]), paper_success=YES)
-    for term in (reward.distance, reward.pitch, reward.insertion, reward.far_contact, reward.approach_command_change):
+    positioning = replace(
+        state, positioning=YES, contact_force_n=torch.tensor([900.0]), paper_success=YES
+    )
+    for term in (
+        reward.distance,
+        reward.pitch,
+        reward.insertion,
+        reward.far_contact,
+        reward.approach_command_change,
+    ):
         assert term(positioning).item() == 0.0, term.__name__
     assert reward.working_distance(state).item() == 0.0, "and once it is done, all the others"
 
@@ -56,7 +69,9 @@ def test_distance_is_one_over_one_plus_metres(state: ToolState) -> None:
 
 def test_pitch_is_one_over_one_plus_radians_both_ways(state: ToolState) -> None:
     assert reward.pitch(state).item() == pytest.approx(1 / 1.25)
-    assert reward.pitch(replace(state, pitch_rad=torch.tensor([1.75]))).item() == pytest.approx(1 / 1.25)
+    assert reward.pitch(replace(state, pitch_rad=torch.tensor([1.75]))).item() == pytest.approx(
+        1 / 1.25
+    )
 
 
 def test_insertion_pays_both_alignments_while_the_papers_criterion_holds(state: ToolState) -> None:
@@ -67,14 +82,22 @@ def test_insertion_pays_both_alignments_while_the_papers_criterion_holds(state: 
 @pytest.mark.parametrize(
     ("distance_m", "expected"), [(0.5, 120.0), (0.43, 120.0), (0.42, 0.0), (0.25, 0.0)]
 )  # r^d = 0.7 at 3/7 m = 0.4286 m
-def test_contact_costs_its_force_only_far_from_the_hole(state: ToolState, distance_m: float, expected: float) -> None:
-    touching = replace(state, contact_force_n=torch.tensor([120.0]), target_m=state.tip_m + torch.tensor([[0.0, 0.0, distance_m]]))
+def test_contact_costs_its_force_only_far_from_the_hole(
+    state: ToolState, distance_m: float, expected: float
+) -> None:
+    touching = replace(
+        state,
+        contact_force_n=torch.tensor([120.0]),
+        target_m=state.tip_m + torch.tensor([[0.0, 0.0, distance_m]]),
+    )
     assert reward.far_contact(touching).item() == pytest.approx(expected)
 
 
 def test_command_change_sums_over_joints(state: ToolState) -> None:
     assert reward.approach_command_change(state).item() == pytest.approx(0.25 + 0.5)
-    assert reward.command_change(replace(state, positioning=YES)).item() == pytest.approx(0.75), "this one counts everywhere"
+    assert reward.command_change(replace(state, positioning=YES)).item() == pytest.approx(0.75), (
+        "this one counts everywhere"
+    )
 
 
 def test_the_papers_total_on_one_state(state: ToolState) -> None:
@@ -88,7 +111,10 @@ def test_the_papers_total_on_one_state(state: ToolState) -> None:
         "approach_command_change": -0.01,
         "working_distance": 1,
     }
-    total = sum(reward.Term(function=f"tasks.reward:{name}", weight=weight)(done) for name, weight in weights.items())
+    total = sum(
+        reward.Term(function=f"tasks.reward:{name}", weight=weight)(done)
+        for name, weight in weights.items()
+    )
     assert float(total) == pytest.approx(1.6 + 8.0 - 0.0075, rel=1e-5)
 
 
@@ -97,7 +123,10 @@ def test_progress_is_the_gain_of_closeness(state: ToolState) -> None:
 
 
 def test_success_and_duration_are_one(state: ToolState) -> None:
-    assert reward.success(state).item() == 0.0 and reward.success(replace(state, success=YES)).item() == 1.0
+    assert (
+        reward.success(state).item() == 0.0
+        and reward.success(replace(state, success=YES)).item() == 1.0
+    )
     assert reward.duration(state).item() == 1.0
 
 
@@ -118,8 +147,15 @@ def test_a_term_that_is_no_function_is_refused(function: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before_n", "now_n", "expected"), [(0, 2500, 2.5), (2500, 1000, 0), (9000, 14000, 1.0), (12000, 15000, 0)]
+    ("before_n", "now_n", "expected"),
+    [(0, 2500, 2.5), (2500, 1000, 0), (9000, 14000, 1.0), (12000, 15000, 0)],
 )
-def test_an_episode_pays_for_its_hardest_blow_once(state: ToolState, before_n: float, now_n: float, expected: float) -> None:
-    blow = replace(state, peak_force_n=torch.tensor([float(before_n)]), contact_force_n=torch.tensor([float(now_n)]))
+def test_an_episode_pays_for_its_hardest_blow_once(
+    state: ToolState, before_n: float, now_n: float, expected: float
+) -> None:
+    blow = replace(
+        state,
+        peak_force_n=torch.tensor([float(before_n)]),
+        contact_force_n=torch.tensor([float(now_n)]),
+    )
     assert reward.peak_contact(blow).item() == pytest.approx(expected)

@@ -24,7 +24,14 @@ from brokk_rl.rl.vec_env import ControlLoop
 
 CPU = torch.device("cpu")
 TRAINING = runs.small(max_seconds=1.0)
-SILENT = {"target_sample_m": 0.0, "target_bias_m": 0.0, "target_relative": 0.0, "filter": "none", "q_scale": 0.0, "u_scale": 0.0}
+SILENT = {
+    "target_sample_m": 0.0,
+    "target_bias_m": 0.0,
+    "target_relative": 0.0,
+    "filter": "none",
+    "q_scale": 0.0,
+    "u_scale": 0.0,
+}
 
 
 @dataclass
@@ -41,7 +48,9 @@ def export_policy(machine: Machine, folder: Path, name: str, kind: str) -> Bundl
     folder.mkdir(exist_ok=True)
     torch.manual_seed(0)
     task = option("task", name)
-    task = replace(task, noise=replace(task.noise, **SILENT), action=replace(task.action, kind=kind))
+    task = replace(
+        task, noise=replace(task.noise, **SILENT), action=replace(task.action, kind=kind)
+    )
     loop = runs.plant(machine, task).build(CPU, 16, 64, 3)
     config = TRAINING.runner_config()
     actor = make_actor(config["actor"], config["obs_groups"], loop)
@@ -59,7 +68,9 @@ def export_policy(machine: Machine, folder: Path, name: str, kind: str) -> Bundl
 
 @pytest.fixture(scope="module")
 def bundle(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
-    return export_policy(machine, tmp_path_factory.mktemp("policy"), "borehole_insertion", "residual")
+    return export_policy(
+        machine, tmp_path_factory.mktemp("policy"), "borehole_insertion", "residual"
+    )
 
 
 @pytest.fixture
@@ -76,38 +87,76 @@ def test_a_bundle_is_four_files_and_nothing_else(bundle: Bundle) -> None:
 
 def test_the_contract_says_all_that_the_machine_needs(bundle: Bundle, machine: Machine) -> None:
     contract = bundle.contract
-    assert contract["schema"] == 1 and contract["machine"] == "brokk170" and contract["rate_hz"] == 20.0
+    assert (
+        contract["schema"] == 1
+        and contract["machine"] == "brokk170"
+        and contract["rate_hz"] == 20.0
+    )
     assert contract["fingerprint"] == machine.fingerprint()
-    assert contract["joints"] == contract["command"]["order"] == ["q1", "q2", "q3", "q4", "q5"] and contract["exclusive"] == ["q2"]
-    assert contract["observation"]["size"] == 133 and contract["observation"]["switch"]["rule"] == "planar"
+    assert contract["joints"] == contract["command"]["order"] == [
+        "q1",
+        "q2",
+        "q3",
+        "q4",
+        "q5",
+    ] and contract["exclusive"] == ["q2"]
+    assert (
+        contract["observation"]["size"] == 133
+        and contract["observation"]["switch"]["rule"] == "planar"
+    )
     parity = contract["parity"]
-    assert parity["observations"] == 400 and parity["largest_difference"] < export.TOLERANCE and parity["at_an_edge"] <= 2
+    assert (
+        parity["observations"] == 400
+        and parity["largest_difference"] < export.TOLERANCE
+        and parity["at_an_edge"] <= 2
+    )
 
 
 def test_the_onnx_file_carries_the_contract(bundle: Bundle, machine: Machine) -> None:
-    session = onnxruntime.InferenceSession(bundle.folder / "policy.onnx", providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(
+        bundle.folder / "policy.onnx", providers=["CPUExecutionProvider"]
+    )
     told = session.get_modelmeta().custom_metadata_map
-    assert told["brokk.machine"] == "brokk170" and json.loads(told["brokk.fingerprint"]) == machine.fingerprint()
-    assert json.loads(told["brokk.observation"]) == bundle.contract["observation"] and float(told["brokk.rate_hz"]) == 20.0
+    assert (
+        told["brokk.machine"] == "brokk170"
+        and json.loads(told["brokk.fingerprint"]) == machine.fingerprint()
+    )
+    assert (
+        json.loads(told["brokk.observation"]) == bundle.contract["observation"]
+        and float(told["brokk.rate_hz"]) == 20.0
+    )
     (given,), (taken,) = session.get_inputs(), session.get_outputs()
     assert (given.name, given.shape) == ("observation", ["batch", 133]) and taken.name == "command"
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"), [("borehole_insertion", "residual"), ("borehole_insertion", "direct"), ("goal_pose", "residual")]
+    ("name", "kind"),
+    [
+        ("borehole_insertion", "residual"),
+        ("borehole_insertion", "direct"),
+        ("goal_pose", "residual"),
+    ],
 )
-def test_on_the_machine_it_commands_what_it_did_in_the_simulator(name: str, kind: str, machine: Machine, tmp_path: Path) -> None:
+def test_on_the_machine_it_commands_what_it_did_in_the_simulator(
+    name: str, kind: str, machine: Machine, tmp_path: Path
+) -> None:
     """Numpy's encoder and onnxruntime on the recorded history against the control loop's own way from observation to command."""
     made = export_policy(machine, tmp_path / "policy", name, kind)
-    session = onnxruntime.InferenceSession(made.folder / "policy.onnx", providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(
+        made.folder / "policy.onnx", providers=["CPUExecutionProvider"]
+    )
     encoder = Encoder(machine, option("task", name).scaling)
     loop, policy = made.loop, Network(made.actor, made.loop)
     loop.begin()
     off, rows = [], 0
     for _ in range(60):
         groups = dict(loop.get_observations().items())
-        recorded = [loop.task.state[f"start.{key}"].numpy() for key in ("target_m", "target_pitch_rad")]
-        vector = encoder.encode(recorded[0], loop.history.q.numpy(), loop.history.u.numpy(), recorded[1])
+        recorded = [
+            loop.task.state[f"start.{key}"].numpy() for key in ("target_m", "target_pitch_rad")
+        ]
+        vector = encoder.encode(
+            recorded[0], loop.history.q.numpy(), loop.history.u.numpy(), recorded[1]
+        )
         on_machine = session.run(None, {"observation": vector.astype(np.float32)})[0]
         with torch.no_grad():
             _, _, done, _ = loop.step(policy.act(groups))
@@ -115,7 +164,9 @@ def test_on_the_machine_it_commands_what_it_did_in_the_simulator(name: str, kind
         difference = np.abs(on_machine[~done.numpy()] - in_force).max(1)
         off.append(difference > 1e-3)
         rows += len(difference)
-    assert rows > 900 and np.concatenate(off).mean() < 0.005, "but at the edges of masks and dead bands, as in the parity check"
+    assert rows > 900 and np.concatenate(off).mean() < 0.005, (
+        "but at the edges of masks and dead bands, as in the parity check"
+    )
 
 
 def test_a_trained_policy_is_read_back_as_it_was_written(bundle: Bundle) -> None:
@@ -131,8 +182,12 @@ def test_an_empty_folder_holds_no_policy(tmp_path: Path, machine: Machine) -> No
 
 
 @pytest.mark.parametrize("file", ["policy.safetensors", "policy.json"])
-@pytest.mark.parametrize("content", [b"", b"{", b"\x10\x00\x00\x00\x00\x00\x00\x00nonsense in here"])
-def test_a_corrupt_file_is_named_with_the_way_out(file: str, content: bytes, copied: Path, machine: Machine) -> None:
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"\x10\x00\x00\x00\x00\x00\x00\x00nonsense in here"]
+)
+def test_a_corrupt_file_is_named_with_the_way_out(
+    file: str, content: bytes, copied: Path, machine: Machine
+) -> None:
     (copied / file).write_bytes(content)
     with pytest.raises(CheckpointError, match=r"is corrupt: .*mode=export"):
         read_bundle(copied, machine)
@@ -190,11 +245,15 @@ def test_a_file_that_says_something_else_is_not_left_behind(
     monkeypatch.setattr(export.onnxruntime, "InferenceSession", Wrong)
     task = option("task", "borehole_insertion").build(machine, 1, CPU)
     with pytest.raises(CheckpointError, match="differs from the network in"):
-        export.export_onnx(copied, bundle.actor, task, bundle.contract, bundle.loop.get_observations()["policy"])
+        export.export_onnx(
+            copied, bundle.actor, task, bundle.contract, bundle.loop.get_observations()["policy"]
+        )
     assert sorted(path.name for path in copied.iterdir()) == ["policy.json", "policy.safetensors"]
 
 
-def test_a_policy_that_ships_is_named_by_package_and_path(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_that_ships_is_named_by_package_and_path(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     package = copied.parent / "shipping"
     package.mkdir()
     (package / "__init__.py").touch()

@@ -37,15 +37,22 @@ def test_only_finished_environments_begin_anew(machine: Machine) -> None:
     loop = make(machine)
     for _ in range(3):
         loop.step(torch.zeros(8, 5))
-    loop.episode_length_buf = torch.where(torch.arange(8) < 2, loop.max_episode_length - 1, loop.episode_length_buf)
+    loop.episode_length_buf = torch.where(
+        torch.arange(8) < 2, loop.max_episode_length - 1, loop.episode_length_buf
+    )
     before = snapshot(loop)
     _, _, done, extras = loop.step(torch.zeros(8, 5))
-    assert done.tolist() == [True, True, *[False] * 6] and extras["time_outs"].tolist() == done.tolist()
+    assert (
+        done.tolist() == [True, True, *[False] * 6]
+        and extras["time_outs"].tolist() == done.tolist()
+    )
     after = snapshot(loop)
     assert (after["task.steps"][:2] == 0).all() and (after["task.steps"][2:] == 4).all()
     assert (after["episode.length"][:2] == 0).all() and (after["episode.length"][2:] == 4).all()
     targets = "task.start.target_m"
-    assert (after[targets][:2] != before[targets][:2]).any() and torch.equal(after[targets][2:], before[targets][2:])
+    assert (after[targets][:2] != before[targets][:2]).any() and torch.equal(
+        after[targets][2:], before[targets][2:]
+    )
     assert (after["history.u"][:2] == 0).all() and (after["history.q"][:2].diff(dim=1) == 0).all()
     assert torch.equal(after["history.q"][:2, -1], after["world.q"][:2]) and torch.equal(
         after["world.q"][:2], after["task.start.q"][:2]
@@ -94,7 +101,9 @@ def test_a_restored_loop_goes_on_exactly(machine: Machine) -> None:
     torch.set_rng_state(random)
     for action, (reward, seen) in zip(actions[20:], first, strict=True):
         found = other.step(action)
-        assert torch.equal(found[1], reward) and all(torch.equal(found[0][name], seen[name]) for name in seen.keys())  # noqa: SIM118
+        assert torch.equal(found[1], reward) and all(
+            torch.equal(found[0][name], seen[name]) for name in seen.keys()
+        )  # noqa: SIM118
 
 
 def test_statistics_count_what_ended_since_they_were_last_asked(machine: Machine) -> None:
@@ -103,17 +112,27 @@ def test_statistics_count_what_ended_since_they_were_last_asked(machine: Machine
     for _ in range(4):
         loop.step(torch.zeros(8, 5))
     found = loop.statistics()
-    assert found["episodes"] == 8 and found["end/time_limit"] == 1.0 and found["length"] == 4.0 and found["fault_rate"] == 0.0
+    assert (
+        found["episodes"] == 8
+        and found["end/time_limit"] == 1.0
+        and found["length"] == 4.0
+        and found["fault_rate"] == 0.0
+    )
     assert loop.statistics()["episodes"] == 0
 
 
 def test_the_action_of_a_step_is_in_force_in_that_step(machine: Machine) -> None:
-    loop = make(machine, action=replace(option("task", "borehole_insertion").action, kind="direct", scale=1.0))
+    loop = make(
+        machine,
+        action=replace(option("task", "borehole_insertion").action, kind="direct", scale=1.0),
+    )
     action = torch.linspace(-1, 1, 40).reshape(8, 5)
     positioning = loop.task.state["positioning"].bool()
     loop.step(action)
     exclusive = torch.as_tensor(machine.is_exclusive)
-    assert torch.equal(loop.history.u[:, -1], torch.where(exclusive == positioning[:, None], action, 0.0))
+    assert torch.equal(
+        loop.history.u[:, -1], torch.where(exclusive == positioning[:, None], action, 0.0)
+    )
 
 
 def results(loop: ControlLoop, policy: Any, seed: int = 7) -> dict[str, Any]:
@@ -142,7 +161,15 @@ def test_every_policy_meets_the_same_holes_and_the_same_errors(machine: Machine)
             return self
 
         def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-            names = ("start.target_m", "start.q", "start.scene", "bias_m", "q_scale", "u_scale", "estimate_m")
+            names = (
+                "start.target_m",
+                "start.q",
+                "start.scene",
+                "bias_m",
+                "q_scale",
+                "u_scale",
+                "estimate_m",
+            )
             if loop.task.state["age"].eq(0).all():
                 met.append({name: loop.task.state[name].clone() for name in names})
             return self._act(groups["policy"])
@@ -162,7 +189,9 @@ def test_an_untrained_policy_depends_on_its_seed_alone(machine: Machine) -> None
     assert torch.equal(before, torch.get_rng_state())
 
 
-def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(machine: Machine) -> None:
+def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(
+    machine: Machine,
+) -> None:
     loop = make(machine, 4, episode_s=0.5)
     starts = {name: value[:4] for name, value in loop.starts.items()}
     _, episodes, seen = evaluate(loop, Classical().build(loop, 0), starts, 7, 2)
@@ -170,7 +199,9 @@ def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(m
     for row, episode in enumerate(episodes):
         assert episode.q[0] == pytest.approx(starts["q"][row].numpy()) and (episode.u[0] == 0).all()
         assert len(episode.t_s) == len(episode.q) == len(episode.u) == len(episode.force_n) == 11
-        assert abs(episode.q[1:] - episode.q[:-1]).max() <= 0.45 * 0.05 + 1e-6, "no jump: top speed is 0.45 rad/s"
+        assert abs(episode.q[1:] - episode.q[:-1]).max() <= 0.45 * 0.05 + 1e-6, (
+            "no jump: top speed is 0.45 rad/s"
+        )
 
 
 @pytest.fixture
@@ -208,14 +239,18 @@ def test_a_fused_control_step_is_compiled_once_and_does_what_the_plain_one_does(
         torch.manual_seed(1)
         loop.begin()
         for step in range(20):
-            with torch.inference_mode(step % 2 == 0):  # rsl-rl rolls out in it, an evaluation does not
+            with torch.inference_mode(
+                step % 2 == 0
+            ):  # rsl-rl rolls out in it, an evaluation does not
                 obs, *_ = loop.step(torch.full((8, 5), 0.3))
         ends.append({name: value.clone() for name, value in obs.items()})
     assert all(torch.equal(ends[1][name], value) for name, value in ends[0].items())
     assert len(traced) == 3
 
 
-def test_without_a_compiler_it_says_what_to_do(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_it_says_what_to_do(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(*_: object) -> None:
         raise BackendCompilerFailed(fail, RuntimeError("No working C++ compiler found"), None)
 

@@ -19,10 +19,24 @@ GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 0.3, "std_type": "
 def _algorithm(kind: type[PPO], device: str = "cpu", **changes: object) -> PPO:
     torch.manual_seed(0)
     obs = TensorDict({"policy": torch.randn(NUM_ENVS, 7, device=device)}, batch_size=[NUM_ENVS])
-    actor = MLPModel(obs, GROUPS, "actor", 3, (16, 16), obs_normalization=True, distribution_cfg=copy.deepcopy(GAUSSIAN))
+    actor = MLPModel(
+        obs,
+        GROUPS,
+        "actor",
+        3,
+        (16, 16),
+        obs_normalization=True,
+        distribution_cfg=copy.deepcopy(GAUSSIAN),
+    )
     critic = MLPModel(obs, GROUPS, "critic", 1, (16, 16))
     storage = RolloutStorage("rl", NUM_ENVS, STEPS, obs, [3], device)
-    settings = {"num_learning_epochs": 3, "num_mini_batches": 4, "desired_kl": 0.01, "device": device, "entropy_coef": 0.01}
+    settings = {
+        "num_learning_epochs": 3,
+        "num_mini_batches": 4,
+        "desired_kl": 0.01,
+        "device": device,
+        "entropy_coef": 0.01,
+    }
     return kind(actor, critic, storage, **(settings | changes))
 
 
@@ -41,7 +55,12 @@ def _roll_out(algorithm: PPO, seed: int) -> TensorDict:
     with torch.inference_mode():
         for _ in range(STEPS):
             algorithm.act(seen())
-            algorithm.process_env_step(seen(), random(NUM_ENVS), random(NUM_ENVS) > 1.5, {"time_outs": random(NUM_ENVS) > 2.0})
+            algorithm.process_env_step(
+                seen(),
+                random(NUM_ENVS),
+                random(NUM_ENVS) > 1.5,
+                {"time_outs": random(NUM_ENVS) > 2.0},
+            )
     return seen()
 
 
@@ -57,7 +76,12 @@ def _iteration(algorithm: PPO, seed: int) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"schedule": "fixed"}, {"normalize_advantage_per_mini_batch": True, "use_clipped_value_loss": False}]
+    "changes",
+    [
+        {},
+        {"schedule": "fixed"},
+        {"normalize_advantage_per_mini_batch": True, "use_clipped_value_loss": False},
+    ],
 )
 def test_it_learns_the_same_as_rsl_rls_own(changes: dict) -> None:
     ours, theirs = _algorithm(DevicePPO, **changes), _algorithm(PPO, **changes)
@@ -91,7 +115,10 @@ def test_it_goes_on_exactly_from_a_saved_state() -> None:
         _iteration(first, seed)
     second = _algorithm(DevicePPO)
     second.load(copy.deepcopy(first.save()), None, strict=True)
-    assert all(group["lr"] == first.learning_rate for group in first.save()["optimizer_state_dict"]["param_groups"])
+    assert all(
+        group["lr"] == first.learning_rate
+        for group in first.save()["optimizer_state_dict"]["param_groups"]
+    )
     for seed in range(2, 4):
         _iteration(second, seed)
     for mine, other in zip(second.actor.parameters(), whole.actor.parameters(), strict=True):
@@ -100,7 +127,10 @@ def test_it_goes_on_exactly_from_a_saved_state() -> None:
 
 def _check_storage(algorithm: PPO, rollout: Rollout, device: str) -> None:
     """Rolls out and checks what is stored against rsl-rl's own functions."""
-    seen, rewards = torch.randn(STEPS, NUM_ENVS, 7, device=device), torch.randn(STEPS, NUM_ENVS, device=device)
+    seen, rewards = (
+        torch.randn(STEPS, NUM_ENVS, 7, device=device),
+        torch.randn(STEPS, NUM_ENVS, device=device),
+    )
     ends = torch.rand(2, STEPS, NUM_ENVS, device=device) > 0.7
     for t in range(STEPS):
         rollout.act({"policy": seen[t]})
@@ -110,12 +140,18 @@ def _check_storage(algorithm: PPO, rollout: Rollout, device: str) -> None:
     with torch.no_grad():
         values = algorithm.critic(obs)
         actor(obs, stochastic_output=True)
-        torch.testing.assert_close(storage.actions_log_prob[..., 0], actor.get_output_log_prob(storage.actions))
-        for stored, wanted in zip(storage.distribution_params, actor.output_distribution_params, strict=True):
+        torch.testing.assert_close(
+            storage.actions_log_prob[..., 0], actor.get_output_log_prob(storage.actions)
+        )
+        for stored, wanted in zip(
+            storage.distribution_params, actor.output_distribution_params, strict=True
+        ):
             torch.testing.assert_close(stored, wanted)
     torch.testing.assert_close(storage.observations["policy"], seen)
     torch.testing.assert_close(storage.values, values)
-    torch.testing.assert_close(storage.rewards[..., 0], rewards + algorithm.gamma * values[..., 0] * ends[1])
+    torch.testing.assert_close(
+        storage.rewards[..., 0], rewards + algorithm.gamma * values[..., 0] * ends[1]
+    )
     assert torch.equal(storage.dones[..., 0].bool(), ends[0] | ends[1])
     drawn = (storage.actions - storage.distribution_params[0]) / storage.distribution_params[1]
     assert abs(float(drawn.mean())) < 0.2 and 0.85 < float(drawn.std()) < 1.15  # 288 draws
@@ -141,7 +177,9 @@ def test_the_graph_learns_what_the_eager_update_learns() -> None:
     for seed in range(3):
         last = _roll_out(captured, seed)
         eager.storage = copy.deepcopy(captured.storage)
-        assert _learn(captured, seed, last) == pytest.approx(_learn(eager, seed, last), rel=1e-3, abs=1e-5)
+        assert _learn(captured, seed, last) == pytest.approx(
+            _learn(eager, seed, last), rel=1e-3, abs=1e-5
+        )
     assert captured._mini_batch is not None and captured._rollout is not None
     for mine, other in zip(captured.actor.parameters(), eager.actor.parameters(), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-5)

@@ -25,10 +25,14 @@ def test_the_budget_of_steps_ends_training(machine: Machine, tmp_path: Path) -> 
     runner = runs.train(machine, tmp_path, runs.small(max_env_steps=5 * ITERATION))
     rows = runs.progress(tmp_path)
     assert [int(float(row["env_steps"])) for row in rows] == [ITERATION * (i + 1) for i in range(5)]
-    assert [int(row["iteration"]) for row in rows] == list(range(5)) and runner.current_learning_iteration == 5
+    assert [int(row["iteration"]) for row in rows] == list(
+        range(5)
+    ) and runner.current_learning_iteration == 5
 
 
-def test_a_budget_that_is_no_multiple_of_an_iteration_is_filled_up(machine: Machine, tmp_path: Path) -> None:
+def test_a_budget_that_is_no_multiple_of_an_iteration_is_filled_up(
+    machine: Machine, tmp_path: Path
+) -> None:
     runs.train(machine, tmp_path, runs.small(max_env_steps=2 * ITERATION + 1, save_interval=50))
     assert float(runs.progress(tmp_path)[-1]["env_steps"]) == 3 * ITERATION
 
@@ -42,7 +46,11 @@ def test_the_budget_of_seconds_ends_training(machine: Machine, tmp_path: Path) -
 
 def test_the_first_budget_that_is_spent_counts() -> None:
     budget = Budget(max_env_steps=100, max_seconds=10.0)
-    assert budget.share_spent(50, 2.0) == 0.5 and budget.share_spent(20, 9.0) == 0.9 and budget.share_spent(100, 0.0) == 1.0
+    assert (
+        budget.share_spent(50, 2.0) == 0.5
+        and budget.share_spent(20, 9.0) == 0.9
+        and budget.share_spent(100, 0.0) == 1.0
+    )
     assert Budget(max_env_steps=None, max_seconds=10.0).share_spent(10**9, 5.0) == 0.5
 
 
@@ -51,8 +59,14 @@ def test_training_without_an_end_is_refused() -> None:
         Budget(max_env_steps=None, max_seconds=None)
 
 
-def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(machine: Machine, tmp_path: Path) -> None:
-    runs.train(machine, tmp_path, runs.small(max_env_steps=7 * ITERATION, save_interval=2, keep_checkpoints=2))
+def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(
+    machine: Machine, tmp_path: Path
+) -> None:
+    runs.train(
+        machine,
+        tmp_path,
+        runs.small(max_env_steps=7 * ITERATION, save_interval=2, keep_checkpoints=2),
+    )
     assert [path.name for path in checkpoints(tmp_path)] == ["model_6.pt", "model_7.pt"]
     assert not list(tmp_path.glob("*.part"))
 
@@ -60,12 +74,20 @@ def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(machine: Mach
 def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None:
     for iteration in (100, 9, 20):
         (tmp_path / f"model_{iteration}.pt").touch()
-    assert [path.name for path in checkpoints(tmp_path)] == ["model_9.pt", "model_20.pt", "model_100.pt"]
+    assert [path.name for path in checkpoints(tmp_path)] == [
+        "model_9.pt",
+        "model_20.pt",
+        "model_100.pt",
+    ]
     assert find_checkpoint(tmp_path).name == "model_100.pt"
 
 
 @pytest.mark.parametrize(
-    "error", [OSError(errno.ENOSPC, "No space left on device"), RuntimeError("PytorchStreamWriter failed writing file")]
+    "error",
+    [
+        OSError(errno.ENOSPC, "No space left on device"),
+        RuntimeError("PytorchStreamWriter failed writing file"),
+    ],
 )
 def test_a_full_disk_leaves_the_older_checkpoint_and_nothing_half_written(
     error: Exception, machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -86,7 +108,9 @@ def test_a_full_disk_leaves_the_older_checkpoint_and_nothing_half_written(
     read_checkpoint(tmp_path / "model_1.pt", "cpu")
 
 
-def test_a_folder_that_cannot_be_written_is_a_storage_error(machine: Machine, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_a_storage_error(
+    machine: Machine, tmp_path: Path
+) -> None:
     runner, book = runs.make(machine, tmp_path / "run", runs.small(max_env_steps=ITERATION))
     (tmp_path / "run").rmdir()
     with book, pytest.raises(StorageError, match=r"cannot write the checkpoint .*model_0\.pt"):
@@ -107,7 +131,9 @@ def changed(checkpoint: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
 
 
 def loading(machine: Machine, checkpoint: Path, **changes: Any) -> None:
-    runner, book = runs.make(machine, checkpoint.parent, runs.small(max_env_steps=ITERATION, **changes))
+    runner, book = runs.make(
+        machine, checkpoint.parent, runs.small(max_env_steps=ITERATION, **changes)
+    )
     with book:
         runner.load(str(checkpoint))
 
@@ -137,32 +163,46 @@ def test_a_checkpoint_cannot_run_code(checkpoint: Path, machine: Machine) -> Non
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf")])
-def test_weights_that_are_no_numbers_are_refused_by_name(number: float, checkpoint: Path, machine: Machine) -> None:
+def test_weights_that_are_no_numbers_are_refused_by_name(
+    number: float, checkpoint: Path, machine: Machine
+) -> None:
     def spoil(content: dict[str, Any]) -> None:
-        next(value for name, value in content["actor_state_dict"].items() if name.endswith("weight"))[0, 0] = number
+        next(
+            value for name, value in content["actor_state_dict"].items() if name.endswith("weight")
+        )[0, 0] = number
 
     with pytest.raises(CheckpointError, match=r"NaN or infinite weights in .*weight"):
         loading(machine, changed(checkpoint, spoil))
 
 
-def test_a_checkpoint_of_another_machine_names_what_differs(checkpoint: Path, machine: Machine) -> None:
+def test_a_checkpoint_of_another_machine_names_what_differs(
+    checkpoint: Path, machine: Machine
+) -> None:
     longer = replace(machine, tool_m=(replace(machine.tool_m[0], value=1.3), *machine.tool_m[1:]))
     with pytest.raises(CheckpointError, match="made for another machine: geometry differ"):
         loading(longer, checkpoint)
 
 
 def test_a_checkpoint_without_a_stamp_is_of_no_machine(checkpoint: Path, machine: Machine) -> None:
-    with pytest.raises(CheckpointError, match="another machine: name, joints, limits, geometry, control, levers"):
+    with pytest.raises(
+        CheckpointError, match="another machine: name, joints, limits, geometry, control, levers"
+    ):
         loading(machine, changed(checkpoint, lambda content: content.pop("fingerprint")))
 
 
-@pytest.mark.parametrize("key", ["env", "optimizer_state_dict", "book", "random", "learning_rate", "iter"])
-def test_a_checkpoint_that_lacks_a_part_is_refused(key: str, checkpoint: Path, machine: Machine) -> None:
+@pytest.mark.parametrize(
+    "key", ["env", "optimizer_state_dict", "book", "random", "learning_rate", "iter"]
+)
+def test_a_checkpoint_that_lacks_a_part_is_refused(
+    key: str, checkpoint: Path, machine: Machine
+) -> None:
     with pytest.raises(CheckpointError, match="does not fit this configuration"):
         loading(machine, changed(checkpoint, lambda content: content.pop(key)))
 
 
-def test_a_checkpoint_of_another_network_or_number_of_environments_is_refused(checkpoint: Path, machine: Machine) -> None:
+def test_a_checkpoint_of_another_network_or_number_of_environments_is_refused(
+    checkpoint: Path, machine: Machine
+) -> None:
     wider = runs.small(max_env_steps=1).runner
     wider["actor"]["hidden_dims"] = [32]
     with pytest.raises(CheckpointError, match="does not fit this configuration"):
@@ -188,7 +228,9 @@ def test_resuming_where_there_is_no_checkpoint_says_so(tmp_path: Path, machine: 
 
 
 def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: Path) -> None:
-    runner, book = runs.make(machine, tmp_path, runs.small(max_env_steps=100 * ITERATION, max_fault_rate=0.001))
+    runner, book = runs.make(
+        machine, tmp_path, runs.small(max_env_steps=100 * ITERATION, max_fault_rate=0.001)
+    )
     step = runner.env.world.step
 
     def diverges(increment: torch.Tensor) -> None:
@@ -199,12 +241,21 @@ def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: 
 
     runner.env.world.step = diverges  # type: ignore[method-assign]
     # one of 16 environments in each step: 6.25 %
-    with book, pytest.raises(SimulationError, match=r"6\.25% of the control steps of iteration 0 .*limit 0\.10%"):
+    with (
+        book,
+        pytest.raises(
+            SimulationError, match=r"6\.25% of the control steps of iteration 0 .*limit 0\.10%"
+        ),
+    ):
         runner.run()
 
 
-def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(machine: Machine, tmp_path: Path) -> None:
-    runner, book = runs.make(machine, tmp_path, runs.small(max_env_steps=3 * ITERATION, max_fault_rate=0.1))
+def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(
+    machine: Machine, tmp_path: Path
+) -> None:
+    runner, book = runs.make(
+        machine, tmp_path, runs.small(max_env_steps=3 * ITERATION, max_fault_rate=0.1)
+    )
     step, calls = runner.env.world.step, [0]
 
     def diverges_once(increment: torch.Tensor) -> None:
@@ -220,13 +271,17 @@ def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(machine
         runner.run()
     rows = runs.progress(tmp_path)
     assert [float(row["fault_rate"]) for row in rows] == [1 / ITERATION, 0.0, 0.0]
-    assert float(rows[0]["episode/end/fault"]) == 1.0 and all(value != "nan" for row in rows for value in row.values())
+    assert float(rows[0]["episode/end/fault"]) == 1.0 and all(
+        value != "nan" for row in rows for value in row.values()
+    )
     assert all(value.isfinite().all() for value in runs.weights(runner).values())
 
 
 def test_the_divergence_of_updates_falls_to_a_tenth_while_the_policy_settles() -> None:
     training = runs.small(max_env_steps=100, settling=0.5)
-    assert [training.divergence(share) for share in (0.0, 0.5, 0.75, 1.0, 1.2)] == pytest.approx([0.01, 0.01, 0.0055, 0.001, 0.001])
+    assert [training.divergence(share) for share in (0.0, 0.5, 0.75, 1.0, 1.2)] == pytest.approx(
+        [0.01, 0.01, 0.0055, 0.001, 0.001]
+    )
     assert runs.small(max_env_steps=100, settling=0.0).divergence(1.0) == 0.01
     with pytest.raises(ConfigError, match=r"rl\.settling: expected a part of the budget"):
         runs.small(max_env_steps=100, settling=1.5)

@@ -25,16 +25,24 @@ def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
     tracker.close()
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     scalars = events.Scalars("episode/success_strict")
-    assert [(event.step, round(event.value, 3)) for event in scalars] == [(0, 0.0), (1, 0.1), (2, 0.2)]
+    assert [(event.step, round(event.value, 3)) for event in scalars] == [
+        (0, 0.0),
+        (1, 0.1),
+        (2, 0.2),
+    ]
     assert len(events.Scalars("loss/value")) == 3
 
 
 def test_wandb_is_offline_unless_asked() -> None:
-    assert option("tracking", "wandb").mode == "offline" and isinstance(option("tracking", "none"), Off)
+    assert option("tracking", "wandb").mode == "offline" and isinstance(
+        option("tracking", "none"), Off
+    )
 
 
 @pytest.mark.slow
-def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
         monkeypatch.setenv(name, str(tmp_path / "home"))
     tracking = Wandb(project="tests", group=None, tags=("a", "b"), mode="offline")
@@ -46,4 +54,6 @@ def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(tmp_path: Path, monk
         tracker.close()
     found = [list((folder / "wandb").glob("offline-run-*")) for folder in folders]
     assert [len(runs) for runs in found] == [1, 1], "one run a job, in its own run folder"
-    assert found[0][0].name != found[1][0].name and all(list(runs[0].glob("run-*.wandb")) for runs in found)
+    assert found[0][0].name != found[1][0].name and all(
+        list(runs[0].glob("run-*.wandb")) for runs in found
+    )

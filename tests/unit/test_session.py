@@ -21,16 +21,22 @@ def session(folder: Path, seed: int = 0, device: str = "cpu") -> Session:
 
 
 def test_auto_takes_what_is_there(tmp_path: Path) -> None:
-    assert session(tmp_path, device="auto").torch_device().type == ("cuda" if torch.cuda.is_available() else "cpu")
+    assert session(tmp_path, device="auto").torch_device().type == (
+        "cuda" if torch.cuda.is_available() else "cpu"
+    )
 
 
-def test_a_gpu_that_is_missing_is_an_error_that_says_what_to_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_that_is_missing_is_an_error_that_says_what_to_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(DeviceError, match=r"session\.device=cpu"):
         session(tmp_path, device="cuda").torch_device()
 
 
-def test_a_gpu_number_that_is_missing_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_number_that_is_missing_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert session(tmp_path, device="cuda:1").torch_device() == torch.device("cuda", 1)
@@ -65,7 +71,12 @@ def test_the_record_tells_how_it_went(tmp_path: Path) -> None:
         assert read_record(tmp_path / "run")["outcome"] == "running"
         record.fields["objective"] = 0.5
     found = read_record(tmp_path / "run")
-    assert (found["outcome"], found["objective"], found["seed"], found["mode"]) == ("finished", 0.5, 3, "train")
+    assert (found["outcome"], found["objective"], found["seed"], found["mode"]) == (
+        "finished",
+        0.5,
+        3,
+        "train",
+    )
     assert found["versions"]["torch"] == torch.__version__.split("+")[0]
     assert (tmp_path / "run" / "resolved.yaml").read_text() == "a: 1\n"
 
@@ -103,11 +114,16 @@ def test_a_run_that_is_refused_after_it_wrote_something_keeps_it(tmp_path: Path)
 
 def test_a_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(StorageError, match=r"session\.out"), session(tmp_path / "file" / "run").start("", {}):
+    with (
+        pytest.raises(StorageError, match=r"session\.out"),
+        session(tmp_path / "file" / "run").start("", {}),
+    ):
         pass
 
 
-def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_is_written_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_json(tmp_path / "a.json", {"old": 1})
 
     def fill_disk(path: Path, text: str) -> None:

@@ -52,10 +52,18 @@ class Arms:
         self.reference = []
         for world in range(NUM_WORLDS):
             data = mujoco.MjData(self.model)
-            data.qpos, data.qvel = random.uniform(-1.0, 1.0, self.model.nq), random.normal(size=self.model.nv)
-            data.act, data.ctrl = data.qpos + random.normal(scale=0.2, size=self.model.na), random.normal(size=self.model.nu)
+            data.qpos, data.qvel = (
+                random.uniform(-1.0, 1.0, self.model.nq),
+                random.normal(size=self.model.nv),
+            )
+            data.act, data.ctrl = (
+                data.qpos + random.normal(scale=0.2, size=self.model.na),
+                random.normal(size=self.model.nu),
+            )
             for name in ("qpos", "qvel", "act", "ctrl"):
-                wp.to_torch(getattr(self.data, name))[world] = wp.to_torch(wp.array(getattr(data, name), dtype=float, device="cpu"))
+                wp.to_torch(getattr(self.data, name))[world] = wp.to_torch(
+                    wp.array(getattr(data, name), dtype=float, device="cpu")
+                )
             mujoco.mj_forward(self.model, data)
             self.reference.append(data)
 
@@ -90,8 +98,12 @@ def test_mass_matrix_and_forces_are_those_of_mujoco_c(arms):
     for world, data in enumerate(arms.reference):
         inertia = np.zeros((arms.model.nv, arms.model.nv))
         mujoco.mj_fullM(arms.model, data, inertia)
-        np.testing.assert_allclose(found[world], inertia[rows, columns], rtol=1e-5, atol=1e-5 * np.trace(inertia))
-        np.testing.assert_allclose(arms.data.qfrc_smooth.numpy()[world], data.qfrc_smooth, rtol=1e-4, atol=2e-3)
+        np.testing.assert_allclose(
+            found[world], inertia[rows, columns], rtol=1e-5, atol=1e-5 * np.trace(inertia)
+        )
+        np.testing.assert_allclose(
+            arms.data.qfrc_smooth.numpy()[world], data.qfrc_smooth, rtol=1e-4, atol=2e-3
+        )
     cut = np.abs(arms.data.actuator_force.numpy()) == 900.0
     assert cut.any() and not cut.all()
 
@@ -105,7 +117,9 @@ def test_the_motion_of_a_point_is_that_of_mujoco_c(arms):
         point, expected = data.geom_xpos[-1], np.zeros((3, arms.model.nv))
         mujoco.mj_jac(arms.model, data, expected, None, point, last)
         to = point - arms.data.subtree_com.numpy()[world, root]
-        np.testing.assert_allclose((motion[world, :, 3:] + np.cross(motion[world, :, :3], to)).T, expected, atol=1e-5)
+        np.testing.assert_allclose(
+            (motion[world, :, 3:] + np.cross(motion[world, :, :3], to)).T, expected, atol=1e-5
+        )
 
 
 def test_a_hundred_substeps_with_servos_at_their_limit_and_contact_are_those_of_mujoco_c(arms):
@@ -116,7 +130,10 @@ def test_a_hundred_substeps_with_servos_at_their_limit_and_contact_are_those_of_
             mujoco.mj_step(arms.model, data)
             touched += data.ncon > 0
     assert touched > 20
-    apart = [np.abs(arms.data.qpos.numpy()[world] - data.qpos).max() for world, data in enumerate(arms.reference)]
+    apart = [
+        np.abs(arms.data.qpos.numpy()[world] - data.qpos).max()
+        for world, data in enumerate(arms.reference)
+    ]
     assert np.median(apart) < 1e-4 and sum(a < 5e-3 for a in apart) >= NUM_WORLDS - 1
     np.testing.assert_allclose(arms.data.act.numpy()[0], arms.reference[0].act, atol=1e-5)
     np.testing.assert_allclose(arms.data.time.numpy(), 1.0, rtol=1e-5)
@@ -128,8 +145,12 @@ def test_rows_contacts_and_pairs_without_room_are_reported(arms):
     data.nefc.fill_(0)
     data.nefc[3:4].fill_(data.njmax + 1)
     arms.dynamics.after_contacts()
-    assert (data.overflow.numpy() == np.where(np.arange(NUM_WORLDS) == 3, int(mjw.OverflowType.NEFC), 0)).all()
+    assert (
+        data.overflow.numpy() == np.where(np.arange(NUM_WORLDS) == 3, int(mjw.OverflowType.NEFC), 0)
+    ).all()
     data.nacon.fill_(data.naconmax + 1)
     data.ncollision.fill_(data.naconmax + 1)
     arms.dynamics.after_contacts()
-    assert (data.overflow.numpy() & int(mjw.OverflowType.NARROWPHASE | mjw.OverflowType.BROADPHASE) != 0).all()
+    assert (
+        data.overflow.numpy() & int(mjw.OverflowType.NARROWPHASE | mjw.OverflowType.BROADPHASE) != 0
+    ).all()

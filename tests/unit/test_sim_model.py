@@ -46,32 +46,46 @@ def _small(machine: Machine, path: Path) -> Machine:
             machine.joints[0],
             name=name,
             kind=kind,
-            body=dataclasses.replace(machine.bodies[0], axis=axis, origin_m=tuple(_dimension(float(x)) for x in origin)),
+            body=dataclasses.replace(
+                machine.bodies[0], axis=axis, origin_m=tuple(_dimension(float(x)) for x in origin)
+            ),
             home=0.0,
         )
         for name, kind, axis, origin in parts
     )
     tool = tuple(_dimension(x) for x in (0.0, 0.0, -1.0))
-    return dataclasses.replace(machine, name="small", mjcf=str(path), joints=joints, exclusive=(), levers=(), tool_m=tool)
+    return dataclasses.replace(
+        machine, name="small", mjcf=str(path), joints=joints, exclusive=(), levers=(), tool_m=tool
+    )
 
 
 def test_numbers_of_the_machine_stand_in_the_model(machine):
     model = compile_model(machine, 0.01)
     np.testing.assert_allclose(model.jnt_range, np.stack([machine.lower, machine.upper], 1))
     np.testing.assert_allclose(
-        [model.body(f"{j.name}_link").mass[0] for j in machine.joints], [body.mass_kg.value for body in machine.bodies]
+        [model.body(f"{j.name}_link").mass[0] for j in machine.joints],
+        [body.mass_kg.value for body in machine.bodies],
     )
-    np.testing.assert_allclose(model.actuator_gainprm[:, 0], [body.stiffness.value for body in machine.bodies])
-    np.testing.assert_allclose(model.actuator_forcerange[:, 1], [body.yield_force.value for body in machine.bodies])
+    np.testing.assert_allclose(
+        model.actuator_gainprm[:, 0], [body.stiffness.value for body in machine.bodies]
+    )
+    np.testing.assert_allclose(
+        model.actuator_forcerange[:, 1], [body.yield_force.value for body in machine.bodies]
+    )
     assert [model.actuator(i).name for i in range(model.nu)] == list(machine.joint_names)
 
 
 def test_a_longer_boom_is_drawn_longer(machine):
     joints = list(machine.joints)
-    longer = dataclasses.replace(joints[2].body, origin_m=(_dimension(3.0), _dimension(0.0), _dimension(0.0)))
+    longer = dataclasses.replace(
+        joints[2].body, origin_m=(_dimension(3.0), _dimension(0.0), _dimension(0.0))
+    )
     joints[2] = dataclasses.replace(joints[2], body=longer)
     longer = dataclasses.replace(machine, joints=tuple(joints))
-    plain, drawn = compile_model(machine, 0.01, visual=True), compile_model(longer, 0.01, visual=True)
+    plain, drawn = (
+        compile_model(machine, 0.01, visual=True),
+        compile_model(longer, 0.01, visual=True),
+    )
     boom = next(i for i in range(plain.ngeom) if plain.geom_bodyid[i] == plain.body("q2_link").id)
     assert drawn.geom_size[boom, 0] == pytest.approx(2 * plain.geom_size[boom, 0], rel=1e-2)
     assert drawn.geom_pos[boom, 0] == pytest.approx(2 * plain.geom_pos[boom, 0])
@@ -128,10 +142,17 @@ def test_the_walls_of_the_hole_lie_exactly_at_its_radius():
 def test_a_hole_has_walls_all_round_and_nothing_inside(scale, radius_m):
     block = collision_block(scale, radius_m)
     angles = np.linspace(0, 2 * np.pi, 721)
-    for distance, expected in ((0.999, False), (1.0 / np.cos(np.pi / 8) + 0.001, True), (1.4, True), (1.8, True)):
+    for distance, expected in (
+        (0.999, False),
+        (1.0 / np.cos(np.pi / 8) + 0.001, True),
+        (1.4, True),
+        (1.8, True),
+    ):
         points = distance * radius_m * np.stack([np.cos(angles), np.sin(angles)], 1)
         inside = np.zeros(len(points), dtype=bool)
-        for name, size, pos, yaw in zip(block.names, block.size, block.pos, block.yaw_rad, strict=True):
+        for name, size, pos, yaw in zip(
+            block.names, block.size, block.pos, block.yaw_rad, strict=True
+        ):
             if name.startswith(("slab", "post")):
                 turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
                 inside |= (np.abs((points - pos[:2]) @ turn) <= size[:2]).all(1)
@@ -148,7 +169,9 @@ def test_scenes_become_the_geoms_of_their_block(machine):
         block = collision_block(scale, radius_m)
         np.testing.assert_allclose(size[row, :-1], block.size, atol=1e-7)
         np.testing.assert_allclose(pos[row, :-1], block.pos, atol=1e-7)
-    np.testing.assert_allclose(pos[:, -1, 2], [-0.75, -0.75], atol=1e-7)  # the ground lies under the rim
+    np.testing.assert_allclose(
+        pos[:, -1, 2], [-0.75, -0.75], atol=1e-7
+    )  # the ground lies under the rim
     _, turn = placement.pose(scene)
     np.testing.assert_allclose(turn[1], [np.cos(0.15), 0, 0, np.sin(0.15)], atol=1e-7)
 

@@ -24,7 +24,9 @@ def _all(num_worlds: int) -> torch.Tensor:
     return torch.ones(num_worlds, dtype=torch.bool)
 
 
-def _motion(kinematics: Kinematics, q: torch.Tensor, shift_m: torch.Tensor, turn_rad: torch.Tensor) -> torch.Tensor:
+def _motion(
+    kinematics: Kinematics, q: torch.Tensor, shift_m: torch.Tensor, turn_rad: torch.Tensor
+) -> torch.Tensor:
     """Returns the increment of q1, q3, q4, q5 that shifts the tip and turns the tool, first order."""
     jacobian = kinematics.jacobian(q)
     rows = torch.cat([jacobian.tip, jacobian.pitch[:, None]], 1)[..., [0, 2, 3, 4]]
@@ -33,7 +35,9 @@ def _motion(kinematics: Kinematics, q: torch.Tensor, shift_m: torch.Tensor, turn
     return step
 
 
-def _above_hole(machine: Machine, scene: torch.Tensor, offset_m: torch.Tensor, height_m: float = 0.05) -> torch.Tensor:
+def _above_hole(
+    machine: Machine, scene: torch.Tensor, offset_m: torch.Tensor, height_m: float = 0.05
+) -> torch.Tensor:
     """Returns joint positions that hold the chisel upright above the hole of each scene, `offset_m` to the side."""
     kinematics = Kinematics(machine)
     q = torch.tensor(machine.home, dtype=torch.float32).repeat(len(scene), 1)
@@ -44,7 +48,9 @@ def _above_hole(machine: Machine, scene: torch.Tensor, offset_m: torch.Tensor, h
     return q
 
 
-def _lower(machine: Machine, world: NativeWorld, q: torch.Tensor, depth_m: float, speed_m_s: float = 0.1) -> torch.Tensor:
+def _lower(
+    machine: Machine, world: NativeWorld, q: torch.Tensor, depth_m: float, speed_m_s: float = 0.1
+) -> torch.Tensor:
     """Commands a straight way down for `depth_m`; returns the greatest contact force of each world."""
     kinematics = Kinematics(machine)
     peak, command = torch.zeros(len(q)), q.clone()
@@ -63,17 +69,25 @@ def test_worlds_do_exactly_what_a_loop_over_plain_mujoco_does(machine):
     speed = torch.tensor(machine.max_speed, dtype=torch.float32)
     data = [mujoco.MjData(world._batch.get_model(i)) for i in range(3)]
     for i, one in enumerate(data):
-        mujoco.mj_setState(world._batch.get_model(i), one, world._batch.state[i], mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_setState(
+            world._batch.get_model(i),
+            one,
+            world._batch.state[i],
+            mujoco.mjtState.mjSTATE_INTEGRATION,
+        )
     velocity = torch.zeros(3, 5)
     touched = False
     for _ in range(60):
         velocity = 0.9 * velocity + 0.3 * speed * torch.randn(3, 5, generator=generator)
         world.step(velocity * machine.period_s)
         for i, one in enumerate(data):
-            # the drive's outputs at the start of the period: what MuJoCo integrated since is ctrl for one period
+            # the drive's outputs at the start of the period: what MuJoCo integrated since is ctrl
+            # for one period
             one.ctrl[:] = world._ctrl[i].numpy()
             one.act[:] = (
-                world._drive.reference[i].numpy() - world._ctrl[i].numpy() * 0.05 + (world._drive._lead * world._ctrl[i]).numpy()
+                world._drive.reference[i].numpy()
+                - world._ctrl[i].numpy() * 0.05
+                + (world._drive._lead * world._ctrl[i]).numpy()
             )
             peak = 0.0
             for _ in range(5):
@@ -82,7 +96,12 @@ def test_worlds_do_exactly_what_a_loop_over_plain_mujoco_does(machine):
             assert world.contact_force_n[i].item() == pytest.approx(peak, rel=1e-4, abs=1e-3)
             np.testing.assert_allclose(world._qpos[i].numpy(), one.qpos, atol=1e-6)
             touched = touched or peak > 0
-            mujoco.mj_setState(world._batch.get_model(i), one, world._batch.state[i], mujoco.mjtState.mjSTATE_INTEGRATION)
+            mujoco.mj_setState(
+                world._batch.get_model(i),
+                one,
+                world._batch.state[i],
+                mujoco.mjtState.mjSTATE_INTEGRATION,
+            )
     assert touched
 
 
@@ -116,7 +135,9 @@ def test_the_arm_does_not_creep_under_load(machine):
     for _ in range(400):
         _settle(world)
     assert force.item() > 1_000
-    assert (world.q - start).abs().max() < 2e-3  # friction in MuJoCo is not perfectly dry: the tip creeps a little
+    assert (
+        world.q - start
+    ).abs().max() < 2e-3  # friction in MuJoCo is not perfectly dry: the tip creeps a little
 
 
 def test_free_motion_follows_the_prediction_within_a_milliradian(machine):
@@ -250,7 +271,9 @@ def test_a_restored_state_goes_on_bit_for_bit(machine):
     for increment in increments[20:]:
         world.step(increment)
         other.step(increment)
-    assert all(torch.equal(tensor, other.state_dict()[name]) for name, tensor in world.state_dict().items())
+    assert all(
+        torch.equal(tensor, other.state_dict()[name]) for name, tensor in world.state_dict().items()
+    )
 
 
 def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine):

@@ -10,8 +10,14 @@ from brokk_rl.sim.warp_solver import Solver
 
 NUM_WORLDS = 64
 TOLERANCE = 1e-6
-CONTACTS = (mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS, mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
-ZONES = {mujoco.mjtConstraintState.mjCNSTRSTATE_SATISFIED, mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC}
+CONTACTS = (
+    mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS,
+    mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC,
+)
+ZONES = {
+    mujoco.mjtConstraintState.mjCNSTRSTATE_SATISFIED,
+    mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC,
+}
 ZONES |= {mujoco.mjtConstraintState.mjCNSTRSTATE_CONE}
 
 
@@ -24,7 +30,10 @@ def _arm(num_joints):
         f'<geom name="side{i}" type="sphere" pos="0.4 0.2 0" size="0.1" mass="3" contype="0"/>'
         for i in range(num_joints)
     ]
-    pairs = "".join(f'<pair geom1="floor" geom2="side{i}" friction="0.3 {0.4 + 0.1 * i}"/>' for i in range(num_joints))
+    pairs = "".join(
+        f'<pair geom1="floor" geom2="side{i}" friction="0.3 {0.4 + 0.1 * i}"/>'
+        for i in range(num_joints)
+    )
     # the floor takes the friction and the dimension of what touches it
     floor = '<geom name="floor" type="plane" size="9 9 1" priority="-1" contype="0" conaffinity="1" condim="1"/>'
     option = '<option cone="elliptic" impratio="2" timestep="0.01" tolerance="0" iterations="200"/>'
@@ -54,7 +63,9 @@ class Problem:
             data.qfrc_applied = random.normal(scale=50.0, size=num_joints)
             data.qacc_warmstart = random.normal(scale=10.0, size=num_joints)
             for name in ("qpos", "qvel", "qfrc_applied", "qacc_warmstart"):
-                wp.to_torch(getattr(self.data, name))[world] = wp.to_torch(wp.array(getattr(data, name), dtype=float, device="cpu"))
+                wp.to_torch(getattr(self.data, name))[world] = wp.to_torch(
+                    wp.array(getattr(data, name), dtype=float, device="cpu")
+                )
             mujoco.mj_forward(self.model, data)
             self.reference.append(data)
         self.peak = wp.zeros(NUM_WORLDS, dtype=float)
@@ -100,11 +111,17 @@ def problem():
 
 
 def test_the_problems_cover_every_zone_of_the_cone_with_limits_and_without_any_constraint(problem):
-    seen = {(data.efc_type[row], data.efc_state[row]) for data in problem.reference for row in range(data.nefc)}
+    seen = {
+        (data.efc_type[row], data.efc_state[row])
+        for data in problem.reference
+        for row in range(data.nefc)
+    }
     assert {(CONTACTS[1], zone) for zone in ZONES} <= seen
     assert CONTACTS[0] in {kind for kind, _ in seen}
     both = [{*data.efc_type} for data in problem.reference]
-    assert sum({mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, CONTACTS[1]} <= kinds for kinds in both) > 5
+    assert (
+        sum({mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, CONTACTS[1]} <= kinds for kinds in both) > 5
+    )
     assert sum(data.nefc == 0 for data in problem.reference) > 2
 
 
@@ -113,8 +130,15 @@ def test_accelerations_and_forces_are_those_of_mujoco_c(num_joints):
     problem = Problem(num_joints)
     acceleration, _, force, _, peak = problem.found()
     for world, data in enumerate(problem.reference):
-        np.testing.assert_allclose(acceleration[world], data.qacc, rtol=2e-3, atol=2e-3 * np.abs(data.qacc).max())
-        np.testing.assert_allclose(force[world], data.qfrc_constraint, rtol=2e-3, atol=2e-3 * np.abs(data.qfrc_constraint).max())
+        np.testing.assert_allclose(
+            acceleration[world], data.qacc, rtol=2e-3, atol=2e-3 * np.abs(data.qacc).max()
+        )
+        np.testing.assert_allclose(
+            force[world],
+            data.qfrc_constraint,
+            rtol=2e-3,
+            atol=2e-3 * np.abs(data.qfrc_constraint).max(),
+        )
         normal = [data.efc_force[c.efc_address] for c in data.contact if c.efc_address >= 0]
         np.testing.assert_allclose(peak[world], sum(normal), rtol=5e-3, atol=0.1)
 
@@ -131,7 +155,9 @@ def test_rows_and_accelerations_are_those_of_mujoco_warp(problem):
         if 0 < num_rows[world] <= problem.model.nv:
             rows = slice(num_rows[world])
             largest = np.abs(theirs[1][world, rows]).max()
-            np.testing.assert_allclose(ours[1][world, rows], theirs[1][world, rows], atol=5e-3 * largest)
+            np.testing.assert_allclose(
+                ours[1][world, rows], theirs[1][world, rows], atol=5e-3 * largest
+            )
 
 
 def test_the_cost_is_within_the_tolerance_of_its_minimum(problem):
@@ -139,7 +165,9 @@ def test_the_cost_is_within_the_tolerance_of_its_minimum(problem):
     assert iterations.max() < 15
     for acceleration, data in zip(found, problem.reference, strict=True):
         least = _cost(data, data.qacc)
-        assert _cost(data, acceleration.astype(float)) - least < 2.0 * TOLERANCE + 1e-9 * least  # float32 gets no closer
+        assert (
+            _cost(data, acceleration.astype(float)) - least < 2.0 * TOLERANCE + 1e-9 * least
+        )  # float32 gets no closer
 
 
 def test_from_the_solution_no_iteration_is_needed(problem):
@@ -151,7 +179,9 @@ def test_from_the_solution_no_iteration_is_needed(problem):
     assert iterations.max() <= 1 and np.median(iterations) == 0
 
 
-def test_the_same_problem_gives_the_same_bits_on_one_thread_and_on_a_warp_nearly(problem, monkeypatch):
+def test_the_same_problem_gives_the_same_bits_on_one_thread_and_on_a_warp_nearly(
+    problem, monkeypatch
+):
     first, again = problem.found(), problem.found()
     assert all(np.array_equal(a, b) for a, b in zip(first[:4], again[:4], strict=True))
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
@@ -192,5 +222,11 @@ def test_a_stopped_slide_takes_the_mean_of_what_it_would_and_what_the_stop_wants
         stage(warp_model, data)
     Solver(warp_model, data, wp.zeros(2, dtype=float))()
     weight, target = data.efc.D.numpy()[0, 0], data.efc.aref.numpy()[0, 0]
-    np.testing.assert_allclose(data.qacc.numpy(), [[(4.0 * -2.0 + weight * target) / (4.0 + weight)], [200_000.0]], rtol=1e-5)
-    np.testing.assert_allclose(data.efc.force.numpy()[:, 0], [weight * (target - data.qacc.numpy()[0, 0]), 0.0], rtol=1e-5)
+    np.testing.assert_allclose(
+        data.qacc.numpy(),
+        [[(4.0 * -2.0 + weight * target) / (4.0 + weight)], [200_000.0]],
+        rtol=1e-5,
+    )
+    np.testing.assert_allclose(
+        data.efc.force.numpy()[:, 0], [weight * (target - data.qacc.numpy()[0, 0]), 0.0], rtol=1e-5
+    )

@@ -26,7 +26,9 @@ def test_without_a_gl_library_the_video_is_a_drawing(machine, motion, tmp_path, 
     monkeypatch.setattr(video, "working_renderer", lambda: None)
     path = video.render_video(machine, motion, tmp_path / "insertion.mp4")
     assert path.stat().st_size > 1000
-    assert sorted(file.name for file in tmp_path.glob("*.png")) == [f"insertion_{i}.png" for i in range(3)]
+    assert sorted(file.name for file in tmp_path.glob("*.png")) == [
+        f"insertion_{i}.png" for i in range(3)
+    ]
 
 
 def test_a_renderer_that_fails_still_leaves_a_drawing(machine, motion, tmp_path, monkeypatch):

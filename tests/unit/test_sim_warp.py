@@ -55,7 +55,8 @@ def test_five_seconds_of_motion_and_contact_agree_with_the_native_world(machine,
         assert (largest[untouched] < 1e-5).all()
     assert (pressed > 1_000).sum() >= 3
     assert not any(world.faults.any() for world in worlds)
-    # contact amplifies rounding: a stop that is met edge on may be passed on either side, so not every world must agree
+    # contact amplifies rounding: a stop that is met edge on may be passed on either side, so not
+    # every world must agree
     assert (largest < 5e-3).sum() >= NUM_WORLDS - 1
 
 
@@ -137,7 +138,11 @@ def test_nan_and_a_full_buffer_are_faults_of_their_worlds_alone(machine, warp):
     [
         ('<joint name="q3"', '<joint damping="5" name="q3"', "springs, dampers"),
         ('<joint name="q3"', '<joint frictionloss="5" name="q3"', "friction in joints"),
-        ('class="chisel_contact"><geom', 'class="chisel_contact"><geom condim="4"', "condim above 3"),
+        (
+            'class="chisel_contact"><geom',
+            'class="chisel_contact"><geom condim="4"',
+            "condim above 3",
+        ),
     ],
 )
 def test_what_the_launches_leave_out_is_refused_by_name(machine, tmp_path, drawn, instead, named):

@@ -57,9 +57,14 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
     def open_page(port: int, query: str = "") -> Any:
         contexts.append(browser.new_context(viewport=SIZE, locale="en-GB", has_touch=True))
         page = contexts[-1].new_page()
-        page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))
+        page.route(
+            "**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body="")
+        )
         page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("requestfinished", lambda request: None if f":{port}/" in request.url else complaints.append(request.url))
+        page.on(
+            "requestfinished",
+            lambda request: None if f":{port}/" in request.url else complaints.append(request.url),
+        )
         page.goto(f"http://localhost:{port}/{query}#token={TOKEN}")
         until(page, "() => window.measured?.drawn > 0 && Boolean(window.sitting())")
         return page
@@ -74,7 +79,9 @@ def until(page: Any, claim: str, seconds: float = 20.0) -> None:
     """Waits for something on a page; Playwright's own way needs `eval`, which the page forbids."""
     end_s = time.monotonic() + seconds
     while not page.evaluate(claim):
-        assert time.monotonic() < end_s, f"it did not come true: {claim}; {page.evaluate('window.sitting()')}"
+        assert time.monotonic() < end_s, (
+            f"it did not come true: {claim}; {page.evaluate('window.sitting()')}"
+        )
         time.sleep(0.02)
 
 
@@ -86,7 +93,9 @@ def answers(place: Path) -> dict[str, Any]:
     return json.loads((place / "questionnaires" / "P01_1.json").read_text())
 
 
-def test_a_sitting_is_walked_through_by_touch(tmp_path: Path, lead: Conductor, port: int, opened: Callable[..., Any]) -> None:
+def test_a_sitting_is_walked_through_by_touch(
+    tmp_path: Path, lead: Conductor, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port)
     page.locator("#study .people button", has_text="P01").tap()
     until(page, "() => window.sitting().kind === 'consent'")
@@ -94,7 +103,10 @@ def test_a_sitting_is_walked_through_by_touch(tmp_path: Path, lead: Conductor, p
     page.locator("#study .primary").tap()
     until(page, "() => window.sitting().kind === 'trial'")
     condition = lead.view()["condition"]
-    assert page.locator("#study h1").inner_text() == {"guided": "With guidance", "unguided": "Without guidance"}[condition]
+    assert (
+        page.locator("#study h1").inner_text()
+        == {"guided": "With guidance", "unguided": "Without guidance"}[condition]
+    )
     assert page.locator("#study .joints .there").count() == 5
     page.locator("#begin").tap()
     until(page, "() => window.sitting().phase === 'countdown'")
@@ -102,7 +114,10 @@ def test_a_sitting_is_walked_through_by_touch(tmp_path: Path, lead: Conductor, p
     arm.now_s += 5.0
     until(page, "() => window.sitting().phase === 'running'")
     # the operator's page is seen then, and its levers follow the condition
-    assert page.locator("#left").is_visible() and page.locator("#study").get_attribute("class") == "bar"
+    assert (
+        page.locator("#left").is_visible()
+        and page.locator("#study").get_attribute("class") == "bar"
+    )
     assert not page.locator("#record").is_visible() and page.locator("#stop").is_visible()
     until(page, f"() => document.body.classList.contains('lost') || {str(condition == 'guided').lower()} === "
                 "(document.querySelector('#advice').textContent !== 'Guidance is off')")  # fmt: skip
@@ -117,7 +132,9 @@ def test_a_sitting_is_walked_through_by_touch(tmp_path: Path, lead: Conductor, p
     assert json.loads((tmp_path / "trials" / "P01_1_01.json").read_text())["outcome"] == "inserted"
 
 
-def test_every_answer_can_be_given_with_gloves(asked: Conductor, port: int, opened: Callable[..., Any]) -> None:
+def test_every_answer_can_be_given_with_gloves(
+    asked: Conductor, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port)
     at(page, 0)
     box = page.locator("#study .scale button").first.bounding_box()
@@ -126,7 +143,9 @@ def test_every_answer_can_be_given_with_gloves(asked: Conductor, port: int, open
         assert min(button.bounding_box()["width"], button.bounding_box()["height"]) >= 64
 
 
-def test_the_whole_questionnaire_by_click(tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]) -> None:
+def test_the_whole_questionnaire_by_click(
+    tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port)
     given = dict(zip(tlx.SCALES, (0, 25, 45, 70, 95, 100), strict=True))
     for screen, (scale, value) in enumerate(given.items()):
@@ -146,10 +165,14 @@ def test_the_whole_questionnaire_by_click(tmp_path: Path, asked: Conductor, port
     until(page, "() => window.sitting().kind === 'trial'")
     found = answers(tmp_path)
     assert found["ratings"] == given and found["finished"] and tlx.check(found) == []
-    assert tlx.weighted(found) == pytest.approx(sum(weights[scale] * given[scale] for scale in given) / 15)
+    assert tlx.weighted(found) == pytest.approx(
+        sum(weights[scale] * given[scale] for scale in given) / 15
+    )
 
 
-def test_the_whole_questionnaire_by_key_in_german(tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]) -> None:
+def test_the_whole_questionnaire_by_key_in_german(
+    tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port, "?lang=de")
     at(page, 0)
     assert page.locator("#study h1").inner_text() == "Geistige Anforderung"
@@ -158,7 +181,10 @@ def test_the_whole_questionnaire_by_key_in_german(tmp_path: Path, asked: Conduct
         at(page, screen)
         for key in ("ArrowRight", *["ArrowRight"] * screen, "ArrowLeft"):
             page.keyboard.press(key)
-        until(page, f"() => window.sitting().ratings[window.sitting().scales[{screen}]] === {45 + 5 * screen}")
+        until(
+            page,
+            f"() => window.sitting().ratings[window.sitting().scales[{screen}]] === {45 + 5 * screen}",
+        )
         page.keyboard.press("Enter")
     for screen in range(6, 21):
         at(page, screen)
@@ -173,7 +199,9 @@ def test_the_whole_questionnaire_by_key_in_german(tmp_path: Path, asked: Conduct
     until(page, "() => window.sitting().kind === 'trial'")
     found = answers(tmp_path)
     assert list(found["ratings"].values()) == [45, 50, 55, 60, 65, 70] and tlx.raw(found) == 57.5
-    assert [answer["chosen"] for answer in found["pairs"]] == [pair[0] for pair in found["shown_pairs"]]
+    assert [answer["chosen"] for answer in found["pairs"]] == [
+        pair[0] for pair in found["shown_pairs"]
+    ]
 
 
 def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
@@ -196,7 +224,10 @@ def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
     with served(StudyFeed(feed(), again), port=port, annex=StudyPages(again)):
         until(page, "() => window.sitting().at === 2")  # the page comes back by itself
         page.locator("#study .language").click()
-        until(page, "() => document.querySelector('#study h1').textContent === 'Zeitliche Anforderung'")
+        until(
+            page,
+            "() => document.querySelector('#study h1').textContent === 'Zeitliche Anforderung'",
+        )
         for screen in range(2, 21):
             at(page, screen)
             page.locator("#study .answers button").last.click()  # left open
@@ -205,7 +236,11 @@ def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
         page.locator("#study .answers button").last.click()
         until(page, "() => window.sitting().kind === 'trial'")
     found = answers(tmp_path)
-    assert found["ratings"] == {"mental": 100, "physical": 0} and found["pairs"] == [] and found["finished"]
+    assert (
+        found["ratings"] == {"mental": 100, "physical": 0}
+        and found["pairs"] == []
+        and found["finished"]
+    )
 
 
 def test_nobody_leads_a_sitting_without_the_key(port: int, lead: Conductor, browser: Any) -> None:
@@ -213,16 +248,24 @@ def test_nobody_leads_a_sitting_without_the_key(port: int, lead: Conductor, brow
     page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))
     for token in ("", "#token=wrong horse"):
         page.goto(f"http://localhost:{port}/{token}")
-        until(page, "() => document.querySelector('#study h1')?.textContent === 'Open this page by the link with the key'")
+        until(
+            page,
+            "() => document.querySelector('#study h1')?.textContent === 'Open this page by the link with the key'",
+        )
     assert lead.view()["kind"] == "choose"
     page.context.close()
 
 
-def test_stopping_takes_two_presses_and_is_kept(tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]) -> None:
+def test_stopping_takes_two_presses_and_is_kept(
+    tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]
+) -> None:
     page = opened(port)
     page.locator("#study .leave").click()
     assert asked.view()["kind"] == "questionnaire"
     page.locator("#study .leave", has_text="Really stop").click()
     until(page, "() => window.sitting().kind === 'stopped'")
     assert json.loads((tmp_path / "participants" / "P01.json").read_text())["stopped"] is True
-    assert len(list((tmp_path / "trials").iterdir())) == 2 and len(list((tmp_path / "recordings").iterdir())) == 2
+    assert (
+        len(list((tmp_path / "trials").iterdir())) == 2
+        and len(list((tmp_path / "recordings").iterdir())) == 2
+    )

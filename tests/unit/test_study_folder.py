@@ -32,7 +32,9 @@ def made(machine: Machine, order: str = "counterbalanced", count: int = 4) -> de
     )  # fmt: skip
 
 
-def study(folder_: Path, machine: Machine, count: int = 4, order: str = "counterbalanced") -> list[design.Trial]:
+def study(
+    folder_: Path, machine: Machine, count: int = 4, order: str = "counterbalanced"
+) -> list[design.Trial]:
     """Writes a whole study in which guided trials last 4 s and others 8 s, the second period 1 s less, and persons differ."""
     what = made(machine, order, count)
     planned = design.trials(what, np.random.default_rng(0))
@@ -43,10 +45,28 @@ def study(folder_: Path, machine: Machine, count: int = 4, order: str = "counter
         time_s = (4.0 if trial.condition == "guided" else 8.0) - (trial.period == 2) + 0.1 * person
         name = f"{folder.RECORDINGS}/{trial.name}.parquet"
         record.write(trial_of(machine, time_s), folder_ / name)
-        facts = {"participant": trial.participant, "period": trial.period, "condition": trial.condition, "number": trial.number}
-        place = {"name": trial.hole, "center_in_base_m": list(hole.center_in_base_m), "radius_m": 0.05}
+        facts = {
+            "participant": trial.participant,
+            "period": trial.period,
+            "condition": trial.condition,
+            "number": trial.number,
+        }
+        place = {
+            "name": trial.hole,
+            "center_in_base_m": list(hole.center_in_base_m),
+            "radius_m": 0.05,
+        }
         folder.write_trial(
-            folder_, trial.name, facts | {"hole": place, "limit_s": 20.0, "outcome": "inserted", "recording": name, "start": "1"}
+            folder_,
+            trial.name,
+            facts
+            | {
+                "hole": place,
+                "limit_s": 20.0,
+                "outcome": "inserted",
+                "recording": name,
+                "start": "1",
+            },
         )
     for who, conditions in folder.read_plan(folder_)["participants"].items():
         for period, condition in zip((1, 2), conditions, strict=True):
@@ -77,7 +97,9 @@ def test_a_whole_study_says_what_was_put_in(machine: Machine, tmp_path: Path) ->
     effect = found.effects["time_s"]
     assert not found.remarks and len(found.trials) == 8 * 8  # practice is there, too …
     assert sum(trial.counts for trial in found.trials) == 8 * 6  # … and does not count
-    assert effect.adjusted == pytest.approx(-4.0, abs=0.06) and effect.period == pytest.approx(-1.0, abs=0.06)
+    assert effect.adjusted == pytest.approx(-4.0, abs=0.06) and effect.period == pytest.approx(
+        -1.0, abs=0.06
+    )
     assert effect.p == pytest.approx(2 / 70)
     assert found.effects["tlx_raw"].adjusted == pytest.approx(-20.0)
     assert found.loads["weighted"]["guided"].tolist() == [30.0] * 8
@@ -93,7 +115,9 @@ def test_a_whole_study_says_what_was_put_in(machine: Machine, tmp_path: Path) ->
     json.loads((tmp_path / "out" / "report.json").read_text())
 
 
-def test_with_the_papers_order_the_report_says_that_nothing_can_be_said(machine: Machine, tmp_path: Path) -> None:
+def test_with_the_papers_order_the_report_says_that_nothing_can_be_said(
+    machine: Machine, tmp_path: Path
+) -> None:
     study(tmp_path, machine, count=5, order="fixed")
     found = analysis.analyse(folder.read(tmp_path), machine)
     text, tone = report.verdict(found)
@@ -109,14 +133,18 @@ def test_what_went_wrong_is_kept_and_said(machine: Machine, tmp_path: Path) -> N
         path.unlink()
     folder.write_participant(tmp_path, "P02", {"stopped": True, "reason": "felt unwell"})
     first = json.loads((trials / "P03_1_01.json").read_text())
-    folder.write_trial(tmp_path, "P03_1_01", {**first, "created": "2999-01-01", "limit_s": 20.0})  # done twice
+    folder.write_trial(
+        tmp_path, "P03_1_01", {**first, "created": "2999-01-01", "limit_s": 20.0}
+    )  # done twice
     folder.write_trial(tmp_path, "P99_1_01", {**first, "participant": "P99"})  # unknown
     swapped = "unguided" if first["condition"] == "guided" else "guided"
     folder.write_trial(tmp_path, "P03_1_07", {**first, "number": 7, "condition": swapped})
     (trials / "P04_1_01.json").write_text("{broken")
     (tmp_path / folder.RECORDINGS / "P05_2_01.parquet").write_bytes(b"cut off")
     aborted = json.loads((trials / "P05_1_01.json").read_text())
-    (trials / "P05_1_01.json").write_text(json.dumps({**aborted, "outcome": "aborted", "reason": "hose burst"}))
+    (trials / "P05_1_01.json").write_text(
+        json.dumps({**aborted, "outcome": "aborted", "reason": "hose burst"})
+    )
     (tmp_path / folder.QUESTIONNAIRES / "P04_2.json").unlink()
     half = {"ratings": {"mental": 40}, "pairs": []}
     folder.write_questionnaire(tmp_path, "P05", 1, half)
@@ -130,7 +158,9 @@ def test_what_went_wrong_is_kept_and_said(machine: Machine, tmp_path: Path) -> N
         "was filled in twice", "P02: 0 trials guided: is in no comparison",
     ):  # fmt: skip
         assert claim in text, claim
-    assert len(found.trials) == len(planned) + 3 - 6 - 1 - 1  # spare ones are still there; the unreadable and missing are not
+    assert (
+        len(found.trials) == len(planned) + 3 - 6 - 1 - 1
+    )  # spare ones are still there; the unreadable and missing are not
     assert sum(not t.counts and bool(t.facts["period"]) for t in found.trials) == 4
     assert found.effects["time_s"].num_persons == 5 and found.effects["tlx_raw"].num_persons == 4
     assert math.isnan(found.means["time_s"]["guided"][1])
@@ -153,7 +183,9 @@ def test_a_participant_is_forgotten_on_request(machine: Machine, tmp_path: Path)
         folder.erase(tmp_path, "Jane")
 
 
-def test_an_outcome_that_the_recording_contradicts_is_said(machine: Machine, tmp_path: Path) -> None:
+def test_an_outcome_that_the_recording_contradicts_is_said(
+    machine: Machine, tmp_path: Path
+) -> None:
     study(tmp_path, machine)
     path = tmp_path / folder.TRIALS / "P01_1_01.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"outcome": "time limit"}))
@@ -168,12 +200,16 @@ def test_every_hole_and_start_stands_everywhere_equally_often(machine: Machine) 
     for attribute, names in (("hole", "ABC"), ("start", "123")):
         for name in names:
             places = [(t.period, t.number) for t in planned if getattr(t, attribute) == name]
-            assert {place: places.count(place) for place in places} == {(p, n): 4 for p in (1, 2) for n in (1, 2, 3)}
+            assert {place: places.count(place) for place in places} == {
+                (p, n): 4 for p in (1, 2) for n in (1, 2, 3)
+            }
     pairs = {(t.hole, t.start) for t in planned}
     assert len(pairs) == 9  # orthogonal squares
     for who in {t.participant for t in planned}:
         mine = [t for t in planned if t.participant == who]
-        assert sorted(t.hole for t in mine) == sorted("ABC" * 2) and {t.condition for t in mine} == {"guided", "unguided"}
+        assert sorted(t.hole for t in mine) == sorted("ABC" * 2) and {
+            t.condition for t in mine
+        } == {"guided", "unguided"}
 
 
 @pytest.mark.parametrize("size", [2, 3, 4, 5, 6, 7])
@@ -182,18 +218,27 @@ def test_squares_are_latin(size: int) -> None:
         for line in (*square, *square.T):
             assert sorted(line) == list(range(size))
     if size in (3, 5, 7):
-        assert len(set(zip(*(square.ravel() for square in design.squares(size)), strict=True))) == size**2
+        assert (
+            len(set(zip(*(square.ravel() for square in design.squares(size)), strict=True)))
+            == size**2
+        )
 
 
 def test_orders_are_drawn_in_pairs_and_differ_from_seed_to_seed(machine: Machine) -> None:
     what = made(machine, count=20)
-    drawn = [[c[0] == "guided" for c in design.sequences(what, np.random.default_rng(seed)).values()] for seed in range(3)]
+    drawn = [
+        [c[0] == "guided" for c in design.sequences(what, np.random.default_rng(seed)).values()]
+        for seed in range(3)
+    ]
     for firsts in drawn:
         assert all(a != b for a, b in zip(firsts[::2], firsts[1::2], strict=True))
     assert drawn[0] != drawn[1] or drawn[1] != drawn[2]
 
 
 def test_a_start_beyond_a_joints_end_is_refused(machine: Machine) -> None:
-    what = replace(made(machine), starts={"1": (0.0, 0.0, 0.0, 0.0, 0.0), "2": (9.0, 0.0, 0.0, 0.0, 0.0), "3": (0.0,) * 5})
+    what = replace(
+        made(machine),
+        starts={"1": (0.0, 0.0, 0.0, 0.0, 0.0), "2": (9.0, 0.0, 0.0, 0.0, 0.0), "3": (0.0,) * 5},
+    )
     with pytest.raises(ConfigError, match=r"starts\.2: q1 = 9\.0"):
         what.check_machine(machine)

@@ -20,7 +20,9 @@ RATE_HZ = 20.0
 SUCCESS = Success(depth_m=0.1, clearance_m=0.013)
 
 
-def recorded(machine: Machine, q: np.ndarray, u: np.ndarray | None = None, **extra: np.ndarray) -> Recording:
+def recorded(
+    machine: Machine, q: np.ndarray, u: np.ndarray | None = None, **extra: np.ndarray
+) -> Recording:
     return Recording(
         machine=machine.name, joints=machine.joint_names, units=("rad",) * 5, rate_hz=RATE_HZ, t_s=np.arange(len(q)) / RATE_HZ,
         u=np.zeros_like(q) if u is None else u, q=q, extra=extra,
@@ -41,7 +43,9 @@ def test_the_tool_is_where_the_projects_kinematics_has_it(machine: Machine) -> N
 
 def test_sparc_is_that_of_the_published_algorithm() -> None:
     t = np.arange(-1, 1, 0.01)
-    assert sparc(np.exp(-5 * t**2), 100.0) == pytest.approx(-1.41403, abs=1e-5)  # the example of the authors' own code
+    assert sparc(np.exp(-5 * t**2), 100.0) == pytest.approx(
+        -1.41403, abs=1e-5
+    )  # the example of the authors' own code
     two = np.exp(-40 * (t + 0.5) ** 2) + np.exp(-40 * (t - 0.5) ** 2)
     assert sparc(two, 100.0) < -1.6
     assert sparc(7 * two, 100.0) == pytest.approx(sparc(two, 100.0))
@@ -72,15 +76,23 @@ def test_a_trial_of_known_motion_gives_known_numbers(machine: Machine) -> None:
     u = np.zeros((201, 5))
     u[40:120, 0], u[80:160, 2] = 0.5, 0.5
     hole = Hole(center_in_base_m=(9.0, 0.0, 0.75), radius_m=0.05)
-    found = measures.measure(recorded(machine, q, u, force_n=np.zeros(201)), machine, hole, SUCCESS, 60.0)
+    found = measures.measure(
+        recorded(machine, q, u, force_n=np.zeros(201)), machine, hole, SUCCESS, 60.0
+    )
     assert found["success"] == 0 and found["time_s"] == 60.0 and math.isnan(found["efficiency"])
     assert found["several_joints"] == pytest.approx(40 / 201, abs=6 / 201)
-    assert found["lever_movements"] == 2 and found["joint_switches"] == 1 and found["exclusive_share"] == 0
+    assert (
+        found["lever_movements"] == 2
+        and found["joint_switches"] == 1
+        and found["exclusive_share"] == 0
+    )
     assert found["control_effort"] == pytest.approx(2.0 / 10.0)
     assert found["contacts"] == 0 and math.isnan(found["advice_error"])
     turn, radius = 80 * 0.05 * 0.2, np.linalg.norm(tool(machine, machine.home).tip_in_base_m[:2])
     alone = measures.measure(recorded(machine, q[:81], u[:81]), machine, hole, SUCCESS, 60.0)
-    assert alone["path_m"] == pytest.approx(radius * turn / 2, rel=0.01) and math.isnan(alone["contacts"])
+    assert alone["path_m"] == pytest.approx(radius * turn / 2, rel=0.01) and math.isnan(
+        alone["contacts"]
+    )
 
 
 def test_insertion_ends_the_trial(machine: Machine) -> None:
@@ -107,7 +119,14 @@ def test_lag_and_distance_from_the_advice() -> None:
 
 
 ANSWERS = {
-    "ratings": {"mental": 70, "physical": 20, "temporal": 40, "performance": 30, "effort": 60, "frustration": 50},
+    "ratings": {
+        "mental": 70,
+        "physical": 20,
+        "temporal": 40,
+        "performance": 30,
+        "effort": 60,
+        "frustration": 50,
+    },
     # the scale named first in the list of all wins each of its pairs: weights 5 4 3 2 1 0
     "pairs": [{"pair": list(pair), "chosen": pair[0]} for pair in tlx.PAIRS],
 }
@@ -119,7 +138,9 @@ def test_tlx_raw_and_weighted_by_hand() -> None:
     assert tlx.weighted(ANSWERS) == pytest.approx((5 * 70 + 4 * 20 + 3 * 40 + 2 * 30 + 1 * 60) / 15)
     assert tlx.check(ANSWERS) == []
     shown = tlx.pairs(np.random.default_rng(0))
-    assert {frozenset(pair) for pair in shown} == {frozenset(pair) for pair in tlx.PAIRS} and shown != list(tlx.PAIRS)
+    assert {frozenset(pair) for pair in shown} == {
+        frozenset(pair) for pair in tlx.PAIRS
+    } and shown != list(tlx.PAIRS)
 
 
 def test_a_half_filled_questionnaire_has_no_score_and_says_why() -> None:

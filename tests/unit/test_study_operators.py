@@ -22,19 +22,36 @@ from deploy.study.operators.hands import Hands
 from deploy.study.operators.traits import Traits
 
 RNG = np.random.default_rng(0)
-START = np.array([0.0, -0.95, 0.5, 1.15, 0.6]) + RNG.uniform(-0.3, 0.3, (8, 5)) * [1.5, 0.2, 0.5, 0.5, 0.5]
+START = np.array([0.0, -0.95, 0.5, 1.15, 0.6]) + RNG.uniform(-0.3, 0.3, (8, 5)) * [
+    1.5,
+    0.2,
+    0.5,
+    0.5,
+    0.5,
+]
 RIM_M = np.column_stack((RNG.uniform(2.4, 2.8, 8), RNG.uniform(-0.8, 0.8, 8), np.full(8, 0.75)))
 ROOT = Path(__file__).parents[2]
-EXACT: dict[str, Any] = {"delay_s": 0.27, "lag_s": 0.15, "gain": 0.9, "tremor": 0.0, "dead_zone": 0.04, "grip_s": 0.5}
+EXACT: dict[str, Any] = {
+    "delay_s": 0.27,
+    "lag_s": 0.15,
+    "gain": 0.9,
+    "tremor": 0.0,
+    "dead_zone": 0.04,
+    "grip_s": 0.5,
+}
 
 
 @pytest.mark.parametrize("most", [1, 2, 5])
 def test_hands_are_those_of_the_follower(most: int, machine: Machine) -> None:
-    proposed = np.random.default_rng(0).uniform(-1, 1, (80, 3, 5)) * (np.random.default_rng(1).random((80, 3, 5)) < 0.6)
+    proposed = np.random.default_rng(0).uniform(-1, 1, (80, 3, 5)) * (
+        np.random.default_rng(1).random((80, 3, 5)) < 0.6
+    )
     proposed[..., 1] *= np.arange(80)[:, None] % 20 < 5
     proposed = np.repeat(proposed[::4], 4, 0)
     here = Hands(joints_at_once=most, **EXACT).build(machine, np.arange(3), 0)
-    there = Person(joints_at_once=most, attention_s=0.0, **EXACT).build(machine, 3, torch.device("cpu"))
+    there = Person(joints_at_once=most, attention_s=0.0, **EXACT).build(
+        machine, 3, torch.device("cpu")
+    )
     for row in proposed:
         expected = there.step(torch.tensor(row, dtype=torch.float32)).numpy()
         assert np.allclose(here.step(row), expected, atol=1e-5)
@@ -48,7 +65,9 @@ def test_a_person_is_the_same_in_every_trial_and_condition() -> None:
     assert Traits(np.array([1]), seed=4).draw("delay_s", (0.2, 0.4))[0, 0] != one[1]
 
 
-def worked(operator: Any, machine: Machine, seconds: float, advice: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def worked(
+    operator: Any, machine: Machine, seconds: float, advice: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns positions and commands, `(T, N, J)`, on an arm of pure dead time whose valves open linearly beyond 0.08."""
     model = operator.build(machine, np.arange(len(START)), 7)
     q, pipe = START.copy(), [np.zeros_like(START)] * round(machine.dead_time_s / machine.period_s)
@@ -58,7 +77,9 @@ def worked(operator: Any, machine: Machine, seconds: float, advice: np.ndarray |
         u = model.step(OperatorView(q=q, rim_in_base_m=RIM_M, advice=shown))
         pipe = [*pipe[1:], u]
         opening = np.sign(pipe[0]) * np.maximum(np.abs(pipe[0]) - 0.08, 0) / 0.92
-        q = np.clip(q + opening * machine.max_speed * machine.period_s, machine.lower, machine.upper)
+        q = np.clip(
+            q + opening * machine.max_speed * machine.period_s, machine.lower, machine.upper
+        )
         qs.append(q)
         us.append(u)
     return np.array(qs), np.array(us)
@@ -89,7 +110,12 @@ def test_operators_without_guidance_find_the_hole_each_in_their_way(machine: Mac
 def test_the_follower_does_what_is_advised_and_without_advice_nothing(machine: Machine) -> None:
     _, still = worked(option("operator", "follower"), machine, 2.0)
     assert not still.any()
-    _, moved = worked(option("operator", "follower"), machine, 3.0, np.tile([0.5, 0.0, 0.0, 0.0, 0.0], (len(START), 1)))
+    _, moved = worked(
+        option("operator", "follower"),
+        machine,
+        3.0,
+        np.tile([0.5, 0.0, 0.0, 0.0, 0.0], (len(START), 1)),
+    )
     assert moved[-1, :, 0] == pytest.approx(0.5, abs=0.15) and not moved[..., 1:].any()
 
 
@@ -99,8 +125,12 @@ def test_every_operator_says_that_it_is_simulated_in_the_list(name: str) -> None
 
 
 @pytest.mark.slow
-def test_a_study_of_simulated_operators_from_nothing_by_one_command(brokk: Callable[..., Any], tmp_path: Path) -> None:
-    hole = "{_target_: deploy.study.design.Hole, center_in_base_m: [2.6, 0.0, 0.75], radius_m: 0.05}"
+def test_a_study_of_simulated_operators_from_nothing_by_one_command(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    hole = (
+        "{_target_: deploy.study.design.Hole, center_in_base_m: [2.6, 0.0, 0.75], radius_m: 0.05}"
+    )
     done = brokk(
         "mode=study", "study.do=simulate", "session.out=run", "study.num_studies=10", "study.design.num_participants=4",
         "study.design.limit_s=2.0", "study.practice.base_s=1.0",
@@ -115,16 +145,28 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(brokk: Calla
     assert "no person took part" in (run / "report.html").read_text()
     trial = json.loads((run / "trials" / "P01_1_01.json").read_text())
     assert trial["simulated"] is True and trial["operator"] in ("follower", "novice")
-    assert "simulated operators" in (run / "plan.html").read_text() and "four of five" in (run / "plan.html").read_text()
-    erased = brokk("mode=study", "study.do=erase", "study.folder=run", "study.participant=P02", "session.out=forget")
+    assert (
+        "simulated operators" in (run / "plan.html").read_text()
+        and "four of five" in (run / "plan.html").read_text()
+    )
+    erased = brokk(
+        "mode=study",
+        "study.do=erase",
+        "study.folder=run",
+        "study.participant=P02",
+        "session.out=forget",
+    )
     assert erased.code == 0 and not list(run.rglob("P02*"))
 
 
 def test_a_study_needs_neither_torch_nor_simulator() -> None:
-    code = (
-        "import sys, brokk_rl.modes.study, deploy.study.study; print([m for m in ('torch', 'mujoco', 'warp') if m in sys.modules])"
+    code = "import sys, brokk_rl.modes.study, deploy.study.study; print([m for m in ('torch', 'mujoco', 'warp') if m in sys.modules])"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+        ).stdout
+        == "[]\n"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout == "[]\n"
 
 
 def test_what_cannot_be_done_is_said(brokk: Callable[..., Any]) -> None:
@@ -138,7 +180,11 @@ def test_what_cannot_be_done_is_said(brokk: Callable[..., Any]) -> None:
         ("bench=guided", "bench=participant"),
     ):
         done = brokk(
-            "preset=study", override, *(["follower=person"] if "guided" in override else []), "ground=none", "session.out=run"
+            "preset=study",
+            override,
+            *(["follower=person"] if "guided" in override else []),
+            "ground=none",
+            "session.out=run",
         )
         assert done.code == 2 and said in done.err
     done = brokk("preset=study", "ground=none", "study.folder=nowhere", "session.out=run")

@@ -54,7 +54,9 @@ def read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def test_a_sitting_from_consent_to_the_end_gives_what_a_report_reads(tmp_path: Path, arm: Arm) -> None:
+def test_a_sitting_from_consent_to_the_end_gives_what_a_report_reads(
+    tmp_path: Path, arm: Arm
+) -> None:
     lead, seen = conductor(tmp_path, arm), []
     agreed(lead)
     while (kind := lead.view()["kind"]) != "done":
@@ -71,9 +73,13 @@ def test_a_sitting_from_consent_to_the_end_gives_what_a_report_reads(tmp_path: P
     found = analysis.analyse(folder.read(tmp_path), MACHINE)
     mine = [trial for trial in found.trials if trial.facts["participant"] == "P01"]
     assert len(mine) == 4 and all(trial.values["success"] == 1 for trial in mine)
-    assert all(trial.facts["outcome"] == "inserted" and trial.facts["twin"] is True for trial in mine)
+    assert all(
+        trial.facts["outcome"] == "inserted" and trial.facts["twin"] is True for trial in mine
+    )
     assert found.loads["weighted"]["guided"][0] == found.loads["raw"]["unguided"][0] == 40.0
-    assert "P01" not in "".join(f"{remark.where}{remark.text}" for remark in found.remarks)  # nothing to say against it
+    assert "P01" not in "".join(
+        f"{remark.where}{remark.text}" for remark in found.remarks
+    )  # nothing to say against it
     consent = read(tmp_path / "participants" / "P01.json")["consent"]
     assert consent["agreed"] and consent["language"] == "de" and consent["version"] == "v1"
     for trial in mine:
@@ -91,7 +97,9 @@ def test_who_does_not_agree_takes_no_part(tmp_path: Path, arm: Arm) -> None:
     assert "no consent" in "".join(remark.text for remark in folder.read(tmp_path).remarks)
 
 
-def test_a_trial_that_the_program_did_not_survive_is_kept_and_done_again(tmp_path: Path, arm: Arm) -> None:
+def test_a_trial_that_the_program_did_not_survive_is_kept_and_done_again(
+    tmp_path: Path, arm: Arm
+) -> None:
     lead = conductor(tmp_path, arm)
     agreed(lead)
     in_trial(lead, arm)
@@ -109,7 +117,10 @@ def test_a_trial_that_the_program_did_not_survive_is_kept_and_done_again(tmp_pat
     in_trial(again, again._stage)  # type: ignore[arg-type]
     again.take({"do": "next"})
     data = folder.read(tmp_path)
-    assert data.trials["P01", 1, 2]["outcome"] == "inserted" and next_step(data, "P01").kind == "questionnaire"
+    assert (
+        data.trials["P01", 1, 2]["outcome"] == "inserted"
+        and next_step(data, "P01").kind == "questionnaire"
+    )
     assert any("aborted (interrupted" in remark.text for remark in data.remarks)
 
 
@@ -126,14 +137,20 @@ def test_half_a_questionnaire_is_kept_said_and_gone_on_with(tmp_path: Path, arm:
     again = conductor(tmp_path, arm)
     again.choose("P01")
     view = again.view()
-    assert view["ratings"] == {"mental": 35} and view["pairs"] == first and view["chosen"][0] == first[0][1]
+    assert (
+        view["ratings"] == {"mental": 35}
+        and view["pairs"] == first
+        and view["chosen"][0] == first[0][1]
+    )
     assert view["at"] == 1, "the first screen without an answer"
     for wrong in ({"value": 101}, {"value": 33}, {"value": True}, {"scale": "joy", "value": 5}, {}):
         assert again.take({"do": "rate", "scale": "effort", **wrong}) == "malformed"
     again.take({"do": "to", "to": 21})
     assert again.take({"do": "finish"}) == "" and again.view()["kind"] == "trial"
     said = [remark.text for remark in analysis.analyse(folder.read(tmp_path), MACHINE).remarks]
-    assert any("physical, temporal, performance, effort, frustration not answered" in text for text in said)
+    assert any(
+        "physical, temporal, performance, effort, frustration not answered" in text for text in said
+    )
     assert any("1 of 15 pairs" in text for text in said)
 
 
@@ -145,7 +162,10 @@ def test_who_stops_in_a_trial_is_believed_and_may_come_back(tmp_path: Path, arm:
     assert lead.take({"do": "stop_sitting", "reason": "felt unwell"}) == ""
     assert lead.view()["kind"] == "stopped" and arm.recorded is None
     assert read(tmp_path / "trials" / "P01_1_01.json")["outcome"] == "stopped"
-    assert any("stopped after 1 trials (felt unwell)" in remark.text for remark in folder.read(tmp_path).remarks)
+    assert any(
+        "stopped after 1 trials (felt unwell)" in remark.text
+        for remark in folder.read(tmp_path).remarks
+    )
     lead.take({"do": "go_on"})
     assert (lead.view()["kind"], lead.view()["number"]) == ("trial", 2)
 
@@ -159,7 +179,9 @@ def test_who_stops_in_a_trial_is_believed_and_may_come_back(tmp_path: Path, arm:
         ("silence", "aborted", "positions"),
     ],
 )
-def test_how_a_trial_can_end(tmp_path: Path, arm: Arm, happens: str, outcome: str, reason: str) -> None:
+def test_how_a_trial_can_end(
+    tmp_path: Path, arm: Arm, happens: str, outcome: str, reason: str
+) -> None:
     lead = conductor(tmp_path, arm)
     agreed(lead)
     lead.take({"do": "begin"})
@@ -179,12 +201,18 @@ def test_how_a_trial_can_end(tmp_path: Path, arm: Arm, happens: str, outcome: st
     assert lead.view()["number"] == (1 if outcome == "aborted" else 2)
 
 
-def test_a_recording_that_cannot_be_used_is_said_and_the_outcome_kept(tmp_path: Path, arm: Arm) -> None:
+def test_a_recording_that_cannot_be_used_is_said_and_the_outcome_kept(
+    tmp_path: Path, arm: Arm
+) -> None:
     lead, arm.fails = conductor(tmp_path, arm), "a gap of 3 s"
     agreed(lead)
     in_trial(lead, arm)
     told = read(tmp_path / "trials" / "P01_1_01.json")
-    assert told["outcome"] == "inserted" and told["recording_problem"] == "a gap of 3 s" and "recording" not in told
+    assert (
+        told["outcome"] == "inserted"
+        and told["recording_problem"] == "a gap of 3 s"
+        and "recording" not in told
+    )
 
 
 def test_practice_ends_with_two_successes_in_a_row_or_when_it_is_said(tmp_path: Path) -> None:
@@ -200,7 +228,10 @@ def test_practice_ends_with_two_successes_in_a_row_or_when_it_is_said(tmp_path: 
     agreed(lead, "P02")
     assert lead.view()["period"] == 0
     lead.take({"do": "end_practice"})
-    assert lead.view()["period"] == 1 and read(tmp_path / "participants" / "P02.json")["consent"]["agreed"]
+    assert (
+        lead.view()["period"] == 1
+        and read(tmp_path / "participants" / "P02.json")["consent"]["agreed"]
+    )
 
 
 def test_advice_leaves_the_loop_in_guided_trials_alone(tmp_path: Path, arm: Arm) -> None:
@@ -213,14 +244,20 @@ def test_advice_leaves_the_loop_in_guided_trials_alone(tmp_path: Path, arm: Arm)
         lead.take({"do": "begin"})
         arm.later(lead, 2.0)
         assert (feed.shown().advice is not None) == feed.shown().guiding == (condition == "guided")
-        assert not feed.wish(Wish("record", "off")) and not feed.wish(Wish("start", "")) and inner.wishes == []
+        assert (
+            not feed.wish(Wish("record", "off"))
+            and not feed.wish(Wish("start", ""))
+            and inner.wishes == []
+        )
         assert feed.wish(Wish("stop", "")) and not lead.running
         arm.later(lead, 1.0)
         saved(lead, arm)
         lead.take({"do": "next"})
 
 
-def test_a_disk_that_takes_no_more_ends_the_trial_and_is_said(tmp_path: Path, arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_takes_no_more_ends_the_trial_and_is_said(
+    tmp_path: Path, arm: Arm, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lead = conductor(tmp_path, arm)
     agreed(lead)
     lead.take({"do": "begin"})
@@ -233,16 +270,26 @@ def test_a_disk_that_takes_no_more_ends_the_trial_and_is_said(tmp_path: Path, ar
         patch.setattr(folder, "write_json", full)
         arm.q = MACHINE.home
         arm.later(lead, 0.2)
-        assert lead.view()["kind"] == "choose" and "No space left" in lead.view()["problem"] and arm.recorded is None
+        assert (
+            lead.view()["kind"] == "choose"
+            and "No space left" in lead.view()["problem"]
+            and arm.recorded is None
+        )
     lead.take({"do": "choose", "who": "P01"})
-    assert (lead.view()["kind"], lead.view()["number"], lead.view()["problem"]) == ("trial", 1, ""), "it is done again"
+    assert (lead.view()["kind"], lead.view()["number"], lead.view()["problem"]) == (
+        "trial",
+        1,
+        "",
+    ), "it is done again"
 
 
 def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
     lead = conductor(tmp_path, arm)
     with pytest.raises(ConfigError, match="no participant of the plan"):
         lead.choose("Jane")
-    assert lead.take({"do": "choose", "who": "Jane"}) == "failed" and "Jane" in lead.view()["problem"]
+    assert (
+        lead.take({"do": "choose", "who": "Jane"}) == "failed" and "Jane" in lead.view()["problem"]
+    )
     assert lead.take({"do": "begin"}) == "nobody" and lead.take({}) == "nobody"
     agreed(lead)
     (tmp_path / "captures" / "P01_1_01").mkdir(parents=True)
@@ -253,7 +300,9 @@ def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
     assert np.all([FACTS["twin"], not FACTS["simulated"]])
 
 
-def test_a_recording_that_an_interruption_left_unsaved_is_made_the_next_time(tmp_path: Path, arm: Arm) -> None:
+def test_a_recording_that_an_interruption_left_unsaved_is_made_the_next_time(
+    tmp_path: Path, arm: Arm
+) -> None:
     lead = conductor(tmp_path, arm)
     agreed(lead)
     in_trial(lead, arm)
@@ -286,7 +335,14 @@ SMALL = (
 def test_a_simulated_participant_at_the_twin_in_real_time_goes_on_after_everything_was_killed(
     tmp_path: Path, brokk: Callable[..., Any]
 ) -> None:
-    planned = brokk("mode=study", "study.do=plan", "study.num_studies=10", "ground=none", "session.out=study", *SMALL)
+    planned = brokk(
+        "mode=study",
+        "study.do=plan",
+        "study.num_studies=10",
+        "ground=none",
+        "session.out=study",
+        *SMALL,
+    )
     assert planned.code == 0, planned.err
     ports = [f"bus.port={free_port()}", f"bench.twin.fault_port={free_port()}", "page.port=0"]
     run = [
@@ -305,25 +361,41 @@ def test_a_simulated_participant_at_the_twin_in_real_time_goes_on_after_everythi
     try:
         end_s, done = time.monotonic() + 180, tmp_path / "study" / "trials"
         while not any(read(path)["outcome"] != "aborted" for path in done.glob("*_02.json")):
-            assert first.poll() is None and time.monotonic() < end_s, "the second trial never came to its end"
+            assert first.poll() is None and time.monotonic() < end_s, (
+                "the second trial never came to its end"
+            )
             time.sleep(0.3)
     finally:
         first.kill()  # its children die with it
         first.wait()
-    again = subprocess.run([*run, "session.out=again"], cwd=tmp_path, env=environment, timeout=240, capture_output=True, text=True)
+    again = subprocess.run(
+        [*run, "session.out=again"],
+        cwd=tmp_path,
+        env=environment,
+        timeout=240,
+        capture_output=True,
+        text=True,
+    )
     assert again.returncode == 0, again.stderr
-    reported = brokk("mode=study", "study.do=report", "study.folder=study", "ground=none", "session.out=report")
+    reported = brokk(
+        "mode=study", "study.do=report", "study.folder=study", "ground=none", "session.out=report"
+    )
     assert reported.code == 0, reported.err
     data = folder.read(tmp_path / "study")
     trials = [trial for (who, _, _), trial in data.trials.items() if who == "P01"]
-    assert len(trials) == 4 and all(trial["simulated"] and trial["twin"] for trial in trials) and data.is_simulated
+    assert (
+        len(trials) == 4
+        and all(trial["simulated"] and trial["twin"] for trial in trials)
+        and data.is_simulated
+    )
     assert {trial["run"] for trial in trials} == {"first", "again"}
     guided = [trial for trial in trials if trial["condition"] == "guided"]
     assert [trial["outcome"] for trial in guided] == ["inserted", "inserted"]
     assert all(data.questionnaires["P01", period]["finished"] for period in (1, 2))
     recording = record.read(tmp_path / "study" / guided[0]["recording"], MACHINE)
     assert (
-        max(np.nanmax(np.abs(recording.extra[f"advice_{joint}"])) for joint in recording.joints) > 0.1
+        max(np.nanmax(np.abs(recording.extra[f"advice_{joint}"])) for joint in recording.joints)
+        > 0.1
         and np.abs(recording.u).max() > 0.1
     )
     assert "no person took part" in (tmp_path / "report" / "report.html").read_text()

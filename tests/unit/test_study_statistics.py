@@ -13,8 +13,17 @@ from deploy.study.crossover import dz_interval, effect, hodges_lehmann
 from deploy.study.practice import Practice, share_significant
 
 DARWIN = np.array([49, -67, 8, 16, 6, 23, 28, 41, 14, 29, 56, 24, 75, 60, -48], float)
-"""Darwin's maize, eighths of an inch; Fisher 1935 counted by hand that 1726 of 32768 flips are as extreme: p = 0.0527."""
-PEOPLE = Practice(base_s=60.0, skill_sd=0.3, hole_sd=0.1, learning=0.37, learning_sd=0.08, guidance_sd=0.1, chance_sd=0.25)
+"""Darwin's maize, eighths of an inch; Fisher 1935 counted by hand that 1726 of 32768 flips are as
+extreme: p = 0.0527."""
+PEOPLE = Practice(
+    base_s=60.0,
+    skill_sd=0.3,
+    hole_sd=0.1,
+    learning=0.37,
+    learning_sd=0.08,
+    guidance_sd=0.1,
+    chance_sd=0.25,
+)
 
 
 def test_the_paired_test_counts_what_fisher_counted() -> None:
@@ -25,7 +34,11 @@ def test_tests_agree_with_scipys_permutations() -> None:
     rng = np.random.default_rng(3)
     difference, first = rng.normal(0.6, 1.0, 9), np.arange(9) < 4
     paired = stats.permutation_test(
-        (difference,), lambda x, axis: x.mean(axis), permutation_type="samples", n_resamples=np.inf, vectorized=True
+        (difference,),
+        lambda x, axis: x.mean(axis),
+        permutation_type="samples",
+        n_resamples=np.inf,
+        vectorized=True,
     )
     sequences = stats.permutation_test(
         (difference[first], difference[~first]),
@@ -36,11 +49,14 @@ def test_tests_agree_with_scipys_permutations() -> None:
     )
     assert exact.paired_p(difference) == pytest.approx(paired.pvalue)
     assert exact.sequence_p(difference, first) == pytest.approx(sequences.pvalue)
-    assert exact.wilcoxon_p(difference) == pytest.approx(stats.wilcoxon(difference, method="exact").pvalue)
+    assert exact.wilcoxon_p(difference) == pytest.approx(
+        stats.wilcoxon(difference, method="exact").pvalue
+    )
 
 
 def test_wilcoxon_with_ties_counts_midranks() -> None:
-    # |d| = 1 1 2: ranks 1.5 1.5 3, sum of signed ranks 6 is the largest; 2 of 8 sign patterns are as extreme
+    # |d| = 1 1 2: ranks 1.5 1.5 3, sum of signed ranks 6 is the largest; 2 of 8 sign patterns are
+    # as extreme
     assert exact.wilcoxon_p(np.array([1.0, 1.0, 2.0, 0.0])) == 0.25
     assert exact.wilcoxon_p(np.zeros(4)) == 1.0
 
@@ -48,21 +64,29 @@ def test_wilcoxon_with_ties_counts_midranks() -> None:
 def test_five_persons_cannot_reach_five_percent_and_six_can() -> None:
     assert exact.smallest_paired_p(5) == 0.0625 == exact.paired_p(np.arange(1.0, 6.0))
     assert exact.smallest_paired_p(6) == 0.03125
-    assert exact.smallest_sequence_p(4, 8) == pytest.approx(2 / 70) == exact.sequence_p(np.arange(8.0), np.arange(8) < 4)
+    assert (
+        exact.smallest_sequence_p(4, 8)
+        == pytest.approx(2 / 70)
+        == exact.sequence_p(np.arange(8.0), np.arange(8) < 4)
+    )
     assert exact.smallest_sequence_p(4, 7) == pytest.approx(1 / 35)
     assert sample_size.least(0.05) == (6, 7)
 
 
 def test_many_studies_at_once_are_those_one_by_one() -> None:
     rows, first = np.random.default_rng(0).normal(size=(4, 8)), np.arange(8) % 2 == 0
-    assert exact.sequence_p(rows, first).tolist() == [float(exact.sequence_p(row, first)) for row in rows]
+    assert exact.sequence_p(rows, first).tolist() == [
+        float(exact.sequence_p(row, first)) for row in rows
+    ]
     with pytest.raises(ValueError, match="both sequences"):
         exact.sequence_p(rows, np.ones(8, bool))
 
 
 def test_more_ways_than_can_be_counted_are_drawn() -> None:
     difference = np.random.default_rng(1).normal(0.3, 1.0, 30)
-    assert exact.paired_p(difference) == pytest.approx(stats.ttest_1samp(difference, 0.0).pvalue, abs=0.02)
+    assert exact.paired_p(difference) == pytest.approx(
+        stats.ttest_1samp(difference, 0.0).pvalue, abs=0.02
+    )
 
 
 def test_holm_is_worked_by_hand() -> None:
@@ -73,8 +97,8 @@ def test_holm_is_worked_by_hand() -> None:
 
 
 def test_hodges_lehmann_is_that_of_hollander_and_wolfe() -> None:
-    # Hamilton's depression scale, example 3.1 (R: wilcox.test(x, y, paired=TRUE, conf.int=TRUE)): estimate 0.46,
-    # 96.1 % interval from 0.01 to 0.786; exact signed-rank p of 0.0391 (two-sided)
+    # Hamilton's depression scale, example 3.1 (R: wilcox.test(x, y, paired=TRUE, conf.int=TRUE)):
+    # estimate 0.46, 96.1 % interval from 0.01 to 0.786; exact signed-rank p of 0.0391 (two-sided)
     x = np.array([1.83, 0.50, 1.62, 2.48, 1.68, 1.88, 1.55, 3.06, 1.30])
     y = np.array([0.878, 0.647, 0.598, 2.05, 1.06, 1.29, 1.06, 3.14, 1.29])
     middle, interval = hodges_lehmann(x - y)
@@ -88,21 +112,28 @@ def test_the_interval_of_dz_turns_back_into_t() -> None:
     low, high = dz_interval(0.8, 4.0, 15)
     assert stats.nct.cdf(3.2, 15, 4 * low) == pytest.approx(0.975)
     assert stats.nct.cdf(3.2, 15, 4 * high) == pytest.approx(0.025)
-    low, high = dz_interval(-300.0, math.sqrt(2), 1)  # two persons who agree: almost anything is possible
+    low, high = dz_interval(
+        -300.0, math.sqrt(2), 1
+    )  # two persons who agree: almost anything is possible
     assert low < -600 and -40 < high < 0
 
 
 def test_guidance_and_period_come_apart() -> None:
-    # each person: 50 s, second period 8 s faster, guidance 5 s faster, and own deviations that cancel within each sequence
+    # each person: 50 s, second period 8 s faster, guidance 5 s faster, and own deviations that
+    # cancel within each sequence
     first = np.array([True, True, True, False, False, False])
     own = np.array([-1.0, 0.0, 1.0, 2.0, 0.0, -2.0])
     guided = 50.0 - 5.0 - 8.0 * ~first + own
     unguided = 50.0 - 8.0 * first
     found = effect(guided, unguided, first)
     assert found.adjusted == pytest.approx(-5.0) and found.period == pytest.approx(-8.0)
-    assert found.difference == pytest.approx(-5.0)  # sequences are equal, so practice cancels in the mean …
+    assert found.difference == pytest.approx(
+        -5.0
+    )  # sequences are equal, so practice cancels in the mean …
     assert found.paired_dz is not None and found.dz is not None
-    assert found.dz == pytest.approx(-5.0 / math.sqrt((2 + 8) / 4)) and abs(found.paired_dz) < abs(found.dz)  # … not in the spread
+    assert found.dz == pytest.approx(-5.0 / math.sqrt((2 + 8) / 4)) and abs(found.paired_dz) < abs(
+        found.dz
+    )  # … not in the spread
     assert found.p == pytest.approx(2 / 20) and found.adjusted_ci95 is not None
     half = stats.t.ppf(0.975, 4) * math.sqrt(2.5) / 2 * math.sqrt(2 / 3)
     assert found.adjusted_ci95 == pytest.approx((-5 - half, -5 + half))
@@ -118,7 +149,9 @@ def test_with_one_sequence_nothing_is_said_about_guidance_apart_from_order() -> 
     assert effect(np.full(3, np.nan), np.ones(3), np.ones(3, bool)).difference is None
 
 
-def test_without_effect_a_counterbalanced_study_errs_as_often_as_it_says_and_one_of_fixed_order_nearly_always() -> None:
+def test_without_effect_a_counterbalanced_study_errs_as_often_as_it_says_and_one_of_fixed_order_nearly_always() -> (
+    None
+):
     fair = share_significant(PEOPLE, 16, 5, 4, 150.0, 0.0, 0.05, 1000, seed=5)
     fixed = share_significant(PEOPLE, 12, 5, 4, 150.0, 0.0, 0.05, 300, seed=5, fixed=True)
     assert fair["share"] <= 0.065
@@ -128,5 +161,7 @@ def test_without_effect_a_counterbalanced_study_errs_as_often_as_it_says_and_one
 def test_a_large_effect_is_found_by_sixteen() -> None:
     found = share_significant(PEOPLE, 16, 5, 4, 150.0, 0.8, 0.05, 500, seed=5)
     assert found["share"] >= 0.8
-    power = stats.nct.sf(stats.t.ppf(0.975, 14), 14, 3.2)  # of the t test with the period in the model
+    power = stats.nct.sf(
+        stats.t.ppf(0.975, 14), 14, 3.2
+    )  # of the t test with the period in the model
     assert sample_size.size(16, 0.05).power[1] == pytest.approx(power, abs=0.04)

@@ -37,24 +37,36 @@ def test_what_is_given_reaches_the_valves_as_the_bus_rounds_it(tmp_path: Path) -
     for _ in range(20):
         one.period(GIVEN)
     for _ in range(3):
-        one.period(np.array([0.0, 0.6, 0.0, 0.0, 0.0]))  # the exclusive joint: the button goes over the bus, too
+        one.period(
+            np.array([0.0, 0.6, 0.0, 0.0, 0.0])
+        )  # the exclusive joint: the button goes over the bus, too
     found = one.recording()
     assert found.u[2:19] == pytest.approx(np.tile(GIVEN, (17, 1)), abs=0.01)
     assert found.u[-1] == pytest.approx([0.0, 0.6, 0.0, 0.0, 0.0], abs=0.01)
     still, moved = found.q[: DEAD_SAMPLES - 1], found.q[DEAD_SAMPLES + 5 :]
-    assert np.abs(still[:, 0] - START[0]).max() < 0.003 and moved[-1, 0] > START[0] + 0.02, "the dead time, then motion"
-    assert found.t_s[0] == 0.0 and len(found.t_s) == 23, "what went before the trial is no part of it"
+    assert np.abs(still[:, 0] - START[0]).max() < 0.003 and moved[-1, 0] > START[0] + 0.02, (
+        "the dead time, then motion"
+    )
+    assert found.t_s[0] == 0.0 and len(found.t_s) == 23, (
+        "what went before the trial is no part of it"
+    )
 
 
-def test_advice_is_shown_from_the_beginning_and_follows_hands_that_follow_it(tmp_path: Path) -> None:
+def test_advice_is_shown_from_the_beginning_and_follows_hands_that_follow_it(
+    tmp_path: Path,
+) -> None:
     one = desk(tmp_path)
     (q, shown), first = one.seen(), None
     for _ in range(round(12.0 / MACHINE.period_s)):
         first = shown.copy() if first is None else first
         q, shown = one.period(shown)
     tip = tool(MACHINE, q).tip_in_base_m
-    assert first is not None and np.abs(first).max() > 0.02, f"after {BEFORE_S} s the history is full"
-    assert np.hypot(*(tip - RIM_M)[:2]) < 0.013 and tip[2] < RIM_M[2] - 0.05, "followed exactly, it leads into the hole"
+    assert first is not None and np.abs(first).max() > 0.02, (
+        f"after {BEFORE_S} s the history is full"
+    )
+    assert np.hypot(*(tip - RIM_M)[:2]) < 0.013 and tip[2] < RIM_M[2] - 0.05, (
+        "followed exactly, it leads into the hole"
+    )
     assert np.abs(one.recording().extra["advice_q1"]).max() > 0.02
 
 
@@ -80,7 +92,9 @@ def test_a_twin_is_put_elsewhere_with_its_block(tmp_path: Path) -> None:
 
 def test_a_place_is_asked_for_once_and_nonsense_refused() -> None:
     faults = Faults()
-    faults.request(json.dumps({"place": {"q": [0.0] * 5, "hole_in_base_m": [2.6, 0.0, 0.75]}}).encode(), 0.0)
+    faults.request(
+        json.dumps({"place": {"q": [0.0] * 5, "hole_in_base_m": [2.6, 0.0, 0.75]}}).encode(), 0.0
+    )
     assert faults.take_place() == ([0.0] * 5, [2.6, 0.0, 0.75]) and faults.take_place() is None
     with pytest.raises(ConfigError, match="expected JSON"):
         faults.request(b'{"place": {"q": [0.0]}}', 0.0)
@@ -101,6 +115,13 @@ def test_how_many_processes_share_the_twins_changes_nothing(tmp_path: Path) -> N
         depth_m=0.1, clearance_m=0.013,
     )  # fmt: skip
     session = Session(out=str(tmp_path), seed=0, device="cpu")
-    one, two = (replace(GROUND, num_processes=count).run(MACHINE, session, batch, Still()) for count in (1, 2))
+    one, two = (
+        replace(GROUND, num_processes=count).run(MACHINE, session, batch, Still())
+        for count in (1, 2)
+    )
     for here, there in zip(one, two, strict=True):
-        assert (here.q == there.q).all() and (here.u == there.u).all() and here.extra.keys() == there.extra.keys()
+        assert (
+            (here.q == there.q).all()
+            and (here.u == there.u).all()
+            and here.extra.keys() == there.extra.keys()
+        )

@@ -24,13 +24,16 @@ TASKS = ("borehole_insertion", "goal_pose")
 class Stage:
     """One or more environments of a task whose arm stands where a test puts it."""
 
-    def __init__(self, machine: Machine, name: str = "borehole_insertion", num_envs: int = 1, **changes: Any) -> None:
+    def __init__(
+        self, machine: Machine, name: str = "borehole_insertion", num_envs: int = 1, **changes: Any
+    ) -> None:
         self.task = replace(option("task", name), **changes)
         self.process: Any = self.task.build(machine, num_envs, CPU)
         self.world = KinematicWorld(machine, num_envs)
         start = self.process.starts(num_envs, 1)
         self.history = History(
-            q=start["q"][:, None].repeat(1, machine.num_history, 1), u=torch.zeros(num_envs, machine.num_history, 5)
+            q=start["q"][:, None].repeat(1, machine.num_history, 1),
+            u=torch.zeros(num_envs, machine.num_history, 5),
         )
         self.process.reset(torch.ones(num_envs, dtype=torch.bool), start)
         self.start = start
@@ -57,11 +60,15 @@ def test_starts_lie_within_the_limits_and_in_the_open(name: str, machine: Machin
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_the_same_seed_gives_the_same_starts_and_another_others(name: str, machine: Machine) -> None:
+def test_the_same_seed_gives_the_same_starts_and_another_others(
+    name: str, machine: Machine
+) -> None:
     process = option("task", name).build(machine, 1, CPU)
     first, again, other = process.starts(32, 3), process.starts(32, 3), process.starts(32, 4)
     assert all(torch.equal(first[key], again[key]) for key in first)
-    assert not torch.equal(first["q"], other["q"]) and not torch.equal(first["target_m"], other["target_m"])
+    assert not torch.equal(first["q"], other["q"]) and not torch.equal(
+        first["target_m"], other["target_m"]
+    )
 
 
 def test_holes_lie_in_their_ranges_and_the_scene_holds_the_target(machine: Machine) -> None:
@@ -82,14 +89,18 @@ def test_poses_have_many_pitches_and_no_block_near(machine: Machine) -> None:
 
 
 def test_too_few_reachable_starts_are_an_error_that_says_what_to_change() -> None:
-    with pytest.raises(ConfigError, match="goal_pose: only 2 of 3 starts were reachable; widen the joint limits"):
+    with pytest.raises(
+        ConfigError, match="goal_pose: only 2 of 3 starts were reachable; widen the joint limits"
+    ):
         keep(3, [{"q": torch.zeros(2, 5)}, {"q": torch.zeros(0, 5)}], "goal_pose")
 
 
 def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
     task = option("task", "goal_pose")
     controller = task.classical.build(machine, CPU)
-    found = reachable(controller, machine, torch.zeros(0, 5), torch.zeros(0, 3), torch.zeros(0), (1.7, 2.4), 0.1)
+    found = reachable(
+        controller, machine, torch.zeros(0, 5), torch.zeros(0, 3), torch.zeros(0), (1.7, 2.4), 0.1
+    )
     assert found.shape == (0,)
 
 
@@ -99,11 +110,18 @@ def test_a_pitch_that_varies_must_be_told_to_the_policy() -> None:
         replace(task, scaling=replace(task.scaling, pitch_rad=None))
 
 
-def judged(machine: Machine, name: str, at_m: tuple[float, float, float], pitch_rad: float = torch.pi / 2) -> tuple[bool, bool]:
+def judged(
+    machine: Machine, name: str, at_m: tuple[float, float, float], pitch_rad: float = torch.pi / 2
+) -> tuple[bool, bool]:
     """Returns strict and paper's success of a tool at `at_m` from the target point, which wants to be met straight down."""
     goal: Any = option("task", name).build(machine, 1, CPU)
-    start = {"target_m": torch.tensor([[2.5, 0.5, 0.75]]), "target_pitch_rad": torch.tensor([torch.pi / 2])}
-    verdict = goal.goal.judge(start["target_m"] + torch.tensor([at_m]), torch.tensor([pitch_rad]), start)
+    start = {
+        "target_m": torch.tensor([[2.5, 0.5, 0.75]]),
+        "target_pitch_rad": torch.tensor([torch.pi / 2]),
+    }
+    verdict = goal.goal.judge(
+        start["target_m"] + torch.tensor([at_m]), torch.tensor([pitch_rad]), start
+    )
     return bool(verdict["success"]), bool(verdict["paper_success"])
 
 
@@ -119,7 +137,9 @@ def judged(machine: Machine, name: str, at_m: tuple[float, float, float], pitch_
         ((0.0, 0.0, 0.2), False),
     ],
 )
-def test_strict_insertion_needs_depth_inside_the_hole(at_m: tuple[float, float, float], strict: bool, machine: Machine) -> None:
+def test_strict_insertion_needs_depth_inside_the_hole(
+    at_m: tuple[float, float, float], strict: bool, machine: Machine
+) -> None:
     assert judged(machine, "borehole_insertion", at_m)[0] is strict
 
 
@@ -127,9 +147,17 @@ def test_strict_insertion_needs_depth_inside_the_hole(at_m: tuple[float, float, 
     ("at_m", "turn_rad", "paper"),
     [
         ((0.0, 0.0, -0.14), 0.0, True),
-        ((0.0, 0.0, -0.051), 0.0, True),  # 5 cm below the rim is the height limit, and 8.9 cm from the target point
+        (
+            (0.0, 0.0, -0.051),
+            0.0,
+            True,
+        ),  # 5 cm below the rim is the height limit, and 8.9 cm from the target point
         ((0.0, 0.0, -0.049), 0.0, False),
-        ((0.11, 0.0, -0.14), 0.0, True),  # 1 / 1.11 = 0.901; the paper does not ask to be inside the hole
+        (
+            (0.11, 0.0, -0.14),
+            0.0,
+            True,
+        ),  # 1 / 1.11 = 0.901; the paper does not ask to be inside the hole
         ((0.112, 0.0, -0.14), 0.0, False),  # 1 / 1.112 = 0.899
         ((0.0, 0.0, -0.14), 0.110, True),
         ((0.0, 0.0, -0.14), -0.112, False),
@@ -169,7 +197,11 @@ def test_closeness_grows_on_the_way_from_none_to_one(name: str, machine: Machine
     tip = target + torch.stack((0 * height_m, 0 * height_m, height_m), 1)
     down = torch.full((50,), torch.pi / 2)
     closeness = goal.judge(tip, down, {"target_m": target, "target_pitch_rad": down})["closeness"]
-    assert (closeness.diff() > 0).all() and closeness[0] > 0 and closeness[-1] == pytest.approx(1.0, abs=1e-5)
+    assert (
+        (closeness.diff() > 0).all()
+        and closeness[0] > 0
+        and closeness[-1] == pytest.approx(1.0, abs=1e-5)
+    )
 
 
 def test_a_start_in_contact_ends_at_once_with_no_reward(machine: Machine) -> None:
@@ -185,7 +217,11 @@ def test_contact_later_in_the_episode_goes_on(machine: Machine) -> None:
     assert not stage.step().terminated.item()
     stage.world.contact_force_n.fill_(500.0)
     touched = stage.step()
-    assert not touched.terminated.item() and touched.reason.item() == -1 and touched.reward.item() != 0.0
+    assert (
+        not touched.terminated.item()
+        and touched.reason.item() == -1
+        and touched.reward.item() != 0.0
+    )
 
 
 @pytest.mark.parametrize("joint", range(5))
@@ -196,7 +232,11 @@ def test_a_joint_at_its_limit_ends_the_episode_as_a_failure(joint: int, machine:
     assert not stage.step().terminated.item(), "11 mrad from the end of the travel is still inside"
     stage.history.q[0, -1, joint] = float(machine.upper[joint]) - 0.009
     end = stage.step()
-    assert end.terminated.item() and not end.timed_out.item() and REASONS[int(end.reason)] == "joint_limit"
+    assert (
+        end.terminated.item()
+        and not end.timed_out.item()
+        and REASONS[int(end.reason)] == "joint_limit"
+    )
     assert end.reward.item() < -5.0, "5 (1 + closeness) is lost"
 
 
@@ -204,14 +244,21 @@ def test_the_time_limit_is_a_time_out_and_no_failure(machine: Machine) -> None:
     stage = Stage(machine, episode_s=0.2)
     ends = [stage.step() for _ in range(4)]
     assert [bool(end.timed_out) for end in ends] == [False, False, False, True]
-    assert not any(bool(end.terminated) for end in ends) and REASONS[int(ends[3].reason)] == "time_limit"
+    assert (
+        not any(bool(end.terminated) for end in ends)
+        and REASONS[int(ends[3].reason)] == "time_limit"
+    )
 
 
 def test_an_episode_that_fails_in_its_last_step_is_no_time_out(machine: Machine) -> None:
     stage = Stage(machine, episode_s=0.05)
     stage.history.q[0, -1, 0] = float(machine.upper[0])
     end = stage.step()
-    assert end.terminated.item() and not end.timed_out.item() and REASONS[int(end.reason)] == "joint_limit"
+    assert (
+        end.terminated.item()
+        and not end.timed_out.item()
+        and REASONS[int(end.reason)] == "joint_limit"
+    )
 
 
 def test_episodes_put_out_of_step_end_earlier_but_know_their_first_step(machine: Machine) -> None:
@@ -228,7 +275,9 @@ def test_a_fault_ends_the_episode_without_reward_or_success(machine: Machine) ->
     stage.target_below_tip(z_m=-0.12)
     stage.world.faults.fill_(True)
     end = stage.step()
-    assert end.terminated.item() and end.reward.item() == 0.0 and REASONS[int(end.reason)] == "fault"
+    assert (
+        end.terminated.item() and end.reward.item() == 0.0 and REASONS[int(end.reason)] == "fault"
+    )
     assert stage.process.episode["success_strict"].item() == 0.0
 
 
@@ -245,7 +294,11 @@ def test_success_ends_the_episode_only_where_it_shall(machine: Machine) -> None:
 def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
     """Five steps of 50 ms: commands 0.5, 0.5, -0.5 of q1 and still; 30 mm beside the hole, then inside at 0.2 s, then out again."""
     task = option("task", "borehole_insertion")
-    stage = Stage(machine, end_on_success=False, action=replace(task.action, kind="direct", scale=1.0, limits=False))
+    stage = Stage(
+        machine,
+        end_on_success=False,
+        action=replace(task.action, kind="direct", scale=1.0, limits=False),
+    )
     script = [  # command of q1, force, tool from the target
         (0.5, 0.0, (0.03, 0.0, 0.5)),
         (0.5, 900.0, (0.03, 0.0, 0.3)),
@@ -254,12 +307,16 @@ def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
         (-0.5, 0.0, (0.3, 0.0, 0.5)),
     ]
     for command, force_n, at_m in script:
-        stage.history.push_u(stage.process.command(torch.tensor([[command, 0.9, 0.0, 0.0, 0.0]])))  # q2 is masked: not positioning
+        stage.history.push_u(
+            stage.process.command(torch.tensor([[command, 0.9, 0.0, 0.0, 0.0]]))
+        )  # q2 is masked: not positioning
         stage.world.contact_force_n.fill_(force_n)
         stage.target_below_tip(*at_m)
         stage.step()
     figures = {name: value.item() for name, value in stage.process.episode.items()}
-    assert figures["valve_travel"] == pytest.approx((0.5 + 0 + 1.0 + 0 + 0) / 0.05 / 5)  # 6 full strokes a second
+    assert figures["valve_travel"] == pytest.approx(
+        (0.5 + 0 + 1.0 + 0 + 0) / 0.05 / 5
+    )  # 6 full strokes a second
     assert figures["time_to_insert_s"] == pytest.approx(0.2)
     assert figures["lateral_error_m"] == pytest.approx(0.005, abs=1e-6)  # when it was inserted
     assert figures["peak_force_n"] == 900.0
@@ -305,7 +362,10 @@ def test_the_mean_filter_gives_the_mean_of_all_samples_so_far(machine: Machine) 
         errors[kind] = estimates(stage, 20)
     running = errors["none"].cumsum(0) / torch.arange(1, 21)[:, None, None]
     torch.testing.assert_close(errors["mean"], running, rtol=0, atol=2e-6)
-    assert errors["none"].abs().max() <= 0.01 + 1e-6 and errors["mean"][-1].std() < errors["none"][-1].std() / 3
+    assert (
+        errors["none"].abs().max() <= 0.01 + 1e-6
+        and errors["mean"][-1].std() < errors["none"][-1].std() / 3
+    )
 
 
 def test_the_bias_is_constant_within_an_episode_and_bounded(machine: Machine) -> None:
@@ -349,14 +409,23 @@ def test_without_noise_the_policy_sees_the_truth(machine: Machine) -> None:
     target, q, _ = stage.process._encoder.decode(vector)
     torch.testing.assert_close(target, stage.start["target_m"], rtol=0, atol=1e-6)
     torch.testing.assert_close(q, stage.history.q, rtol=0, atol=1e-6)
-    torch.testing.assert_close(stage.process._encoder.decode_pitch(vector), stage.start["target_pitch_rad"], rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        stage.process._encoder.decode_pitch(vector),
+        stage.start["target_pitch_rad"],
+        rtol=0,
+        atol=1e-6,
+    )
 
 
 @pytest.mark.parametrize("name", TASKS)
 @pytest.mark.parametrize("kind", ["direct", "residual"])
-def test_the_deployed_policy_commands_what_the_task_does(name: str, kind: str, machine: Machine) -> None:
+def test_the_deployed_policy_commands_what_the_task_does(
+    name: str, kind: str, machine: Machine
+) -> None:
     """From the observation vector alone, with another pitch in each episode of goal_pose."""
-    stage = Stage(machine, name, num_envs=64, action=replace(option("task", name).action, kind=kind))
+    stage = Stage(
+        machine, name, num_envs=64, action=replace(option("task", name).action, kind=kind)
+    )
     torch.manual_seed(0)
     stage.history.u.uniform_(-1, 1)
     groups = stage.process.observe(stage.history)

@@ -19,18 +19,43 @@ def switch(rule: str) -> Switch:
 
 
 def seen(reach_m: float, reach_3d_m: float, tip_z_m: float) -> Any:
-    return SimpleNamespace(reach_m=torch.tensor([reach_m]), reach_3d_m=torch.tensor([reach_3d_m]), tip_z_m=torch.tensor([tip_z_m]))
+    return SimpleNamespace(
+        reach_m=torch.tensor([reach_m]),
+        reach_3d_m=torch.tensor([reach_3d_m]),
+        tip_z_m=torch.tensor([tip_z_m]),
+    )
 
 
 @pytest.mark.parametrize(
     ("reach_m", "reach_3d_m", "tip_z_m", "planar", "text", "equation"),
     [
-        (2.0, 2.0, 1.0, False, False, True),  # in range, tool high: the equation goes on positioning, the text does not
+        (
+            2.0,
+            2.0,
+            1.0,
+            False,
+            False,
+            True,
+        ),  # in range, tool high: the equation goes on positioning, the text does not
         (2.0, 2.0, 0.1, False, False, False),  # in range, tool low
         (3.0, 3.0, 1.0, True, True, True),  # too far, tool high
-        (3.0, 3.0, 0.1, False, False, True),  # too far, tool low: the text rests q2 to keep the tool off the ground
+        (
+            3.0,
+            3.0,
+            0.1,
+            False,
+            False,
+            True,
+        ),  # too far, tool low: the text rests q2 to keep the tool off the ground
         (1.0, 1.0, 1.0, True, True, True),  # too near
-        (2.0, 3.5, 1.0, False, True, True),  # q1 points elsewhere: in the plane in range, in space not
+        (
+            2.0,
+            3.5,
+            1.0,
+            False,
+            True,
+            True,
+        ),  # q1 points elsewhere: in the plane in range, in space not
         (1.7, 1.7, 0.1, False, False, False),  # the edges belong to the range
         (2.4, 2.4, 0.1, False, False, False),
     ],
@@ -53,10 +78,18 @@ FREE = torch.ones(5)
 
 def test_no_action_drives_a_joint_into_its_end() -> None:
     action = Action(kind="residual", scale=1.0, mask=False, limits=True)
-    lowest, highest = torch.tensor([[-1.0, 0.0, -0.3, -1.0, -1.0]]), torch.tensor([[0.0, 1.0, 1.0, 0.4, 1.0]])
+    lowest, highest = (
+        torch.tensor([[-1.0, 0.0, -0.3, -1.0, -1.0]]),
+        torch.tensor([[0.0, 1.0, 1.0, 0.4, 1.0]]),
+    )
     for output in (torch.full((1, 5), 3.0), torch.full((1, 5), -3.0)):
         u = action.command(
-            output, torch.full((1, 5), 0.1), lowest, highest, torch.tensor([False]), torch.zeros(5, dtype=torch.bool)
+            output,
+            torch.full((1, 5), 0.1),
+            lowest,
+            highest,
+            torch.tensor([False]),
+            torch.zeros(5, dtype=torch.bool),
         )
         assert torch.equal(u, highest if output[0, 0] > 0 else lowest)
 
@@ -67,7 +100,9 @@ def test_q2_never_moves_with_another_joint(kind: str, machine: Machine) -> None:
     action = Action(kind=kind, scale=0.5, mask=True, limits=False)  # type: ignore[arg-type]
     positioning = torch.arange(64) % 2 == 0
     exclusive = torch.as_tensor(machine.is_exclusive)
-    u = action.command(5 * torch.randn(64, 5), torch.rand(64, 5) * 2 - 1, -FREE, FREE, positioning, exclusive)
+    u = action.command(
+        5 * torch.randn(64, 5), torch.rand(64, 5) * 2 - 1, -FREE, FREE, positioning, exclusive
+    )
     assert (u[positioning][:, [0, 2, 3, 4]] == 0).all() and (u[positioning][:, 1] != 0).any()
     assert (u[~positioning][:, 1] == 0).all() and (u[~positioning][:, [0, 2, 3, 4]] != 0).any()
     assert (u.abs() <= 1).all()
@@ -77,16 +112,34 @@ def test_the_masks_are_the_papers_and_those_of_the_machine(machine: Machine) -> 
     action = Action(kind="direct", scale=1.0, mask=True, limits=False)
     for positioning, paper in ((True, [0, 1, 0, 0, 0]), (False, [1, 0, 1, 1, 1])):
         flag = torch.tensor([positioning])
-        u = action.command(torch.ones(1, 5), torch.zeros(1, 5), -FREE, FREE, flag, torch.as_tensor(machine.is_exclusive))
-        assert u[0].tolist() == paper == exclusive_mask(machine.is_exclusive, positioning).astype(int).tolist()
+        u = action.command(
+            torch.ones(1, 5),
+            torch.zeros(1, 5),
+            -FREE,
+            FREE,
+            flag,
+            torch.as_tensor(machine.is_exclusive),
+        )
+        assert (
+            u[0].tolist()
+            == paper
+            == exclusive_mask(machine.is_exclusive, positioning).astype(int).tolist()
+        )
 
 
 def test_direct_and_residual_actions_on_numbers(machine: Machine) -> None:
-    output, base = torch.tensor([[0.4, 0.4, -0.4, 4.0, 0.0]]), torch.tensor([[0.5, 0.5, 0.5, 0.5, -0.25]])
+    output, base = (
+        torch.tensor([[0.4, 0.4, -0.4, 4.0, 0.0]]),
+        torch.tensor([[0.5, 0.5, 0.5, 0.5, -0.25]]),
+    )
     rest = (-FREE, FREE, torch.tensor([False]), torch.as_tensor(machine.is_exclusive))
     direct = Action(kind="direct", scale=0.5, mask=True, limits=False).command(output, base, *rest)
-    residual = Action(kind="residual", scale=0.5, mask=True, limits=False).command(output, base, *rest)
-    unmasked = Action(kind="residual", scale=0.5, mask=False, limits=False).command(output, base, *rest)
+    residual = Action(kind="residual", scale=0.5, mask=True, limits=False).command(
+        output, base, *rest
+    )
+    unmasked = Action(kind="residual", scale=0.5, mask=False, limits=False).command(
+        output, base, *rest
+    )
     np.testing.assert_allclose(direct[0], [0.2, 0.0, -0.2, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(residual[0], [0.7, 0.0, 0.3, 1.0, -0.25], atol=1e-6)
     np.testing.assert_allclose(unmasked[0], [0.7, 0.7, 0.3, 1.0, -0.25], atol=1e-6)
@@ -96,7 +149,9 @@ def guided(machine: Machine, q: torch.Tensor, target_m: torch.Tensor) -> Any:
     task = option("task", "borehole_insertion")
     controller = task.classical.build(machine, torch.device("cpu"))
     history = q[:, None].repeat(1, machine.num_history, 1)
-    return controller.guide(history, torch.zeros_like(history), target_m, torch.full((len(q),), 1.57), (1.7, 2.4))
+    return controller.guide(
+        history, torch.zeros_like(history), target_m, torch.full((len(q),), 1.57), (1.7, 2.4)
+    )
 
 
 def test_the_planar_rule_does_not_depend_on_where_q1_points(machine: Machine) -> None:
@@ -106,16 +161,23 @@ def test_the_planar_rule_does_not_depend_on_where_q1_points(machine: Machine) ->
     turned = q.clone()
     turned[:, 0] = 1.2
     target = torch.tensor([[2.8, 0.3, 0.7]]).repeat(32, 1)
-    here, there = (switch("planar").positioning(guided(machine, rows, target)) for rows in (q, turned))
+    here, there = (
+        switch("planar").positioning(guided(machine, rows, target)) for rows in (q, turned)
+    )
     assert torch.equal(here, there) and here.any() and not here.all()
 
 
-def test_in_space_q2_alone_cannot_bring_a_target_behind_the_shoulder_into_range(machine: Machine) -> None:
+def test_in_space_q2_alone_cannot_bring_a_target_behind_the_shoulder_into_range(
+    machine: Machine,
+) -> None:
     """Why there is a planar rule: with q1 1.5 rad away, no q2 ends the positioning of text and equation."""
     q = torch.tensor(machine.home, dtype=torch.float32).repeat(100, 1)
     q[:, 0] = 1.5
     q[:, 1] = torch.linspace(float(machine.lower[1]), float(machine.upper[1]), 100)
     found = guided(machine, q, torch.tensor([[3.0, 0.0, 0.7]]).repeat(100, 1))
     high = found.tip_z_m >= 0.2
-    assert switch("text").positioning(found)[high].all() and switch("equation").positioning(found).all()
+    assert (
+        switch("text").positioning(found)[high].all()
+        and switch("equation").positioning(found).all()
+    )
     assert not switch("planar").positioning(found).all()

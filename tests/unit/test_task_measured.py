@@ -44,15 +44,21 @@ def test_errors_are_those_of_the_table_by_distance(tmp_path: Path) -> None:
     noise = measured(table=str(table(tmp_path / "a.json")), conditions=("clean",), frame_share=0.5)
     # 0.5 + 0.3 * 4 = 1.7 mm and 0.5 + 0.3 * 9 = 3.2 mm are 95 % of the longest
     np.testing.assert_allclose(noise.bias_m(AHEAD), np.array([[1.7], [3.2]]) / 950.0, rtol=1e-5)
-    # half of the standard deviation of an axis, 0.85 and 1.6 mm, evenly spread over twice the square root of three
-    np.testing.assert_allclose(noise.sample_m(AHEAD), np.array([[0.85], [1.6]]) / 1000 * 0.5 * np.sqrt(3), rtol=1e-5)
+    # half of the standard deviation of an axis, 0.85 and 1.6 mm, evenly spread over twice the
+    # square root of three
+    np.testing.assert_allclose(
+        noise.sample_m(AHEAD), np.array([[0.85], [1.6]]) / 1000 * 0.5 * np.sqrt(3), rtol=1e-5
+    )
     worst = replace(noise, conditions=("clean", "haze"))
     np.testing.assert_allclose(worst.bias_m(AHEAD), np.array([[3.4], [6.4]]) / 950.0, rtol=1e-5)
 
 
 def test_the_calibration_of_the_camera_is_part_of_the_bias(tmp_path: Path) -> None:
     # 3 mm in each direction, 5.2 mm in space: 95 % of such errors are shorter than 2.795 * 3 mm
-    noise = replace(measured(table=str(table(tmp_path / "a.json")), conditions=("clean",)), calibration_m=0.003 * np.sqrt(3))
+    noise = replace(
+        measured(table=str(table(tmp_path / "a.json")), conditions=("clean",)),
+        calibration_m=0.003 * np.sqrt(3),
+    )
     expected = np.hypot(np.array([[1.7], [3.2]]), 2.795 * 3) / 950.0
     np.testing.assert_allclose(noise.bias_m(AHEAD), expected, rtol=1e-3)
 
@@ -68,7 +74,9 @@ def test_a_law_that_grows_faster_than_the_square_stays_above_zero(tmp_path: Path
     assert float(near) >= 0.0  # type: ignore[arg-type]
 
 
-def test_without_a_table_what_was_assumed_is_used_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_a_table_what_was_assumed_is_used_and_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     with caplog.at_level(logging.WARNING):
         noise = measured(table=str(tmp_path / "none.json"))
     assert "there is no file" in caplog.text and "benchmarks/perception/table.py" in caplog.text
@@ -86,17 +94,28 @@ def test_tables_that_say_too_little_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_episode_draws_its_bias_by_distance(tmp_path: Path, machine: Machine) -> None:
-    noise = measured(table=str(table(tmp_path / "a.json")), conditions=("clean",), frame_share=0.0, filter="none")
+    noise = measured(
+        table=str(table(tmp_path / "a.json")), conditions=("clean",), frame_share=0.0, filter="none"
+    )
     torch.manual_seed(0)
-    process = replace(option("task", "borehole_insertion"), noise=noise).build(machine, 256, torch.device("cpu"))
+    process = replace(option("task", "borehole_insertion"), noise=noise).build(
+        machine, 256, torch.device("cpu")
+    )
     process.reset(torch.ones(256, dtype=torch.bool), process.starts(256, 0))
     longest = noise.bias_m(process.state["start.target_m"])
     assert longest.max() > 1.1 * longest.min()  # type: ignore[union-attr]
     share = process.state["bias_m"].norm(dim=1, keepdim=True) / longest
-    assert share.max() <= 1.001 and share.max() > 0.95 and share.min() < 0.05 and 0.4 < share.mean() < 0.6
+    assert (
+        share.max() <= 1.001
+        and share.max() > 0.95
+        and share.min() < 0.05
+        and 0.4 < share.mean() < 0.6
+    )
 
 
 def test_the_option_is_chosen_by_name() -> None:
     with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", ["mode=train", "task/noise=measured", "task.noise.table=nowhere.json"])
+        cfg = hydra.compose(
+            "config", ["mode=train", "task/noise=measured", "task.noise.table=nowhere.json"]
+        )
     assert isinstance(instantiate(cfg.task.noise, _convert_="all"), Measured)

@@ -35,7 +35,13 @@ class Always:
 def named(effect: str | None, joints: tuple[str, ...], probability: float) -> Answer:
     """Returns an answer that names one effect, or `none`, and nothing else."""
     verdict: Verdict = "effects" if effect else "none"
-    selected = Selected(effect=effect, joints=joints, probability=probability, parameters={}, gap_closed=None) if effect else None
+    selected = (
+        Selected(
+            effect=effect, joints=joints, probability=probability, parameters={}, gap_closed=None
+        )
+        if effect
+        else None
+    )
     return Answer(
         verdict=verdict,
         selected=(selected,) if selected else (),

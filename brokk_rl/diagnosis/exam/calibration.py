@@ -1,7 +1,8 @@
 """Prices and certainty of the diagnosis, from development exams: what was weighed is chosen from again at other prices.
 
-Nothing is simulated, so hundreds of prices are tried in minutes. Exams of several plants go in at once: what is right for one
-machine only is not found. What is left after a choice is taken from the run that weighed; it hardly depends on prices.
+Nothing is simulated, so hundreds of prices are tried in minutes. Exams of several plants go in at
+once: what is right for one machine only is not found. What is left after a choice is taken from the
+run that weighed; it hardly depends on prices.
 """
 
 from __future__ import annotations
@@ -36,11 +37,13 @@ RANGES = {
 }  # fmt: skip
 """Prices that are tried, log-uniform."""
 NEAR = 0.25
-"""Around the best so far the second half of the trials is drawn: standard deviation of the logarithm."""
+"""Around the best so far the second half of the trials is drawn: standard deviation of the
+logarithm."""
 QUIET_WEIGHT = 2.0
 """A false alarm costs as much as so many effects that are missed."""
 PULL = 10.0
-"""Precision of a weight about where it begins, which earlier answers told; signs are of about unit size."""
+"""Precision of a weight about where it begins, which earlier answers told; signs are of about unit
+size."""
 FORMS = np.linspace(0.0, 0.3, 61)
 COVERED = 0.9
 """Share of true sizes that 90 % intervals should hold."""
@@ -74,7 +77,9 @@ def items(folders: Sequence[Path]) -> list[Item]:
         if not (exam / seal.LABELS).is_file():
             exam = Path(yaml.safe_load((folder / "resolved.yaml").read_text())["exam"]["folder"])
         if json.loads((exam / "exam.json").read_text())["sealed"]:
-            raise ConfigError(f"exam.answers: {exam} is a sealed exam; prices are fitted to development exams only")
+            raise ConfigError(
+                f"exam.answers: {exam} is a sealed exam; prices are fitted to development exams only"
+            )
         for label in seal.opened(exam)["cases"]:
             place = folder / label["case"] / answer.FILE
             said = answer.read(place) if place.is_file() else None
@@ -93,7 +98,9 @@ def halves(cases: Sequence[Item]) -> tuple[list[Item], list[Item]]:
     side = {name: number % 2 for number, name in enumerate(families)}
     quiet = iter(range(len(cases)))
     sides = [side[item.family] if item.family in side else next(quiet) % 2 for item in cases]
-    first, second = ([item for item, other in zip(cases, sides, strict=True) if other == half] for half in (0, 1))
+    first, second = (
+        [item for item, other in zip(cases, sides, strict=True) if other == half] for half in (0, 1)
+    )
     return first, second
 
 
@@ -106,19 +113,34 @@ class Claims:
     none: dict[str, float]
 
 
-def answered(item: Item, prices: Prices, weights: Certainty, kinds: Sequence[Kind], machine: Machine) -> tuple[Answer, Claims]:
+def answered(
+    item: Item, prices: Prices, weights: Certainty, kinds: Sequence[Kind], machine: Machine
+) -> tuple[Answer, Claims]:
     """Returns what the diagnosis would say at these prices, without numbers, and why it is so sure."""
     found = verdict.likely(weighing.findings(item.told, prices, kinds), prices, weights)
     unknown = verdict.is_unknown(found, prices, weights)
-    selected = [] if unknown else [verdict.other(found, one, weights, machine) for one in found.others]
+    selected = (
+        [] if unknown else [verdict.other(found, one, weights, machine) for one in found.others]
+    )
     signs = [(one.kind.name, verdict.other_signs(found, weights, one)) for one in found.others]
     for name in found.chosen.names:
         swaps = verdict.rivals(found, name)
         like = verdict.same_as(swaps, verdict.own_gain(found, name))
         signs.append((name, verdict.named_signs(found, prices, weights, name, swaps, like)))
-        joints = tuple(j for j, subset in zip(machine.joint_names, found.chosen.subsets, strict=True) if name in subset)
+        joints = tuple(
+            j
+            for j, subset in zip(machine.joint_names, found.chosen.subsets, strict=True)
+            if name in subset
+        )
         chance = certainty.chance(weights.right, signs[-1][1])
-        one = Selected(effect=name, joints=joints, probability=chance, parameters={}, gap_closed=None, same_as=like)
+        one = Selected(
+            effect=name,
+            joints=joints,
+            probability=chance,
+            parameters={},
+            gap_closed=None,
+            same_as=like,
+        )
         selected += [] if unknown else [one]
     told = "unknown" if unknown else "effects" if selected else "none"
     chance = verdict.unknown_chance(found, prices, weights)
@@ -136,8 +158,12 @@ def worth(mark: Mark) -> tuple[float, float]:
     if mark.kind == "outside":
         return float(mark.verdict == "unknown"), 1.0
     right, named, there = len(mark.hits), len(mark.named), len(mark.truth)
-    exact = float(right == named == there) * (0.8 + 0.2 * float(np.mean(mark.joints_right or (True,))))
-    return 0.6 * exact + 0.4 * (mark.first if there == 1 else 2.0 * right / max(named + there, 1)), 1.0
+    exact = float(right == named == there) * (
+        0.8 + 0.2 * float(np.mean(mark.joints_right or (True,)))
+    )
+    return 0.6 * exact + 0.4 * (
+        mark.first if there == 1 else 2.0 * right / max(named + there, 1)
+    ), 1.0
 
 
 @dataclass(frozen=True)
@@ -166,7 +192,9 @@ class Calibration:
         """Returns the marks of all cases at these prices, with these weights."""
         return [mark for mark, _ in self._marked(cases, prices, weights)]
 
-    def _marked(self, cases: Sequence[Item], prices: Prices, weights: Certainty) -> list[tuple[Mark, Claims]]:
+    def _marked(
+        self, cases: Sequence[Item], prices: Prices, weights: Certainty
+    ) -> list[tuple[Mark, Claims]]:
         said = [answered(item, prices, weights, self.kinds, self.machine) for item in cases]
         return [
             (marking.mark(i.label, one, self.classes, self.of_machine), claims)
@@ -183,8 +211,13 @@ class Calibration:
     ) -> tuple[Prices, Certainty]:
         """Returns the prices of the best answers: half the trials anywhere, half around the best; then the weights of signs."""
         weights = self.weighed(cases, start, weights)
-        generator, best = np.random.default_rng(self.seed), (self.value(cases, start, weights), start)
-        with ProcessPoolExecutor(self.workers, initializer=_begin, initargs=(self, cases, weights)) as pool:
+        generator, best = (
+            np.random.default_rng(self.seed),
+            (self.value(cases, start, weights), start),
+        )
+        with ProcessPoolExecutor(
+            self.workers, initializer=_begin, initargs=(self, cases, weights)
+        ) as pool:
             for half in (0, 1):
                 trials = [self._drawn(best[1], half, generator) for _ in range(self.trials // 2)]
                 for prices, value in zip(trials, pool.map(_value, trials), strict=True):
@@ -196,18 +229,28 @@ class Calibration:
     def weighed(self, cases: Sequence[Item], prices: Prices, start: Certainty) -> Certainty:
         """Returns the weights under which what is true of these cases is most probable, and what forms add to errors."""
         is_outside = [item.label["kind"] == "outside" for item in cases]
-        outside = logistic([claims.outside for _, claims in self._marked(cases, prices, start)], is_outside, start.outside)
+        outside = logistic(
+            [claims.outside for _, claims in self._marked(cases, prices, start)],
+            is_outside,
+            start.outside,
+        )
         weights = replace(start, outside=outside)
         named, true = self._named(cases, prices, weights)
         found = {"right": logistic(named, true, start.right) if len(set(true)) > 1 else start.right}
         silent = [
-            (claims.none, mark.kind in QUIET) for mark, claims in self._marked(cases, prices, weights) if mark.verdict == "none"
+            (claims.none, mark.kind in QUIET)
+            for mark, claims in self._marked(cases, prices, weights)
+            if mark.verdict == "none"
         ]
         if len({quiet for _, quiet in silent}) > 1:
-            found["none"] = logistic([signs for signs, _ in silent], [quiet for _, quiet in silent], start.none)
+            found["none"] = logistic(
+                [signs for signs, _ in silent], [quiet for _, quiet in silent], start.none
+            )
         return replace(weights, form=self.forms(cases, weights.form), **found)
 
-    def _named(self, cases: Sequence[Item], prices: Prices, weights: Certainty) -> tuple[list[dict[str, float]], list[bool]]:
+    def _named(
+        self, cases: Sequence[Item], prices: Prices, weights: Certainty
+    ) -> tuple[list[dict[str, float]], list[bool]]:
         """Returns the signs of all effects that are named, and whether they are there."""
         signs, true = [], []
         for mark, claims in self._marked(cases, prices, weights):
@@ -220,15 +263,24 @@ class Calibration:
     def forms(self, cases: Sequence[Item], now: Mapping[str, float]) -> dict[str, float]:
         """Returns the smallest errors of form, by stage, with which 90 % intervals hold nine in ten true sizes.
 
-        What moves the machine (timing, actuation) has one, what measures it (sensing, kinematics) another.
+        What moves the machine (timing, actuation) has one, what measures it (sensing, kinematics)
+        another.
         """
         stages, found = {kind.name: kind.stage for kind in self.kinds}, dict(now)
         for group in (("timing", "actuation"), ("sensing", "kinematics", "perception")):
             errors = []
             for item in cases:
                 mark = marking.mark(item.label, item.said, self.classes, self.of_machine)
-                errors += [(one, now[stages[one.effect]]) for one in mark.numbers if stages[one.effect] in group]
-            holds = [form for form in FORMS if errors and np.mean([_holds(one, was, form) for one, was in errors]) >= COVERED]
+                errors += [
+                    (one, now[stages[one.effect]])
+                    for one in mark.numbers
+                    if stages[one.effect] in group
+                ]
+            holds = [
+                form
+                for form in FORMS
+                if errors and np.mean([_holds(one, was, form) for one, was in errors]) >= COVERED
+            ]
             found |= dict.fromkeys(group, round(float(holds[0]), 3)) if holds else {}
         return found
 
@@ -257,10 +309,15 @@ def _value(prices: Prices) -> float:
     return calibration.value(cases, prices, weights)
 
 
-def logistic(signs: Sequence[Mapping[str, float]], true: Sequence[bool], start: Mapping[str, float]) -> dict[str, float]:
+def logistic(
+    signs: Sequence[Mapping[str, float]], true: Sequence[bool], start: Mapping[str, float]
+) -> dict[str, float]:
     """Returns the weights of a logistic regression, pulled towards those at which it begins but for the constant."""
     names, y = list(signs[0]), np.array(true, dtype=float)
-    x, begin = np.array([[one[name] for name in names] for one in signs]), np.array([start[name] for name in names])
+    x, begin = (
+        np.array([[one[name] for name in names] for one in signs]),
+        np.array([start[name] for name in names]),
+    )
     pull = np.array([0.0 if name == "constant" else PULL for name in names])
 
     def loss(w: np.ndarray) -> tuple[float, np.ndarray]:

@@ -1,8 +1,9 @@
 """Residual features of a case, by joint: what a simple model of the reference leaves over in the field, weighed with probes.
 
-The model: how far a joint gets in a quarter of a second, linear in pieces of its delayed commands (Hammerstein). Each probe is what
-some effect would leave over; a feature is the slope of the residual on a probe in the field less that in the reference, over how
-much that slope varies from one minute of the reference to the next.
+The model: how far a joint gets in a quarter of a second, linear in pieces of its delayed commands
+(Hammerstein). Each probe is what some effect would leave over; a feature is the slope of the
+residual on a probe in the field less that in the reference, over how much that slope varies from
+one minute of the reference to the next.
 """
 
 from __future__ import annotations
@@ -32,11 +33,18 @@ TOOL = ("ee_x_m", "ee_y_m", "ee_z_m")
 
 def of_case(case: Path, machine: Machine) -> np.ndarray:
     """Returns the features of each joint of a case, `(J, F)`."""
-    reference, field = (record.read_all(str(case / half / "*.parquet"), machine) for half in ("reference", "field"))
+    reference, field = (
+        record.read_all(str(case / half / "*.parquet"), machine) for half in ("reference", "field")
+    )
     rows = []
     for joint in range(machine.num_joints):
-        inputs, ways = (np.concatenate(parts) for parts in zip(*(_pieces(one, joint) for one in reference), strict=True))
-        weights = np.linalg.solve(inputs.T @ inputs + RIDGE * len(inputs) * np.eye(inputs.shape[1]), inputs.T @ ways)
+        inputs, ways = (
+            np.concatenate(parts)
+            for parts in zip(*(_pieces(one, joint) for one in reference), strict=True)
+        )
+        weights = np.linalg.solve(
+            inputs.T @ inputs + RIDGE * len(inputs) * np.eye(inputs.shape[1]), inputs.T @ ways
+        )
         there = [_slopes(one, joint, weights, machine) for one in reference]
         here = np.concatenate([_slopes(one, joint, weights, machine) for one in field])
         before = np.concatenate(there)
@@ -44,16 +52,24 @@ def of_case(case: Path, machine: Machine) -> np.ndarray:
     own = np.clip(np.stack(rows), -50.0, 50.0)
     tool = _tool(field, machine) - _tool(reference, machine)
     others = np.stack([np.abs(np.delete(own, j, 0)).max(0) for j in range(machine.num_joints)])
-    return np.concatenate([own, others, np.tile(tool, (machine.num_joints, 1)), np.eye(machine.num_joints)], 1)
+    return np.concatenate(
+        [own, others, np.tile(tool, (machine.num_joints, 1)), np.eye(machine.num_joints)], 1
+    )
 
 
 def _pieces(recording: Recording, joint: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns the inputs `(T, P)` and the way of the next `STEP` samples, `(T,)`."""
     u, q = recording.u[:, joint].astype(float), recording.q[:, joint].astype(float)
-    curve = np.stack([np.maximum(side * u - knee, 0.0) for knee in KNEES for side in (1.0, -1.0)], 1)
+    curve = np.stack(
+        [np.maximum(side * u - knee, 0.0) for knee in KNEES for side in (1.0, -1.0)], 1
+    )
     count, first = len(u) - STEP - max(LAGS), max(LAGS)
-    inputs = np.concatenate([curve[first + STEP - lag : first + STEP - lag + count] for lag in LAGS], 1)
-    return np.concatenate([inputs, np.ones((count, 1))], 1), q[first + STEP : first + STEP + count] - q[first : first + count]
+    inputs = np.concatenate(
+        [curve[first + STEP - lag : first + STEP - lag + count] for lag in LAGS], 1
+    )
+    return np.concatenate([inputs, np.ones((count, 1))], 1), q[
+        first + STEP : first + STEP + count
+    ] - q[first : first + count]
 
 
 def _slopes(recording: Recording, joint: int, weights: np.ndarray, machine: Machine) -> np.ndarray:
@@ -61,7 +77,9 @@ def _slopes(recording: Recording, joint: int, weights: np.ndarray, machine: Mach
     inputs, ways = _pieces(recording, joint)
     left, first = ways - inputs @ weights, max(LAGS)
     q, u = recording.q[first:].astype(float), recording.u.astype(float)
-    late = np.stack([u[first + STEP - lag : first + STEP - lag + len(left)] for lag in (7, 9, 11, 13)])
+    late = np.stack(
+        [u[first + STEP - lag : first + STEP - lag + len(left)] for lag in (7, 9, 11, 13)]
+    )
     own, sign = late[1, :, joint], np.sign(late[1, :, joint])
     change = late[:, :, joint][0] - late[:, :, joint][3]
     others = np.abs(np.delete(late[1], joint, 1)).sum(1)
@@ -81,9 +99,16 @@ def _slopes(recording: Recording, joint: int, weights: np.ndarray, machine: Mach
         slopes = (x * r[:, None]).sum(0) / ((x * x).sum(0) + 1e-3 * len(x))
         centred = r - r.mean()
         power = float((centred**2).mean()) + 1e-12
-        echoes = [float((centred[lag:] * centred[:-lag]).mean()) / power for lag in (1, 3, 5, 7, 10, 15)]
+        echoes = [
+            float((centred[lag:] * centred[:-lag]).mean()) / power for lag in (1, 3, 5, 7, 10, 15)
+        ]
         quiet = np.abs(np.diff(recording.q[first:, joint].astype(float)[part]))
-        figures = [np.log(power), np.log((jitter[part] ** 2).mean() + 1e-12), float((quiet < 1e-6).mean()), _kurtosis(centred)]
+        figures = [
+            np.log(power),
+            np.log((jitter[part] ** 2).mean() + 1e-12),
+            float((quiet < 1e-6).mean()),
+            _kurtosis(centred),
+        ]
         found.append([*slopes, *echoes, *figures])
     return np.array(found)
 

@@ -27,7 +27,8 @@ class Errors:
 
     Attributes:
         z: Errors over their noise, `(E,)`.
-        shapes: What each effect would change about them, one shape a ray; effects that do nothing to the joint are absent.
+        shapes: What each effect would change about them, one shape a ray; effects that do nothing
+            to the joint are absent.
         fold: Half of the recordings of each entry.
     """
 
@@ -55,14 +56,18 @@ class Ground:
     errors: list[Errors]
 
 
-def of_case(folder: Path, fit: ActuatorFit, machine: Machine, names: Sequence[str] | None = None) -> Ground:
+def of_case(
+    folder: Path, fit: ActuatorFit, machine: Machine, names: Sequence[str] | None = None
+) -> Ground:
     """Returns the ground of a case, for the effects `names`, or for all that a free run can show.
 
     Raises:
         RecordingError: the simulator cannot be fitted.
     """
     with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
-        base = simulator.fitted(case.load(folder, machine), fit, Path(scratch), 0, torch.device("cpu"))
+        base = simulator.fitted(
+            case.load(folder, machine), fit, Path(scratch), 0, torch.device("cpu")
+        )
     evidence, grown = base.field.evidence, {}
     shapes: list[dict[str, list[Shape]]] = [{} for _ in range(machine.num_joints)]
     for kind in library.load(machine, None if names is None else tuple(names)):
@@ -72,5 +77,12 @@ def of_case(folder: Path, fit: ActuatorFit, machine: Machine, names: Sequence[st
         responses = [evidence.response(ray) for ray in ways]
         for j, mine in enumerate(shapes):
             if max((np.abs(response[j]).max() for response in responses), default=0.0) > TOUCHES:
-                mine[kind.name] = [Shape(ray.sizes, response[j]) for ray, response in zip(ways, responses, strict=True)]
-    return Ground(base, grown, [Errors(z, mine, evidence.fold) for z, mine in zip(evidence.z, shapes, strict=True)])
+                mine[kind.name] = [
+                    Shape(ray.sizes, response[j])
+                    for ray, response in zip(ways, responses, strict=True)
+                ]
+    return Ground(
+        base,
+        grown,
+        [Errors(z, mine, evidence.fold) for z, mine in zip(evidence.z, shapes, strict=True)],
+    )

@@ -33,7 +33,13 @@ def append(path: Path, when: str, exam: dict[str, Any], name: str, table: dict[s
         "sat": table["sat"]["value"],
         "failed": table["failed"],
     }
-    line = {"when": when, "commit": commit(), "candidate": name, **exam, **{key: _short(value) for key, value in figures.items()}}
+    line = {
+        "when": when,
+        "commit": commit(),
+        "candidate": name,
+        **exam,
+        **{key: _short(value) for key, value in figures.items()},
+    }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as file:

@@ -30,9 +30,11 @@ from brokk_rl.spec import spec
 SIDE_BY_SIDE = 240
 """Runs simulated at once; their random numbers lie in memory."""
 NUM_PLANS = 4
-"""Plans drawn before a file is said to be too short: now and then the ways between distant poses leave no room."""
+"""Plans drawn before a file is said to be too short: now and then the ways between distant poses
+leave no room."""
 FIRST_DAY = datetime(2026, 1, 5, 8, 0, tzinfo=UTC)
-"""Recordings say when they were made, so that warm-up can be read across files; all cases say the same."""
+"""Recordings say when they were made, so that warm-up can be read across files; all cases say the
+same."""
 EPOCH_S = FIRST_DAY.timestamp()
 
 
@@ -52,7 +54,9 @@ class Half:
 
     def check(self) -> None:
         if not self.programs or not all(self.programs):
-            raise ConfigError("exam: each file needs one or more excitations, e.g. [[levels], [levels, holds]]")
+            raise ConfigError(
+                "exam: each file needs one or more excitations, e.g. [[levels], [levels, holds]]"
+            )
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,8 @@ class Made:
     Attributes:
         u: Commands, `(T, J)` a file.
         q: Measured positions.
-        without_q: Where the same machine would have gone, by the same commands and chance, without what the case is about.
+        without_q: Where the same machine would have gone, by the same commands and chance, without
+            what the case is about.
     """
 
     u: list[np.ndarray]
@@ -98,16 +103,30 @@ class Job:
 
     plan: Plan
 
-    def __init__(self, question: Question, case: int, number: int, half: Half, is_field: bool) -> None:
-        self.question, self.case, self.number, self.half, self.is_field = question, case, number, half, is_field
+    def __init__(
+        self, question: Question, case: int, number: int, half: Half, is_field: bool
+    ) -> None:
+        self.question, self.case, self.number, self.half, self.is_field = (
+            question,
+            case,
+            number,
+            half,
+            is_field,
+        )
         share = (number + float(self.stream("elapsed").random())) / len(half.programs)
         low_s, high_s = half.elapsed_s
-        self.elapsed_s = low_s + share * (high_s - low_s)  # files follow one another through the day
-        self.created = record.later(FIRST_DAY.isoformat(timespec="milliseconds"), self.elapsed_s + 86400.0 * is_field)
+        self.elapsed_s = low_s + share * (
+            high_s - low_s
+        )  # files follow one another through the day
+        self.created = record.later(
+            FIRST_DAY.isoformat(timespec="milliseconds"), self.elapsed_s + 86400.0 * is_field
+        )
 
     def stream(self, name: str) -> np.random.Generator:
         """Returns a stream of chance that is this file's alone."""
-        return np.random.default_rng([self.question.chance, self.number, int(self.is_field), *name.encode()])
+        return np.random.default_rng(
+            [self.question.chance, self.number, int(self.is_field), *name.encode()]
+        )
 
 
 class Workshop:
@@ -122,7 +141,12 @@ class Workshop:
     """
 
     def __init__(
-        self, machine: Machine, plants: PlantFamily, roughness: str, excitations: Mapping[str, Excitation], approach: Approach
+        self,
+        machine: Machine,
+        plants: PlantFamily,
+        roughness: str,
+        excitations: Mapping[str, Excitation],
+        approach: Approach,
     ) -> None:
         self._machine, self._plants, self._roughness = machine, plants, roughness
         self._excitations, self._approach = excitations, approach
@@ -134,12 +158,22 @@ class Workshop:
         Raises:
             ConfigError: an excitation is unknown, or finds no room in a file.
         """
-        jobs = [Job(question, n, k, half, is_field) for n, question in enumerate(questions) for k in range(len(half.programs))]
+        jobs = [
+            Job(question, n, k, half, is_field)
+            for n, question in enumerate(questions)
+            for k in range(len(half.programs))
+        ]
         for job in jobs:
             job.plan = self._plan(job)
         return jobs
 
-    def record(self, jobs: Sequence[Job], folders: Sequence[Path], workers: int, advance: Callable[[int], None]) -> list[Made]:
+    def record(
+        self,
+        jobs: Sequence[Job],
+        folders: Sequence[Path],
+        workers: int,
+        advance: Callable[[int], None],
+    ) -> list[Made]:
         """Writes the files of one half of each case into its folder; returns what is in them, by case.
 
         Args:
@@ -157,8 +191,12 @@ class Workshop:
         found: dict[int, Made] = {}
         with ExitStack() as stack:
             run = map if workers == 1 else stack.enter_context(ProcessPoolExecutor(workers)).map
-            parts = ([[items[i] for i in batch] for batch in batches] for items in (jobs, specimens))
-            for batch, made in zip(batches, run(self._batch, *parts, [folders] * len(batches)), strict=True):
+            parts = (
+                [[items[i] for i in batch] for batch in batches] for items in (jobs, specimens)
+            )
+            for batch, made in zip(
+                batches, run(self._batch, *parts, [folders] * len(batches)), strict=True
+            ):
                 found |= dict(zip(batch, made, strict=True))
                 advance(len(batch))
         done = [Made([], [], []) for _ in folders]
@@ -169,7 +207,9 @@ class Workshop:
 
     def _specimen(self, job: Job) -> Specimen:
         question = job.question
-        faults = {fault.effect: fault.parameters for fault in question.faults} if job.is_field else {}
+        faults = (
+            {fault.effect: fault.parameters for fault in question.faults} if job.is_field else {}
+        )
         return Specimen(
             seed=question.machine_seed,
             roughness=self._roughness,
@@ -184,7 +224,9 @@ class Workshop:
         names = job.half.programs[job.number]
         for name in names:
             if name not in self._excitations:
-                raise ConfigError(f"exam: programs: no excitation '{name}'; {choices(name, self._excitations)}")
+                raise ConfigError(
+                    f"exam: programs: no excitation '{name}'; {choices(name, self._excitations)}"
+                )
         chosen = {name: self._excitations[name] for name in names}
         stream = job.stream("plan")
         tried = 1
@@ -196,21 +238,32 @@ class Workshop:
                     raise
                 tried += 1
 
-    def _batch(self, jobs: Sequence[Job], specimens: Sequence[Specimen], folders: Sequence[Path]) -> list[Made]:
+    def _batch(
+        self, jobs: Sequence[Job], specimens: Sequence[Specimen], folders: Sequence[Path]
+    ) -> list[Made]:
         """Records files of one half, of machines of one make; returns what is in each."""
         half, is_field = jobs[0].half, jobs[0].is_field
         machine = self._machine
-        plan = Plan(runs=tuple(job.plan.runs[0] for job in jobs), run_s=half.file_s, names=tuple(self._excitations))
+        plan = Plan(
+            runs=tuple(job.plan.runs[0] for job in jobs),
+            run_s=half.file_s,
+            names=tuple(self._excitations),
+        )
         link = self._plants.build(machine, specimens, half.file_s)
         runner = Runner(plan, machine, self._approach, self._guards)
         with link as opened, _without_warnings():
             samples = list(drive(opened, runner, machine, len(jobs), half.file_s))
         track = Track(samples)
-        extra = {name: np.stack([sample.extra[name] for sample in samples], 1) for name in samples[0].extra}
+        extra = {
+            name: np.stack([sample.extra[name] for sample in samples], 1)
+            for name in samples[0].extra
+        }
         u, q = track.u.astype(np.float32), track.q.astype(np.float32)
         without = self._without(specimens, u, half) if is_field else q
         for n, job in enumerate(jobs):
-            columns = {name: values[n] for name, values in extra.items()} if job.question.tracked else {}
+            columns = (
+                {name: values[n] for name, values in extra.items()} if job.question.tracked else {}
+            )
             recording = record.Recording(
                 machine=machine.name,
                 joints=machine.joint_names,
@@ -222,14 +275,20 @@ class Workshop:
                 extra=columns,
                 metadata={"created": job.created, "fingerprint": record.stamp(machine)},
             )
-            path = folders[job.case] / ("field" if is_field else "reference") / f"{job.number:02d}.parquet"
+            path = (
+                folders[job.case]
+                / ("field" if is_field else "reference")
+                / f"{job.number:02d}.parquet"
+            )
             record.write(recording, path)
             os.utime(path, (EPOCH_S, EPOCH_S))
         return [Made([u[:, n]], [q[:, n]], [without[:, n]]) for n in range(len(jobs))]
 
     def _without(self, specimens: Sequence[Specimen], u: np.ndarray, half: Half) -> np.ndarray:
         """Returns the positions of the same machines without faults, under the same commands and chance, `(T, N, J)`."""
-        healthy = [replace(specimen, faults={}, ailment=None, tracked=False) for specimen in specimens]
+        healthy = [
+            replace(specimen, faults={}, ailment=None, tracked=False) for specimen in specimens
+        ]
         link, path = self._plants.build(self._machine, healthy, half.file_s), []
         with link as opened:
             for command in u:

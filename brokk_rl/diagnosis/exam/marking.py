@@ -1,7 +1,8 @@
 """One answer against one label: what was right about it.
 
-An answer names an effect rightly, over classes, when it names the true one, one of its class (see `Mix.classes`), or has the true
-one in its `same_as`; strictly, when it names the true one. A case whose effect is below the noise counts as one without a gap.
+An answer names an effect rightly, over classes, when it names the true one, one of its class (see
+`Mix.classes`), or has the true one in its `same_as`; strictly, when it names the true one. A case
+whose effect is below the noise counts as one without a gap.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class Number:
         deviation: The stated standard deviation, over the same.
         said: The stated distance from the value that changes nothing, over the same.
         in_95: Whether the 95 % interval holds the truth.
-        in_90: The same for the 90 % interval, which is the 95 % interval drawn together as for a normal distribution.
+        in_90: The same for the 90 % interval, which is the 95 % interval drawn together as for a
+            normal distribution.
     """
 
     effect: str
@@ -62,15 +64,18 @@ class Mark:
         verdict: `effects`, `none`, `unknown`, or `failed` where there is no answer.
         first: Whether the most probable name is right, over classes; strictly.
         first_strictly: See `first`.
-        joints_right: Whether a rightly named effect has exactly its joints, for each that joints can have.
+        joints_right: Whether a rightly named effect has exactly its joints, for each that joints
+            can have.
         unknown: Probability that the cause lies outside the library.
         claims: Statements whose truth the label knows.
         numbers: Parameters of what was strictly right.
         size: Largest size of an effect, of typical; of what lies outside too.
-        moved_rad: What the cause changes of the motion over 5 s, on the joint where it changes most.
+        moved_rad: What the cause changes of the motion over 5 s, on the joint where it changes
+            most.
         closed: Share of the gap closed, by the answer's own account.
         predicted: Share of the gap that the answer said would be closed, before it looked.
-        oracle: Share of the gap that the true effects close when fitted, where somebody computed it.
+        oracle: Share of the gap that the true effects close when fitted, where somebody computed
+            it.
         seconds: Time the answer took.
         outside: Name of what lies outside the library.
     """
@@ -116,7 +121,11 @@ def mark(
     """
     kind = label["kind"]
     true = {one["effect"]: one for one in label["effects"]} if kind not in QUIET else {}
-    chosen = sorted(answer.selected, key=lambda one: -one.probability) if answer and answer.verdict == "effects" else []
+    chosen = (
+        sorted(answer.selected, key=lambda one: -one.probability)
+        if answer and answer.verdict == "effects"
+        else []
+    )
     pairs = _pairs(list(true), chosen, classes)
     stands_for = {id(one): effect for effect, one in pairs}
     verdict = answer.verdict if answer else "failed"
@@ -124,7 +133,12 @@ def mark(
     unknown = _probability(answer, "unknown")
     claims = [Claim(one.probability, id(one) in stands_for) for one in chosen]
     if verdict in ("none", "unknown"):
-        claims.append(Claim(_probability(answer, verdict), kind in QUIET if verdict == "none" else kind == "outside"))
+        claims.append(
+            Claim(
+                _probability(answer, verdict),
+                kind in QUIET if verdict == "none" else kind == "outside",
+            )
+        )
     outside = label["outside"]
     sizes = [one["size"] for one in label["effects"]] + ([outside["size"]] if outside else [])
     gap = answer.gap if answer else None
@@ -138,10 +152,19 @@ def mark(
         verdict=verdict,
         first=top is not None and id(top) in stands_for,
         first_strictly=top is not None and top.effect in true,
-        joints_right=tuple(set(one.joints) == set(true[effect]["joints"]) for effect, one in pairs if effect not in of_machine),
+        joints_right=tuple(
+            set(one.joints) == set(true[effect]["joints"])
+            for effect, one in pairs
+            if effect not in of_machine
+        ),
         unknown=unknown,
         claims=tuple(claims),
-        numbers=tuple(number for effect, one in pairs if effect == one.effect for number in _numbers(true[effect], one)),
+        numbers=tuple(
+            number
+            for effect, one in pairs
+            if effect == one.effect
+            for number in _numbers(true[effect], one)
+        ),
         size=max(sizes, default=0.0),
         moved_rad=max(label["moved_rad"].values()),
         closed=gap.closed.mean if gap and gap.closed else None,
@@ -152,7 +175,9 @@ def mark(
     )
 
 
-def _pairs(true: Sequence[str], chosen: Sequence[Selected], classes: Sequence[Sequence[str]]) -> list[tuple[str, Selected]]:
+def _pairs(
+    true: Sequence[str], chosen: Sequence[Selected], classes: Sequence[Sequence[str]]
+) -> list[tuple[str, Selected]]:
     """Returns each true effect with the name that stands for it; the true name itself before others of its class."""
     found, left = [], list(chosen)
     for stands in (_is_it, lambda effect, one: _is_like_it(effect, one, classes)):
@@ -169,7 +194,9 @@ def _is_it(effect: str, one: Selected) -> bool:
 
 
 def _is_like_it(effect: str, one: Selected, classes: Sequence[Sequence[str]]) -> bool:
-    return effect in one.same_as or any(effect in group and one.effect in group for group in classes)
+    return effect in one.same_as or any(
+        effect in group and one.effect in group for group in classes
+    )
 
 
 def _probability(answer: Answer | None, name: str) -> float:
@@ -188,7 +215,11 @@ def _numbers(true: Mapping[str, Any], one: Selected) -> list[Number]:
         values = dict(by_joint)
         if "machine" in said:  # a number that joints do not have
             values = {"machine": next(iter(by_joint.values()))}
-        elif len(set(values.values())) == 1 and len(set(said.values())) == 1 and set(said) >= set(values):
+        elif (
+            len(set(values.values())) == 1
+            and len(set(said.values())) == 1
+            and set(said) >= set(values)
+        ):
             values = dict(list(values.items())[:1])  # one that they share counts once
         for joint, value in values.items():
             if joint not in said:

@@ -15,7 +15,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
 KINDS = ("none", "faint", "one", "several", "outside")
-"""No gap; an effect too small to be seen; one effect; two or three; something that no library has."""
+"""No gap; an effect too small to be seen; one effect; two or three; something that no library
+has."""
 
 
 @spec
@@ -50,7 +51,8 @@ class Fault:
         joints: The joints that have it.
         size: Of typical.
         parameters: `(J,)` by name.
-        drawn: The parameters that were drawn, and so can be asked for, with the value that changes nothing.
+        drawn: The parameters that were drawn, and so can be asked for, with the value that changes
+            nothing.
     """
 
     effect: str
@@ -96,7 +98,8 @@ class Mix:
         faint_sizes: Range of sizes of effects that are too small to be seen.
         tracked_share: Part of the cases with measured tool point; those that need it have it.
         second_joint: Chance that another joint has an effect too.
-        classes: Effects that commands and joint positions cannot tell apart; a case has one of each at most.
+        classes: Effects that commands and joint positions cannot tell apart; a case has one of each
+            at most.
         troubles: How each effect is drawn; those that are not named do not occur.
     """
 
@@ -110,39 +113,68 @@ class Mix:
     troubles: dict[str, Trouble]
 
     def check(self) -> None:
-        if set(self.shares) != set(KINDS) or not math.isclose(sum(self.shares.values()), 1.0, abs_tol=1e-6):
-            raise ConfigError(f"exam.mix.shares: expected {', '.join(KINDS)} with sum 1, got {self.shares}")
+        if set(self.shares) != set(KINDS) or not math.isclose(
+            sum(self.shares.values()), 1.0, abs_tol=1e-6
+        ):
+            raise ConfigError(
+                f"exam.mix.shares: expected {', '.join(KINDS)} with sum 1, got {self.shares}"
+            )
         if self.num_cases < 1 or not self.troubles:
             raise ConfigError("exam.mix: expected num_cases of 1 or more, and some troubles")
 
-    def questions(self, machine: Machine, ailments: Sequence[str], generator: np.random.Generator) -> list[Question]:
+    def questions(
+        self, machine: Machine, ailments: Sequence[str], generator: np.random.Generator
+    ) -> list[Question]:
         """Returns the cases in random order; each effect, and each ailment, occurs about as often as any other."""
         kinds = [kind for kind, count in self._counts().items() for _ in range(count)]
-        effects, strange = _rounds(list(self.troubles), generator), _rounds(list(ailments), generator)
+        effects, strange = (
+            _rounds(list(self.troubles), generator),
+            _rounds(list(ailments), generator),
+        )
         found = []
         for kind in kinds:
-            tracked, faults, ailment, size = bool(generator.random() < self.tracked_share), [], None, None
+            tracked, faults, ailment, size = (
+                bool(generator.random() < self.tracked_share),
+                [],
+                None,
+                None,
+            )
             joints: tuple[str, ...] = ()
             if kind in ("one", "faint"):
-                faults = [self._fault(next(effects), machine, self.faint_sizes if kind == "faint" else self.sizes, generator)]
+                faults = [
+                    self._fault(
+                        next(effects),
+                        machine,
+                        self.faint_sizes if kind == "faint" else self.sizes,
+                        generator,
+                    )
+                ]
             elif kind == "several":
                 names = self._distinct(effects, int(generator.integers(2, 4)))
                 faults = [self._fault(name, machine, self.sizes, generator) for name in names]
             elif kind == "outside":
                 size = float(generator.uniform(*self.sizes))
-                chosen = self._some(np.flatnonzero(~machine.is_exclusive), generator)  # much of it shows in company only
-                ailment = Ailment(next(strange), size * np.isin(np.arange(machine.num_joints), chosen))
+                chosen = self._some(
+                    np.flatnonzero(~machine.is_exclusive), generator
+                )  # much of it shows in company only
+                ailment = Ailment(
+                    next(strange), size * np.isin(np.arange(machine.num_joints), chosen)
+                )
                 joints = tuple(machine.joint_names[j] for j in chosen)
             tracked = tracked or any(self.troubles[fault.effect].needs_tool for fault in faults)
             machine_seed, chance = generator.integers(2**62, size=2).tolist()
-            found.append(Question(kind, machine_seed, chance, tuple(faults), ailment, size, tracked, joints))
+            found.append(
+                Question(kind, machine_seed, chance, tuple(faults), ailment, size, tracked, joints)
+            )
         return [found[i] for i in generator.permutation(len(found))]
 
     def _counts(self) -> dict[str, int]:
         """Returns the number of cases of each kind: whole parts of the shares, the largest remainders get what is left."""
         exact = {kind: self.shares[kind] * self.num_cases for kind in KINDS}
         counts = {kind: int(value + 1e-9) for kind, value in exact.items()}
-        for kind in sorted(KINDS, key=lambda kind: counts[kind] - exact[kind])[: self.num_cases - sum(counts.values())]:
+        for kind in sorted(KINDS, key=lambda kind: counts[kind] - exact[kind])[
+            : self.num_cases - sum(counts.values())
+        ]:
             counts[kind] += 1
         return counts
 
@@ -150,7 +182,9 @@ class Mix:
         found: list[str] = []
         while len(found) < count:
             name = next(effects)
-            taken = {other for group in self.classes if any(f in group for f in found) for other in group}
+            taken = {
+                other for group in self.classes if any(f in group for f in found) for other in group
+            }
             if name not in found and name not in taken:
                 found.append(name)
         return found
@@ -159,7 +193,13 @@ class Mix:
         count = 1 + (len(able) > 1 and generator.random() < self.second_joint)
         return np.sort(generator.choice(able, count, replace=False))
 
-    def _fault(self, name: str, machine: Machine, sizes: tuple[float, float], generator: np.random.Generator) -> Fault:
+    def _fault(
+        self,
+        name: str,
+        machine: Machine,
+        sizes: tuple[float, float],
+        generator: np.random.Generator,
+    ) -> Fault:
         trouble, size = self.troubles[name], float(generator.uniform(*sizes))
         able = np.flatnonzero([joint not in trouble.not_on for joint in machine.joint_names])
         chosen = able if trouble.joints == "all" else self._some(able, generator)
@@ -168,11 +208,16 @@ class Mix:
         if trouble.only_one:
             drawn = (drawn[int(generator.integers(len(drawn)))],)
         sign = float(generator.choice([-1.0, 1.0])) if trouble.mirrored else 1.0
-        parameters = {key: np.full(machine.num_joints, value) for key, value in trouble.shape.items()}
+        parameters = {
+            key: np.full(machine.num_joints, value) for key, value in trouble.shape.items()
+        }
         for key, (none, typical) in trouble.numbers.items():
-            # where nothing changes a threshold is not there at all, rather than where it begins to count
+            # where nothing changes a threshold is not there at all, rather than where it begins to
+            # count
             away = none if none in (0.0, 1.0) else 0.0
-            parameters[key] = np.where(has & (key in drawn), none + sign * size * (typical - none), away)
+            parameters[key] = np.where(
+                has & (key in drawn), none + sign * size * (typical - none), away
+            )
         nothing = {key: trouble.numbers[key][0] for key in drawn}
         return Fault(name, tuple(machine.joint_names[j] for j in chosen), size, parameters, nothing)
 

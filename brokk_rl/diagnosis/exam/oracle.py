@@ -20,7 +20,9 @@ NO_GAP = 1.1
 """Error over floor below which nobody can say what share of the gap is closed."""
 
 
-def closed_by(folder: Path, effects: Mapping[str, Sequence[str]], fit: ActuatorFit, machine: Machine) -> float | None:
+def closed_by(
+    folder: Path, effects: Mapping[str, Sequence[str]], fit: ActuatorFit, machine: Machine
+) -> float | None:
     """Returns the share of the gap of a case that its true effects close, on windows that their sizes were not fitted to.
 
     Args:
@@ -38,23 +40,37 @@ def closed_by(folder: Path, effects: Mapping[str, Sequence[str]], fit: ActuatorF
     found = ground.of_case(folder, fit, machine, tuple(effects))
     evidence = found.base.field.evidence
     subsets = [
-        frozenset(name for name, joints in effects.items() if joint in joints and name in errors.shapes)
+        frozenset(
+            name for name, joints in effects.items() if joint in joints and name in errors.shapes
+        )
         for joint, errors in zip(machine.joint_names, found.errors, strict=True)
     ]
     measured = evidence.candidates.cut.measured
     before = gap.squares(evidence.base, measured, machine)
-    floors = [gap.squares(one.evidence.base, one.evidence.candidates.cut.measured, machine) for one in found.base.nulls]
+    floors = [
+        gap.squares(one.evidence.base, one.evidence.candidates.cut.measured, machine)
+        for one in found.base.nulls
+    ]
     floor = np.concatenate(floors)
     if not any(subsets) or gap.rmse(before) < NO_GAP * gap.rmse(floor):
         return None
     start = [_start(errors, subset) for errors, subset in zip(found.errors, subsets, strict=True)]
     after = gap.squares(repair(evidence, subsets, found.rays, start).after, measured, machine)
-    return float(gap.shares(before, after, floor, [])[0])  # as an answer says it: no repair is better than the floor
+    return float(
+        gap.shares(before, after, floor, [])[0]
+    )  # as an answer says it: no repair is better than the floor
 
 
-def of_label(cases: Path, fit: ActuatorFit, machine: Machine, label: Mapping[str, Any]) -> float | None:
+def of_label(
+    cases: Path, fit: ActuatorFit, machine: Machine, label: Mapping[str, Any]
+) -> float | None:
     """Returns the same for the case of a label, in the folder `cases`."""
-    return closed_by(cases / label["case"], {one["effect"]: one["joints"] for one in label["effects"]}, fit, machine)
+    return closed_by(
+        cases / label["case"],
+        {one["effect"]: one["joints"] for one in label["effects"]},
+        fit,
+        machine,
+    )
 
 
 def _start(errors: Errors, names: frozenset[str]) -> dict[str, np.ndarray]:
@@ -62,4 +78,6 @@ def _start(errors: Errors, names: frozenset[str]) -> dict[str, np.ndarray]:
     if not names:
         return {}
     ends = np.cumsum([len(errors.shapes[name]) for name in sorted(names)])[:-1]
-    return dict(zip(sorted(names), np.split(fitted(errors.z, errors.rays(names)), ends), strict=True))
+    return dict(
+        zip(sorted(names), np.split(fitted(errors.z, errors.rays(names)), ends), strict=True)
+    )

@@ -44,18 +44,37 @@ def rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
     for key, (words, more_is_better) in ROWS.items():
         values = {name: table[key]["value"] for name, table in tables.items()}
         known = [value for value in values.values() if value is not None]
-        best = None if more_is_better is None or len(known) < 2 else (max if more_is_better else min)(known)
+        best = (
+            None
+            if more_is_better is None or len(known) < 2
+            else (max if more_is_better else min)(known)
+        )
         cells: list[str | Cell] = [words]
         for name, table in tables.items():
             value, interval = values[name], table[key]["ci95"]
             if value is None:
                 cells.append(Cell(MISSING))
                 continue
-            note = f"{interval[0]:.2f} to {interval[1]:.2f}, of {table[key]['of']}" if interval else ""
+            note = (
+                f"{interval[0]:.2f} to {interval[1]:.2f}, of {table[key]['of']}" if interval else ""
+            )
             cells.append(Cell(f"{value:.2f}", note, value == best))
         found.append(cells)
-    found.append(["seconds a case, median (most)", *(_seconds(table["seconds"]) for table in tables.values())])
-    found.append(["cases sat", *(Cell(f"{table['sat']['value']} of {table['sat']['of']}") for table in tables.values())])
+    found.append(
+        [
+            "seconds a case, median (most)",
+            *(_seconds(table["seconds"]) for table in tables.values()),
+        ]
+    )
+    found.append(
+        [
+            "cases sat",
+            *(
+                Cell(f"{table['sat']['value']} of {table['sat']['of']}")
+                for table in tables.values()
+            ),
+        ]
+    )
     found.append(["no answer", *(Cell(str(table["failed"])) for table in tables.values())])
     return found
 
@@ -65,7 +84,12 @@ def markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
     lines = [["", *tables], ["---"] * (1 + len(tables))]
     for words, *cells in rows(tables):
         told = (cell if isinstance(cell, Cell) else Cell(cell) for cell in cells)
-        lines.append([str(words).strip(), *(f"{one.value} ({one.note})" if one.note else str(one.value) for one in told)])
+        lines.append(
+            [
+                str(words).strip(),
+                *(f"{one.value} ({one.note})" if one.note else str(one.value) for one in told),
+            ]
+        )
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
@@ -74,29 +98,48 @@ def write(folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[st
     first = next(iter(tables.values()))
     kinds = ", ".join(f"{count} {kind}" for kind, count in first["cases"].items() if count)
     page = Page(
-        f"Exam of {', '.join(tables)}", f"{exam['num_cases']} cases ({kinds}), roughness {exam['roughness']}, seed {exam['seed']}."
+        f"Exam of {', '.join(tables)}",
+        f"{exam['num_cases']} cases ({kinds}), roughness {exam['roughness']}, seed {exam['seed']}.",
     )
     for name, table in tables.items():
         if table["sat"]["value"] < table["sat"]["of"]:
-            page.text(f"{name} sat {table['sat']['value']} of {table['sat']['of']} cases; the others are left out.", "warn")
+            page.text(
+                f"{name} sat {table['sat']['value']} of {table['sat']['of']} cases; the others are left out.",
+                "warn",
+            )
     if not exam["sealed"]:
-        page.text("A development seed: its cases may have been looked at while the candidates were made.", "warn")
+        page.text(
+            "A development seed: its cases may have been looked at while the candidates were made.",
+            "warn",
+        )
     page.heading("Marks")
-    page.table(["", *tables], rows(tables), "Rates with 95 % Wilson intervals, other figures with bootstrap intervals over cases")
+    page.table(
+        ["", *tables],
+        rows(tables),
+        "Rates with 95 % Wilson intervals, other figures with bootstrap intervals over cases",
+    )
     for name, table in tables.items():
         page.heading(name)
-        drawings = {"confusion": confusion(table), "reliability": reliability(table), "size": sizes(table)}
+        drawings = {
+            "confusion": confusion(table),
+            "reliability": reliability(table),
+            "size": sizes(table),
+        }
         for stem, figure in drawings.items():
             if figure is not None:
                 figure.savefig(folder / f"{stem}_{name}.png", dpi=DPI)
                 page.picture(folder / f"{stem}_{name}.png", CAPTIONS[stem])
         with page.details("By effect, all cases"):
             columns = ["right", "wrong", "missed", "precision", "recall", "f1", "parameter_error"]
-            lines = [[effect, *(figures[column] for column in columns)] for effect, figures in table["by_effect"].items()]
+            lines = [
+                [effect, *(figures[column] for column in columns)]
+                for effect, figures in table["by_effect"].items()
+            ]
             page.table(["effect", *(column.replace("_", " ") for column in columns)], lines)
         with page.details("What lies outside the library, and what was said"):
             said = [
-                [kind, ", ".join(f"{count} {answer}" for answer, count in row.items())] for kind, row in table["outside"].items()
+                [kind, ", ".join(f"{count} {answer}" for answer, count in row.items())]
+                for kind, row in table["outside"].items()
             ]
             page.table(["outside", "said"], said)
     page.facts({"labels, SHA-256": exam["labels_sha256"]})
@@ -117,15 +160,30 @@ def confusion(table: Mapping[str, Any]) -> Figure | None:
     if not found:
         return None
     there = sorted(found)
-    said = sorted({name for row in found.values() for name in row} - {"none", "unknown", "failed"} | set(there))
-    said += [name for name in ("none", "unknown", "failed") if any(name in row for row in found.values())]
+    said = sorted(
+        {name for row in found.values() for name in row} - {"none", "unknown", "failed"}
+        | set(there)
+    )
+    said += [
+        name for name in ("none", "unknown", "failed") if any(name in row for row in found.values())
+    ]
     counts = np.array([[found[true].get(name, 0) for name in said] for true in there])
     figure = Figure(figsize=(2.6 + 0.34 * len(said), 2.2 + 0.3 * len(there)), layout="constrained")
     axes = figure.add_subplot()
-    axes.imshow(counts / counts.sum(1, keepdims=True), cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    axes.imshow(
+        counts / counts.sum(1, keepdims=True), cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto"
+    )
     for row, column in np.argwhere(counts):
         dark = counts[row, column] > 0.5 * counts[row].sum()
-        axes.text(column, row, str(counts[row, column]), ha="center", va="center", color="white" if dark else "black", fontsize=8)
+        axes.text(
+            column,
+            row,
+            str(counts[row, column]),
+            ha="center",
+            va="center",
+            color="white" if dark else "black",
+            fontsize=8,
+        )
     axes.set_xticks(range(len(said)), said, rotation=90, fontsize=8)
     axes.set_yticks(range(len(there)), there, fontsize=8)
     axes.set_xlabel("said")
@@ -141,9 +199,19 @@ def reliability(table: Mapping[str, Any]) -> Figure | None:
     figure = Figure(figsize=(4.6, 4.2), layout="constrained")
     axes = figure.add_subplot()
     axes.plot([0, 1], [0, 1], color="#8c8c8c", linewidth=1)
-    stated, true = np.array([one["stated"] for one in bins]), np.array([one["value"] for one in bins])
+    stated, true = (
+        np.array([one["stated"] for one in bins]),
+        np.array([one["value"] for one in bins]),
+    )
     low, high = np.array([one["ci95"] for one in bins]).T
-    axes.errorbar(stated, true, [np.maximum(true - low, 0), np.maximum(high - true, 0)], fmt="none", ecolor="#0072b2", linewidth=1)
+    axes.errorbar(
+        stated,
+        true,
+        [np.maximum(true - low, 0), np.maximum(high - true, 0)],
+        fmt="none",
+        ecolor="#0072b2",
+        linewidth=1,
+    )
     axes.scatter(stated, true, s=[12 + 4 * one["of"] for one in bins], color="#0072b2", zorder=3)
     axes.set(xlabel="stated probability", ylabel="true", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
     return figure
@@ -154,7 +222,10 @@ def sizes(table: Mapping[str, Any]) -> Figure | None:
     if not table["by_size"]:
         return None
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
-    scales = (("by_size", "size, of typical", 1.0), ("by_motion", "change of motion over 5 s, mrad", 1000.0))
+    scales = (
+        ("by_size", "size, of typical", 1.0),
+        ("by_motion", "change of motion over 5 s, mrad", 1000.0),
+    )
     for axes, (key, words, scale) in zip(figure.subplots(1, 2, sharey=True), scales, strict=True):
         bins = table[key]
         places = range(len(bins))
@@ -162,11 +233,26 @@ def sizes(table: Mapping[str, Any]) -> Figure | None:
             value = np.array([one[name]["value"] for one in bins])
             low, high = np.array([one[name]["ci95"] for one in bins]).T
             error = [np.maximum(value - low, 0), np.maximum(high - value, 0)]
-            axes.errorbar(places, value, error, color=colour, marker="o", label={"right": "rightly named", "none": "none"}[name])
-        labels = [f"{one['from'] * scale:g} to {one['to'] * scale:g}\n({one['right']['of']})" for one in bins]
+            axes.errorbar(
+                places,
+                value,
+                error,
+                color=colour,
+                marker="o",
+                label={"right": "rightly named", "none": "none"}[name],
+            )
+        labels = [
+            f"{one['from'] * scale:g} to {one['to'] * scale:g}\n({one['right']['of']})"
+            for one in bins
+        ]
         axes.set_xticks(places, labels, fontsize=7)
         axes.set(xlabel=words, ylim=(-0.03, 1.03))
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=2,
+        frameon=False,
+    )
     return figure
 
 

@@ -29,15 +29,22 @@ def write(
     """Records all cases into `folder/cases/<id>`, in so many `workers`; returns their labels, plain JSON, in the same order."""
     names = [f"{number:04d}" for number in range(len(questions))]
     folders = [folder / CASES / name for name in names]
-    halves = [workshop.planned(questions, half, is_field) for half, is_field in ((reference, False), (field, True))]
+    halves = [
+        workshop.planned(questions, half, is_field)
+        for half, is_field in ((reference, False), (field, True))
+    ]
     _, made = (workshop.record(jobs, folders, workers, advance) for jobs in halves)
-    return [label(name, question, half, machine) for name, question, half in zip(names, questions, made, strict=True)]
+    return [
+        label(name, question, half, machine)
+        for name, question, half in zip(names, questions, made, strict=True)
+    ]
 
 
 def label(name: str, question: Question, field: Made, machine: Machine) -> dict[str, Any]:
     """Returns what is true about a case.
 
-    `moved_rad`: root mean square of what its cause changes of the measured motion in 5 s from equal beginnings, by joint.
+    `moved_rad`: root mean square of what its cause changes of the measured motion in 5 s from equal
+    beginnings, by joint.
     """
     return {
         "case": name,
@@ -49,7 +56,10 @@ def label(name: str, question: Question, field: Made, machine: Machine) -> dict[
                 "joints": list(fault.joints),
                 "size": fault.size,
                 "parameters": {
-                    key: {joint: float(fault.parameters[key][machine.joint_names.index(joint)]) for joint in fault.joints}
+                    key: {
+                        joint: float(fault.parameters[key][machine.joint_names.index(joint)])
+                        for joint in fault.joints
+                    }
                     for key in fault.drawn
                 },
                 "nothing": fault.drawn,
@@ -58,7 +68,11 @@ def label(name: str, question: Question, field: Made, machine: Machine) -> dict[
         ],
         "outside": None
         if question.ailment is None
-        else {"ailment": question.ailment.kind, "joints": list(question.joints), "size": question.size},
+        else {
+            "ailment": question.ailment.kind,
+            "joints": list(question.joints),
+            "size": question.size,
+        },
         "moved_rad": dict(zip(machine.joint_names, moved(field, machine).tolist(), strict=True)),
         "machine_seed": question.machine_seed,
         "chance": question.chance,

@@ -28,7 +28,9 @@ def seal(folder: Path, labels: dict[str, Any], salt: str) -> str:
             file.write(text)
         write_text(folder / HASH, f"{found}  {LABELS}\n")  # as sha256sum writes it
     except FileExistsError as error:
-        raise StorageError(f"{path} exists: the exam in this folder is sealed; choose another session.out=<folder>") from error
+        raise StorageError(
+            f"{path} exists: the exam in this folder is sealed; choose another session.out=<folder>"
+        ) from error
     except OSError as error:
         raise StorageError(f"cannot seal the labels in {folder}: {error.strerror}") from error
     return found
@@ -43,7 +45,11 @@ def opened(folder: Path) -> dict[str, Any]:
     try:
         text, published = (folder / LABELS).read_text(), (folder / HASH).read_text().split()[0]
     except (OSError, IndexError) as error:
-        raise RecordingError(f"{folder}: expected {LABELS} and {HASH}, as exam.do=make leaves them ({error})") from error
+        raise RecordingError(
+            f"{folder}: expected {LABELS} and {HASH}, as exam.do=make leaves them ({error})"
+        ) from error
     if hashlib.sha256(text.encode()).hexdigest() != published:
-        raise RecordingError(f"{folder / LABELS} is not what was sealed: its SHA-256 is not that of {HASH}; make the exam again")
+        raise RecordingError(
+            f"{folder / LABELS} is not what was sealed: its SHA-256 is not that of {HASH}; make the exam again"
+        )
     return json.loads(text)

@@ -44,7 +44,8 @@ class Command:
     """A program that diagnoses one case, started anew for each, without a way to the labels.
 
     Attributes:
-        command: Program and arguments; `{case}` and `{out}` stand for the two folders. `brokk` is the one that runs now.
+        command: Program and arguments; `{case}` and `{out}` stand for the two folders. `brokk` is
+            the one that runs now.
         limit_s: Time after which it is ended.
         threads: CPU threads for its numerical libraries.
     """
@@ -56,7 +57,9 @@ class Command:
     def check(self) -> None:
         text = " ".join(self.command)
         if "{case}" not in text or "{out}" not in text:
-            raise ConfigError(f"candidate.command: expected {{case}} and {{out}} among its arguments, got {list(self.command)}")
+            raise ConfigError(
+                f"candidate.command: expected {{case}} and {{out}} among its arguments, got {list(self.command)}"
+            )
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
         """Starts the program in an empty folder and waits for it."""
@@ -65,28 +68,47 @@ class Command:
             words[:1] = [sys.executable, "-P", "-m", "brokk_rl"]
         environment = {
             **os.environ,
-            **{name: str(self.threads) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")},
+            **{
+                name: str(self.threads)
+                for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+            },
         }
         for name in ("OLDPWD", "PWD"):
             environment.pop(name, None)
         with tempfile.TemporaryDirectory(prefix="brokk") as empty:
             try:
-                done = subprocess.run(words, cwd=empty, env=environment, capture_output=True, text=True, timeout=self.limit_s)
+                done = subprocess.run(
+                    words,
+                    cwd=empty,
+                    env=environment,
+                    capture_output=True,
+                    text=True,
+                    timeout=self.limit_s,
+                )
             except subprocess.TimeoutExpired as error:
                 raise RecordingError(f"no answer within {self.limit_s:g} s") from error
             except OSError as error:
                 raise RecordingError(f"{words[0]} cannot be started: {error.strerror}") from error
         if done.returncode:
-            raise RecordingError((done.stderr or done.stdout)[-LAST_CHARACTERS:].strip() or f"exit status {done.returncode}")
+            raise RecordingError(
+                (done.stderr or done.stdout)[-LAST_CHARACTERS:].strip()
+                or f"exit status {done.returncode}"
+            )
 
 
 def sit(
-    candidate: Candidate, cases: Sequence[Path], folder: Path, machine: Machine, workers: int, advance: Callable[[], None]
+    candidate: Candidate,
+    cases: Sequence[Path],
+    folder: Path,
+    machine: Machine,
+    workers: int,
+    advance: Callable[[], None],
 ) -> int:
     """Has every case answered that is not yet; returns how many have no answer in the end.
 
-    `folder/<case>/diagnosis.json` is the answer, `sitting.json` beside it says how long it took, or why there is none. A case
-    without an answer is tried again by the next run, an answer that stands is kept.
+    `folder/<case>/diagnosis.json` is the answer, `sitting.json` beside it says how long it took, or
+    why there is none. A case without an answer is tried again by the next run, an answer that
+    stands is kept.
 
     Args:
         candidate: Who answers.

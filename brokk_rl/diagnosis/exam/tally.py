@@ -28,10 +28,16 @@ Figure = dict[str, Any]
 def rate(right: Sequence[bool]) -> Figure:
     """Returns share, number and Wilson interval."""
     low, high = wilson(sum(right), len(right))
-    return {"value": float(np.mean(right)) if right else None, "of": len(right), "ci95": [low, high]}
+    return {
+        "value": float(np.mean(right)) if right else None,
+        "of": len(right),
+        "ci95": [low, high],
+    }
 
 
-def over_cases(marks: Sequence[Mark], figure: Callable[[Sequence[Mark]], float | None], seed: int = 0) -> Figure:
+def over_cases(
+    marks: Sequence[Mark], figure: Callable[[Sequence[Mark]], float | None], seed: int = 0
+) -> Figure:
     """Returns any figure of marks with its percentile bootstrap interval over cases."""
     value = figure(marks)
     if value is None:
@@ -55,7 +61,10 @@ def tally(marks: Sequence[Mark], not_begun: int = 0) -> dict[str, Any]:
     joints = [right for mark in one + several for right in mark.joints_right]
     seconds = [mark.seconds for mark in marks if mark.seconds is not None]
     return {
-        "cases": {kind: sum(mark.kind == kind for mark in marks) for kind in ("none", "faint", "one", "several", "outside")},
+        "cases": {
+            kind: sum(mark.kind == kind for mark in marks)
+            for kind in ("none", "faint", "one", "several", "outside")
+        },
         "sat": {"value": len(marks), "of": len(marks) + not_begun},
         "failed": sum(mark.verdict == "failed" for mark in marks),
         "top1": rate([mark.first for mark in one]),
@@ -66,14 +75,20 @@ def tally(marks: Sequence[Mark], not_begun: int = 0) -> dict[str, Any]:
         "exact_set": rate([_exact(mark) for mark in several]),
         "set_f1": over_cases(several, micro_f1),
         "false_alarms": rate([mark.verdict not in ("none", "failed") for mark in quiet]),
-        "false_alarms_none": rate([mark.verdict not in ("none", "failed") for mark in quiet if mark.kind == "none"]),
-        "false_alarms_faint": rate([mark.verdict not in ("none", "failed") for mark in quiet if mark.kind == "faint"]),
+        "false_alarms_none": rate(
+            [mark.verdict not in ("none", "failed") for mark in quiet if mark.kind == "none"]
+        ),
+        "false_alarms_faint": rate(
+            [mark.verdict not in ("none", "failed") for mark in quiet if mark.kind == "faint"]
+        ),
         "unknown_recall": rate([mark.verdict == "unknown" for mark in outside]),
         "unknown_wrongly": rate([mark.verdict == "unknown" for mark in one + several]),
         "unknown_auroc": over_cases(marks, auroc),
         "ece": over_cases(marks, lambda drawn: ece(claims(drawn))),
         "reliability": reliability(claims(marks)),
-        "parameter_error": over_cases(marks, lambda drawn: _median([n.error for mark in drawn for n in mark.numbers])),
+        "parameter_error": over_cases(
+            marks, lambda drawn: _median([n.error for mark in drawn for n in mark.numbers])
+        ),
         "cover_90": rate([number.in_90 for mark in marks for number in mark.numbers]),
         "cover_95": rate([number.in_95 for mark in marks for number in mark.numbers]),
         "closed_of_oracle": over_cases(one + several, closed_of_oracle),
@@ -134,7 +149,9 @@ def by_effect(marks: Sequence[Mark]) -> dict[str, Figure]:
             "precision": right / (right + wrong) if right + wrong else None,
             "recall": right / (right + missed) if right + missed else None,
             "f1": f1(right, wrong, missed) if right + missed else None,
-            "parameter_error": _median([n.error for mark in marks for n in mark.numbers if n.effect == effect]),
+            "parameter_error": _median(
+                [n.error for mark in marks for n in mark.numbers if n.effect == effect]
+            ),
         }
     return found
 
@@ -167,7 +184,14 @@ def curve(marks: Sequence[Mark], at: Sequence[float], edges: Sequence[float]) ->
         inside = [mark for mark, value in zip(marks, at, strict=True) if low <= value < high]
         if inside:
             quiet = [mark.verdict == "none" for mark in inside]
-            found.append({"from": low, "to": high, "right": rate([mark.first for mark in inside]), "none": rate(quiet)})
+            found.append(
+                {
+                    "from": low,
+                    "to": high,
+                    "right": rate([mark.first for mark in inside]),
+                    "none": rate(quiet),
+                }
+            )
     return found
 
 
@@ -190,9 +214,16 @@ def reliability(made: Sequence[Claim]) -> list[Figure]:
     """Returns, by bins of the stated probability, its mean and how often such a statement is true."""
     found = []
     for k in range(NUM_BINS):
-        inside = [claim for claim in made if min(int(claim.probability * NUM_BINS), NUM_BINS - 1) == k]
+        inside = [
+            claim for claim in made if min(int(claim.probability * NUM_BINS), NUM_BINS - 1) == k
+        ]
         if inside:
-            found.append({"stated": float(np.mean([claim.probability for claim in inside])), **rate([c.is_true for c in inside])})
+            found.append(
+                {
+                    "stated": float(np.mean([claim.probability for claim in inside])),
+                    **rate([c.is_true for c in inside]),
+                }
+            )
     return found
 
 
@@ -207,14 +238,27 @@ def ece(made: Sequence[Claim]) -> float | None:
 def closed_of_oracle(marks: Sequence[Mark]) -> float | None:
     """Returns the share of the gap closed over what the true effects close, the median of the cases where they close something.
 
-    The median, as the gap itself is a difference of two errors: where it is small, shares of it are wild.
+    The median, as the gap itself is a difference of two errors: where it is small, shares of it are
+    wild.
     """
-    return _median([(mark.closed or 0.0) / mark.oracle for mark in marks if mark.oracle is not None and mark.oracle > CLOSES])
+    return _median(
+        [
+            (mark.closed or 0.0) / mark.oracle
+            for mark in marks
+            if mark.oracle is not None and mark.oracle > CLOSES
+        ]
+    )
 
 
 def predicted_off(marks: Sequence[Mark]) -> float | None:
     """Returns the median distance of predicted and achieved closing."""
-    return _median([abs(m.predicted - m.closed) for m in marks if m.predicted is not None and m.closed is not None])
+    return _median(
+        [
+            abs(m.predicted - m.closed)
+            for m in marks
+            if m.predicted is not None and m.closed is not None
+        ]
+    )
 
 
 def _median(values: Sequence[float]) -> float | None:

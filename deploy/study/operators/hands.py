@@ -1,7 +1,8 @@
 """A person's hands on the levers: what is wanted becomes what is given, late, sluggish, imprecise, a few levers at a time.
 
-The law is that of `follower=person` (reaction delay, first-order lag integrated exactly over the period, amplitude, tremor, dead
-zone, a choice of levers that holds for a while), in numpy, for the machine's own computer; the names of the numbers are the same.
+The law is that of `follower=person` (reaction delay, first-order lag integrated exactly over the
+period, amplitude, tremor, dead zone, a choice of levers that holds for a while), in numpy, for the
+machine's own computer; the names of the numbers are the same.
 Axes: `N` trials, `J` joints.
 """
 
@@ -40,9 +41,15 @@ class Hands:
     grip_s: Range
 
     def check(self) -> None:
-        most = self.joints_at_once[0] if isinstance(self.joints_at_once, tuple) else self.joints_at_once
+        most = (
+            self.joints_at_once[0]
+            if isinstance(self.joints_at_once, tuple)
+            else self.joints_at_once
+        )
         if most < 1:
-            raise ConfigError(f"operator.hands.joints_at_once: expected 1 or more, got {self.joints_at_once}")
+            raise ConfigError(
+                f"operator.hands.joints_at_once: expected 1 or more, got {self.joints_at_once}"
+            )
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> HandsModel:
         """Returns the hands of the persons `(N,)`."""
@@ -57,12 +64,30 @@ class HandsModel:
         self._exclusive = machine.is_exclusive
         self._delay = traits.draw("delay_s", hands.delay_s) / machine.period_s
         self._lag = np.maximum(traits.draw("lag_s", hands.lag_s) / machine.period_s, 1e-9)
-        self._gain, self._tremor = traits.draw("gain", hands.gain), traits.draw("tremor", hands.tremor)
-        self._dead_zone, self._grip_s = traits.draw("dead_zone", hands.dead_zone), traits.draw("grip_s", hands.grip_s)
-        most = hands.joints_at_once if isinstance(hands.joints_at_once, tuple) else (hands.joints_at_once, hands.joints_at_once)
-        self._most = traits.draw("joints_at_once", (most[0] - 0.5 + 1e-9, most[1] + 0.5 - 1e-9)).round()
+        self._gain, self._tremor = (
+            traits.draw("gain", hands.gain),
+            traits.draw("tremor", hands.tremor),
+        )
+        self._dead_zone, self._grip_s = (
+            traits.draw("dead_zone", hands.dead_zone),
+            traits.draw("grip_s", hands.grip_s),
+        )
+        most = (
+            hands.joints_at_once
+            if isinstance(hands.joints_at_once, tuple)
+            else (hands.joints_at_once, hands.joints_at_once)
+        )
+        self._most = traits.draw(
+            "joints_at_once", (most[0] - 0.5 + 1e-9, most[1] + 0.5 - 1e-9)
+        ).round()
         shape = (len(persons), machine.num_joints)
-        self._wanted = np.zeros((len(persons), math.ceil(float(self._delay.max(initial=0.0)) - 1e-6) + 2, machine.num_joints))
+        self._wanted = np.zeros(
+            (
+                len(persons),
+                math.ceil(float(self._delay.max(initial=0.0)) - 1e-6) + 2,
+                machine.num_joints,
+            )
+        )
         self._hand, self._held_s = np.zeros(shape), np.zeros(shape)
         self._generator = np.random.default_rng((seed, 1))
 
@@ -85,7 +110,11 @@ class HandsModel:
         self._hand = np.where(held, hand, 0.0)
         shaken = 1.0 + self._tremor * self._generator.standard_normal(wanted.shape)
         deflection = np.clip(np.where(held, first + second, 0.0) * self._gain * shaken, -1.0, 1.0)
-        return np.sign(deflection) * np.maximum(np.abs(deflection) - self._dead_zone, 0.0) / (1.0 - self._dead_zone)
+        return (
+            np.sign(deflection)
+            * np.maximum(np.abs(deflection) - self._dead_zone, 0.0)
+            / (1.0 - self._dead_zone)
+        )
 
     def _holds(self, asked: np.ndarray) -> np.ndarray:
         """Returns which levers are held, `(N, J)` bool: the exclusive or the others, the largest, those once taken for a while."""
@@ -101,7 +130,11 @@ class HandsModel:
         self._held_s = np.where(held & taken, self._held_s + self._period_s, 0.0)
         return held
 
-    def _reach(self, hand: np.ndarray, target: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _reach(
+        self, hand: np.ndarray, target: np.ndarray, part: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Returns where the hand is after `part` of a period on its way to `target`, and what that adds to the period's mean."""
         left = np.exp(-part / self._lag)
-        return target + (hand - target) * left, target * part + (hand - target) * self._lag * (1.0 - left)
+        return target + (hand - target) * left, target * part + (hand - target) * self._lag * (
+            1.0 - left
+        )

@@ -12,14 +12,16 @@ from deploy.study.operators.sight import Sight
 from deploy.study.operators.traits import Range, Traits
 
 LONGER, SHORTER, RANGE = 1.25, 0.6, (0.05, 2.5)
-"""Factors on short moves of a joint after one that was not enough, and after one that was too much; bounds of their product."""
+"""Factors on short moves of a joint after one that was not enough, and after one that was too much;
+bounds of their product."""
 
 
 @spec
 class Novice:
     """Simulated, unguided: one joint at a time: deflects, lets go, waits until nothing moves, looks again.
 
-    Move and wait is what people do under delays (Ferrell, IEEE Trans. Hum. Factors Electron. 6, 1965).
+    Move and wait is what people do under delays (Ferrell, IEEE Trans. Hum. Factors Electron. 6,
+    1965).
 
     Attributes:
         hands: How the levers are moved.
@@ -27,8 +29,10 @@ class Novice:
         deflection: Deflection of a long move.
         fine: Deflection of a short one, and the time below which a move is short, s.
         band: Command up to which valves stay shut, as the person knows it.
-        lost_s: Time for which a lever must be held before anything moves at all, as the person knows it.
-        judgement: Length of a move over the right one; for short ones joint by joint corrected by what the last one did.
+        lost_s: Time for which a lever must be held before anything moves at all, as the person
+            knows it.
+        judgement: Length of a move over the right one; for short ones joint by joint corrected by
+            what the last one did.
         scatter: Standard deviation of its logarithm, from move to move.
         wait_s: Pause after a move, beyond the time in which the machine comes to rest.
         good_rad: Error with which a joint is left alone, rad or m.
@@ -56,7 +60,10 @@ class NoviceModel:
     def __init__(self, novice: Novice, machine: Machine, persons: np.ndarray, seed: int) -> None:
         traits = Traits(persons, seed)
         self._config, self._machine = novice, machine
-        self._hands, self._sight = novice.hands.build(machine, persons, seed), novice.sight.build(machine, persons, seed)
+        self._hands, self._sight = (
+            novice.hands.build(machine, persons, seed),
+            novice.sight.build(machine, persons, seed),
+        )
         self._deflection = traits.draw("deflection", novice.deflection)[:, 0]
         self._judgement = traits.draw("judgement", novice.judgement)[:, 0]
         self._pause_s = traits.draw("wait_s", novice.wait_s)[:, 0] + machine.dead_time_s
@@ -91,9 +98,14 @@ class NoviceModel:
         short = np.abs(away) / (speed[joint] * full) < config.fine[1]
         level = np.where(short, config.fine[0], self._deflection)
         turned = self._last[rows, joint] * away
-        factor = self._learnt[rows, joint] * np.where(turned > 0, LONGER, np.where(turned < 0, SHORTER, 1.0))
+        factor = self._learnt[rows, joint] * np.where(
+            turned > 0, LONGER, np.where(turned < 0, SHORTER, 1.0)
+        )
         factor = np.where(short, np.clip(factor, *RANGE), 1.0)
-        time_s = (np.abs(away) / (speed[joint] * self._rate(level)) * self._judgement * scattered + self._lost_s) * factor
+        time_s = (
+            np.abs(away) / (speed[joint] * self._rate(level)) * self._judgement * scattered
+            + self._lost_s
+        ) * factor
         self._learnt[rows[moves & short], joint[moves & short]] = factor[moves & short]
         self._last[rows[moves], joint[moves]] = away[moves]
         chosen = np.zeros_like(self._move)

@@ -1,7 +1,8 @@
 """What an operator without advice goes by: where the tool is seen from the hole, and what each joint would have to do about it.
 
-The eye judges the way left with an error in proportion to it, a few times a second; the head knows how the arm moves.
-The tool is first brought above the hole, then, as far as it is aligned, lowered a little at a time.
+The eye judges the way left with an error in proportion to it, a few times a second; the head knows
+how the arm moves. The tool is first brought above the hole, then, as far as it is aligned, lowered
+a little at a time.
 """
 
 from __future__ import annotations
@@ -28,13 +29,15 @@ class Sight:
 
     Attributes:
         looks_hz: Pictures a second.
-        relative: Error of the way left, as a share of it; constant through a person's trial and part by part new in each picture.
+        relative: Error of the way left, as a share of it; constant through a person's trial and
+            part by part new in each picture.
         finest_m: Error that remains close by.
         hover_m: Height above the target at which the tool is aligned.
         funnel_m: Lateral errors at which lowering begins and at which it is free, (outer, inner).
         lower_m: How far the tool is lowered at a time.
         depth_m: How deep it is aimed below the rim.
-        reach_m: Distances from the first joint behind the exclusive ones within which these rest, (nearest, farthest).
+        reach_m: Distances from the first joint behind the exclusive ones within which these rest,
+            (nearest, farthest).
         clear_m: Height of the tool above the rim below which the exclusive joints rest.
     """
 
@@ -59,15 +62,21 @@ class SightModel:
     def __init__(self, sight: Sight, machine: Machine, persons: np.ndarray, seed: int) -> None:
         self._config, self._machine = sight, machine
         traits = Traits(persons, seed)
-        self._relative, self._finest_m = traits.draw("relative", sight.relative), traits.draw("finest_m", sight.finest_m)
+        self._relative, self._finest_m = (
+            traits.draw("relative", sight.relative),
+            traits.draw("finest_m", sight.finest_m),
+        )
         self._generator = np.random.default_rng((seed, 2))
         self._habit = self._generator.standard_normal((len(persons), 3))
         exclusive = np.flatnonzero(machine.is_exclusive)
-        self._reach_joint = min(int(exclusive[-1]) + 1, machine.num_joints - 1) if len(exclusive) else 0
+        self._reach_joint = (
+            min(int(exclusive[-1]) + 1, machine.num_joints - 1) if len(exclusive) else 0
+        )
         self._period = max(1, round(1.0 / (sight.looks_hz * machine.period_s)))
         self._steps = 0
         self.way = np.zeros((len(persons), machine.num_joints))
-        """How far each joint seems to be from where it should be, `(N, J)`: exclusive joints alone, or all others."""
+        """How far each joint seems to be from where it should be, `(N, J)`: exclusive joints alone,
+        or all others."""
 
     def look(self, view: OperatorView, q: np.ndarray) -> bool:
         """Looks, where it is time to, at the arm at `q`, `(N, J)` (where it is, or will be); says whether `way` is new."""
@@ -85,7 +94,9 @@ class SightModel:
         lift = np.clip((aside - inner) / (outer - inner), 0.0, 1.0) * config.hover_m
         height = now.tip_in_base_m[:, 2] - seen[:, 2]
         goal = seen.copy()
-        goal[:, 2] += np.maximum(lift - config.depth_m, np.minimum(height, config.hover_m) - config.lower_m)
+        goal[:, 2] += np.maximum(
+            lift - config.depth_m, np.minimum(height, config.hover_m) - config.lower_m
+        )
         self.way = np.where(machine.is_exclusive, 0.0, self._solved(q, goal) - q)
         for joint in np.flatnonzero(machine.is_exclusive):
             self._position(int(joint), q, seen, now.tip_in_base_m)
@@ -98,7 +109,9 @@ class SightModel:
         for _ in range(ROUNDS):
             at = tool(machine, q)
             step = goal_m - at.tip_in_base_m
-            step = step * np.minimum(1.0, 0.6 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9))
+            step = step * np.minimum(
+                1.0, 0.6 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+            )
             tilt = np.clip(np.array([0.0, 0.0, -1.0]) - at.axis_in_base, -0.5, 0.5)
             jacobian = np.concatenate((at.jacobian, at.turn), 1)[:, :, free]
             square = np.swapaxes(jacobian, 1, 2) @ jacobian + DAMPING**2 * np.eye(int(free.sum()))
@@ -115,9 +128,15 @@ class SightModel:
         nudged = q.copy()
         nudged[:, joint] += 0.01
         slope = (self._reach(nudged, rim_m) - distance) / 0.01
-        out = ((distance < near) | (distance > far)) & (tip_m[:, 2] > rim_m[:, 2] + self._config.clear_m)
+        out = ((distance < near) | (distance > far)) & (
+            tip_m[:, 2] > rim_m[:, 2] + self._config.clear_m
+        )
         wanted = np.clip(((near + far) / 2 - distance) * slope / (slope**2 + 0.05), -0.5, 0.5)
-        target = np.clip(q[:, joint] + wanted, self._machine.lower[joint] + 0.05, self._machine.upper[joint] - 0.05)
+        target = np.clip(
+            q[:, joint] + wanted,
+            self._machine.lower[joint] + 0.05,
+            self._machine.upper[joint] - 0.05,
+        )
         moves = out & (np.abs(target - q[:, joint]) > 0.01)
         self.way[moves] = 0.0
         self.way[moves, joint] = (target - q[:, joint])[moves]

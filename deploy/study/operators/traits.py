@@ -17,7 +17,8 @@ class Traits:
 
     Args:
         persons: Number of the person in each trial, `(N,)`.
-        seed: The same seed, person and name give the same place within a range, whatever the range: who is slow is slow in all.
+        seed: The same seed, person and name give the same place within a range, whatever the range:
+            who is slow is slow in all.
     """
 
     def __init__(self, persons: np.ndarray, seed: int) -> None:
