@@ -24,9 +24,9 @@ from typing import ClassVar
 
 import torch
 
-from actuators import draw
 from actuators.effects.ranges import CHANCE, Number, Ranges, Value
-from actuators.transport import commands_in_force, opened
+from actuators.models import draw
+from actuators.models.transport import commands_in_force, opened
 from brokk_rl.errors import ConfigError
 from brokk_rl.follower import moved_levers
 from brokk_rl.machine import Machine, exclusive_mask
@@ -88,7 +88,7 @@ class Person:
         return number if isinstance(number, tuple) else (number, number)
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> PersonModel:
-        """Returns `num_envs` persons; see `brokk_rl.contracts.Follower`.
+        """Returns `num_envs` persons; see `brokk_rl.contracts.actuator.Follower`.
 
         Raises:
             ConfigError: A number is out of bounds, a range upside down, or a joint unknown.
@@ -97,7 +97,7 @@ class Person:
 
 
 class PersonModel:
-    """Persons at work; fulfils `brokk_rl.contracts.FollowerModel`.
+    """Persons at work; fulfils `brokk_rl.contracts.actuator.FollowerModel`.
 
     Attributes:
         state: What each person has seen and holds, who it is, and where its draws stand.

@@ -32,7 +32,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 from rich.logging import RichHandler
 
-from brokk_rl import extensions, places, ranks, registry
+from brokk_rl import distributed, extensions, gpu_pool, registry
 from brokk_rl.errors import BrokkError, ConfigError, choices
 from brokk_rl.session import earlier, remove_empty
 from brokk_rl.sweep import SweepFolder
@@ -85,7 +85,7 @@ def job(cfg: DictConfig) -> float | None:
     """Runs one composed configuration: all of `brokk`, or one job of a sweep."""
     set_up_logging()  # a launcher may run the job in a process of its own
     try:
-        with places.taken():
+        with gpu_pool.taken():
             return _run(cfg)
     except Exception as error:
         if HydraConfig.get().mode is not RunMode.MULTIRUN:
@@ -103,7 +103,7 @@ def _run(cfg: DictConfig) -> float | None:
     """Instantiates the mode and runs it within its session, where it has one."""
     cfg, sweep = _taken_in(cfg), HydraConfig.get().mode is RunMode.MULTIRUN
     if "session" not in cfg:
-        ranks.check_together(get_class(str(cfg._target_)), sweep)
+        distributed.check_together(get_class(str(cfg._target_)), sweep)
         return instantiate(cfg, _convert_="all").run()
     folder, resolved = run_folder(cfg), _resolved(cfg)
     try:
@@ -113,7 +113,7 @@ def _run(cfg: DictConfig) -> float | None:
             return before.get("objective")
         again = {"resume": str(folder)} if before and "resume" in cfg and cfg.resume is None else {}
         mode = instantiate(cfg, session={"out": str(folder)}, **again, _convert_="all")
-        ranks.check_together(type(mode), sweep)
+        distributed.check_together(type(mode), sweep)
         resume = bool(before or getattr(mode, "resume", None))
         with mode.session.start(resolved, _facts(cfg, mode), resume) as record:
             objective = mode.run()
@@ -132,7 +132,7 @@ def _run(cfg: DictConfig) -> float | None:
 def _speaks() -> bool:
     """Whether this process shows a person how things go; of several only the first."""
     try:
-        return ranks.own().first
+        return distributed.own().first
     except ConfigError:
         return True
 

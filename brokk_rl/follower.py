@@ -18,7 +18,7 @@ class Nobody:
     """Nobody: the policy's command is given as it is, at once."""
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> Direct:
-        """Returns the follower that changes nothing; see `brokk_rl.contracts.Follower`."""
+        """Returns the follower that changes nothing; see `brokk_rl.contracts.actuator.Follower`."""
         return Direct()
 
 

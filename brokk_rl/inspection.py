@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from brokk_rl.breaches import runs
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.recording_validation import runs
 from brokk_rl.spec import spec
 
 Kind = Literal["no motion", "no command", "frozen", "repeated rows", "beyond limit", "exclusive"]

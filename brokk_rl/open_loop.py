@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from brokk_rl.contracts import Actuator
+from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

@@ -17,10 +17,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from brokk_rl import breaches
-from brokk_rl.breaches import SCHEMA, Breach
+from brokk_rl import recording_validation
 from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
+from brokk_rl.recording_validation import SCHEMA, Breach
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,8 +158,8 @@ def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach
     ]
     required = ["t_s", *commands, *positions]
     found = [
-        *breaches.of_metadata(metadata, machine.name),
-        *breaches.of_names(required, table.column_names),
+        *recording_validation.of_metadata(metadata, machine.name),
+        *recording_validation.of_names(required, table.column_names),
     ]
     columns: dict[str, np.ndarray] = {}
     for name in [*required, *(name for name in table.column_names if name not in required)]:
@@ -170,8 +170,8 @@ def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach
             columns[name] = column.cast(pa.float64()).to_numpy()  # an empty cell becomes NaN
         else:
             found.append(Breach(f"column '{name}' holds {column.type}, expected numbers", name))
-    rate_hz = breaches.rate_hz(metadata) or 1.0 / machine.period_s
-    found += breaches.of_columns(columns, required, rate_hz)
+    rate_hz = recording_validation.rate_hz(metadata) or 1.0 / machine.period_s
+    found += recording_validation.of_columns(columns, required, rate_hz)
     missing = np.full(table.num_rows, np.nan)
     recording = Recording(
         machine=metadata.get("machine", machine.name),
@@ -234,7 +234,9 @@ def check(recording: Recording, where: str) -> None:
         columns[command_column(joint)] = recording.u[:, j]
         columns[position_column(joint, unit)] = recording.q[:, j]
     required = list(columns)
-    for breach in breaches.of_columns(columns | dict(recording.extra), required, recording.rate_hz):
+    for breach in recording_validation.of_columns(
+        columns | dict(recording.extra), required, recording.rate_hz
+    ):
         raise RecordingError(f"{where}: {breach}")
 
 

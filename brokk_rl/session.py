@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brokk_rl import ranks
+from brokk_rl import distributed
 from brokk_rl.errors import BrokkError, ConfigError, DeviceError, StorageError
 from brokk_rl.spec import spec
 
@@ -81,7 +81,7 @@ class Session:
         import torch
 
         kind, _, index = self.device.partition(":")
-        rank = ranks.own()
+        rank = distributed.own()
         if rank.count > 1:
             if index:
                 raise DeviceError(
@@ -113,7 +113,7 @@ class Session:
         Of several processes the first has the streams of a process that is alone, each other one
         streams of its own.
         """
-        rank = ranks.own().index
+        rank = distributed.own().index
         key = f"{self.seed}/{name}" + (f"/rank{rank}" if rank else "")
         return int.from_bytes(hashlib.sha256(key.encode()).digest()[:4], "little")
 
@@ -152,7 +152,7 @@ class Session:
             StorageError: The folder holds a run already and `resume` is false, or cannot be
                 written.
         """
-        if not ranks.own().first:
+        if not distributed.own().first:
             yield Record(self.folder)
             return
         before = read_record(self.folder) if self.folder.is_dir() else None

@@ -8,7 +8,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from brokk_rl import places
+from brokk_rl import gpu_pool
 from brokk_rl.session import missing_folders, remove_empty
 
 
@@ -21,7 +21,7 @@ class SweepFolder(Callback):
         """Called by Hydra before it makes the folder."""
         type(self).new = tuple(missing_folders(Path(str(config.hydra.sweep.dir))))
         if str(config.hydra.launcher._target_).endswith(".LocalLauncher"):
-            places.offer()
+            gpu_pool.offer()
 
     @classmethod
     def drop_if_unused(cls) -> None:

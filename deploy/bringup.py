@@ -26,13 +26,13 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.bus.description import GATEWAY, REMOTE, Description
-from deploy.loop.listener import Children, Listener
-from deploy.loop.records import Exchange
-from deploy.loop.target import Aim
-from deploy.motion import Motion, judge
+from deploy.guard.motion import Motion, judge
 from deploy.policy.adviser import REASONS, Advised
 from deploy.recorder import reading
 from deploy.recorder.capture import MCAP, Capture
+from deploy.runtime.process_group import Children, Listener
+from deploy.runtime.shm_layout import Exchange
+from deploy.runtime.target import Aim
 
 log = logging.getLogger(__name__)
 

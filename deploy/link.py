@@ -19,13 +19,13 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.spec import spec
 from deploy.bus.wire import Wire
-from deploy.guard import State
-from deploy.limits import Limits
-from deploy.loop.listener import BUS_PRIORITY, PATIENCE_S
-from deploy.loop.outlet import view
-from deploy.loop.process import Child, ask_for_priority, back_to_ordinary
-from deploy.loop.records import Exchange
-from deploy.loop.station import Setting
+from deploy.guard.guard import State
+from deploy.guard.limits import Limits
+from deploy.runtime.bus_process import Setting
+from deploy.runtime.operator_state import view
+from deploy.runtime.process import Child, ask_for_priority, back_to_ordinary
+from deploy.runtime.process_group import BUS_PRIORITY, PATIENCE_S
+from deploy.runtime.shm_layout import Exchange
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class Can:
 
 
 class CanLink:
-    """The link at work; see `brokk_rl.contracts.Link`."""
+    """The link at work; see `brokk_rl.contracts.link.Link`."""
 
     def __init__(self, can: Can, machine: Machine) -> None:
         self._can, self._machine = can, machine
@@ -131,7 +131,7 @@ class CanLink:
         priority = BUS_PRIORITY if can.realtime else None
         self._child = Child(
             "bus",
-            "deploy.loop.station:run",
+            "deploy.runtime.bus_process:run",
             (setting, self._exchange),
             self._exchange.files,
             priority,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from brokk_rl.sight import Rejection
+from brokk_rl.contracts.vision import Rejection
 
 WORDS = {
     "part of the picture that is block": (
@@ -34,7 +34,7 @@ WORDS = {
     ),
     "radius, m": (
         "on the face it does not have the size of a hole",
-        "Look at perception.pose.radius_m if the holes are of another size.",
+        "Look at perception.pose.estimator.radius_m if the holes are of another size.",
     ),
     "brightness inside over outside": (
         "it is not dark inside",

@@ -10,8 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from brokk_rl.errors import ConfigError, FrameError
-from brokk_rl.sight import (
+from brokk_rl.contracts.vision import (  # fmt: skip
     Ellipse,
     EllipseSpec,
     FilterSpec,
@@ -21,11 +20,12 @@ from brokk_rl.sight import (
     SegmenterSpec,
     Sighting,
     Target,
-)  # fmt: skip
+)
+from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Borehole, Frame
 from brokk_rl.spec import spec
 from perception import explain, search
-from perception.pose import gray_of
+from perception.pose.estimator import gray_of
 
 ALIKE = 0.15
 """Part of its size by which an ellipse differs from another that is the same rim."""

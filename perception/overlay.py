@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from brokk_rl.contracts.vision import Ellipse, HolePose, Sighting
 from brokk_rl.errors import ConfigError, StorageError
-from brokk_rl.sight import Ellipse, HolePose, Sighting
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 
@@ -44,7 +44,7 @@ class Drawing:
             )
 
     def write(self, path: Path, frame: Frame, sighting: Sighting) -> None:
-        """Writes the picture in one step; see `brokk_rl.sight.Overlay`."""
+        """Writes the picture in one step; see `brokk_rl.contracts.vision.Overlay`."""
         done, data = cv2.imencode(".png", self.draw(frame, sighting))
         part = path.with_name(f".{path.name}.{os.getpid()}")
         try:

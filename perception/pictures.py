@@ -33,7 +33,7 @@ class Pictures:
 
 
 class PictureSource:
-    """An open folder of pictures; see `brokk_rl.sight.FrameSource`."""
+    """An open folder of pictures; see `brokk_rl.contracts.vision.FrameSource`."""
 
     def __init__(self, place: Path) -> None:
         self._place = place

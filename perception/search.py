@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from brokk_rl.sight import Ellipse, EllipseDetector, SizePrior
+from brokk_rl.contracts.vision import Ellipse, EllipseDetector, SizePrior
 from brokk_rl.signals import Frame
 
 STEP = 8

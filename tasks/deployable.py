@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from brokk_rl.classical import Guidance
+from tasks.classical import Guidance
 
 if TYPE_CHECKING:
     from tasks.process import ToolPoseProcess

@@ -14,13 +14,14 @@ from typing import Any, Protocol, Self
 
 import torch
 
-from brokk_rl.classical import Classical, ClassicalController
-from brokk_rl.contracts import Transition, World
+from brokk_rl.contracts.task import Transition
+from brokk_rl.contracts.world import World
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.observation import Encoder, Scaling
 from tasks.advice import Advice
+from tasks.classical import Classical, ClassicalController
 from tasks.deployable import Deployable, features
 from tasks.measured import Measured
 from tasks.reward import Term
@@ -76,7 +77,7 @@ class Options:
 
 
 class ToolPoseProcess:
-    """See the module; fulfils `brokk_rl.contracts.TaskProcess`."""
+    """See the module; fulfils `brokk_rl.contracts.task.TaskProcess`."""
 
     reasons: tuple[str, ...] = REASONS
 

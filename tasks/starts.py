@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import torch
 
-from brokk_rl.classical import ClassicalController
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
+from tasks.classical import ClassicalController
 
 
 @spec

@@ -10,9 +10,9 @@ from typing import Literal
 
 import torch
 
-from brokk_rl.classical import Guidance
 from brokk_rl.machine import exclusive_mask
 from brokk_rl.spec import spec
+from tasks.classical import Guidance
 
 
 @spec

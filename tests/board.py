@@ -12,8 +12,8 @@ from composed import option
 from scipy.spatial.transform import Rotation
 
 from brokk_rl.machine import Machine
-from perception.calibration import arm, rigid
-from perception.calibration.views import Views
+from perception.calibrate import arm, rigid
+from perception.calibrate.views import Views
 
 SIZE_PX = (1280, 720)
 MATRIX = np.array([[700.0, 0.0, 639.5], [0.0, 700.0, 359.5], [0.0, 0.0, 1.0]])

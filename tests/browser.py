@@ -16,9 +16,19 @@ from composed import option
 
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
+from deploy.page.protocol import (
+    Advice,
+    Drawn,
+    Levers,
+    Recording,
+    Safety,
+    Shown,
+    Stream,
+    Target,
+    Wish,
+)
 from deploy.page.server import Server
 from deploy.page.settings import OperatorPage
-from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Wish
 
 TOKEN = "correct horse battery staple"
 CHROMIUM = (

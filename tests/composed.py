@@ -8,7 +8,9 @@ import hydra
 import pytest
 from hydra.utils import instantiate
 
-from brokk_rl import registry
+from brokk_rl import extensions, registry
+
+extensions.register([])  # the exam's options are those of an extension
 
 
 def option(group: str, name: str) -> Any:

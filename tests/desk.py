@@ -13,17 +13,17 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from actuators.excite.plan.drive import NominalMachine
 from brokk_rl.machine import Machine
-from brokk_rl.plan.drive import NominalMachine
 from brokk_rl.session import Session
 from deploy.bus.description import Description
 from deploy.bus.protection import Fault
 from deploy.bus.wire import Wire
-from deploy.limits import Limits
-from deploy.loop.outlet import view
-from deploy.loop.process import Child
-from deploy.loop.records import Exchange
-from deploy.loop.station import Setting
+from deploy.guard.limits import Limits
+from deploy.runtime.bus_process import Setting
+from deploy.runtime.operator_state import view
+from deploy.runtime.process import Child
+from deploy.runtime.shm_layout import Exchange
 from deploy.twin.faults import ask
 from deploy.twin.twin import Twin
 
@@ -107,7 +107,7 @@ class Desk:
         """Starts `twin`, `bus` or `commander`."""
         what: dict[str, tuple[str, tuple[Any, ...], int | None]] = {
             "twin": ("deploy.twin.twin:run", self._twin_arguments, 60),
-            "bus": ("deploy.loop.station:run", (self._setting, self.exchange), 55),
+            "bus": ("deploy.runtime.bus_process:run", (self._setting, self.exchange), 55),
             "commander": ("desk:command", (self.machine.home, self.exchange), 50),
         }
         target, arguments, priority = what[name]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from brokk_rl.sight import Ellipse, Masks
+from brokk_rl.contracts.vision import Ellipse, Masks
 from brokk_rl.signals import Frame
-from perception import conic
+from perception.ellipse import conic
 
 K = np.array([[528.0, 0.0, 319.5], [0.0, 528.0, 239.5], [0.0, 0.0, 1.0]])
 CENTER, AXIS = np.array([0.05, 0.02, 1.2]), np.array([0.0, -0.57, -0.82]) / np.hypot(0.57, 0.82)

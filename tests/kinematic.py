@@ -20,7 +20,7 @@ class Kinematic:
 
 
 class KinematicWorld:
-    """Fulfils `brokk_rl.contracts.World`; forces and faults are whatever a test writes into them."""
+    """Fulfils `brokk_rl.contracts.world.World`; forces and faults are whatever a test writes into them."""
 
     supports_graphs = False
 

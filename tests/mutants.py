@@ -1,6 +1,6 @@
 """Mutants of a module: one small change each, to see whether the tests notice.
 
-    python tests/mutants.py deploy.guard tests/unit/test_deploy_guard.py
+    python tests/mutants.py deploy.guard.guard tests/unit/test_deploy_guard.py
 
 Comparisons turned, off by one boundary, negated conditions, arithmetic exchanged, constants
 changed, statements dropped. Each mutant runs in a forked process; what survives is printed. A

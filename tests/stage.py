@@ -18,16 +18,16 @@ import numpy as np
 import pytest
 from composed import option
 
+from actuators.excite.plan.drive import NominalMachine
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
-from brokk_rl.plan.drive import NominalMachine
 from brokk_rl.session import Session
 from deploy.bus.wire import Wire, Wired
-from deploy.loop.outlet import View, view
-from deploy.loop.records import Exchange
-from deploy.loop.station import Setting, Station
 from deploy.policy.adviser import Adviser, Counsel
 from deploy.policy.bundle import Bundle
+from deploy.runtime.bus_process import Setting, Station
+from deploy.runtime.operator_state import View, view
+from deploy.runtime.shm_layout import Exchange
 from deploy.twin.faults import FaultPort
 from deploy.twin.twin import Running, Twin
 

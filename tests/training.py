@@ -13,7 +13,7 @@ from composed import option
 from kinematic import Kinematic
 
 from brokk_rl.machine import Machine
-from brokk_rl.rl.logbook import Logbook
+from brokk_rl.rl.logger import Logbook
 from brokk_rl.rl.runner import Budget, Runner, Training
 from brokk_rl.rl.tracking import Off
 from brokk_rl.rl.vec_env import ControlLoop, Plant

@@ -2,7 +2,7 @@
 
 import torch
 
-from brokk_rl.contracts import Actuator, ActuatorModel, Effect
+from brokk_rl.contracts.actuator import Actuator, ActuatorModel, Effect
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec

@@ -7,7 +7,7 @@ import torch
 from actuators.effects.ranges import Joints, Number, Value
 from actuators.effects.timing import with_newest
 from actuators.effects.wrapped import EffectSpec, Memory, Moment
-from actuators.transport import opened
+from actuators.models.transport import opened
 from brokk_rl.spec import spec
 
 

@@ -8,8 +8,8 @@ import torch
 from actuators.effects.ranges import Joints, Number, Ranges, Value
 from actuators.effects.timing import DelayJitter
 from actuators.effects.wrapped import EffectSpec, Memory, Moment, Plant, per_row
-from actuators.parameters import OTHER, PerJoint
-from brokk_rl.contracts import ActuatorModel
+from actuators.models.parameters import OTHER, PerJoint
+from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.errors import ConfigError, choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -72,7 +72,7 @@ class Library:
     def wrap(
         self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
     ) -> "LibraryModel":
-        """Returns `model` with the effects around it; see `brokk_rl.contracts.Effect`.
+        """Returns `model` with the effects around it; see `brokk_rl.contracts.actuator.Effect`.
 
         Raises:
             ConfigError: a number is out of bounds, or a joint unknown.
@@ -81,7 +81,7 @@ class Library:
 
 
 class LibraryModel:
-    """An actuator model with the effects around it; fulfils `brokk_rl.contracts.SensingModel`.
+    """An actuator model with the effects around it; fulfils `brokk_rl.contracts.actuator.SensingModel`.
 
     An episode begins at rest: commands from before it reach the valves as they are.
 

@@ -4,9 +4,9 @@ from typing import ClassVar
 
 import torch
 
-from actuators import draw
 from actuators.effects.ranges import CHANCE, Joints, Number, Value
 from actuators.effects.wrapped import EffectSpec
+from actuators.models import draw
 from brokk_rl.spec import spec
 
 

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from actuators import draw
-from actuators.parameters import per_joint
+from actuators.models import draw
+from actuators.models.parameters import per_joint
 from brokk_rl.errors import ConfigError, choices
 from brokk_rl.machine import Machine
 

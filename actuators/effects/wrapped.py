@@ -8,9 +8,9 @@ from typing import ClassVar, Literal
 
 import torch
 
-from actuators import draw
 from actuators.effects.ranges import CHANCE, Joints, Number, Ranges
-from brokk_rl.contracts import ActuatorModel
+from actuators.models import draw
+from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics

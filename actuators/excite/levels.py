@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from actuators.excite.poses import poses
-from brokk_rl.contracts import Segment
+from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, exclusive_mask
 from brokk_rl.spec import spec

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from brokk_rl.contracts import Segment
+from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec

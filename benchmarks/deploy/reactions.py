@@ -25,7 +25,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 from composed import option  # noqa: E402
 from desk import Desk, Stop  # noqa: E402
 
-from deploy.loop.process import ask_for_priority  # noqa: E402
+from deploy.runtime.process import ask_for_priority  # noqa: E402
 
 KILLS = (
     ("commander", signal.SIGKILL),

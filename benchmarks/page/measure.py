@@ -31,7 +31,7 @@ from deploy.page import server
 from deploy.page.clock import PageClock, Said
 from deploy.page.cloud import encode
 from deploy.page.demo import Demo, DemoFeed
-from deploy.page.shown import Drawn
+from deploy.page.protocol import Drawn
 
 SECONDS, WARM_S = 10.0, 6.0
 QUANTILES = {"p50": 0.5, "p95": 0.95, "max": 1.0}

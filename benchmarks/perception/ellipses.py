@@ -21,11 +21,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from brokk_rl.sight import EllipseDetector
-from perception.bench_hidden import SHAPES, hidden, shapes
-from perception.bench_hidden import STYLES as HIDDEN
-from perception.bench_patterns import CONDITIONS, NEGATIVES, matches, negative, pattern
-from perception.bench_photographs import STYLES, photograph
+from brokk_rl.contracts.vision import EllipseDetector
+from perception.benchmark.hidden import SHAPES, hidden, shapes
+from perception.benchmark.hidden import STYLES as HIDDEN
+from perception.benchmark.patterns import CONDITIONS, NEGATIVES, matches, negative, pattern
+from perception.benchmark.photographs import STYLES, photograph
 
 NONE = np.empty((0, 5))
 

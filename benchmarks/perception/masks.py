@@ -22,10 +22,10 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from brokk_rl.sight import FrameSource, Segmenter
+from brokk_rl.contracts.vision import FrameSource, Segmenter
 from perception import dataset
-from perception.segment_network import THRESHOLD
-from perception.training_report import pieces
+from perception.segment.network import THRESHOLD
+from perception.train.report import pieces
 
 FIGURES = ("block", "mouth", "found", "false", "ms")
 

@@ -32,10 +32,10 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from brokk_rl.contracts.vision import Observer, Overlay, Sighting
 from brokk_rl.session import Session
-from brokk_rl.sight import Observer, Overlay, Sighting
 from brokk_rl.signals import Frame
-from perception.bench import Tally, judge
+from perception.benchmark.cells import Tally, judge
 from perception.render.drawing import compose
 from perception.render.studio import Studio
 

@@ -16,7 +16,7 @@ from brokk_rl.checks.exercise import (
     rest_history,
     same,
 )
-from brokk_rl.contracts import Actuator, ActuatorModel, Effect
+from brokk_rl.contracts.actuator import Actuator, ActuatorModel, Effect
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 

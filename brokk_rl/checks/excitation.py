@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.checks.exercise import require
-from brokk_rl.contracts import Excitation, Segment
+from brokk_rl.contracts.actuator import Excitation, Segment
 from brokk_rl.machine import Machine
 
 DURATION_S = 300.0

@@ -15,7 +15,7 @@ from brokk_rl.checks.exercise import (
     require_rows,
     same,
 )
-from brokk_rl.contracts import Follower, FollowerModel
+from brokk_rl.contracts.actuator import Follower, FollowerModel
 from brokk_rl.machine import Machine, exclusive_mask
 
 NUM_STEPS = 60

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from brokk_rl.checks.exercise import require
-from brokk_rl.contracts import Link
+from brokk_rl.contracts.link import Link
 from brokk_rl.errors import BrokkError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.checks.exercise import require
-from brokk_rl.contracts import PerceptionBackend
+from brokk_rl.contracts.vision import PerceptionBackend
 from brokk_rl.signals import Frame
 
 

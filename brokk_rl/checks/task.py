@@ -20,7 +20,7 @@ from brokk_rl.checks.exercise import (
     rest_history,
     same,
 )
-from brokk_rl.contracts import Task, TaskProcess
+from brokk_rl.contracts.task import Task, TaskProcess
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from brokk_rl.checks.exercise import NUM_ENVS, in_place, places, require, same
-from brokk_rl.contracts import Simulator, World
+from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.machine import Machine
 
 

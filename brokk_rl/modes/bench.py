@@ -14,12 +14,14 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from brokk_rl.contracts import Actuator, Effect, Follower, Simulator, Task
+from brokk_rl.contracts.actuator import Actuator, Effect, Follower
+from brokk_rl.contracts.task import Task
+from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.distributed import Group
 from brokk_rl.rl.graph import capture
-from brokk_rl.rl.logbook import Logbook
+from brokk_rl.rl.logger import Logbook
 from brokk_rl.rl.runner import Runner, Training
 from brokk_rl.rl.tracking import Off
 from brokk_rl.rl.vec_env import ControlLoop, Plant

@@ -9,7 +9,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from brokk_rl.contracts import Actuator, Effect, Follower, Policy, Simulator, Task
+from brokk_rl.contracts.actuator import Actuator, Effect, Follower
+from brokk_rl.contracts.task import Policy, Task
+from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import Episode, evaluate

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import torch
 
-from brokk_rl.contracts import Actuator, Follower, Simulator, Task
+from brokk_rl.contracts.actuator import Actuator, Follower
+from brokk_rl.contracts.task import Task
+from brokk_rl.contracts.world import Simulator
 from brokk_rl.machine import Machine
 from brokk_rl.modes.train import find_checkpoint, follower_of
 from brokk_rl.rl.evaluation import evaluate

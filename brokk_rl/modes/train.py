@@ -9,20 +9,22 @@ from typing import Any, ClassVar
 import torch
 import yaml
 
-from brokk_rl import ranks
-from brokk_rl.contracts import Actuator, Effect, Follower, Simulator, Task
+from brokk_rl import distributed
+from brokk_rl.contracts.actuator import Actuator, Effect, Follower
+from brokk_rl.contracts.task import Task
+from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import Evaluation, evaluate_policies
 from brokk_rl.rl.curves import draw_curves
 from brokk_rl.rl.distributed import Group
 from brokk_rl.rl.export import export_onnx
-from brokk_rl.rl.head_start import begin_with
-from brokk_rl.rl.logbook import PROGRESS, Logbook
+from brokk_rl.rl.logger import PROGRESS, Logbook
 from brokk_rl.rl.policy import Classical, Trained, Untrained, write_bundle
 from brokk_rl.rl.runner import Runner, Training, checkpoints
 from brokk_rl.rl.tracking import Off, Tracking
 from brokk_rl.rl.vec_env import Plant
+from brokk_rl.rl.warm_start import begin_with
 from brokk_rl.session import RESOLVED, Session
 from brokk_rl.spec import spec
 
@@ -153,7 +155,7 @@ class Train:
             return None
         folder = self.session.folder
         if Path(self.resume).resolve() == folder.resolve() and not checkpoints(folder):
-            if ranks.own().first:
+            if distributed.own().first:
                 (folder / PROGRESS).unlink(missing_ok=True)
             return None
         return find_checkpoint(Path(self.resume))

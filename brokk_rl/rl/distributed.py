@@ -14,7 +14,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from brokk_rl import ranks
+from brokk_rl import distributed
 from brokk_rl.errors import DistributedError
 
 
@@ -27,7 +27,7 @@ class Group:
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.device, self.rank = device, ranks.own()
+        self.device, self.rank = device, distributed.own()
 
     @property
     def together(self) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from brokk_rl.contracts import Policy
+from brokk_rl.contracts.task import Policy
 from brokk_rl.intervals import wilson
 from brokk_rl.rl.vec_env import ControlLoop, Starts
 

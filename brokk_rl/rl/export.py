@@ -17,7 +17,7 @@ import onnxruntime
 import torch
 from rsl_rl.models import MLPModel
 
-from brokk_rl.contracts import TaskProcess
+from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.errors import CheckpointError
 from brokk_rl.rl.policy import CONTRACT, ONNX
 from brokk_rl.session import write_json

@@ -19,7 +19,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
-from brokk_rl.contracts import Policy
+from brokk_rl.contracts.task import Policy
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.runner import Training
@@ -120,7 +120,7 @@ class Network:
         self.actor = actor.to(loop.device).eval()
 
     def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Returns the mean action; see `brokk_rl.contracts.Policy`."""
+        """Returns the mean action; see `brokk_rl.contracts.task.Policy`."""
         return self.actor(TensorDict(groups, batch_size=[len(next(iter(groups.values())))]))
 
 

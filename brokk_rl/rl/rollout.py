@@ -23,8 +23,9 @@ class Rollout:
     def __init__(self, algorithm: PPO) -> None:
         self._algorithm, storage = algorithm, algorithm.storage
         self._observations = {
-            name: torch.zeros_like(value[0]) for name, value in storage.observations.items()
-        }  # type: ignore[arg-type]
+            name: torch.zeros_like(value[0])  # type: ignore[arg-type]
+            for name, value in storage.observations.items()
+        }
         self._reward, self._done, self._timed_out = (
             torch.zeros_like(storage.rewards[0]) for _ in range(3)
         )

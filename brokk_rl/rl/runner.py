@@ -16,7 +16,7 @@ from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl.errors import CheckpointError, ConfigError, StorageError
 from brokk_rl.rl.distributed import Group
-from brokk_rl.rl.logbook import Logbook
+from brokk_rl.rl.logger import Logbook
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.spec import spec
 

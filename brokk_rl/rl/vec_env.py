@@ -16,18 +16,16 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from brokk_rl.contracts import (
+from brokk_rl.contracts.actuator import (
     Actuator,
     ActuatorModel,
     Effect,
     Follower,
     FollowerModel,
     SensingModel,
-    Simulator,
-    Task,
-    TaskProcess,
-    World,
 )
+from brokk_rl.contracts.task import Task, TaskProcess
+from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.graph import capture, compiling

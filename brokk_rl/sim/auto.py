@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from brokk_rl.contracts import World
+from brokk_rl.contracts.world import World
 from brokk_rl.machine import Machine
 from brokk_rl.sim.native import Native
 from brokk_rl.sim.warp import Warp

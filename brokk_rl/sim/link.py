@@ -5,7 +5,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from brokk_rl.contracts import Actuator
+from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

@@ -50,7 +50,7 @@ class Native:
 
 
 class NativeWorld:
-    """Fulfils `brokk_rl.contracts.World` with a thread pool; results are the same at any number of threads.
+    """Fulfils `brokk_rl.contracts.world.World` with a thread pool; results are the same at any number of threads.
 
     Args:
         machine: The machine.
@@ -94,7 +94,7 @@ class NativeWorld:
         self.reset(~self.faults, home, nominal(num_worlds))
 
     def step(self, increment: torch.Tensor) -> None:
-        """Advances one control period; see `brokk_rl.contracts.World`."""
+        """Advances one control period; see `brokk_rl.contracts.world.World`."""
         self._drive.step(self._qpos, increment, self._act, self._ctrl)
         try:
             self._batch.rollout(self._substeps, record=("sensordata",), out=self._recorded)
@@ -111,7 +111,7 @@ class NativeWorld:
         self._batch.step(nstep=self._substeps)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
-        """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.World`."""
+        """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
         rows = mask.nonzero()[:, 0]
         if not len(rows):
             return

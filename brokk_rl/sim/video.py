@@ -75,7 +75,7 @@ def render_video(machine: Machine, motion: Motion, path: Path) -> Path:
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "video.mp4"
         if not _painted(machine, arrays, draft):
-            from brokk_rl.sim.sketch import frames
+            from brokk_rl.sim.schematic_video import frames
 
             write(draft, frames(machine, arrays, SIZE), len(arrays["q"]), machine.period_s)
         try:
@@ -134,7 +134,7 @@ def _pictures(
     """Returns what draws the given steps: the overview, the borehole close up, and the commands."""
     from PIL import Image, ImageDraw, ImageFont
 
-    from brokk_rl.sim.painter import Painter
+    from brokk_rl.sim.renderer import Painter
 
     lines, font, (width, height) = captions(machine, arrays), ImageFont.load_default(18), SIZE
     split = width - CLOSE_WIDTH
@@ -219,8 +219,12 @@ def write(
     chosen = {round(i * (len(steps) - 1) / (NUM_STILLS - 1)): i for i in range(NUM_STILLS)}
     rate_hz = 1.0 / (period_s * stride)
     writer = imageio_ffmpeg.write_frames(
-        str(path), SIZE, fps=rate_hz, quality=7, macro_block_size=4
-    )  # pyright: ignore[reportArgumentType]
+        str(path),
+        SIZE,
+        fps=rate_hz,  # pyright: ignore[reportArgumentType]
+        quality=7,
+        macro_block_size=4,
+    )
     writer.send(None)
     try:
         for count, picture in enumerate(draw(steps)):

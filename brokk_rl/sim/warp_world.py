@@ -26,7 +26,7 @@ _LOST = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowT
 
 
 class WarpWorld:
-    """Fulfils `brokk_rl.contracts.World` on a GPU (or, for tests, on the CPU).
+    """Fulfils `brokk_rl.contracts.world.World` on a GPU (or, for tests, on the CPU).
 
     All tensors are views of Warp's arrays. `step` and `reset` use torch's current stream and keep
     every address, so that the caller may capture them together with its own torch operations inside
@@ -86,7 +86,7 @@ class WarpWorld:
         self.reset(torch.ones_like(self.faults), home, nominal(num_worlds, device))
 
     def step(self, increment: torch.Tensor) -> None:
-        """Advances one control period; see `brokk_rl.contracts.World`."""
+        """Advances one control period; see `brokk_rl.contracts.world.World`."""
         view = self._views
         self._drive.step(view["qpos"], increment, view["act"], view["ctrl"])
         self.contact_force_n.zero_()
@@ -99,7 +99,7 @@ class WarpWorld:
         )
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
-        """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.World`."""
+        """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
         view = self._views
         position, turn = self._placement.pose(scene)
         size, pos = self._placement.geoms(scene)

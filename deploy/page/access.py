@@ -14,7 +14,7 @@ import json
 import re
 from typing import Literal
 
-from deploy.page.shown import KINDS, Shown, Wish
+from deploy.page.protocol import KINDS, Shown, Wish
 
 Refusal = Literal["token", "malformed", "deadman", "target", "nowhere", "busy"]
 """Why a wish was refused: wrong token; no such wish; the dead-man is not held; no such target;

@@ -18,11 +18,21 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from deploy.loop.target import NEAR_M
 from deploy.page.demo_camera import Camera
 from deploy.page.pointing import borehole_at
+from deploy.page.protocol import (
+    Advice,
+    Drawn,
+    Levers,
+    Recording,
+    Safety,
+    Shown,
+    Stream,
+    Target,
+    Wish,
+)
 from deploy.page.scene import approach
-from deploy.page.shown import Advice, Drawn, Levers, Recording, Safety, Shown, Stream, Target, Wish
+from deploy.runtime.target import NEAR_M
 
 EXCLUSIVE_S, OTHERS_S = 5.0, 9.0
 """How long each part of the programme takes."""
@@ -74,7 +84,7 @@ class Demo:
 
 
 class DemoFeed:
-    """See `deploy.page.shown.Feed`.
+    """See `deploy.page.protocol.Feed`.
 
     Args:
         demo: What is shown.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from brokk_rl.signals import Frame
-from deploy.page.shown import Target, Vector
+from deploy.page.protocol import Target, Vector
 
 EYE_M, LOOK_AT_M = np.array([0.1, 0.33, 1.6]), np.array([2.7, 0.0, 0.5])
 FOV_RAD = 1.0

@@ -21,16 +21,26 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from deploy.guidance import Guidance, full_angles_rad
-from deploy.loop import outlet
-from deploy.loop.eyes import frame_of
-from deploy.loop.process import Stop
-from deploy.loop.records import Exchange
-from deploy.loop.station import TEXT
-from deploy.loop.target import Place, holes_of, nearest, place_of
 from deploy.page.pointing import borehole_at
+from deploy.page.protocol import (
+    Advice,
+    Drawn,
+    Recording,
+    Safety,
+    Shown,
+    Stream,
+    Target,
+    Vector,
+    Wish,
+)
 from deploy.page.scene import approach
 from deploy.page.settings import LINK, OperatorPage
-from deploy.page.shown import Advice, Drawn, Recording, Safety, Shown, Stream, Target, Vector, Wish
+from deploy.runtime import operator_state
+from deploy.runtime.bus_process import TEXT
+from deploy.runtime.perception_process import frame_of
+from deploy.runtime.process import Stop
+from deploy.runtime.shm_layout import Exchange
+from deploy.runtime.target import Place, holes_of, nearest, place_of
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +96,7 @@ def run(stop: Stop, beside: Beside, exchange: Exchange) -> None:
 
 
 class LoopFeed:
-    """See `deploy.page.shown.Feed`.
+    """See `deploy.page.protocol.Feed`.
 
     Args:
         beside: What is shown, and how.
@@ -109,7 +119,7 @@ class LoopFeed:
 
     def shown(self) -> Shown:
         """See `Feed`."""
-        seen, beside = outlet.view(self._exchange), self._beside
+        seen, beside = operator_state.view(self._exchange), self._beside
         target, controls = self._exchange.target.read(), self._exchange.controls.read()
         found = self._targets(target)
         aimed = next((one for one in found if one.chosen), None)
@@ -203,7 +213,7 @@ class LoopFeed:
             TEXT + json.dumps({"topic": topic, "t_s": self._clock(), **values}).encode()
         )
 
-    def _advice(self, proposed: outlet.Advice) -> Advice:
+    def _advice(self, proposed: operator_state.Advice) -> Advice:
         levers = proposed.levers.parts(self._full_rad)
         due_s = 0.0 if levers.button_right else None
         if (

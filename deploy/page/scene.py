@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.machine import Machine
-from deploy.page.shown import Vector
+from deploy.page.protocol import Vector
 
 ABOVE_M, BELOW_M = 0.3, 0.1
 """From where over the rim the tool goes straight down, and how deep it has to go: 0.10 m in the

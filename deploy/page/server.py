@@ -27,8 +27,8 @@ from brokk_rl.machine import Machine
 from deploy.page import access, cloud
 from deploy.page.clock import PageClock
 from deploy.page.files import FILES, SECURITY, load
-from deploy.page.newest import Newest, Room
-from deploy.page.shown import Drawn, Feed, Shown
+from deploy.page.latest_value import Newest, Room
+from deploy.page.protocol import Drawn, Feed, Shown
 
 if TYPE_CHECKING:
     from deploy.page.settings import OperatorPage

@@ -14,9 +14,9 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
+from deploy.page.protocol import Feed
 from deploy.page.scene import geometry
 from deploy.page.server import Annex, Server
-from deploy.page.shown import Feed
 
 LINK = "page.url"
 """File in the run folder with the address that carries the token; only its owner may read it."""

@@ -15,11 +15,11 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from deploy.guidance import Guidance, LeverDisplay
-from deploy.loop.process import Pace, Stop
-from deploy.loop.records import Exchange
-from deploy.loop.station import TEXT
 from deploy.policy.bundle import Bundle
 from deploy.policy.sampling import Ring
+from deploy.runtime.bus_process import TEXT
+from deploy.runtime.process import Pace, Stop
+from deploy.runtime.shm_layout import Exchange
 
 
 class Advised(Enum):

@@ -27,12 +27,12 @@ from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from deploy.bus.description import Description, Layout, located
 from deploy.bus.protection import Fault
-from deploy.loop.exchange import Slot
-from deploy.loop.eyes import frame_of
-from deploy.loop.process import Stop
-from deploy.loop.records import Exchange, wall_offset_ns
-from deploy.loop.station import FRAME, FRAMES
 from deploy.picture import jpeg
+from deploy.runtime.bus_process import FRAME, FRAMES
+from deploy.runtime.perception_process import frame_of
+from deploy.runtime.process import Stop
+from deploy.runtime.shared_memory import Slot
+from deploy.runtime.shm_layout import Exchange, wall_offset_ns
 
 log = logging.getLogger(__name__)
 

@@ -39,7 +39,7 @@ class CaptureLog:
     shortest_s: float
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
-        """Returns the pieces of the capture at `path`; see `brokk_rl.modes.convert.LogReader`.
+        """Returns the pieces of the capture at `path`; see `actuators.modes.convert.LogReader`.
 
         Raises:
             RecordingError: it cannot be read, was made on another machine, or holds no piece that

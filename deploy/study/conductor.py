@@ -23,9 +23,9 @@ from brokk_rl.machine import Machine
 from deploy.study import folder as folders
 from deploy.study.folder import StudyData
 from deploy.study.form import Form
-from deploy.study.stage import Stage
 from deploy.study.steps import Step, next_step, progress
 from deploy.study.trial import Attempt, Times, keep
+from deploy.study.twin_control import Stage
 
 log = logging.getLogger(__name__)
 

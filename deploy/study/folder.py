@@ -235,7 +235,10 @@ def _read_trials(data: StudyData) -> None:
         if who not in data.plan["participants"]:
             problem = f"'{who}' is no participant of the plan; kept, but it does not count"
         elif period not in (0, *PERIODS) or condition not in CONDITIONS:
-            problem = f"period {period}, condition '{condition}': expected 0, 1 or 2 and {' or '.join(CONDITIONS)}; it does not count"
+            problem = (
+                f"period {period}, condition '{condition}': expected 0, 1 or 2 and"
+                f" {' or '.join(CONDITIONS)}; it does not count"
+            )
         elif period and data.plan["participants"][who][period - 1] != condition:
             problem = f"done {condition}, but planned {data.plan['participants'][who][period - 1]}; kept, but it does not count"
         elif key in data.trials:

@@ -21,17 +21,18 @@ from typing import Any
 import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
 
-from brokk_rl.contracts import Connection, Operator, OperatorModel, OperatorView
+from brokk_rl.contracts.link import Connection
+from brokk_rl.contracts.operator import Operator, OperatorModel, OperatorView
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.bus.description import Description
 from deploy.bus.wire import Wire
 from deploy.guidance import AXES, Guidance, LeverMap
-from deploy.loop.process import Pace, Stop
-from deploy.loop.records import Exchange
-from deploy.loop.supervisor import Companion
 from deploy.page.settings import LINK
+from deploy.runtime.process import Pace, Stop
+from deploy.runtime.shm_layout import Exchange
+from deploy.runtime.supervisor import Companion
 from deploy.study.simulation import answered
 from deploy.twin.gateway import axis_full_rad
 from deploy.twin.remote import Remote
@@ -136,8 +137,11 @@ class _Taking:
         async with (
             connect(f"ws://{host}/state", proxy=None, close_timeout=0.5) as state,
             connect(
-                f"ws://{host}/study", origin=f"http://{host}", proxy=None, close_timeout=0.5
-            ) as study,  # type: ignore[arg-type]
+                f"ws://{host}/study",
+                origin=f"http://{host}",  # type: ignore[arg-type]
+                proxy=None,
+                close_timeout=0.5,
+            ) as study,
         ):
             await study.send(json.dumps({"token": token}))
             tasks = [

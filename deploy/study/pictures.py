@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brokk_rl.intervals import student
-from brokk_rl.panels import BLUE, GREEN, GREY, ORANGE, RED, clean, legend
+from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, clean, legend
 from deploy.study import tlx
 from deploy.study.analysis import Analysis, MeasuredTrial
 from deploy.study.crossover import Effect

@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 
 from brokk_rl import record
-from brokk_rl.contracts import Operator, OperatorModel, OperatorView, TrialBatch, TrialGround
+from brokk_rl.contracts.operator import (
+    Operator,
+    OperatorModel,
+    OperatorView,
+    TrialBatch,
+    TrialGround,
+)
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
@@ -29,7 +35,7 @@ class Nowhere:
     def run(
         self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
     ) -> list[Recording]:
-        """Is never asked: the study refuses before it begins; see `brokk_rl.contracts.TrialGround`."""
+        """Is never asked: the study refuses before it begins; see `brokk_rl.contracts.operator.TrialGround`."""
         raise NotImplementedError
 
 
@@ -151,7 +157,7 @@ class Divided:
         ]
 
     def step(self, view: OperatorView) -> np.ndarray:
-        """See `brokk_rl.contracts.OperatorModel`."""
+        """See `brokk_rl.contracts.operator.OperatorModel`."""
         given = np.zeros(self._shape)
         for rows, model in self._parts:
             given[rows] = model.step(

@@ -12,14 +12,14 @@ from brokk_rl.errors import ConfigError, choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.loop.supervisor import Companion, Loop
-from deploy.loop.target import File
 from deploy.page.from_loop import Beside
 from deploy.page.settings import OperatorPage
+from deploy.runtime.supervisor import Companion, Loop
+from deploy.runtime.target import File
 from deploy.study import folder as folders
 from deploy.study.conductor import Words
 from deploy.study.participant import Participant
-from deploy.study.room import Sitters
+from deploy.study.study_server import Sitters
 from deploy.study.trial import Times
 from deploy.twin.bench import Bench
 
@@ -119,7 +119,7 @@ class Sitting:
             loop.run(
                 machine,
                 session,
-                [*beside, Companion("study", "deploy.study.room:run", (room,), None)],
+                [*beside, Companion("study", "deploy.study.study_server:run", (room,), None)],
             )
 
 

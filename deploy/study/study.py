@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from rich.progress import track
 
-from brokk_rl.contracts import Operator, TrialGround
+from brokk_rl.contracts.operator import Operator, TrialGround
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
@@ -59,7 +59,7 @@ class Steps:
         guided: Operator,
         unguided: Operator,
     ) -> None:
-        """Does the step `do`; see `brokk_rl.modes.study.Steps`."""
+        """Does the step `do`; see `deploy.modes.study.Steps`."""
         if self.do == "plan":
             self._plan(machine, session)
         elif self.do == "erase":

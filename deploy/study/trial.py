@@ -20,7 +20,7 @@ from brokk_rl.spec import spec
 from deploy.study import folder as folders
 from deploy.study.design import Hole, Success, Trial
 from deploy.study.measures import insertion
-from deploy.study.stage import FILLED, Stage
+from deploy.study.twin_control import FILLED, Stage
 
 log = logging.getLogger(__name__)
 

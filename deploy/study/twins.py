@@ -18,7 +18,8 @@ import numpy as np
 from rich.progress import track
 
 from brokk_rl.chain import tool
-from brokk_rl.contracts import Connection, OperatorModel, OperatorView, TrialBatch
+from brokk_rl.contracts.link import Connection
+from brokk_rl.contracts.operator import OperatorModel, OperatorView, TrialBatch
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -26,13 +27,13 @@ from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.bus.description import Description
 from deploy.bus.wire import Wire, Wired
+from deploy.guard.limits import Limits
 from deploy.guidance import Guidance, LeverMap
-from deploy.limits import Limits
-from deploy.loop.receiver import Receiver
-from deploy.loop.records import advice_fields, state_fields
 from deploy.policy.adviser import REASONS, Advised, Adviser, Counsel
 from deploy.policy.bundle import Bundle
-from deploy.study.crew import Crew, cores
+from deploy.runtime.receiver import Receiver
+from deploy.runtime.shm_layout import advice_fields, state_fields
+from deploy.study.twin_pool import Crew, cores
 from deploy.twin.faults import FaultPort
 from deploy.twin.gateway import axis_full_rad
 from deploy.twin.remote import Remote
@@ -76,7 +77,7 @@ class Twins:
     def run(
         self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
     ) -> list[Recording]:
-        """See `brokk_rl.contracts.TrialGround`."""
+        """See `brokk_rl.contracts.operator.TrialGround`."""
         num, nothing = len(trials.q), np.full(machine.num_joints, np.nan)
         places = [
             (
@@ -138,7 +139,7 @@ def _inserted(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray
 
 
 class _Newest:
-    """The newest record, for one process; see `deploy.loop.exchange.Slot`."""
+    """The newest record, for one process; see `deploy.runtime.shared_memory.Slot`."""
 
     def __init__(self, fields: np.dtype, record: Any = None) -> None:
         self._fields, self._record = fields, record

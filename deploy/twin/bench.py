@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from brokk_rl.contracts import Connection, Follower
+from brokk_rl.contracts.actuator import Follower
+from brokk_rl.contracts.link import Connection
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.guidance import Guidance, LeverMap
-from deploy.loop.supervisor import Companion
+from deploy.runtime.supervisor import Companion
 from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 

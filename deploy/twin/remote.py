@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.contracts import Follower
+from brokk_rl.contracts.actuator import Follower
 from brokk_rl.machine import Machine
 from deploy.bus.description import LEVER_AXES, Description
 from deploy.bus.wire import Wire, Wired
 from deploy.guidance import AXES, LeverMap
-from deploy.loop.process import Pace, Stop
-from deploy.loop.records import Exchange
+from deploy.runtime.process import Pace, Stop
+from deploy.runtime.shm_layout import Exchange
 from deploy.twin.gateway import axis_full_rad
 
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from brokk_rl.contracts import Connection, Link
+from brokk_rl.contracts.link import Connection, Link
 from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
@@ -22,7 +22,7 @@ from brokk_rl.spec import spec
 from deploy.bus.description import GATEWAY, Description
 from deploy.bus.header import c_header
 from deploy.bus.wire import Wire, Wired
-from deploy.loop.process import Pace, Stop, ask_for_priority
+from deploy.runtime.process import Pace, Stop, ask_for_priority
 from deploy.twin.faults import FaultPort, Faults
 from deploy.twin.gateway import NOBODY, PC, Gateway
 from deploy.twin.remote import Remote

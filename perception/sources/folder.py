@@ -15,7 +15,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
-from perception.calibration.extrinsics import Place, placed
+from perception.calibrate.extrinsics import Place, placed
 from perception.sources import soundness
 from perception.stereo import Stereo
 
@@ -119,7 +119,7 @@ def read_picture(path: Path) -> np.ndarray:
 
 
 class FolderSource:
-    """An open folder; see `brokk_rl.sight.FrameSource`."""
+    """An open folder; see `brokk_rl.contracts.vision.FrameSource`."""
 
     def __init__(self, settings: Folder) -> None:
         self._settings, self._place = settings, Path(settings.folder)

@@ -81,7 +81,7 @@ class Freshness:
 
 
 class LiveSource:
-    """An open camera; see `brokk_rl.sight.FrameSource`. Each frame is returned once.
+    """An open camera; see `brokk_rl.contracts.vision.FrameSource`. Each frame is returned once.
 
     Args:
         device: The camera's library.

@@ -73,7 +73,7 @@ class Simulated:
 
 
 class SimulatedSource:
-    """An open simulated camera; see `brokk_rl.sight.FrameSource`.
+    """An open simulated camera; see `brokk_rl.contracts.vision.FrameSource`.
 
     Whoever runs the simulation calls `show` before each `read_latest`.
     """

@@ -10,7 +10,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.spec import spec
-from perception.calibration.extrinsics import Place, placed
+from perception.calibrate.extrinsics import Place, placed
 from perception.sources import soundness
 from perception.sources.live import Capture, Freshness, Lens, LiveSource
 

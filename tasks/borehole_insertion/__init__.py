@@ -4,13 +4,13 @@ import math
 
 import torch
 
-from brokk_rl.classical import Classical
-from brokk_rl.contracts import TaskProcess
+from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.machine import Machine
 from brokk_rl.observation import Scaling
 from brokk_rl.sim import scene
 from brokk_rl.spec import spec
 from tasks.advice import Advice
+from tasks.classical import Classical
 from tasks.measured import Measured
 from tasks.process import Options, ToolPoseProcess
 from tasks.reward import Term

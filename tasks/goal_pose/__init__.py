@@ -2,14 +2,14 @@
 
 import torch
 
-from brokk_rl.classical import Classical
-from brokk_rl.contracts import TaskProcess
+from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import Scaling
 from brokk_rl.sim import scene
 from brokk_rl.spec import spec
 from tasks.advice import Advice
+from tasks.classical import Classical
 from tasks.process import Options, ToolPoseProcess
 from tasks.reward import Term
 from tasks.starts import Arms, Targets, Uniform, random_starts

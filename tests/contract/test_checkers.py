@@ -14,7 +14,7 @@ import torch
 from composed import option
 
 from brokk_rl.checks import check_actuator, check_excitation, check_finder, check_link, check_task
-from brokk_rl.contracts import Segment
+from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

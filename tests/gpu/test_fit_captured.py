@@ -13,10 +13,11 @@ import pytest
 import torch
 from composed import option
 
-from actuators import checkpoint, descent
-from actuators.dataset import Windows
-from actuators.descent import Descent
-from actuators.network import JointNetworks
+from actuators.identify import descent
+from actuators.identify.dataset import Windows
+from actuators.identify.descent import Descent
+from actuators.models import checkpoint
+from actuators.models.network import JointNetworks
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 

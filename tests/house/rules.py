@@ -6,16 +6,19 @@ import ast
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-ROOMS = ("tasks", "actuators", "perception", "deploy")
+ROOMS = ("tasks", "actuators", "perception", "deploy", "diagnosis")
+EXTENSIONS = ("exam",)
+"""Packages that stand on all rooms, as a package from elsewhere would."""
+MODE = 4
+"""Floor of the modes: `brokk_rl.modes` and `<room>.modes`."""
 FLOORS = (
     ("brokk_rl.cli", 5),
     ("brokk_rl.__main__", 5),
     ("brokk_rl.extensions", 5),
     ("brokk_rl.sweep", 5),
     ("conf", 5),
-    ("brokk_rl.modes", 4),
-    ("brokk_rl.diagnosis", 3),
-    *((room, 3) for room in ROOMS),
+    *((f"{package}.modes", MODE) for package in ("brokk_rl", *ROOMS, *EXTENSIONS)),
+    *((package, 3) for package in (*ROOMS, *EXTENSIONS)),
     ("brokk_rl.sim", 2),
     ("brokk_rl.rl", 2),
     ("brokk_rl.spec", 0),
@@ -39,9 +42,9 @@ DOORS = {
 }
 CLOSED = {
     "deploy": ("brokk_rl.sim", "brokk_rl.rl", "mujoco", "warp", "rsl_rl"),
-    "deploy.guard": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
-    "deploy.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
-    "deploy.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.guard.guard": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.guard.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.guard.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
 }
 """What a package must not import, whatever its floor: the machine's own computer has neither
 simulator nor trainer."""
@@ -91,7 +94,8 @@ def floors(sources: Mapping[str, str]) -> list[str]:
             if other is None or mine is None:
                 continue
             up = other > mine
-            into_room = top in (*ROOMS, "conf") and top != room
+            into_room = top in (*ROOMS, *EXTENSIONS, "conf") and top != room
+            into_room = into_room and not (room in EXTENSIONS and top in ROOMS)
             if up or into_room:
                 found.append(
                     f"{module}:{entry.line} imports {entry.name}, which is {'above it' if up else 'a room of its own'}"
@@ -126,7 +130,7 @@ def prints(sources: Mapping[str, str]) -> list[str]:
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
         and node.func.id == "print"
-        and not within(module, "brokk_rl.modes")
+        and floor(module) != MODE
     ]
 
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 from composed import option
 
-from actuators.hydraulic import Hydraulic
-from actuators.lag import Lag
-from actuators.parameters import per_joint
-from actuators.transport import commands_in_force, opened
+from actuators.models.hydraulic import Hydraulic
+from actuators.models.lag import Lag
+from actuators.models.parameters import per_joint
+from actuators.models.transport import commands_in_force, opened
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import GRAVITY_M_S2, Gravity
 from brokk_rl.history import History

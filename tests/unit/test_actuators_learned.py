@@ -12,10 +12,10 @@ from composed import option
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from actuators import checkpoint
-from actuators.coupled import Coupled
-from actuators.mlp import Mlp, load
-from actuators.network import JointNetworks, SharedFlow
+from actuators.models import checkpoint
+from actuators.models.coupled import Coupled
+from actuators.models.mlp import Mlp, load
+from actuators.models.network import JointNetworks, SharedFlow
 from brokk_rl.errors import CheckpointError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

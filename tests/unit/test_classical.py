@@ -10,9 +10,9 @@ import torch
 from composed import option
 from kinematic import KinematicWorld
 
-from brokk_rl.classical import ClassicalController, _solve_4
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
+from tasks.classical import ClassicalController, _solve_4
 
 CPU = torch.device("cpu")
 RANGE_M = (1.7, 2.4)

@@ -14,11 +14,11 @@ from composed import option
 from conftest import Done
 from training import CPU, plant, small, train
 
-from brokk_rl.diagnosis import downstream, downstream_page
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.rl.head_start import begin_with
 from brokk_rl.rl.policy import make_actor, write_bundle
+from brokk_rl.rl.warm_start import begin_with
+from diagnosis import downstream, downstream_page
 
 EPISODES = 200
 

@@ -17,12 +17,12 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
 from actuators.effects.affected import Affected
+from actuators.excite.plan.drive import Nominal
+from actuators.modes.collect import Collect
 from brokk_rl import record
 from brokk_rl.errors import LinkError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.modes.collect import Collect
-from brokk_rl.plan.drive import Nominal
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
@@ -235,7 +235,7 @@ def test_a_file_that_grows_is_on_the_disk_before_it_is_full(
     collect = replace(collect, collect=replace(collect.collect, flush_s=1.0))
     Killed.folder, clock_s = tmp_path / "run", iter(np.arange(0.0, 1e3, 0.05))
     monkeypatch.setattr(
-        "brokk_rl.modes.collect.time",
+        "actuators.modes.collect.time",
         type("Clock", (), {"monotonic": staticmethod(lambda: next(clock_s))}),
     )
     collect.run()

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from composed import option
 
+from actuators.recordings.column_map import Column, ColumnMap, CommandColumn
 from brokk_rl import record
-from brokk_rl.column_map import Column, ColumnMap, CommandColumn
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 

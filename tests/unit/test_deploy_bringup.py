@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from desk import DBC, free_port
 
+from actuators.excite.plan.drive import NominalMachine
 from brokk_rl.machine import Machine
-from brokk_rl.plan.drive import NominalMachine
 from brokk_rl.session import Session
 from deploy.bus.description import Description
 from deploy.bus.wire import Wire
-from deploy.loop.process import Child, Pace
-from deploy.motion import judge
+from deploy.guard.motion import judge
+from deploy.runtime.process import Child, Pace
 from deploy.twin.faults import ask
 from deploy.twin.remote import Remote
 from deploy.twin.twin import Twin

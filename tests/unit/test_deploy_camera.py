@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 from composed import option
 
+from brokk_rl.contracts.vision import HolePose
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
-from brokk_rl.sight import HolePose
 from brokk_rl.signals import Frame
-from deploy.loop import eyes
-from deploy.loop.eyes import Camera, KnownHoles, frame_of
-from deploy.loop.records import Exchange
-from deploy.loop.target import Aim, File, Given, Seen
-from deploy.loop.wanted import Recorder, Wanted
 from deploy.page.demo import BLOCK_M, TARGETS
 from deploy.page.demo_camera import Camera as DemoCamera
 from deploy.page.from_loop import GIVEN, Beside, LoopFeed
 from deploy.page.pointing import borehole_at
-from deploy.page.shown import Wish
+from deploy.page.protocol import Wish
 from deploy.recorder import reading
 from deploy.recorder.capture import Capture, Log, Pictures
+from deploy.runtime import perception_process
+from deploy.runtime.operator_requests import Recorder, Wanted
+from deploy.runtime.perception_process import Camera, KnownHoles, frame_of
+from deploy.runtime.shm_layout import Exchange
+from deploy.runtime.target import Aim, File, Given, Seen
 
 MACHINE = option("machine", "brokk170")
 FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).frame(0, 12.0)
@@ -76,13 +76,13 @@ def test_a_click_at_the_sky_or_without_a_calibrated_camera_gives_none() -> None:
 
 def test_a_frame_is_handed_on_whole_or_shrunk_with_its_camera(exchange: Exchange) -> None:
     assert exchange.frame is not None and exchange.frame.peek("t_s") is None
-    eyes._publish(exchange.frame, FRAME, PIXELS, 5.0)
+    perception_process._publish(exchange.frame, FRAME, PIXELS, 5.0)
     assert exchange.frame.peek("t_s") == 5.0 and exchange.frame.number == 1
     whole = frame_of(exchange.frame.read())
     assert np.array_equal(whole.color, FRAME.color) and np.array_equal(
         whole.depth_m, FRAME.depth_m, equal_nan=True
     )
-    eyes._publish(exchange.frame, FRAME, PIXELS // 4, 6.0)
+    perception_process._publish(exchange.frame, FRAME, PIXELS // 4, 6.0)
     small = frame_of(exchange.frame.read())
     assert small.color.shape == (180, 320, 3) and exchange.frame.number == 2
     center_m = np.array(TARGETS[0].center_in_base_m)
@@ -171,7 +171,7 @@ def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(
 
 
 def eyes_place(exchange: Exchange, row: int) -> Any:
-    from deploy.loop.target import holes_of, place_of
+    from deploy.runtime.target import holes_of, place_of
 
     return place_of(holes_of(exchange.holes)[row])
 
@@ -229,7 +229,7 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     point = Wish("point", "{:.4f},{:.4f}".format(*seen_at(FRAME, center_m)))
     assert not feed.wish(point), "there is no picture yet"
     assert exchange.frame is not None
-    eyes._publish(exchange.frame, FRAME, PIXELS, time.monotonic())
+    perception_process._publish(exchange.frame, FRAME, PIXELS, time.monotonic())
     assert feed.wish(point)
     wanted.refresh()
     assert np.linalg.norm(np.array(aimed(exchange)) - center_m) < 0.012
@@ -272,7 +272,7 @@ class Blinking:
     def find(self, frame: Frame) -> None: ...
 
     def look(self, frame: Frame) -> Any:
-        from brokk_rl.sight import Sighting
+        from brokk_rl.contracts.vision import Sighting
 
         return Sighting([pose(2.6, 0.0)], [], [], None)
 
@@ -281,7 +281,7 @@ def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recor
     exchange: Exchange,
 ) -> None:
     source: Any = Blinking()
-    eyes.run(lambda: False, camera(source), exchange)
+    perception_process.run(lambda: False, camera(source), exchange)
     assert exchange.frame is not None and exchange.frame.number == 2
     said = [json.loads(data[1:]) for data in exchange.sight_log.take()]
     assert [one["topic"] for one in said] == ["holes"] * 2 and said[1]["holes"][0][
@@ -305,7 +305,7 @@ def test_pictures_are_recorded_as_often_as_asked_and_come_back(
     assert pictures.due() is None
     with Log(Capture(tmp_path, "deploy:dbc/example_gateway.dbc", MACHINE, {}, 2.0)) as log:
         for number in range(3):
-            eyes._publish(exchange.frame, FRAME, PIXELS, 100.0 + number)
+            perception_process._publish(exchange.frame, FRAME, PIXELS, 100.0 + number)
             if (picture := pictures.due()) is not None:
                 log.add_picture(*picture)
     import base64

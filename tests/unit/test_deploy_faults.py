@@ -18,10 +18,10 @@ from stage import DBC, Mode, Stage
 
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
-from deploy.loop.records import Exchange
 from deploy.recorder import reading
 from deploy.recorder.capture import MCAP, Capture, Log
 from deploy.recorder.capture import run as record
+from deploy.runtime.shm_layout import Exchange
 
 MODES = get_args(Mode)
 COMMANDING = ("collect", "auto")

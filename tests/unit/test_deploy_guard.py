@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brokk_rl.errors import ConfigError
-from deploy.guard import Decision, Guard, Request, Seen, State, Trip
-from deploy.limits import Limits, body_of
-from deploy.plausibility import Plausibility
+from deploy.guard.guard import Decision, Guard, Request, Seen, State, Trip
+from deploy.guard.limits import Limits, body_of
+from deploy.guard.plausibility import Plausibility
 
 BODY = body_of([-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [False, True, False])
 LIMITS = Limits(

@@ -22,14 +22,14 @@ from hypothesis import strategies as st
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from deploy.guidance import AXES, LeverDisplay, LeverMap
-from deploy.loop.exchange import Pipe, Slot
-from deploy.loop.outlet import view
-from deploy.loop.process import Pace
-from deploy.loop.records import Exchange, state_fields
-from deploy.loop.target import File
 from deploy.policy.adviser import Advised, Adviser, Counsel
 from deploy.policy.bundle import Bundle
 from deploy.policy.sampling import Ring
+from deploy.runtime.operator_state import view
+from deploy.runtime.process import Pace
+from deploy.runtime.shared_memory import Pipe, Slot
+from deploy.runtime.shm_layout import Exchange, state_fields
+from deploy.runtime.target import File
 
 SHIPPED = "tasks:policies/borehole_insertion"
 FIELDS = np.dtype([("a", float), ("b", float, (3,))])
@@ -76,7 +76,7 @@ def test_a_pipe_keeps_order_and_drops_only_what_finds_no_room(rounds: list[list[
 
 def test_a_deadline_that_was_missed_is_skipped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [100.0]
-    monkeypatch.setattr("deploy.loop.process.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("deploy.runtime.process.time.monotonic", lambda: clock[0])
     pace = Pace(0.05)
     for now_s, skipped, next_s in ((100.05, 0, 100.10), (100.11, 0, 100.15), (100.27, 2, 100.30)):
         clock[0] = now_s
@@ -374,7 +374,7 @@ def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_pa
 
 
 def test_the_machines_computer_needs_no_torch_no_simulator_and_no_trainer() -> None:
-    modules = "deploy.loop.supervisor, deploy.policy.adviser, deploy.loop.station, deploy.recorder.capture, deploy.link"
+    modules = "deploy.runtime.supervisor, deploy.policy.adviser, deploy.runtime.bus_process, deploy.recorder.capture, deploy.link"
     code = f"import sys, {modules}; print([m for m in ('torch', 'warp', 'mujoco', 'rsl_rl') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -19,10 +19,10 @@ from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from deploy.bus.description import Description
-from deploy.loop.station import FRAME, FRAMES, TEXT
 from deploy.recorder import reading
 from deploy.recorder.capture import BLF, MCAP, Capture, Log
 from deploy.recorder.conversion import CaptureLog
+from deploy.runtime.bus_process import FRAME, FRAMES, TEXT
 
 READER = CaptureLog(longest_gap_s=0.15, shortest_s=1.0)
 

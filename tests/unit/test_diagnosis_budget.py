@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from brokk_rl.diagnosis.budget import Budget, account
-from brokk_rl.diagnosis.free_runs import FreeRuns
-from brokk_rl.diagnosis.geometry import COLUMNS, geometry
-from brokk_rl.diagnosis.probes import probes
-from brokk_rl.diagnosis.stages import TARGET, Known, foremost, measurement_noise, perception, stages
-from brokk_rl.diagnosis.where import locate
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis.budget import Budget, account
+from diagnosis.free_runs import FreeRuns
+from diagnosis.geometry import COLUMNS, geometry
+from diagnosis.probes import probes
+from diagnosis.stages import TARGET, Known, foremost, measurement_noise, perception, stages
+from diagnosis.where import locate
 
 PERIOD_S, DELAY = 0.05, 11
 DEAD_TIME_S = np.full(5, DELAY * PERIOD_S)

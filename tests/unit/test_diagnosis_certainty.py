@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.contracts import Actuator
-from brokk_rl.diagnosis import certainty, remainder, verdict
-from brokk_rl.diagnosis.candidates import Candidates
-from brokk_rl.diagnosis.certainty import Certainty
-from brokk_rl.diagnosis.engine import Findings, Prices
-from brokk_rl.diagnosis.evidence import Evidence
-from brokk_rl.diagnosis.exam.calibration import Item, halves, logistic
-from brokk_rl.diagnosis.noise import Noise
-from brokk_rl.diagnosis.repair import Repair
-from brokk_rl.diagnosis.search import Chosen
+from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.open_loop import Windows
+from diagnosis import certainty, remainder, verdict
+from diagnosis.candidates import Candidates
+from diagnosis.certainty import Certainty
+from diagnosis.engine import Findings, Prices
+from diagnosis.evidence import Evidence
+from diagnosis.noise import Noise
+from diagnosis.repair import Repair
+from diagnosis.search import Chosen
+from exam.calibration import Item, halves, logistic
 
 
 @pytest.fixture

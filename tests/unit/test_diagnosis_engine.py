@@ -16,11 +16,15 @@ from composed import option
 from actuators.effects.affected import Affected
 from actuators.effects.command import DeadBand
 from actuators.effects.speed import Compliance, FlowGain
-from actuators.lag import Lag
+from actuators.models.lag import Lag
 from brokk_rl import record
-from brokk_rl.contracts import Effect
-from brokk_rl.diagnosis import already, answer, case, library, prescription, simulator
-from brokk_rl.diagnosis.answer import (
+from brokk_rl.contracts.actuator import Effect
+from brokk_rl.errors import RecordingError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from diagnosis import already, answer, case, library, prescription, simulator
+from diagnosis.answer import (
     Answer,
     Estimate,
     Gap,
@@ -31,13 +35,9 @@ from brokk_rl.diagnosis.answer import (
     Selected,
     Where,
 )
-from brokk_rl.diagnosis.case import Case
-from brokk_rl.diagnosis.conclusion import Diagnosis
-from brokk_rl.diagnosis.engine import Prices
-from brokk_rl.errors import RecordingError
-from brokk_rl.history import History
-from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
+from diagnosis.case import Case
+from diagnosis.conclusion import Diagnosis
+from diagnosis.engine import Prices
 
 CPU = torch.device("cpu")
 PLANT = Lag(

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from actuators.valve import Pose
-from brokk_rl.diagnosis import around, gap, library, noise
-from brokk_rl.diagnosis.evidence import rays
-from brokk_rl.diagnosis.noise import Noise
-from brokk_rl.diagnosis.search import Table, choose
-from brokk_rl.diagnosis.shapes import rays_of
-from brokk_rl.diagnosis.sizes import Shape, earned, fitted, plain
-from brokk_rl.diagnosis.tied import tied
+from actuators.models.valve import Pose
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
+from diagnosis import around, gap, library, noise
+from diagnosis.evidence import rays
+from diagnosis.noise import Noise
+from diagnosis.search import Table, choose
+from diagnosis.shapes import rays_of
+from diagnosis.sizes import Shape, earned, fitted, plain
+from diagnosis.tied import tied
 
 
 def motion(random: np.random.Generator, rows: int = 80, steps: int = 60) -> np.ndarray:

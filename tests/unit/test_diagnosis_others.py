@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from actuators.lag import Lag
-from brokk_rl.diagnosis import frames, library, sensors, simulator, tool
-from brokk_rl.diagnosis.answer import Estimate
-from brokk_rl.diagnosis.case import Case
-from brokk_rl.diagnosis.evidence import Evidence, rays
-from brokk_rl.diagnosis.found import Found, interval
-from brokk_rl.diagnosis.sizes import Shape, fitted
+from actuators.models.lag import Lag
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis import frames, library, sensors, simulator, tool
+from diagnosis.answer import Estimate
+from diagnosis.case import Case
+from diagnosis.evidence import Evidence, rays
+from diagnosis.found import Found, interval
+from diagnosis.sizes import Shape, fitted
 
 CPU = torch.device("cpu")
 PLANT = Lag(

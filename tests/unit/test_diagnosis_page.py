@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.diagnosis import outcome, page, pictures, wording
-from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Selected, Where
-from brokk_rl.diagnosis.free_runs import FreeRuns
-from brokk_rl.diagnosis.outcome import Outcome
-from brokk_rl.diagnosis.survey import Survey, survey
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis import outcome, page, pictures, wording
+from diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Selected, Where
+from diagnosis.free_runs import FreeRuns
+from diagnosis.outcome import Outcome
+from diagnosis.survey import Survey, survey
 
 GAIN = Selected(
     effect="flow_gain", joints=("q4",), probability=0.97, parameters={"gain": {"q4": Estimate(0.81, (0.78, 0.84))}},

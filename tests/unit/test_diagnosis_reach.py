@@ -14,15 +14,15 @@ from composed import option
 
 from actuators.effects.affected import Affected
 from actuators.effects.command import DeadBand, Saturation
-from actuators.lag import Lag
-from brokk_rl.diagnosis import gap, library, repair, simulator
-from brokk_rl.diagnosis.case import Case
-from brokk_rl.diagnosis.evidence import rays
-from brokk_rl.diagnosis.noise import Noise
-from brokk_rl.diagnosis.reach import Reach
+from actuators.models.lag import Lag
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis import gap, library, repair, simulator
+from diagnosis.case import Case
+from diagnosis.evidence import rays
+from diagnosis.noise import Noise
+from diagnosis.reach import Reach
 
 CPU = torch.device("cpu")
 LINEAR = Lag(

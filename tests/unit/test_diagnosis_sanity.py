@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.diagnosis.sanity import TEXTS, Remark, examine
 from brokk_rl.inspection import Thresholds
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis.sanity import TEXTS, Remark, examine
 
 PERIOD_S = 0.05
 DELAY = 11

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brokk_rl.diagnosis.blocks import FALSE_DISCOVERIES, adjusted, excess_p
-from brokk_rl.diagnosis.free_runs import FreeRuns
-from brokk_rl.diagnosis.growth import growth
-from brokk_rl.diagnosis.occasions import REGIMES, in_force, loads, regimes
-from brokk_rl.diagnosis.tracing import traced
-from brokk_rl.diagnosis.where import Location, locate
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis.blocks import FALSE_DISCOVERIES, adjusted, excess_p
+from diagnosis.free_runs import FreeRuns
+from diagnosis.growth import growth
+from diagnosis.occasions import REGIMES, in_force, loads, regimes
+from diagnosis.tracing import traced
+from diagnosis.where import Location, locate
 
 PERIOD_S = 0.05
 DELAY_S = 0.5

@@ -11,7 +11,7 @@ import torch
 from composed import option
 
 from actuators.effects.library import Library
-from brokk_rl import dead_time
+from actuators.identify import dead_time
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

@@ -19,14 +19,14 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
 from brokk_rl import record
-from brokk_rl.diagnosis import answer
-from brokk_rl.diagnosis.answer import FILE
-from brokk_rl.diagnosis.exam import paper, seal, sitting
-from brokk_rl.diagnosis.exam.baselines import Always
-from brokk_rl.diagnosis.exam.mix import KINDS, Mix, Question
-from brokk_rl.diagnosis.exam.trees import Trees
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.machine import Machine
+from diagnosis import answer
+from diagnosis.answer import FILE
+from exam import paper, seal, sitting
+from exam.baselines import Always
+from exam.mix import KINDS, Mix, Question
+from exam.trees import Trees
 
 SMALL = (
     "mode=exam", "exam.mix.num_cases=2", "exam.mix.shares={none: 0.5, faint: 0, one: 0.5, several: 0, outside: 0}",

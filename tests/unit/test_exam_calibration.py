@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.diagnosis import library, verdict, weighing
-from brokk_rl.diagnosis.certainty import Certainty
-from brokk_rl.diagnosis.engine import Findings, Prices
-from brokk_rl.diagnosis.evidence import Evidence
-from brokk_rl.diagnosis.exam import seal
-from brokk_rl.diagnosis.exam.calibration import Calibration, Item, items
-from brokk_rl.diagnosis.search import Table
-from brokk_rl.diagnosis.sizes import Shape, plain
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
+from diagnosis import library, verdict, weighing
+from diagnosis.certainty import Certainty
+from diagnosis.engine import Findings, Prices
+from diagnosis.evidence import Evidence
+from diagnosis.search import Table
+from diagnosis.sizes import Shape, plain
+from exam import seal
+from exam.calibration import Calibration, Item, items
 
 SIZES = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
-from brokk_rl.diagnosis.exam import marking, rules, tally
-from brokk_rl.diagnosis.exam.ground import Errors
-from brokk_rl.diagnosis.exam.marking import Claim, Mark, mark
-from brokk_rl.diagnosis.sizes import Shape
+from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
+from diagnosis.sizes import Shape
+from exam import marking, rules, tally
+from exam.ground import Errors
+from exam.marking import Claim, Mark, mark
 
 CLASSES = (("dead_time", "clock_offset"), ("flow_gain", "encoder_scale"))
 

@@ -9,16 +9,16 @@ import pytest
 import torch
 from composed import option
 
-from actuators.exam import strangers
-from actuators.exam.anatomy import MAKES, Anatomy, drawn
-from actuators.exam.faults import FAULTS, afflicted
-from actuators.exam.line import Line
-from actuators.exam.linkage import Arm
-from actuators.exam.plant import Plant
-from actuators.exam.valve import Valve
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine, exclusive_mask
 from brokk_rl.signals import Command
+from exam.plants import strangers
+from exam.plants.anatomy import MAKES, Anatomy, drawn
+from exam.plants.faults import FAULTS, afflicted
+from exam.plants.line import Line
+from exam.plants.linkage import Arm
+from exam.plants.plant import Plant
+from exam.plants.valve import Valve
 
 Q3 = 2
 

@@ -10,7 +10,7 @@ import torch
 from composed import option
 
 from actuators.excite.poses import load, poses
-from brokk_rl.contracts import Segment
+from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine

@@ -13,9 +13,9 @@ import torch
 from composed import option
 from safetensors.torch import load_file
 
-from actuators import fit, survey
-from actuators.dataset import Windows
-from actuators.fit import NetworkFit
+from actuators.identify import fit, survey
+from actuators.identify.dataset import Windows
+from actuators.identify.fit import NetworkFit
 from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording

@@ -14,10 +14,10 @@ import torch
 import yaml
 from composed import option
 
-from actuators import greybox
-from actuators.gauss_newton import FreeRuns, certainty
-from actuators.greybox import GreyBoxFit
-from actuators.lag import Lag
+from actuators.identify import greybox
+from actuators.identify.gauss_newton import FreeRuns, certainty
+from actuators.identify.greybox import GreyBoxFit
+from actuators.models.lag import Lag
 from brokk_rl import open_loop
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.history import History
@@ -125,7 +125,7 @@ def test_what_a_fit_leaves_is_an_option(
     assert "4 recordings (4 runs, 2 min)" in text and "95 % intervals" in text
     done = brokk("mode=train", f"actuator=@{tmp_path}/lag.yaml", "--cfg", "job")
     node = yaml.safe_load(done.out)["actuator"]
-    assert node.pop("_target_") == "actuators.lag.Lag"
+    assert node.pop("_target_") == "actuators.models.lag.Lag"
     assert Lag(**node) == fitted
 
 

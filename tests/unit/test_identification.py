@@ -12,15 +12,15 @@ import pytest
 import torch
 from composed import option
 
-from actuators.lag import Lag
-from actuators.linear import Hold
+from actuators.identify import page
+from actuators.identify.verdict import verdict
+from actuators.models.lag import Lag
+from actuators.models.linear import Hold
+from actuators.modes.identify import Identification, Identify
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.history import History
-from brokk_rl.identification import page
-from brokk_rl.identification.verdict import verdict
 from brokk_rl.machine import Machine
-from brokk_rl.modes.identify import Identification, Identify
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
 

@@ -11,9 +11,10 @@ import pytest
 import torch
 from composed import option
 
-from actuators.lag import Lag
-from actuators.linear import ArxFit, Hold
-from brokk_rl import dead_time, open_loop, record
+from actuators.identify import dead_time
+from actuators.models.lag import Lag
+from actuators.models.linear import ArxFit, Hold
+from brokk_rl import open_loop, record
 from brokk_rl.errors import RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from actuators.lag import Lag
+from actuators.models.lag import Lag
 from brokk_rl.checks import check_actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import Gravity

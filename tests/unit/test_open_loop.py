@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from actuators.lag import Lag
+from actuators.identify.regimes import by_regime, memberships
+from actuators.identify.scores import Scores
+from actuators.models.lag import Lag
 from brokk_rl import open_loop
 from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
-from brokk_rl.identification.regimes import by_regime, memberships
-from brokk_rl.identification.scores import Scores
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 

@@ -15,7 +15,7 @@ from browser import LEVERS, SHOWN, TOKEN, Scripted, chromium, served
 from PIL import Image
 
 from brokk_rl.signals import Frame
-from deploy.page.shown import Stream, Wish
+from deploy.page.protocol import Stream, Wish
 
 SIZE = {"width": 1280, "height": 800}
 TRAVEL = 95.0

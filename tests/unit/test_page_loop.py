@@ -13,14 +13,14 @@ import pytest
 from composed import option
 
 from brokk_rl.session import Session
-from deploy.guard import State
-from deploy.loop.records import Exchange
-from deploy.loop.station import TEXT, TRIPS
-from deploy.loop.target import Aim, File
-from deploy.loop.wanted import Recorder, Wanted
+from deploy.guard.guard import State
 from deploy.page.from_loop import Beside, LoopFeed
-from deploy.page.shown import Drawn, Levers, Wish
+from deploy.page.protocol import Drawn, Levers, Wish
 from deploy.policy.adviser import REASONS, Advised
+from deploy.runtime.bus_process import TEXT, TRIPS
+from deploy.runtime.operator_requests import Recorder, Wanted
+from deploy.runtime.shm_layout import Exchange
+from deploy.runtime.target import Aim, File
 
 MACHINE = option("machine", "brokk170")
 FULL_RAD = 0.35

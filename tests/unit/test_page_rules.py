@@ -23,10 +23,10 @@ from deploy.page import access, cloud
 from deploy.page.clock import PageClock
 from deploy.page.demo import Demo
 from deploy.page.files import load
-from deploy.page.newest import Room
+from deploy.page.latest_value import Room
+from deploy.page.protocol import Stream, Wish
 from deploy.page.scene import approach
 from deploy.page.settings import link
-from deploy.page.shown import Stream, Wish
 
 MINE = access.names("127.0.0.1", 8170, ())
 
@@ -299,7 +299,7 @@ def test_both_languages_say_everything() -> None:
         for name, part in (("de", german), ("en", english))
     }
     assert keys["en"] <= keys["de"]
-    from deploy.guard import Trip
+    from deploy.guard.guard import Trip
     from deploy.policy.adviser import Advised
 
     said = {one.value for one in (*Trip, *Advised)} - {"valid"}

@@ -13,7 +13,7 @@ from browser import TOKEN, Scripted, served
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from deploy.page.shown import Shown
+from deploy.page.protocol import Shown
 
 
 @pytest.fixture

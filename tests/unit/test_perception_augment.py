@@ -16,8 +16,8 @@ from hydra.utils import instantiate
 
 import conf
 from brokk_rl.errors import ConfigError
-from perception import augment, jpeg, training_report
-from perception.training_data import Crop, Samples, Views, cut
+from perception.train import augment, jpeg, report
+from perception.train.data import Crop, Samples, Views, cut
 
 SHIPPED: dict[str, Any] = instantiate(
     yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())[
@@ -182,7 +182,7 @@ def test_a_sample_that_nothing_is_done_to_is_what_the_segmenter_would_see(closer
     views = Views(
         torch.from_numpy(np.stack([layers, layers[:, ::-1].copy()])[None]), ("clean",), ("one",)
     )
-    seen, _ = training_report.looked_at(views, (80, 48))
+    seen, _ = report.looked_at(views, (80, 48))
     sample, _ = Samples(views, plain, {}, (80, 48), closer, 0, torch.device("cpu")).batch(0, 1)
     assert float((255.0 * sample[0] - seen[0, int(closer)].float()).abs().mean()) < 2.0
 

@@ -21,8 +21,8 @@ from brokk_rl import record
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from perception import dataset
-from perception.calibration import arm, clock, hand_eye, rigid, start, touched
-from perception.calibration.extrinsics import point_std_m
+from perception.calibrate import arm, clock, hand_eye, rigid, start, touched
+from perception.calibrate.extrinsics import point_std_m
 from perception.sources.folder import Folder
 
 EXACT = np.diag([0.0005, 0.0005, 0.001, 0.001, 0.001, 0.0005]) ** 2

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from composed import option
 
+from brokk_rl.contracts.vision import Ellipse, SizePrior
 from brokk_rl.errors import ConfigError
-from brokk_rl.sight import Ellipse, SizePrior
-from perception import bench_hidden, bench_patterns, bench_photographs, conic, ellipse_drawing
+from perception.benchmark import hidden, patterns, photographs
+from perception.ellipse import conic, edge_drawing
 
 K = np.array([[1056.0, 0.0, 959.5], [0.0, 1056.0, 539.5], [0.0, 0.0, 1.0]])
 
@@ -75,35 +76,35 @@ def test_one_of_the_two_circles_of_a_known_radius_is_the_true_one() -> None:
     [("clean", 0.98), ("dark", 0.98), ("haze", 0.98), ("noise_25", 0.9), ("blur", 0.95)],
 )
 def test_patterns_are_found_in_any_light(condition: str, recall: float, detector) -> None:
-    picture, truth = bench_patterns.pattern(np.random.default_rng(5), condition, 512, 384)
+    picture, truth = patterns.pattern(np.random.default_rng(5), condition, 512, 384)
     found = detector.detect(picture, None, None)
-    hits = bench_patterns.matches(found, truth)
+    hits = patterns.matches(found, truth)
     assert hits >= recall * len(truth)
     assert hits >= 0.95 * len(found)
 
 
 @pytest.mark.parametrize("style", ["dots", "rings", "board"])
 def test_coloured_photographs_are_searched_as_well(style: str, detector) -> None:
-    picture, truth = bench_photographs.photograph(np.random.default_rng(7), style, 512, 384)
+    picture, truth = photographs.photograph(np.random.default_rng(7), style, 512, 384)
     found = detector.detect(picture, None, None)
-    hits = bench_patterns.matches(found, truth)
+    hits = patterns.matches(found, truth)
     assert len(truth) > 5 and hits >= 0.95 * len(truth) and hits >= 0.95 * len(found)
 
 
 @pytest.mark.parametrize("kind", ["noise", "spiral", "squares", "octagons", "hearts"])
 def test_nothing_is_found_where_nothing_is(kind: str, detector) -> None:
-    assert not detector.detect(bench_patterns.negative(kind, np.random.default_rng(0)), None, None)
+    assert not detector.detect(patterns.negative(kind, np.random.default_rng(0)), None, None)
 
 
 @pytest.mark.parametrize("kind", ["hearts of arcs", "spirals", "polygons", "salt"])
 def test_shapes_like_parts_of_ellipses_are_none(kind: str, detector) -> None:
-    assert not detector.detect(bench_hidden.shapes(np.random.default_rng(3), kind), None, None)
+    assert not detector.detect(hidden.shapes(np.random.default_rng(3), kind), None, None)
 
 
 def test_hearts_of_curves_are_none(detector) -> None:
     for seed in range(1000, 1008):
         assert not detector.detect(
-            bench_hidden.shapes(np.random.default_rng(seed), "hearts of curves"), None, None
+            hidden.shapes(np.random.default_rng(seed), "hearts of curves"), None, None
         )
 
 
@@ -111,10 +112,10 @@ def test_hearts_of_curves_are_none(detector) -> None:
 def test_ellipses_of_which_half_is_seen_are_found(style: str, detector) -> None:
     hits = found = there = 0
     for seed in range(3):
-        picture, truth = bench_hidden.hidden(np.random.default_rng(seed), style)
+        picture, truth = hidden.hidden(np.random.default_rng(seed), style)
         seen = detector.detect(picture, None, None)
         hits, found, there = (
-            hits + bench_patterns.matches(seen, truth),
+            hits + patterns.matches(seen, truth),
             found + len(seen),
             there + len(truth),
         )
@@ -146,7 +147,7 @@ def test_what_hides_half_of_a_disc_may_be_as_dark_and_as_wide(detector) -> None:
     cv2.rectangle(gray, (100, 95), (136, 145), 70, -1)
     found = detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
     assert [
-        bench_patterns.overlap(row(one), np.array([100.0, 120, 30, 22, 0])) > 0.9 for one in found
+        patterns.overlap(row(one), np.array([100.0, 120, 30, 22, 0])) > 0.9 for one in found
     ] == [True]
 
 
@@ -157,7 +158,7 @@ def test_half_of_an_ellipse_tells_the_whole(detector) -> None:
     found = detector.detect(cv2.GaussianBlur(picture, (0, 0), 0.8), None, SizePrior(45.0, 75.0))
     assert (
         max(
-            bench_patterns.overlap(row(one), np.array([120, 100, 60, 45, np.radians(20)]))
+            patterns.overlap(row(one), np.array([120, 100, 60, 45, np.radians(20)]))
             for one in found
         )
         > 0.9
@@ -222,9 +223,9 @@ def test_what_edge_drawing_proposes_is_judged_like_the_rest(
     seen = option("perception/ellipse", "edge_drawing").build().detect(picture, None, None)
     assert len(seen) == 1
     assert row(seen[0])[:4] == pytest.approx([60, 50, 30, 20], abs=0.8)
-    rows = ellipse_drawing.rows_of(found)
+    rows = edge_drawing.rows_of(found)
     assert rows == pytest.approx(np.array([[60, 50, 30, 20, np.pi / 2], [120, 50, 25, 25, 0]]))
-    assert len(ellipse_drawing.rows_of(None)) == 0
+    assert len(edge_drawing.rows_of(None)) == 0
 
 
 def row(one: Ellipse) -> np.ndarray:

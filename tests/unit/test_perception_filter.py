@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from composed import option
 
+from brokk_rl.contracts.vision import HolePose
 from brokk_rl.errors import ConfigError
-from brokk_rl.sight import HolePose
-from perception.calibration import rigid
+from perception.calibrate import rigid
 
 
 def seen(center: tuple[float, float, float], std_m: float = 0.002, t_s: float = 0.0) -> HolePose:

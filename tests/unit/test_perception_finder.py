@@ -10,10 +10,10 @@ import pytest
 from composed import option
 from drawn import AXIS, CENTER, drawn
 
+from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, SizePrior
 from brokk_rl.errors import FrameError
-from brokk_rl.sight import Ellipse, HolePose, Masks, SizePrior
 from perception import dataset, search
-from perception.bench import Tally, compare, judge
+from perception.benchmark.cells import Tally, compare, judge
 from perception.finder import Finder, rectified
 
 

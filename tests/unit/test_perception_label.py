@@ -15,9 +15,10 @@ from composed import option
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
-from perception import dataset, label_placing
-from perception.label_camera import Charuco, Given, TagGrid
-from perception.label_cuboid import look, sight_lines
+from perception import dataset
+from perception.label import placing as label_placing
+from perception.label.camera import Charuco, Given, TagGrid
+from perception.label.cuboid import look, sight_lines
 
 SIZE_PX = (480, 270)
 EYES_M = ((-1.8, -0.9, 1.0), (-2.0, 0.3, 0.8), (-1.5, 0.9, 1.2), (-2.4, -0.3, 0.7))

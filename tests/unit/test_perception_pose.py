@@ -10,10 +10,11 @@ import pytest
 from composed import option
 from drawn import AXIS, CENTER, RAYS, K, drawn
 
-from brokk_rl.sight import HolePose, Rejection
-from perception import alignment, appearance, conic, plane, rim
-from perception.pose import gray_of
-from perception.pose import vector as pose_row
+from brokk_rl.contracts.vision import HolePose, Rejection
+from perception.ellipse import conic
+from perception.pose import alignment, appearance, plane, rim
+from perception.pose.estimator import gray_of
+from perception.pose.estimator import vector as pose_row
 
 
 @pytest.fixture(scope="module")

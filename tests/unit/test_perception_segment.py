@@ -15,14 +15,16 @@ from hypothesis import strategies as st
 
 from brokk_rl.errors import CheckpointError, ConfigError, FrameError
 from brokk_rl.signals import Frame
-from perception import dataset, export, segment_network
+from perception import dataset
 from perception.dataset import Label
 from perception.render.drawing import compose
 from perception.render.studio import Studio
-from perception.segment_network import NetworkSegmenter
-from perception.segment_plane import onto_edges
-from perception.segment_window import Window, around, block_box, whole
-from perception.unet import UNet
+from perception.segment import network as segment_network
+from perception.segment.network import NetworkSegmenter
+from perception.segment.plane_segmenter import onto_edges
+from perception.segment.unet import UNet
+from perception.segment.window import Window, around, block_box, whole
+from perception.train import export
 
 SIZE_PX = (640, 360)
 

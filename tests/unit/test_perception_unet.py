@@ -16,9 +16,10 @@ from safetensors.torch import load_file
 
 import conf
 import perception
-from perception import dataset, export, training, training_data, training_report
+from perception import dataset
 from perception.dataset import Label
-from perception.unet import loss
+from perception.segment.unet import loss
+from perception.train import data, export, report, training
 
 SMALL = (
     "training.size_px=[64,40]", "training.widths=[6,12,16]", "training.batch=6", "training.rate=0.01",
@@ -76,7 +77,7 @@ def test_figures_of_a_worked_example_are_right() -> None:
     said[0, 0, 0, :, :5] = 0.9  # 20 px
     said[0, 1, 1, 3, 3:] = 0.9  # the second mouth, one pixel too much: overlap 2 / 3
     said[1, 1, 1, 0, 0] = 0.9  # a mouth where there is none
-    table = training_report.judged(said, known, ["clean", "empty"])
+    table = report.judged(said, known, ["clean", "empty"])
     assert table["all"] == {
         "block": pytest.approx(0.8),
         "mouth": pytest.approx(0.4),
@@ -251,6 +252,6 @@ def test_a_small_block_is_not_enlarged_beyond_what_its_frame_shows(
 ) -> None:
     known = np.zeros((270, 480, 2), np.uint8)
     known[50 : 50 + side_px, 60 : 60 + side_px, 0] = 255
-    _, closer = training_data._looks(known, (480, 288), 0.15, np.random.default_rng(0))
+    _, closer = data._looks(known, (480, 288), 0.15, np.random.default_rng(0))
     assert closer.width == pytest.approx(width_px, abs=2)
     assert closer.left + closer.width / 2 == pytest.approx(60 + side_px / 2, abs=2)

@@ -15,16 +15,16 @@ from composed import option
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
-from brokk_rl.contracts import Segment
+from actuators.excite.plan import account, picture
+from actuators.excite.plan.account import Track
+from actuators.excite.plan.drive import Nominal, drive
+from actuators.excite.plan.guard import Guards, predicted_tool_speed
+from actuators.excite.plan.runner import DONE, PLAY, Runner
+from actuators.excite.plan.schedule import Approach, Plan, schedule
+from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.plan import account, picture
-from brokk_rl.plan.account import Track
-from brokk_rl.plan.drive import Nominal, drive
-from brokk_rl.plan.guard import Guards, predicted_tool_speed
-from brokk_rl.plan.runner import DONE, PLAY, Runner
-from brokk_rl.plan.schedule import Approach, Plan, schedule
 from brokk_rl.signals import Command, JointState
 
 OPEN = Guards(max_command=1.0, max_tool_speed_m_s=None)
@@ -316,7 +316,7 @@ def test_a_link_that_fails_is_an_error(
     approach: Approach,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("brokk_rl.plan.drive.SILENCE_S", 0.05)
+    monkeypatch.setattr("actuators.excite.plan.drive.SILENCE_S", 0.05)
     with pytest.raises(LinkError, match=message):
         played([[constant({0: 0.3}, 5.0, machine.home)]], machine, approach, link=link(machine, 1))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from brokk_rl import ranks
+from brokk_rl import distributed
 from brokk_rl.errors import ConfigError, DeviceError
 from brokk_rl.rl.distributed import Group, fingerprint
 from brokk_rl.session import Session
@@ -23,18 +23,18 @@ def session(folder: Path, device: str = "cpu") -> Session:
 
 
 def test_a_process_started_by_hand_is_alone() -> None:
-    assert ranks.own() == ranks.Rank(0, 0, 1) and ranks.own().first
+    assert distributed.own() == distributed.Rank(0, 0, 1) and distributed.own().first
 
 
 def test_torchrun_says_which_process_this_is(monkeypatch: pytest.MonkeyPatch) -> None:
     told(monkeypatch, RANK=5, LOCAL_RANK=1, WORLD_SIZE=8)
-    assert ranks.own() == ranks.Rank(5, 1, 8) and not ranks.own().first
+    assert distributed.own() == distributed.Rank(5, 1, 8) and not distributed.own().first
 
 
 def test_half_an_environment_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     told(monkeypatch, WORLD_SIZE=2)
     with pytest.raises(ConfigError, match="RANK and LOCAL_RANK below WORLD_SIZE"):
-        ranks.own()
+        distributed.own()
 
 
 def test_only_modes_that_share_their_work_run_in_several_processes(
@@ -43,13 +43,13 @@ def test_only_modes_that_share_their_work_run_in_several_processes(
     class Shares:
         together = True
 
-    ranks.check_together(int, sweep=True)
+    distributed.check_together(int, sweep=True)
     told(monkeypatch, RANK=1, LOCAL_RANK=1, WORLD_SIZE=2)
-    ranks.check_together(Shares, sweep=False)
+    distributed.check_together(Shares, sweep=False)
     with pytest.raises(ConfigError, match="int is the work of one process"):
-        ranks.check_together(int, sweep=False)
+        distributed.check_together(int, sweep=False)
     with pytest.raises(ConfigError, match="hydra/launcher=submitit_local"):
-        ranks.check_together(Shares, sweep=True)
+        distributed.check_together(Shares, sweep=True)
 
 
 def test_the_first_has_the_streams_of_one_alone_and_the_others_their_own(

@@ -12,9 +12,9 @@ import pytest
 import yaml
 from conftest import Done
 
-from brokk_rl.diagnosis import downstream, story_page
-from brokk_rl.diagnosis.answer import Answer, Estimate, Gap, Selected, Where
-from brokk_rl.modes import rehearse
+from diagnosis import downstream, story_page
+from diagnosis.answer import Answer, Estimate, Gap, Selected, Where
+from diagnosis.modes import rehearse
 
 SHARE = {"mean": 0.5, "ci95": [0.4, 0.6]}
 WITHHELD = {

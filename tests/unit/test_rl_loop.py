@@ -102,8 +102,9 @@ def test_a_restored_loop_goes_on_exactly(machine: Machine) -> None:
     for action, (reward, seen) in zip(actions[20:], first, strict=True):
         found = other.step(action)
         assert torch.equal(found[1], reward) and all(
-            torch.equal(found[0][name], seen[name]) for name in seen.keys()
-        )  # noqa: SIM118
+            torch.equal(found[0][name], seen[name])
+            for name in seen.keys()  # noqa: SIM118
+        )
 
 
 def test_statistics_count_what_ended_since_they_were_last_asked(machine: Machine) -> None:

@@ -14,7 +14,7 @@ from sitting import Arm, conductor, feed, in_trial, machine, plan
 
 from deploy.study import tlx
 from deploy.study.conductor import Conductor
-from deploy.study.room import StudyFeed, StudyPages
+from deploy.study.study_server import StudyFeed, StudyPages
 
 MACHINE = machine()
 SIZE = {"width": 1280, "height": 800}

@@ -16,7 +16,7 @@ from composed import every, option
 
 from actuators.person import Person
 from brokk_rl.chain import tool
-from brokk_rl.contracts import OperatorView
+from brokk_rl.contracts.operator import OperatorView
 from brokk_rl.machine import Machine
 from deploy.study.operators.hands import Hands
 from deploy.study.operators.traits import Traits
@@ -160,7 +160,7 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(
 
 
 def test_a_study_needs_neither_torch_nor_simulator() -> None:
-    code = "import sys, brokk_rl.modes.study, deploy.study.study; print([m for m in ('torch', 'mujoco', 'warp') if m in sys.modules])"
+    code = "import sys, deploy.modes.study, deploy.study.study; print([m for m in ('torch', 'mujoco', 'warp') if m in sys.modules])"
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT

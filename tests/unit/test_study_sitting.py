@@ -21,12 +21,12 @@ from sitting import FACTS, Arm, conductor, in_trial, machine, plan, saved
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError
-from deploy.page.shown import Wish
+from deploy.page.protocol import Wish
 from deploy.study import analysis, folder, tlx
 from deploy.study.conductor import Conductor
-from deploy.study.room import StudyFeed
 from deploy.study.sitting import alone
 from deploy.study.steps import next_step
+from deploy.study.study_server import StudyFeed
 
 MACHINE = machine()
 

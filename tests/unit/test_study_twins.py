@@ -12,7 +12,7 @@ import pytest
 from composed import option
 
 from brokk_rl.chain import tool
-from brokk_rl.contracts import OperatorView, TrialBatch
+from brokk_rl.contracts.operator import OperatorView, TrialBatch
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session
 from brokk_rl.signals import Command

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brokk_rl.contracts import OperatorModel, OperatorView
+from brokk_rl.contracts.operator import OperatorModel, OperatorView
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.study.operators.hands import Hands
@@ -39,7 +39,7 @@ class Crossover:
     good_rad: float
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
-        """See `brokk_rl.contracts.Operator`."""
+        """See `brokk_rl.contracts.operator.Operator`."""
         return CrossoverModel(self, machine, persons, seed)
 
 
@@ -64,7 +64,7 @@ class CrossoverModel:
         self._since = np.zeros((len(persons), machine.num_joints))
 
     def step(self, view: OperatorView) -> np.ndarray:
-        """See `brokk_rl.contracts.OperatorModel`."""
+        """See `brokk_rl.contracts.operator.OperatorModel`."""
         coming = self._sent.sum(1) * self._period_s * self._speed
         ahead = view.q + self._anticipation * coming
         if self._sight.look(view, ahead):

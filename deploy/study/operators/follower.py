@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brokk_rl.contracts import OperatorModel, OperatorView
+from brokk_rl.contracts.operator import OperatorModel, OperatorView
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.study.operators.hands import Hands, HandsModel
@@ -21,7 +21,7 @@ class Follower:
     hands: Hands
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
-        """See `brokk_rl.contracts.Operator`."""
+        """See `brokk_rl.contracts.operator.Operator`."""
         return FollowerModel(self.hands.build(machine, persons, seed))
 
 
@@ -32,5 +32,5 @@ class FollowerModel:
         self._hands = hands
 
     def step(self, view: OperatorView) -> np.ndarray:
-        """See `brokk_rl.contracts.OperatorModel`."""
+        """See `brokk_rl.contracts.operator.OperatorModel`."""
         return self._hands.step(np.nan_to_num(view.advice))

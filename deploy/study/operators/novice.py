@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brokk_rl.contracts import OperatorModel, OperatorView
+from brokk_rl.contracts.operator import OperatorModel, OperatorView
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.study.operators.hands import Hands
@@ -50,7 +50,7 @@ class Novice:
     good_rad: float
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
-        """See `brokk_rl.contracts.Operator`."""
+        """See `brokk_rl.contracts.operator.Operator`."""
         return NoviceModel(self, machine, persons, seed)
 
 
@@ -76,7 +76,7 @@ class NoviceModel:
         self._generator = np.random.default_rng((seed, 3))
 
     def step(self, view: OperatorView) -> np.ndarray:
-        """See `brokk_rl.contracts.OperatorModel`."""
+        """See `brokk_rl.contracts.operator.OperatorModel`."""
         period_s = self._machine.period_s
         self._left_s -= period_s
         self._rest_s = np.where(self._left_s > 0, self._pause_s, self._rest_s - period_s)

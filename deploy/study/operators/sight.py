@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from brokk_rl.chain import tool
-from brokk_rl.contracts import OperatorView
+from brokk_rl.contracts.operator import OperatorView
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.study.operators.traits import Range, Traits

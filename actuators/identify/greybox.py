@@ -1,0 +1,326 @@
+"""Grey boxes: the physical numbers of an actuator model, fitted to recordings by free runs, with intervals."""
+
+import dataclasses
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import Progress
+from scipy.stats import qmc
+
+from actuators.identify import parameter_report
+from actuators.identify.dataset import COMMANDED
+from actuators.identify.gauss_newton import FreeRuns, certainty, improve, parameters_of
+from brokk_rl import open_loop, record
+from brokk_rl.contracts.actuator import Actuator
+from brokk_rl.errors import ConfigError, RecordingError, StorageError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.session import write_json, write_text
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+ACTIVE_SHARE = 0.1
+"""A window says something about a joint that is commanded for so much of it."""
+
+
+@spec
+class GreyBoxFit:
+    """Fits the numbers of a physical model by free runs: a search over their ranges, then Gauss-Newton steps with a robust loss.
+
+    Attributes:
+        name: Name of the model in tables and of what it leaves: `<name>.yaml`, an option for
+            `actuator=@…`, and `<name>.json`.
+        actuator: The model; numbers that are not free keep the values they have here.
+        free: Lower and upper bound of each number that is fitted, joint by joint, by name.
+        coupled: Whether a joint's numbers change how the others move (a shared pump); costs a free
+            run a joint and number.
+        horizon_s: Length of the free runs.
+        windows: Free runs a joint, taken evenly from the runs of the machine, where the joint is
+            commanded.
+        validation_windows: The same from the recordings by which the start is chosen.
+        candidates: Points of the Latin hypercube over the ranges from which the best starts are
+            taken; the actuator's own numbers compete with them.
+        starts: Gauss-Newton runs from the best candidates.
+        iterations: Most steps of each.
+        tolerance: Relative gain in loss below which a run ends.
+        robust: Errors beyond so many times the typical one count with their size instead of its
+            square.
+    """
+
+    name: str
+    actuator: Actuator
+    free: dict[str, tuple[float, float]]
+    coupled: bool
+    horizon_s: float
+    windows: int
+    validation_windows: int
+    candidates: int
+    starts: int
+    iterations: int
+    tolerance: float
+    robust: float
+
+    def check(self) -> None:
+        if not self.free:
+            raise ConfigError("fit.free: expected at least one number to fit")
+        for name, (low, high) in self.free.items():
+            if not low < high:
+                raise ConfigError(
+                    f"fit.free.{name}: expected [low, high] with low < high, got [{low}, {high}]"
+                )
+        if (
+            min(
+                self.windows, self.validation_windows, self.candidates, self.starts, self.iterations
+            )
+            < 1
+        ):
+            raise ConfigError(
+                "fit: windows, validation_windows, candidates, starts and iterations must be 1 or more"
+            )
+        if self.starts > self.candidates + 1:
+            raise ConfigError(
+                f"fit.starts: {self.starts} of {self.candidates} candidates; raise fit.candidates"
+            )
+        if min(self.horizon_s, self.tolerance, self.robust) <= 0:
+            raise ConfigError("fit: horizon_s, tolerance and robust must be above 0")
+        if getattr(self.actuator, "spread", None):
+            raise ConfigError(
+                "fit.actuator.spread: expected {}; a number that is drawn anew at each reset cannot be fitted"
+            )
+
+    def fit(
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        validation: Sequence[Recording],
+        folder: Path,
+        seed: int,
+        device: torch.device,
+    ) -> Actuator:
+        """Fits to `train`, chooses among the starts by `validation`, writes `<name>.yaml` and `<name>.json` into `folder`.
+
+        Goes on exactly from what an interrupted fit with the same settings and recordings left
+        there.
+
+        Raises:
+            ConfigError: a bound makes no sense, or the actuator has no such number.
+            RecordingError: too little data.
+            StorageError: a file could not be written.
+        """
+        began = time.monotonic()
+        nominal = self._nominal(machine, device)
+        random = np.random.default_rng(seed)
+        runs = self._free_runs(machine, train, self.windows, random, device)
+        if (idle := np.flatnonzero(~runs.active.any(0))).size:
+            joint = machine.joint_names[idle[0]]
+            raise RecordingError(
+                f"too little data: joint {joint} is never commanded in the {len(train)} recordings to fit to"
+            )
+        held = self._free_runs(machine, validation, self.validation_windows, random, device)
+        place = folder / f"{self.name}.progress.json"
+        search = _Search(self, runs, place, _digest(self, machine, runs, held, seed))
+        x = search.choose(search.run(nominal, seed), held)
+        sure = certainty(runs, x, self.robust)
+        found = self._rounded(machine, runs, x)
+        fitted: Any = dataclasses.replace(self.actuator, **found)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        facts = {
+            "schema": 1,
+            "machine": machine.name,
+            "recordings": len(train),
+            "runs": len({recording.run for recording in train}),
+            "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
+            "windows": len(runs.active),
+            "horizon_s": self.horizon_s,
+            "validation_rmse": dict(zip(machine.joint_names, held.end_rmse(x), strict=True)),
+            "seconds": round(search.before_s + time.monotonic() - began, 1),
+            "created": record.now(),
+            "parameters": parameter_report.table(found, runs, x, sure),
+            "tangled": parameter_report.tangled(machine, runs, sure),
+        }
+        try:
+            write_json(folder / f"{self.name}.json", facts)
+            write_text(folder / f"{self.name}.yaml", parameter_report.option(fitted, facts))
+            place.unlink(missing_ok=True)
+        except OSError as failure:
+            raise StorageError(
+                f"cannot write into {folder}: {failure.strerror or failure}"
+            ) from failure
+        parameter_report.tell(facts)
+        return fitted
+
+    def _nominal(self, machine: Machine, device: torch.device) -> np.ndarray:
+        """Returns the actuator's own numbers in units of their ranges, `(P, J)`, and sees that the bounds make sense."""
+        names = tuple(self.free)
+        parameters = parameters_of(self.actuator.build(machine, 1, device), names)
+        for side in (0, 1):
+            ends: Any = {name: bounds[side] for name, bounds in self.free.items()}
+            try:
+                dataclasses.replace(self.actuator, **ends).build(machine, 1, device)  # pyright: ignore[reportArgumentType]
+            except ConfigError as error:
+                raise ConfigError(
+                    f"fit.free: with every number at its {('lower', 'upper')[side]} bound: {error}"
+                ) from error
+        own = np.stack([parameters[name][0].cpu().numpy().astype(np.float64) for name in names])
+        low, high = np.array([self.free[name] for name in names]).T[:, :, None]
+        return np.clip((own - low) / (high - low), 0.0, 1.0)
+
+    def _free_runs(
+        self,
+        machine: Machine,
+        recordings: Sequence[Recording],
+        num_windows: int,
+        random: np.random.Generator,
+        device: torch.device,
+    ) -> FreeRuns:
+        cut = open_loop.windows(recordings, machine, self.horizon_s, self.horizon_s)
+        active = (np.abs(cut.u) > COMMANDED).mean(1) >= ACTIVE_SHARE
+        rows = _spread_over_runs(active, cut.run, num_windows, random)
+        cut = dataclasses.replace(cut, u=cut.u[rows], q=cut.q[rows], run=cut.run[rows])
+        return FreeRuns(self.actuator, self.free, self.coupled, machine, cut, active[rows], device)
+
+    def _rounded(
+        self, machine: Machine, runs: FreeRuns, x: np.ndarray
+    ) -> dict[str, dict[str, float]]:
+        return {
+            name: {
+                joint: float(f"{value:.5g}")
+                for joint, value in zip(machine.joint_names, row, strict=True)
+            }
+            for name, row in zip(runs.names, runs.values(x), strict=True)
+        }
+
+
+@dataclass
+class _Search:
+    """The search at work; what it has found so far lies in `place` after each step, for an interrupted fit to go on from."""
+
+    config: GreyBoxFit
+    runs: FreeRuns
+    place: Path
+    digest: str
+    before_s: float = 0.0
+
+    def run(self, nominal: np.ndarray, seed: int) -> list[np.ndarray]:
+        """Returns where each start leads, each `(P, J)`."""
+        config, began = self.config, time.monotonic()
+        with Progress(transient=True) as progress:
+            task = progress.add_task(
+                f"{config.name}: search", total=config.starts * config.iterations
+            )
+            state = self._left() or {
+                "done": [],
+                "iteration": 0,
+                "waiting": self._starts(nominal, seed).tolist(),
+            }
+            self.before_s = state.get("seconds", 0.0)
+            done, iteration = [np.array(x) for x in state["done"]], state["iteration"]
+            waiting = [np.array(x) for x in state["waiting"]]
+            while waiting:
+                progress.update(
+                    task,
+                    completed=len(done) * config.iterations + iteration,
+                    description=f"{config.name}: start {len(done) + 1} of {config.starts}, step {iteration + 1}",
+                )
+                waiting[0], gain = improve(self.runs, waiting[0], config.robust)
+                iteration += 1
+                if gain < config.tolerance or iteration >= config.iterations:
+                    log.info(
+                        "%s: start %d ended after %d steps", config.name, len(done) + 1, iteration
+                    )
+                    done.append(waiting.pop(0))
+                    iteration = 0
+                self._keep(done, iteration, waiting, self.before_s + time.monotonic() - began)
+        return done
+
+    def choose(self, found: list[np.ndarray], held: FreeRuns) -> np.ndarray:
+        """Returns the numbers that run freely best on the validation windows, joint by joint where joints are independent."""
+        stacked = np.stack(found)
+        score, fallback = (
+            _typical(runs.squares(stacked), runs.active) for runs in (held, self.runs)
+        )
+        score = np.where(
+            np.isfinite(score), score, fallback
+        )  # a joint that the validation never moves
+        if self.config.coupled:
+            score = np.repeat((score / score.min(0)).sum(1, keepdims=True), score.shape[1], 1)
+        return np.stack([stacked[best][:, j] for j, best in enumerate(score.argmin(0))], 1)
+
+    def _starts(self, nominal: np.ndarray, seed: int) -> np.ndarray:
+        """Returns the best points of a Latin hypercube and the nominal one, joint by joint, `(S, P, J)`."""
+        num, joints = nominal.shape
+        points = qmc.LatinHypercube(num, rng=np.random.default_rng(seed)).random(
+            self.config.candidates
+        )
+        candidates = np.concatenate([np.repeat(points[:, :, None], joints, 2), nominal[None]])
+        some = np.arange(0, len(self.runs.active), 4 if len(self.runs.active) >= 16 * joints else 1)
+        order = _typical(self.runs.squares(candidates, some), self.runs.active[some]).argsort(0)[
+            : self.config.starts
+        ]  # (S, J)
+        return np.stack([candidates[order[:, j], :, j] for j in range(joints)], 2)
+
+    def _left(self) -> dict[str, Any] | None:
+        """Returns what an interrupted fit with the same settings left, if anything."""
+        try:
+            state = json.loads(self.place.read_text())
+        except (OSError, ValueError):
+            return None
+        if state.get("digest") != self.digest:
+            log.warning(
+                "%s is of a fit with other settings or recordings; this one begins anew", self.place
+            )
+            return None
+        log.info("going on from %s", self.place)
+        return state
+
+    def _keep(
+        self, done: list[np.ndarray], iteration: int, waiting: list[np.ndarray], seconds: float
+    ) -> None:
+        state = {"digest": self.digest, "seconds": seconds, "iteration": iteration}
+        state |= {"done": [x.tolist() for x in done], "waiting": [x.tolist() for x in waiting]}
+        try:
+            self.place.parent.mkdir(parents=True, exist_ok=True)
+            write_json(self.place, state)
+        except OSError as error:
+            raise StorageError(f"cannot write {self.place}: {error.strerror or error}") from error
+
+
+def _spread_over_runs(
+    active: np.ndarray, run: np.ndarray, count: int, random: np.random.Generator
+) -> np.ndarray:
+    """Returns rows such that each joint is active in about `count` of them, taken in turn from the runs that move it."""
+    chosen = np.zeros(len(active), dtype=bool)
+    for j in range(active.shape[1]):
+        rows = random.permutation(np.flatnonzero(active[:, j]))
+        turn = np.zeros(len(rows), dtype=int)
+        for name in np.unique(run[rows]):
+            mine = run[rows] == name
+            turn[mine] = np.arange(mine.sum())
+        rows = rows[np.argsort(turn, kind="stable")]
+        wanted = max(0, count - int(chosen[rows].sum()))
+        chosen[rows[~chosen[rows]][:wanted]] = True
+    return np.flatnonzero(chosen)
+
+
+def _typical(squares: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """Returns the mean over active windows of the root mean square error, `(C, J)`; NaN where a joint is never active."""
+    count = np.where(active.any(0), active.sum(0), np.nan)
+    return np.sqrt(squares).sum(1) / count
+
+
+def _digest(config: GreyBoxFit, machine: Machine, runs: FreeRuns, held: FreeRuns, seed: int) -> str:
+    """Returns a hash of all that the result depends on."""
+    told = hashlib.sha256(
+        repr((config, machine.fingerprint(), machine.max_speed.tolist(), seed)).encode()
+    )
+    for part in (runs.cut, held.cut):
+        told.update(part.u.tobytes() + part.q.tobytes())
+    return told.hexdigest()

@@ -1,0 +1,167 @@
+"""The fits of an identification one after another, each remembered when it is done, so that an interrupted run goes on.
+
+With one split there is one stage; with cross-validation one for each fold, and a last one that fits
+the model that is kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+
+from brokk_rl import open_loop, registry
+from brokk_rl.contracts.actuator import Actuator, ActuatorFit
+from brokk_rl.errors import StorageError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+log = logging.getLogger(__name__)
+
+FREE_RUNS = "free_runs"
+"""Folder of what a stage's models predicted."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Recordings by run for one fit, and where what it learns is written.
+
+    Attributes:
+        name: What to call it in the log.
+        folder: Where the fitted model goes; rivals have folders of their own within it.
+        seed: Of the fit.
+        train: To fit to.
+        validation: To stop the fit by.
+        test: To judge by; none where a model is only made to be kept.
+    """
+
+    name: str
+    folder: Path
+    seed: int
+    train: Mapping[str, Sequence[Recording]]
+    validation: Mapping[str, Sequence[Recording]]
+    test: Mapping[str, Sequence[Recording]]
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of all that is in the recordings, by part."""
+        state = hashlib.sha256(str(self.seed).encode())
+        for part in (self.train, self.validation, self.test):
+            state.update(b"part")
+            for recording in members(part):
+                state.update(recording.u.tobytes() + recording.q.tobytes())
+        return state.hexdigest()
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What is left of a fit.
+
+    Attributes:
+        predicted: Positions in free runs through the stage's windows, `(W, K, J)`.
+        seconds: Time the fit took in the process that finished it.
+        use: Overrides that make other modes use the model; empty where no option of `actuator` can
+            load it.
+    """
+
+    predicted: np.ndarray
+    seconds: float
+    use: str
+
+
+def members(part: Mapping[str, Sequence[Recording]]) -> list[Recording]:
+    """Returns the recordings of all runs."""
+    return [recording for recordings in part.values() for recording in recordings]
+
+
+def fitted(
+    stage: Stage,
+    name: str,
+    fit: ActuatorFit,
+    folder: Path,
+    machine: Machine,
+    cut: open_loop.Windows | None,
+    device: torch.device,
+) -> Fitted:
+    """Fits a model and lets it run freely through windows, or returns what an earlier process left of the same fit.
+
+    Raises:
+        StorageError: another fit, or one to other recordings, has been done in this folder.
+        RecordingError: too little data to fit to.
+    """
+    path = folder / FREE_RUNS / f"{name}.npz"
+    shape = () if cut is None else cut.q.shape
+    key = hashlib.sha256(
+        repr((fit, machine.fingerprint(), stage.digest, shape)).encode()
+    ).hexdigest()
+    if path.exists():
+        return _remembered(path, key)
+    log.info(
+        "%sfitting %s to %d runs", f"{stage.name}: " if stage.name else "", name, len(stage.train)
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    actuator = fit.fit(
+        machine, members(stage.train), members(stage.validation), folder, stage.seed, device
+    )
+    seconds = time.monotonic() - began
+    predicted = (
+        np.zeros((0, 0, machine.num_joints))
+        if cut is None
+        else open_loop.free_run(actuator, machine, cut, device)
+    )
+    found = Fitted(predicted, seconds, use(actuator, folder, name))
+    part = path.with_name(f".{path.name}.{os.getpid()}.npz")
+    try:
+        path.parent.mkdir(exist_ok=True)
+        np.savez_compressed(
+            part, predicted=predicted.astype(np.float32), seconds=seconds, use=found.use, key=key
+        )
+        part.replace(path)
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return found
+
+
+def use(actuator: Actuator, folder: Path, name: str) -> str:
+    """Returns the overrides with which `mode=train` and others use a fitted actuator; empty where there are none."""
+    if (folder / f"{name}.yaml").exists():
+        return f"actuator=@{folder / f'{name}.yaml'}"
+    target = f"{type(actuator).__module__}.{type(actuator).__qualname__}"
+    checkpoint = getattr(actuator, "checkpoint", None)
+    if checkpoint is None:
+        return ""
+    for option in registry.options():
+        if (
+            option.group == "actuator"
+            and (yaml.safe_load(option.path.read_text()) or {}).get("_target_") == target
+        ):
+            return f"actuator={option.name} actuator.checkpoint={checkpoint}"
+    return ""
+
+
+def _remembered(path: Path, key: str) -> Fitted:
+    try:
+        with np.load(path) as stored:
+            values = {name: stored[name] for name in stored.files}
+        if str(values["key"]) != key:
+            raise StorageError(
+                f"{path} is of another fit, or of other recordings or windows. To go on, give the settings of the interrupted run; "
+                "for others choose another session.out"
+            )
+        return Fitted(values["predicted"], float(values["seconds"]), str(values["use"]))
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise StorageError(
+            f"{path} cannot be read ({error}); delete it, and this fit is done again"
+        ) from error

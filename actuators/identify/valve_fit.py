@@ -1,0 +1,193 @@
+"""Fits `actuators.models.valve` in seconds.
+
+Positions hardly feed back into the speed, so the speed is fitted as a function of commands.
+
+
+The model is driven by recorded commands and, for the pose, recorded positions; increments of
+`WIDTH` samples are compared. For given dead time, play and lags the curves are a linear
+least-squares problem; pose and pump follow in a few turns.
+Axes: `R` recordings, `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments.
+"""
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from rich.progress import Progress
+from scipy.optimize import least_squares
+
+from actuators.identify.valve_speeds import PLAYS, Speeds
+from actuators.models.valve import Valve
+from brokk_rl.errors import ConfigError, StorageError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.session import write_text
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class ValveFit:
+    """Fits the valve curve and all other numbers of `actuator=valve`.
+
+    Attributes:
+        name: Name of the model in tables and of the file that it leaves, `<name>.yaml`, an option
+            for `actuator=@…`.
+        actuator: The model; its knots are kept.
+        longest_lag_s: Upper bound of each lag.
+        sweeps: Turns of curve, pose and pump.
+        iterations: Steps of each of the two searches for dead time, play and lags, joint by joint;
+            the second knows pose and pump.
+    """
+
+    name: str
+    actuator: Valve
+    longest_lag_s: float
+    sweeps: int
+    iterations: int
+
+    def check(self) -> None:
+        if self.longest_lag_s <= 0 or min(self.sweeps, self.iterations) < 1:
+            raise ConfigError("fit: longest_lag_s must be above 0, sweeps and iterations 1 or more")
+
+    def fit(
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        validation: Sequence[Recording],
+        folder: Path,
+        seed: int,
+        device: torch.device,
+    ) -> Valve:
+        """Fits to all recordings (nothing is chosen by validation) and writes `<name>.yaml` into `folder`.
+
+        Raises:
+            RecordingError: a joint never moves.
+            StorageError: the file could not be written.
+        """
+        del seed, device  # deterministic, numpy
+        data = Speeds([*train, *validation], machine, np.array(self.actuator.knots))
+        dynamics = np.zeros((machine.num_joints, 4))
+        with Progress(transient=True) as progress:
+            rounds = [(turn, j) for turn in range(2) for j in range(machine.num_joints)]
+            known: list[list[np.ndarray]] | None = None
+            for turn, j in progress.track(rounds, description=f"{self.name}: dead times and lags"):
+                if turn and known is None:
+                    known = data.factors(data.statics(dynamics, self.sweeps), dynamics)
+                dynamics[j] = self._dynamics(
+                    data, j, known[j] if known else None, dynamics[j] if turn else None
+                )
+        fitted = self._spec(data, dynamics)
+        facts = {key: _plain(value) for key, value in dataclasses.asdict(fitted).items()}  # pyright: ignore[reportArgumentType]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            text = yaml.safe_dump(
+                {"_target_": f"{Valve.__module__}.{Valve.__name__}", **facts},
+                sort_keys=False,
+                width=130,
+            )
+            write_text(
+                folder / f"{self.name}.yaml",
+                f"# fitted to {len(data.recordings)} recordings of {machine.name}\n{text}",
+            )
+        except OSError as error:
+            raise StorageError(f"cannot write into {folder}: {error.strerror or error}") from error
+        return fitted
+
+    def refit(self, fitted: Valve, machine: Machine, recordings: Sequence[Recording]) -> Valve:
+        """Returns `fitted` with curves, pose and pump fitted to other recordings; dead times, play and lags stay."""
+        columns = [getattr(fitted, name) for name in ("dead_time_s", "play", "spool_s", "speed_s")]
+        dynamics = np.array([[column[name] for column in columns] for name in machine.joint_names])
+        assert isinstance(fitted.demand, dict), "a fitted actuator has numbers by joint"
+        demand = np.array([fitted.demand[name] for name in machine.joint_names])
+        return self._spec(
+            Speeds(recordings, machine, np.array(self.actuator.knots)), dynamics, demand
+        )
+
+    def _dynamics(
+        self, data: Speeds, j: int, known: Sequence[np.ndarray] | None, start: np.ndarray | None
+    ) -> np.ndarray:
+        """Returns dead time, play, spool lag and speed lag of joint `j` that explain its increments best.
+
+        Args:
+            data: The recordings.
+            j: The joint.
+            known: Factor on the speed, from pose and pump, of each recording; `None` while they are
+                not known.
+            start: Where the search begins; `None`: at the best dead time.
+        """
+        machine = data.machine
+        most = np.array(
+            [
+                (machine.num_history - 2) * machine.period_s,
+                PLAYS[-1],
+                self.longest_lag_s,
+                self.longest_lag_s,
+            ]
+        )
+
+        def left(x: np.ndarray) -> np.ndarray:
+            features = data.features(j, x, known)
+            return (data.way[j] - features @ data.curve(features, data.way[j])) / np.sqrt(
+                data.scale[j]
+            )
+
+        if start is None:
+            delays = np.arange(0.0, most[0] + 1e-9, machine.period_s)
+            losses = [
+                float(np.square(left(np.array([delay, 0.01, 0.04, 0.0]))).sum()) for delay in delays
+            ]
+            start = np.array([delays[int(np.argmin(losses))], 0.02, 0.03, 0.02])
+        inside = np.clip(start, 1e-6, most - 1e-6)
+        step = np.array([0.1, 0.3, 0.3, 0.3])  # of `x_scale`: above the grain of the samples
+        return least_squares(
+            left,
+            inside,
+            bounds=(np.zeros(4), most),
+            x_scale=np.array([0.02, 0.02, 0.02, 0.02]),
+            diff_step=0.02 * step / np.maximum(inside, 1e-3) * 0.5,
+            loss="soft_l1",
+            f_scale=0.05,
+            max_nfev=self.iterations,
+        ).x
+
+    def _spec(self, data: Speeds, dynamics: np.ndarray, demand: np.ndarray | None = None) -> Valve:
+        found = data.statics(
+            dynamics, self.sweeps if demand is None else max(1, self.sweeps // 2), demand
+        )
+        names, half = data.machine.joint_names, len(self.actuator.knots) - 1
+
+        def table(values: np.ndarray) -> dict[str, float]:
+            return {name: float(f"{value:.5g}") for name, value in zip(names, values, strict=True)}
+
+        def rows(values: np.ndarray) -> dict[str, tuple[float, ...]]:
+            return {
+                name: tuple(float(f"{v:.5g}") for v in row)
+                for name, row in zip(names, values, strict=True)
+            }
+
+        zero = np.zeros((len(names), 1))
+        return dataclasses.replace(  # pyright: ignore[reportArgumentType]
+            self.actuator,  # pyright: ignore[reportArgumentType]
+            dead_time_s=table(dynamics[:, 0]),
+            play=table(dynamics[:, 1]),
+            spool_s=table(dynamics[:, 2]),
+            speed_s=table(dynamics[:, 3]),
+            demand=table(found.demand),
+            curve_extend=rows(np.hstack([zero, np.maximum(found.curve[:, :half], 0.0)])),
+            curve_retract=rows(np.hstack([zero, np.maximum(found.curve[:, half:], 0.0)])),
+            pose_extend=rows(found.pose[:, 0]),
+            pose_retract=rows(found.pose[:, 1]),
+        )
+
+
+def _plain(value: object) -> object:
+    """Returns tuples as lists, for YAML."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, tuple) else value

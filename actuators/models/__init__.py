@@ -1,0 +1,1 @@
+"""Actuator models: next joint positions from the history of commands and positions."""

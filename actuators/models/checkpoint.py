@@ -1,0 +1,108 @@
+"""Checkpoints of learned actuators: weights in safetensors, with the facts about them as JSON in its metadata."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from brokk_rl.errors import CheckpointError, StorageError
+from brokk_rl.machine import Machine
+
+SCHEMA = 1
+SHIPPED = Path(__file__).parents[1] / "weights"
+"""Folder of the checkpoints that come with the package."""
+
+
+def found(checkpoint: str) -> Path:
+    """Returns the path of a checkpoint: as given if it exists, else the one of that name that ships with the package.
+
+    Raises:
+        CheckpointError: there is neither.
+    """
+    for path in (Path(checkpoint), SHIPPED / checkpoint):
+        if path.is_file():
+            return path
+    shipped = ", ".join(sorted(path.name for path in SHIPPED.glob("*.safetensors"))) or "none"
+    raise CheckpointError(
+        f"actuator.checkpoint: there is no file '{checkpoint}' (seen from {Path.cwd()}), nor does one of that name ship with the "
+        f"package ({shipped}). `brokk mode=identify` makes one."
+    )
+
+
+def write(
+    path: Path,
+    kind: str,
+    machine: Machine,
+    tensors: Mapping[str, torch.Tensor],
+    facts: Mapping[str, Any],
+) -> None:
+    """Writes a checkpoint in one step.
+
+    Args:
+        path: Where to.
+        kind: Name of the model class that can load it, e.g. `mlp`.
+        machine: The machine it is for.
+        tensors: Weights and normalisation.
+        facts: Anything else worth knowing; JSON.
+
+    Raises:
+        StorageError: the file could not be written.
+    """
+    header = {
+        "schema": SCHEMA,
+        "kind": kind,
+        "machine": machine.name,
+        "fingerprint": machine.fingerprint(),
+        "joints": list(machine.joint_names),
+        "rate_hz": 1.0 / machine.period_s,
+        "num_history": machine.num_history,
+        **facts,
+    }
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+        part.write_bytes(save(tensors, metadata={"brokk": json.dumps(header)}))
+        part.replace(path)
+    except OSError as error:
+        raise StorageError(f"cannot write checkpoint {path}: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def read(path: Path, kind: str, machine: Machine) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Returns the tensors and the header of a checkpoint made for `machine`.
+
+    Raises:
+        CheckpointError: it is corrupt, of another kind, made for another machine, or holds numbers
+            that are not finite.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {})["brokk"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(
+            f"{path}: corrupt or truncated ({error}); copy it again or make a new one with `brokk mode=identify`"
+        ) from error
+    except (KeyError, ValueError) as error:
+        raise CheckpointError(
+            f"{path}: a safetensors file, but not an actuator of ours (no 'brokk' header)"
+        ) from error
+    if header.get("schema") != SCHEMA or header.get("kind") != kind:
+        raise CheckpointError(
+            f"{path}: holds a '{header.get('kind')}' of schema {header.get('schema')}, expected a '{kind}' of schema {SCHEMA}; "
+            "choose the actuator=… it was made for"
+        )
+    machine.check_fingerprint(header.get("fingerprint", {}), f"{path}")
+    for name, value in tensors.items():
+        if not bool(torch.isfinite(value).all()):
+            raise CheckpointError(
+                f"{path}: tensor '{name}' holds NaN or infinity; the fit diverged, make a new one with `brokk mode=identify`"
+            )
+    return tensors, header

@@ -1,0 +1,293 @@
+"""The rich plant that stands in for the machine: valves, one pump, cylinders, friction, weight and warm oil.
+
+Equations, per joint, with time step `substep_s` (symplectic Euler; friction implicit, so that it
+can never drive a joint):
+
+    u        command of `transport_s` ago, exact to the fraction of a sample
+    pilot    play operator of width `hysteresis` on u
+    spool    second order, `spool_hz`, `spool_damping`; slower in cold oil
+    opening  spool beyond the overlap of its side, progressive notch s (1 - c + c |s|)
+    flow     opening * min(1, pump / sum of flows over joints) * sqrt(1 - sign(opening) force /
+    supply) speed    flow * max_speed * (1 extending | `retract_ratio` retracting) * (1 +
+    `thermal_gain` (oil - reference)) force'   stiffness * (flow speed - joint speed) - leak
+    joint'   inertia * joint speed' = force + weight(q) - Coulomb, Stribeck and viscous friction
+
+Reduced, and why: the two chamber pressures are one load force, and the oil's stiffness does not
+depend on the piston's position (at 20 Hz only the first mode of the joint is visible, and the
+machine's YAML knows one stiffness); inertia is constant, `stiffness / (2 pi mode_hz)^2` (coupling
+through the arm's inertia is small against the 5 to 10 Hz of the oil column); pressure compensation
+is imperfect in one number, `load_sensitivity`; supply pressure is constant and the pump is limited
+by flow. Contact reaches the plant
+through the measured position only: a blocked joint keeps pushing, and the simulator's drive yields.
+"""
+
+import math
+
+import numpy as np
+import torch
+
+from actuators.models.parameters import Parameters, PerJoint, per_joint
+from actuators.models.transport import check_dead_time, commands_in_force, opened
+from brokk_rl.errors import ConfigError
+from brokk_rl.gravity import Gravity
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+@spec
+class Hydraulic:
+    """Valve spools, shared pump, oil compliance, friction, load, leak and oil temperature (stands in for the machine).
+
+    Attributes:
+        transport_s: Pure delay of radio, bus and pilot stage. Spool and oil add to it until the
+            joint moves.
+        hysteresis: Width of the play between command and spool, of full command.
+        spool_hz: Natural frequency of the spool in oil at the reference temperature.
+        spool_damping: Damping ratio of the spool.
+        overlap_extend: Spool stroke up to which no oil flows in the positive direction, of full
+            stroke.
+        overlap_retract: The same for the negative direction.
+        notch: Progressiveness `c` of the flow curve: 0 linear, 1 quadratic.
+        speed_scale: Speed at full command without load, extending, over the machine's `max_speed`.
+        retract_ratio: Retracting speed over extending speed at equal flow: bore area over rod-side
+            area, 1 for a motor.
+        flow_share: Flow at full opening over the flow of the pump.
+        supply_ratio: Force at supply pressure over the machine's `yield_force`.
+        load_sensitivity: 0 ideal pressure compensator (speed free of load), 1 none.
+        mode_hz: First mode of the joint on its closed cylinder; with the machine's `stiffness` this
+            gives the inertia.
+        leak_hz: Rate at which a held force bleeds off through the closed valve.
+        coulomb: Friction force in motion over the supply force.
+        breakaway: Friction force at the onset of motion over the supply force, at least `coulomb`.
+        stribeck_speed: Speed, of full speed, at which break-away friction has fallen to a third of
+            its excess.
+        viscous: Friction force proportional to speed, at full speed, over the supply force.
+        oil_start_c: Oil temperature after a reset.
+        oil_ambient_c: Temperature to which resting oil cools.
+        oil_rise_c: Rise above that at full pump flow, after a long time.
+        oil_time_s: Time constant of warming and cooling.
+        oil_reference_c: Temperature at which speeds and spool frequencies hold.
+        thermal_gain: Relative change of speed and spool frequency per kelvin.
+        substep_s: Own time step; the control period is divided into the nearest whole number of
+            them.
+        spread: Relative half width, by field name, of what is drawn per environment and joint at
+            reset.
+    """
+
+    transport_s: PerJoint
+    hysteresis: PerJoint
+    spool_hz: PerJoint
+    spool_damping: PerJoint
+    overlap_extend: PerJoint
+    overlap_retract: PerJoint
+    notch: PerJoint
+    speed_scale: PerJoint
+    retract_ratio: PerJoint
+    flow_share: PerJoint
+    supply_ratio: PerJoint
+    load_sensitivity: PerJoint
+    mode_hz: PerJoint
+    leak_hz: PerJoint
+    coulomb: PerJoint
+    breakaway: PerJoint
+    stribeck_speed: PerJoint
+    viscous: PerJoint
+    oil_start_c: float
+    oil_ambient_c: float
+    oil_rise_c: float
+    oil_time_s: float
+    oil_reference_c: float
+    thermal_gain: float
+    substep_s: float
+    spread: dict[str, float]
+
+    def check(self) -> None:
+        if not 0 < self.substep_s <= 0.01:
+            raise ConfigError(
+                f"actuator.substep_s: expected (0, 0.01] s, where the plant is stable, got {self.substep_s}"
+            )
+        if self.oil_time_s <= 0:
+            raise ConfigError(f"actuator.oil_time_s: expected more than 0, got {self.oil_time_s}")
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "HydraulicModel":
+        """Returns a model for `num_envs` environments on `device`.
+
+        Raises:
+            ConfigError: a number makes no sense, or the delay does not fit the machine's history.
+        """
+        return HydraulicModel(self, machine, num_envs, device)
+
+
+PER_JOINT = tuple(name for name, hint in Hydraulic.__annotations__.items() if hint is PerJoint)
+
+
+class HydraulicModel:
+    """The plant at work in `N` environments; see the module for its equations.
+
+    Attributes:
+        parameters: Numbers by name, `(N, J)`; write in place to simulate `N` candidates side by
+            side.
+    """
+
+    def __init__(
+        self, config: Hydraulic, machine: Machine, num_envs: int, device: torch.device
+    ) -> None:
+        nominal = {
+            name: per_joint(getattr(config, name), machine, f"actuator.{name}")
+            for name in PER_JOINT
+        }
+        _check(nominal)
+        longest_s = nominal["transport_s"].max() * (1.0 + config.spread.get("transport_s", 0.0))
+        check_dead_time(float(longest_s), machine, "actuator.transport_s")
+        self._parameters = Parameters(nominal, config.spread, num_envs, device, "actuator.spread")
+        self.parameters = self._parameters.value
+        self._config = config
+        self._period_s = machine.period_s
+        self._num_substeps = max(1, round(machine.period_s / config.substep_s))
+        self._gravity = Gravity(machine, device)
+
+        def tensor(values: np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=device)
+
+        self._lower, self._upper = tensor(machine.lower), tensor(machine.upper)
+        self._full_speed = tensor(machine.max_speed)
+        self._stiffness = tensor(np.array([body.stiffness.value for body in machine.bodies]))
+        self._yield_force = tensor(np.array([body.yield_force.value for body in machine.bodies]))
+        shape = (num_envs, machine.num_joints)
+        self._state = {
+            name: torch.zeros(shape, device=device)
+            for name in ("pilot", "spool", "spool_rate", "speed", "force")
+        }
+        self._state["oil_c"] = torch.zeros(num_envs, device=device)
+        self._state["fresh"] = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """`pilot`, `spool` (of full stroke), `spool_rate` (1/s), `speed` (rad/s), `force` (Nm), each `(N, J)`; `oil_c` `(N,)`."""
+        return {**self._state, **self._parameters.state}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Lets the environments of `mask`, shape `(N,)` bool, go on from their history at the next step."""
+        for name in ("pilot", "spool", "spool_rate", "speed", "force"):
+            self._state[name].masked_fill_(mask[:, None], 0.0)
+        self._state["oil_c"].masked_fill_(mask, self._config.oil_start_c)
+        self._state["fresh"].logical_or_(mask)
+        self._parameters.redraw(mask)
+
+    def step(self, history: History) -> torch.Tensor:
+        """Returns the joint positions one control period later, shape `(N, J)`."""
+        state, p, config = self._state, self.parameters, self._config
+        q, dt = history.q[:, -1], self._period_s / self._num_substeps
+        weight = self._gravity.load(q)
+        warm = 1.0 + config.thermal_gain * (state["oil_c"] - config.oil_reference_c)[:, None]
+        earlier, later, part = commands_in_force(history.u, p["transport_s"] / self._period_s)
+
+        supply = p["supply_ratio"] * self._yield_force
+        inertia = self._stiffness / (2.0 * math.pi * p["mode_hz"]) ** 2
+        pull = (
+            dt * (2.0 * math.pi * p["spool_hz"] * warm) ** 2,
+            dt * 2.0 * p["spool_damping"] * 2.0 * math.pi * p["spool_hz"] * warm,
+        )
+        extend_speed = p["speed_scale"] * self._full_speed * warm
+        retract_speed = extend_speed * p["retract_ratio"]
+        play = 0.5 * p["hysteresis"]
+        excess = p["breakaway"] - p["coulomb"]
+        knee = p["stribeck_speed"] * self._full_speed
+        viscous = p["viscous"] / self._full_speed
+        still = (
+            0.01 * self._full_speed
+        )  # below 1 % of full speed friction grows with speed: no stick-slip chatter at this time step
+        rub = dt * supply / inertia
+
+        def rubbing(speed: torch.Tensor) -> torch.Tensor:
+            """Friction force over supply force and speed."""
+            fast = speed.abs()
+            return (p["coulomb"] + excess * torch.exp(-fast / knee)) / (fast + still) + viscous
+
+        # a free run may begin in the middle of a motion, which the history shows; the spool trails
+        # its command by 2 damping / omega
+        trail_s = p["spool_damping"] / (math.pi * p["spool_hz"])
+        trailing, _, _ = commands_in_force(history.u, (p["transport_s"] + trail_s) / self._period_s)
+        measured = (q - history.q[:, -2]) / self._period_s
+        begun = {
+            "pilot": earlier,
+            "spool": trailing,
+            "spool_rate": torch.zeros_like(q),
+            "speed": measured,
+        }
+        begun["force"] = supply * rubbing(measured) * measured - weight
+        pilot, spool, spool_rate, speed, force = (
+            torch.where(state["fresh"][:, None], begun[name], state[name])
+            for name in ("pilot", "spool", "spool_rate", "speed", "force")
+        )
+        demand = torch.zeros_like(q)
+        for i in range(self._num_substeps):
+            u = torch.lerp(
+                later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0)
+            )  # smooth in the delay
+            pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
+            spool_rate = spool_rate + pull[0] * (pilot - spool) - pull[1] * spool_rate
+            spool = (spool + dt * spool_rate).clamp(-1.0, 1.0)
+            opening = opened(spool, p["overlap_extend"], p["overlap_retract"])
+            opening = opening * (1.0 - p["notch"] + p["notch"] * opening.abs())
+            demand = opening.abs() * p["flow_share"]
+            opening = opening / demand.sum(1, keepdim=True).clamp(min=1.0)
+            head = (
+                (1.0 - p["load_sensitivity"] * opening.sign() * force / supply)
+                .clamp(0.0, 2.0)
+                .sqrt()
+            )
+            flow_speed = opening * head * torch.where(opening > 0, extend_speed, retract_speed)
+            force = force + dt * (self._stiffness * (flow_speed - speed) - p["leak_hz"] * force)
+            force = torch.minimum(torch.maximum(force, -supply), supply)  # relief valves
+            speed = (speed + dt * (force + weight) / inertia) / (1.0 + rub * rubbing(speed))
+            moved = q + dt * speed
+            q = moved.clamp(self._lower, self._upper)
+            speed = speed.masked_fill(q != moved, 0.0)
+
+        for name, value in (
+            ("pilot", pilot),
+            ("spool", spool),
+            ("spool_rate", spool_rate),
+            ("speed", speed),
+            ("force", force),
+        ):
+            state[name].copy_(value)
+        state["fresh"].fill_(False)
+        work = demand.sum(1).clamp(max=1.0)
+        settled_c = config.oil_ambient_c + config.oil_rise_c * work
+        state["oil_c"].add_(
+            (settled_c - state["oil_c"]) * (1.0 - math.exp(-self._period_s / config.oil_time_s))
+        )
+        return q
+
+
+def _check(nominal: dict[str, np.ndarray]) -> None:
+    """Raises a `ConfigError` for numbers outside the range in which the equations mean something."""
+    positive = (
+        "spool_hz",
+        "spool_damping",
+        "speed_scale",
+        "retract_ratio",
+        "flow_share",
+        "supply_ratio",
+        "mode_hz",
+        "stribeck_speed",
+    )
+    for name, value in nominal.items():
+        low = 1e-6 if name in positive else 0.0
+        if (value < low).any():
+            raise ConfigError(
+                f"actuator.{name}: expected {'more than 0' if low else '0 or more'}, got {value.tolist()}"
+            )
+    for name in ("overlap_extend", "overlap_retract", "hysteresis", "notch", "load_sensitivity"):
+        if (nominal[name] > (0.9 if name.startswith("overlap") else 1.0)).any():
+            raise ConfigError(
+                f"actuator.{name}: expected at most {0.9 if name.startswith('overlap') else 1.0}, got {nominal[name].tolist()}"
+            )
+    if (nominal["breakaway"] < nominal["coulomb"]).any():
+        raise ConfigError(
+            "actuator.breakaway: expected at least actuator.coulomb (friction at rest is no smaller than in motion)"
+        )

@@ -1,0 +1,124 @@
+"""Dead time, dead band, gain and a first-order lag: the smallest model in which a hydraulic arm is recognisable."""
+
+import torch
+
+from actuators.models.parameters import Parameters, PerJoint, per_joint
+from actuators.models.transport import check_dead_time, commands_in_force, opened
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+@spec
+class Lag:
+    """Dead time, dead band on each side, gain and first-order lag, joint by joint.
+
+    Attributes:
+        dead_time_s: Pure transport delay of the command; `null` takes the machine's. Need not be a
+            multiple of the period.
+        dead_band_extend: Command up to which nothing moves in the positive direction, in [0, 1).
+        dead_band_retract: The same for the negative direction.
+        gain: Speed at full command over the machine's `max_speed`.
+        time_constant_s: Time constant with which the speed follows the command; 0 for none.
+        spread: Relative half width, by field name, of what is drawn per environment and joint at
+            reset.
+    """
+
+    dead_time_s: PerJoint | None
+    dead_band_extend: PerJoint
+    dead_band_retract: PerJoint
+    gain: PerJoint
+    time_constant_s: PerJoint
+    spread: dict[str, float]
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "LagModel":
+        """Returns a model for `num_envs` environments on `device`.
+
+        Raises:
+            ConfigError: the dead time does not fit the machine's history, or a number makes no
+                sense.
+        """
+        return LagModel(self, machine, num_envs, device)
+
+
+class LagModel:
+    """Exact solution of `time_constant * v' + v = v_full * opened(u(t - dead_time))` over each part of the control period.
+
+    Attributes:
+        parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
+            candidates side by side; gradients flow to an entry that wants them until the next
+            `reset`.
+    """
+
+    def __init__(self, config: Lag, machine: Machine, num_envs: int, device: torch.device) -> None:
+        names = ("dead_band_extend", "dead_band_retract", "gain", "time_constant_s")
+        nominal = {
+            name: per_joint(getattr(config, name), machine, f"actuator.{name}") for name in names
+        }
+        dead_time_s = machine.dead_time_s if config.dead_time_s is None else config.dead_time_s
+        nominal["dead_time_s"] = per_joint(dead_time_s, machine, "actuator.dead_time_s")
+        for name in names[:2]:
+            if ((nominal[name] < 0) | (nominal[name] >= 1)).any():
+                raise ConfigError(
+                    f"actuator.{name}: expected dead bands in [0, 1), got {nominal[name].tolist()}"
+                )
+        if (nominal["time_constant_s"] < 0).any():
+            raise ConfigError(
+                f"actuator.time_constant_s: expected 0 or more, got {nominal['time_constant_s'].tolist()}"
+            )
+        longest_s = nominal["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
+        check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
+        self._parameters = Parameters(nominal, config.spread, num_envs, device, "actuator.spread")
+        self.parameters = self._parameters.value
+        self._period_s = machine.period_s
+        self._max_speed = torch.as_tensor(machine.max_speed, dtype=torch.float32, device=device)
+        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
+        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
+        self._speed = torch.zeros(num_envs, machine.num_joints, device=device)
+        self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """`speed` `(N, J)` in rad/s or m/s, whether it is still to be read off the history, and what was drawn at reset."""
+        return {"speed": self._speed, "fresh": self._fresh, **self._parameters.state}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Lets the environments of `mask`, shape `(N,)` bool, go on from their history; draws their parameters; cuts gradients."""
+        if self._speed.requires_grad:
+            self._speed.detach_()
+        self._speed.masked_fill_(mask[:, None], 0.0)
+        self._fresh.logical_or_(mask)
+        self._parameters.redraw(mask)
+
+    def step(self, history: History) -> torch.Tensor:
+        """Returns the joint positions one control period later, shape `(N, J)`."""
+        value = self.parameters
+        earlier, later, part = commands_in_force(history.u, value["dead_time_s"] / self._period_s)
+        q = history.q[:, -1]
+        # a free run may begin in the middle of a motion; at rest the history is level
+        speed = torch.where(
+            self._fresh.clone()[:, None], (q - history.q[:, -2]) / self._period_s, self._speed
+        )
+        for u, duration_s in (
+            (earlier, part * self._period_s),
+            (later, (1.0 - part) * self._period_s),
+        ):
+            target = (
+                opened(u, value["dead_band_extend"], value["dead_band_retract"])
+                * value["gain"]
+                * self._max_speed
+            )
+            time_constant_s = value["time_constant_s"].clamp(
+                min=1e-6
+            )  # 0 would divide by zero; a microsecond is as good
+            decay = torch.exp(-duration_s / time_constant_s)
+            q = q + target * duration_s + (speed - target) * time_constant_s * (1.0 - decay)
+            speed = target + (speed - target) * decay
+        held = q.clamp(self._lower, self._upper)
+        self._speed.copy_(
+            speed.masked_fill(held != q, 0.0)
+        )  # a joint at its stop has no speed left
+        self._fresh.fill_(False)
+        return held

@@ -1,0 +1,178 @@
+"""Baselines that a learned actuator must beat: a machine that stands still, and a linear model."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from actuators.models import checkpoint
+from brokk_rl.errors import CheckpointError, ConfigError, RecordingError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.spec import spec
+
+
+@spec
+class Hold:
+    """Never moves: the error that any model must beat."""
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "HoldModel":
+        """Returns the model."""
+        return HoldModel()
+
+
+class HoldModel:
+    """`q' = q`."""
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Nothing."""
+        return {}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Does nothing."""
+
+    def step(self, history: History) -> torch.Tensor:
+        """Returns the newest position, shape `(N, J)`."""
+        return history.q[:, -1].clone()
+
+
+@spec
+class HoldFit:
+    """Nothing to learn: the machine stands still.
+
+    Attributes:
+        name: Name in tables.
+    """
+
+    name: str
+
+    def fit(
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        validation: Sequence[Recording],
+        folder: Path,
+        seed: int,
+        device: torch.device,
+    ) -> Hold:
+        """Returns `Hold`."""
+        return Hold()
+
+
+@spec
+class Arx:
+    """Linear in the last 13 u, |u| u and increments; one row of weights a joint.
+
+    Attributes:
+        checkpoint: A file, or the name of one that ships with the package.
+    """
+
+    checkpoint: str
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ArxModel":
+        """Returns the model.
+
+        Raises:
+            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
+                NaN.
+        """
+        path = checkpoint.found(self.checkpoint)
+        tensors, _ = checkpoint.read(path, "arx", machine)
+        expected = (machine.num_joints, 3 * machine.num_history - 1)
+        if "weight" not in tensors or tuple(tensors["weight"].shape) != expected:
+            raise CheckpointError(f"{path}: expected a tensor 'weight' of shape {expected}")
+        return ArxModel(tensors["weight"].to(device), machine, device)
+
+
+class ArxModel:
+    """`q' = q + weight . [u, |u| u, increments]`, each joint from its own history."""
+
+    def __init__(self, weight: torch.Tensor, machine: Machine, device: torch.device) -> None:
+        self._weight = weight
+        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
+        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Nothing."""
+        return {}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Does nothing."""
+
+    def step(self, history: History) -> torch.Tensor:
+        """Returns the joint positions one control period later, shape `(N, J)`."""
+        u, q = history.u, history.q
+        inputs = torch.cat([u, u.abs() * u, q[:, 1:] - q[:, :-1]], 1)
+        moved = torch.einsum("nij,ji->nj", inputs, self._weight)
+        return (q[:, -1] + moved).clamp(self._lower, self._upper)
+
+
+@spec
+class ArxFit:
+    """Ridge regression of the next increment, joint by joint.
+
+    Attributes:
+        name: Name in tables and of the checkpoint.
+        ridge: Weight of the penalty, relative to the mean square of the inputs.
+    """
+
+    name: str
+    ridge: float
+
+    def check(self) -> None:
+        if self.ridge < 0:
+            raise ConfigError(f"ridge: expected 0 or more, got {self.ridge}")
+
+    def fit(
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        validation: Sequence[Recording],
+        folder: Path,
+        seed: int,
+        device: torch.device,
+    ) -> Arx:
+        """Fits to `train` and writes `<name>.safetensors` into `folder`.
+
+        Raises:
+            RecordingError: too little data.
+        """
+        size = machine.num_history
+        rows, targets = [], []
+        for recording in train:
+            if recording.num_samples <= size:
+                continue
+            u, q = recording.u.astype(np.float64), recording.q.astype(np.float64)
+            views = [
+                np.lib.stride_tricks.sliding_window_view(x, size, 0)[:-1]
+                for x in (u, np.abs(u) * u)
+            ]  # (T - H, J, H)
+            increments = np.lib.stride_tricks.sliding_window_view(np.diff(q, axis=0), size - 1, 0)[
+                :-1
+            ]
+            rows.append(np.concatenate([*views, increments], 2))
+            targets.append(q[size:] - q[size - 1 : -1])
+        if not rows:
+            raise RecordingError(
+                f"too little data: none of {len(train)} recordings is longer than the history of {size} samples"
+            )
+        inputs, target = np.concatenate(rows), np.concatenate(targets)
+        weight = np.zeros((machine.num_joints, inputs.shape[2]))
+        for j in range(machine.num_joints):
+            x = inputs[:, j]
+            scale = np.sqrt(np.mean(x**2, 0)) + 1e-9
+            gram = (x / scale).T @ (x / scale) / len(x) + self.ridge * np.eye(x.shape[1])
+            weight[j] = np.linalg.solve(gram, (x / scale).T @ target[:, j] / len(x)) / scale
+        path = folder / f"{self.name}.safetensors"
+        checkpoint.write(
+            path,
+            "arx",
+            machine,
+            {"weight": torch.as_tensor(weight, dtype=torch.float32)},
+            {"ridge": self.ridge},
+        )
+        return Arx(checkpoint=str(path))

@@ -1,0 +1,109 @@
+"""Numbers of an actuator: given once or joint by joint, and, where asked for, drawn anew for each environment and episode."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from actuators.models.draw import hashed
+from brokk_rl.errors import ConfigError, choices
+from brokk_rl.machine import Machine
+
+OTHER = "other"
+"""Key for the joints that a per-joint table does not name."""
+
+PerJoint = float | dict[str, float]
+"""One number for all joints, or a table by joint name; `other` stands for the joints it does not
+name."""
+
+
+def per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarray:
+    """Returns `value` for every joint of `machine`, shape `(J,)`.
+
+    A table that has `other` may name joints that this machine lacks, so that one file serves
+    several machines; without `other` it must name exactly the joints of the machine.
+
+    Raises:
+        ConfigError: a joint is missing or unknown; names `where`.
+    """
+    if not isinstance(value, Mapping):
+        return np.full(machine.num_joints, float(value))
+    known = machine.joint_names
+    if OTHER not in value:
+        for name in value:
+            if name not in known:
+                raise ConfigError(
+                    f"{where}: '{name}' is no joint of machine '{machine.name}'; {choices(name, (*known, OTHER))}"
+                )
+    missing = [name for name in known if name not in value and OTHER not in value]
+    if missing:
+        raise ConfigError(
+            f"{where}: no value for {', '.join(missing)} of machine '{machine.name}'; add them, or '{OTHER}'"
+        )
+    return np.array([float(value.get(name, value.get(OTHER, 0.0))) for name in known])
+
+
+class Parameters:
+    """Numbers of an actuator for all environments: tensors `(N, J)` of fixed address, in `value` by name.
+
+    With a `spread` a number is `nominal * (1 + spread * U(-1, 1))`, drawn per environment and joint
+    at each reset. The draws come
+    from a counter in `state` and not from a generator: no host is involved, a CUDA graph may hold
+    them, and a resumed run goes on exactly.
+
+    Args:
+        nominal: Nominal values by name, each `(J,)`.
+        spread: Relative half width by name; names that are not listed stay at their nominal value.
+        num_envs: Number of environments, `N`.
+        device: Where the tensors live.
+        where: Spec field named in error messages.
+
+    Raises:
+        ConfigError: `spread` names something that is no parameter, or is outside [0, 1).
+    """
+
+    def __init__(
+        self,
+        nominal: Mapping[str, np.ndarray],
+        spread: Mapping[str, float],
+        num_envs: int,
+        device: torch.device,
+        where: str,
+    ) -> None:
+        for name, width in spread.items():
+            if name not in nominal:
+                raise ConfigError(f"{where}: '{name}' is no parameter; {choices(name, nominal)}")
+            if not 0 <= width < 1:
+                raise ConfigError(
+                    f"{where}.{name}: expected a relative half width in [0, 1), got {width}"
+                )
+        self.value = {
+            name: torch.as_tensor(value, dtype=torch.float32, device=device)
+            .expand(num_envs, -1)
+            .clone()
+            for name, value in nominal.items()
+        }
+        self.state: dict[str, torch.Tensor] = {}
+        self._width = dict(spread)
+        self._nominal = {name: self.value[name].clone() for name in spread}
+        if spread:
+            seed = torch.initial_seed() % 2**31
+            self._draw = (
+                torch.arange(num_envs, dtype=torch.int64, device=device) * 2_654_435_761 + seed
+            )
+            self.state = {
+                "draw": self._draw,
+                **{f"drawn_{name}": self.value[name] for name in spread},
+            }
+            num_joints = next(iter(self.value.values())).shape[1]
+            self._joint = torch.arange(num_joints, dtype=torch.int64, device=device) * 40_503
+
+    def redraw(self, mask: torch.Tensor) -> None:
+        """Draws new values in the environments of `mask`, shape `(N,)` bool."""
+        if not self._width:
+            return
+        self._draw.add_(mask.to(torch.int64))
+        for column, (name, width) in enumerate(self._width.items()):
+            uniform = hashed(self._draw[:, None] * 7_919 + self._joint + column * 104_729)
+            drawn = self._nominal[name] * (1.0 + width * (2.0 * uniform - 1.0))
+            self.value[name].copy_(torch.where(mask[:, None], drawn, self.value[name]))

@@ -1,0 +1,1 @@
+"""Modes of recordings and models: `collect`, `convert`, `inspect`, `identify`."""

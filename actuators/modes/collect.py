@@ -1,0 +1,257 @@
+"""`brokk mode=collect`: plans an excitation, shows the plan, drives a machine through it, and writes recordings."""
+
+import json
+import logging
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rich.progress import Progress
+
+from actuators.excite.plan import account, picture
+from actuators.excite.plan.account import Track
+from actuators.excite.plan.drive import Nominal, Sample, drive
+from actuators.excite.plan.guard import Guards, predicted_tool_speed
+from actuators.excite.plan.runner import Runner
+from actuators.excite.plan.schedule import Approach, Plan, schedule
+from brokk_rl import record
+from brokk_rl.contracts.actuator import Excitation
+from brokk_rl.contracts.link import Connection
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.recording_validation import RATE_TOLERANCE
+from brokk_rl.session import Session, write_json
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+FOLDER = "recordings"
+CUT = 0.2
+"""Part of a program that may be missing at the end of a run without a warning."""
+
+
+@spec
+class Collection:
+    """How much to record, and within which bounds.
+
+    Attributes:
+        num_runs: Runs side by side, each on a machine of its own; a real machine has one.
+        run_minutes: Length of each run; its oil warms up over this time.
+        file_minutes: A run is cut into files of this length.
+        flush_s: The file that grows is written again after this time, so that even a power failure
+            costs no more.
+        only_plan: Stop after `plan.png` and `plan.json`, before anything moves.
+        approach: How start poses are taken up.
+        guards: Bounds that no program can exceed.
+    """
+
+    num_runs: int
+    run_minutes: float
+    file_minutes: float
+    flush_s: float
+    only_plan: bool
+    approach: Approach
+    guards: Guards
+
+    def check(self) -> None:
+        if self.num_runs < 1:
+            raise ConfigError(f"collect.num_runs: expected 1 or more, got {self.num_runs}")
+        if not 0 < self.file_minutes <= self.run_minutes:
+            raise ConfigError(
+                f"collect: expected 0 < file_minutes <= run_minutes, got {self.file_minutes} and {self.run_minutes}"
+            )
+        if self.flush_s <= 0:
+            raise ConfigError(f"collect.flush_s: expected more than 0, got {self.flush_s}")
+
+
+@spec
+class Collect:
+    """Drives a machine, simulated or real, through a plan of excitations; writes what was commanded and measured, as recordings."""
+
+    session: Session
+    machine: Machine
+    link: Connection
+    excitation: dict[str, Excitation]
+    collect: Collection
+
+    def run(self) -> None:
+        """Writes `plan.png` and `plan.json`, then `recordings/<run>_<part>.parquet`, into the run folder.
+
+        Raises:
+            ConfigError: the plan finds no room in a run.
+            LinkError: the link to the machine failed; what was recorded until then is kept.
+            StorageError: a file could not be written.
+        """
+        self.session.seed_all()
+        settings, run_s = self.collect, self.collect.run_minutes * 60.0
+        plan = schedule(
+            self.excitation,
+            self.machine,
+            settings.approach,
+            settings.num_runs,
+            run_s,
+            self.session.generator("collect"),
+        )
+        self._show(plan)
+        if settings.only_plan:
+            return
+        link = self.link.build(self.machine, settings.num_runs, self.session)
+        writer = Writer(self.machine, plan, self._folder, settings, self._metadata(plan))
+        with link as opened, Progress(transient=True) as progress:
+            task = progress.add_task(f"{settings.num_runs} runs", total=run_s)
+            try:
+                for sample in drive(
+                    opened, self._runner(plan), self.machine, settings.num_runs, run_s
+                ):
+                    writer.add(sample)
+                    progress.advance(task, self.machine.period_s)
+            finally:
+                writer.close()  # what was recorded before an interruption is kept
+        log.info(
+            "%d recordings of %.1f minutes in all in %s",
+            writer.files,
+            writer.recorded_s / 60.0,
+            self._folder,
+        )
+
+    @property
+    def _folder(self) -> Path:
+        return self.session.folder / FOLDER
+
+    def _runner(self, plan: Plan) -> Runner:
+        return Runner(plan, self.machine, self.collect.approach, self.collect.guards)
+
+    def _show(self, plan: Plan) -> None:
+        """Tries the plan out on a nominal machine; writes picture and figures."""
+        machine, count = self.machine, self.collect.num_runs
+        track = Track(
+            drive(Nominal(machine, count), self._runner(plan), machine, count, plan.run_s)
+        )
+        summary = account.summary(plan, track, machine)
+        write_json(self.session.folder / "plan.json", summary)
+        picture.draw_plan(
+            plan,
+            track,
+            machine,
+            predicted_tool_speed(machine, track.q[:, 0]),
+            self.session.folder / "plan.png",
+        )
+        unplayed = {
+            entry["name"]
+            for run in summary["runs"]
+            for entry in run
+            if entry["cut_s"] > CUT * entry["program_s"]
+        }
+        if unplayed:
+            log.warning(
+                "plan: no time for %s in some of the runs; raise collect.run_minutes",
+                ", ".join(sorted(unplayed)),
+            )
+        log.info(
+            "plan: %d segments in the first of %d runs; see %s",
+            len(plan.runs[0]),
+            count,
+            self.session.folder / "plan.png",
+        )
+
+    def _metadata(self, plan: Plan) -> dict[str, str]:
+        return {
+            "source": f"{self.link.source}, excitation: {', '.join(plan.names)}",
+            "fingerprint": record.stamp(self.machine),
+            "seed": str(self.session.seed),
+        }
+
+
+class Writer:
+    """Cuts the samples of all runs into files and writes them; a file that grows is written again every now and then.
+
+    Attributes:
+        files: Number of files written.
+        recorded_s: Time recorded, all runs together.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        plan: Plan,
+        folder: Path,
+        settings: Collection,
+        metadata: dict[str, str],
+    ) -> None:
+        self._plan, self._folder, self._period_s, self._flush_s = (
+            plan,
+            folder,
+            machine.period_s,
+            settings.flush_s,
+        )
+        self._per_file = max(2, round(settings.file_minutes * 60.0 / machine.period_s))
+        self._names = [f"{'-'.join(plan.names)}_{n:02d}" for n in range(len(plan.runs))]
+        self._created, self._begin_s = record.now(), 0.0
+        self._template = record.Recording(
+            machine=machine.name,
+            joints=machine.joint_names,
+            units=tuple(joint.unit for joint in machine.joints),
+            rate_hz=1.0 / machine.period_s,
+            t_s=np.empty(0),
+            u=np.empty(0),
+            q=np.empty(0),
+            metadata=metadata,
+        )
+        self._part, self._samples, self._written = 0, [], time.monotonic()
+        self.files, self.recorded_s = 0, 0.0
+
+    def add(self, sample: Sample) -> None:
+        """Appends one sample of all runs; begins new files where the old ones are long enough, or time has a gap."""
+        if not self.files and not self._samples:
+            self._begin_s = sample.t_s
+        if self._samples:
+            late = abs((sample.t_s - self._samples[-1].t_s) / self._period_s - 1.0) > RATE_TOLERANCE
+            if late or len(self._samples) >= self._per_file:
+                self._finish()
+        self._samples.append(sample)
+        if time.monotonic() - self._written > self._flush_s:
+            self._write()
+
+    def close(self) -> None:
+        """Writes what is pending."""
+        self._finish()
+
+    def _finish(self) -> None:
+        """Writes the present files for the last time; a single sample is no recording and is left out."""
+        if len(self._samples) > 1:
+            self._write()
+            self._part += 1
+            self.files += len(self._names)
+            self.recorded_s += len(self._names) * len(self._samples) * self._period_s
+        self._samples = []
+
+    def _write(self) -> None:
+        """Writes one file a run."""
+        self._written = time.monotonic()
+        if len(self._samples) < 2:
+            return
+        samples = self._samples
+        track, begin_s = Track(samples), samples[0].t_s
+        extra = {
+            name: np.stack([sample.extra[name] for sample in samples], 1)
+            for name in samples[0].extra
+        }
+        for n, name in enumerate(self._names):
+            notes = account.notes(track, n, self._plan.runs[n], self._period_s)
+            metadata = {
+                **self._template.metadata,
+                "created": record.later(self._created, begin_s - self._begin_s),
+                "run": f"{name} {self._created}",
+                "excitation": json.dumps(notes),
+            }
+            columns = {key: values[n] for key, values in extra.items()}
+            recording = replace(
+                self._template,
+                t_s=track.t_s - begin_s,
+                u=track.u[:, n],
+                q=track.q[:, n],
+                extra=columns,
+                metadata=metadata,
+            )
+            record.write(recording, self._folder / f"{name}_{self._part:02d}.parquet")

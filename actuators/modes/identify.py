@@ -1,0 +1,301 @@
+"""`brokk mode=identify`: fits an actuator model to recordings and says how good it is on recordings it has not seen."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from actuators.identify import page
+from actuators.identify.findings import Identified, gather
+from actuators.identify.stages import Fitted, Stage, fitted, members
+from actuators.identify.verdict import HOLD, LINEAR, Finding
+from brokk_rl import open_loop, record
+from brokk_rl.contracts.actuator import ActuatorFit
+from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.session import Session, read_record, write_json
+from brokk_rl.spec import spec
+from brokk_rl.split import by_run, check_commanded, split
+
+log = logging.getLogger(__name__)
+
+HORIZONS_S = (1.0, 2.0, 5.0, 10.0)
+"""Horizons of `identification.json`."""
+TONES = {"good": "green", "bad": "red", "warn": "yellow", "plain": "default"}
+
+Runs = Mapping[str, Sequence[Recording]]
+
+
+@spec
+class Identification:
+    """What to fit to and what to judge by. Runs are never split: parts of one run stay together.
+
+    Attributes:
+        recordings: Glob, or list of globs, of recordings to fit to.
+        test: Glob or globs of unseen recordings to judge by, best of another excitation; `null`
+            sets a part of `recordings` aside.
+        folds: Cross-validation: each run is judged once, by a model fitted to the other folds; then
+            one model is fitted to all runs
+            and kept. For few recordings. `null`: one split.
+        hold_out: One part in so many is kept from the fit to stop it by, and another one to judge
+            by (without `test`).
+        stride_s: Distance between the beginnings of two free runs.
+        threads: CPU threads for the fit; the networks are so small that one is fastest, above all
+            beside other work.
+    """
+
+    recordings: str | tuple[str, ...]
+    test: str | tuple[str, ...] | None
+    folds: int | None
+    hold_out: int
+    stride_s: float
+    threads: int
+
+    def check(self) -> None:
+        if self.hold_out < 3:
+            raise ConfigError(f"identify.hold_out: expected 3 or more, got {self.hold_out}")
+        if self.threads < 1:
+            raise ConfigError(f"identify.threads: expected 1 or more, got {self.threads}")
+        if self.stride_s <= 0:
+            raise ConfigError(f"identify.stride_s: expected more than 0, got {self.stride_s}")
+        if self.folds is not None and self.folds < 2:
+            raise ConfigError(
+                f"identify.folds: expected 2 or more, or null for one split, got {self.folds}"
+            )
+        if self.folds is not None and self.test is not None:
+            raise ConfigError("identify: folds and test are two ways of judging; give one of them")
+
+
+@spec
+class Identify:
+    """Fits an actuator model to recordings; compares free runs on unseen ones with baselines and rivals.
+
+    Attributes:
+        session: Folder, seed, device.
+        machine: The machine that was recorded.
+        fit: The model that is kept.
+        baselines: What it is compared with, by name: `hold`, `arx`, and any more
+            (`+fit@baselines.<name>=<fit>`).
+        identify: What to fit to and what to judge by.
+        resume: Run folder of an interrupted identification to go on with; the same as
+            `session.out`.
+    """
+
+    session: Session
+    machine: Machine
+    fit: ActuatorFit
+    baselines: dict[str, ActuatorFit]
+    identify: Identification
+    resume: str | None
+
+    def check(self) -> None:
+        if lacking := {HOLD, LINEAR} - self.baselines.keys():
+            raise ConfigError(
+                f"baselines: {' and '.join(sorted(lacking))} must be among them; no error means anything by itself"
+            )
+        if self.baselines.get(self.fit.name, self.fit) != self.fit:
+            raise ConfigError(
+                f"baselines.{self.fit.name} differs from fit, but has its name; give it another: +fit@baselines.<name>=…"
+            )
+
+    def run(self) -> float:
+        """Writes the model, `identification.json`, pictures and `identification.html`; returns the error at the longest horizon.
+
+        Returns:
+            Root mean square error at 10 s (or the longest horizon that fits), % of travel, mean
+            over joints.
+
+        Raises:
+            RecordingError: a recording cannot be used, or there is too little data.
+            CheckpointError: the fit left nothing that can be loaded.
+            StorageError: something could not be written, or the folder holds other fits.
+        """
+        self._check_resume()
+        self.session.seed_all()
+        stages = self._stages()
+        judged = [recording for stage in stages for recording in members(stage.test)]
+        horizons_s = [
+            h for h in HORIZONS_S if h <= open_loop.longest_s(judged, self.machine) + 1e-9
+        ]
+        cuts = [self._cut(stage, horizons_s) for stage in stages]
+        models = {self.fit.name: self.fit, **self.baselines}
+        done: list[dict[str, Fitted]] = []
+        device = self.session.torch_device()
+        with _threads(self.identify.threads):
+            for stage, cut in zip(stages, cuts, strict=True):
+                chosen = models if cut or not self.identify.folds else {self.fit.name: self.fit}
+                done.append(
+                    {
+                        name: self._fitted(stage, name, fit, cut, device)
+                        for name, fit in chosen.items()
+                    }
+                )
+        identified = Identified(
+            self.machine, self.fit.name, stages, cuts, done, tuple(horizons_s), HORIZONS_S
+        )
+        result, findings, drawings = gather(
+            identified, self.session.generator("resample"), self.session.generator("delay")
+        )
+        result |= {"device": str(device), "seed": self.session.seed, "folds": self.identify.folds}
+        folder = self.session.folder
+        write_json(folder / "identification.json", result)
+        page.write(folder, result, findings, drawings, self.machine)
+        _show(result, findings, folder)
+        return result["overall"][self.fit.name][f"{horizons_s[-1]:g}"]["percent"]
+
+    def _check_resume(self) -> None:
+        if self.resume is None:
+            return
+        if Path(self.resume).resolve() != self.session.folder.resolve():
+            raise ConfigError(
+                f"resume={self.resume}: an identification goes on in its own folder; add session.out={self.resume}"
+            )
+        if not (read_record(self.session.folder) or {}).get("resumed"):
+            raise ConfigError(
+                f"resume={self.resume}: there is no run to go on with; leave resume away to begin one"
+            )
+
+    def _stages(self) -> list[Stage]:
+        """Returns the fits to do, each with whole runs to fit to, to stop by, and to judge by."""
+        options, folder = self.identify, self.session.folder
+        runs = by_run(record.read_all(options.recordings, self.machine))
+        if options.folds:
+            check_commanded(
+                runs, self.machine, 3, "for every fold to have one to fit to and one to stop by"
+            )
+            if len(runs) < options.folds:
+                raise RecordingError(
+                    f"too little data: identify.folds={options.folds}, but there are {len(runs)} runs"
+                )
+            stages = []
+            for number, tested in enumerate(
+                split(
+                    runs, dict.fromkeys(map(str, range(options.folds)), 1.0 / options.folds)
+                ).values()
+            ):
+                name, rest = (
+                    f"fold {number + 1} of {options.folds}",
+                    {key: runs[key] for key in runs if key not in tested},
+                )
+                test = {key: runs[key] for key in tested}
+                stages.append(self._stage(name, folder / "folds" / str(number + 1), rest, test))
+            return [*stages, self._stage("all runs", folder, runs, {})]
+        if options.test is not None:
+            test = by_run(record.read_all(options.test, self.machine))
+            self._check_unseen(runs, test)
+            check_commanded(runs, self.machine, 2, "one to fit to and one to stop the fit by")
+            return [self._stage("", folder, runs, test)]
+        check_commanded(
+            runs,
+            self.machine,
+            3,
+            "one to fit to, one to stop the fit by and one to judge by (identify.test, or folds)",
+        )
+        share = 1.0 / options.hold_out
+        parts = split(runs, {"rest": 1.0 - share, "test": share})
+        rest, test = ({name: runs[name] for name in parts[part]} for part in ("rest", "test"))
+        return [self._stage("", folder, rest, test)]
+
+    def _stage(self, name: str, folder: Path, rest: Runs, test: Runs) -> Stage:
+        check_commanded(
+            rest,
+            self.machine,
+            2,
+            f"{f'in {name} ' if name else ''}one to fit to and one to stop the fit by",
+        )
+        share = 1.0 / self.identify.hold_out
+        parts = split(rest, {"train": 1.0 - share, "validation": share})
+        train, validation = (
+            {key: rest[key] for key in parts[part]} for part in ("train", "validation")
+        )
+        return Stage(
+            name, folder, self.session.stream(f"fit {name}".strip()), train, validation, test
+        )
+
+    def _check_unseen(self, runs: Runs, test: Runs) -> None:
+        files = [{r.path.resolve() for r in members(part) if r.path} for part in (runs, test)]
+        if shared := {*map(str, files[0] & files[1]), *(runs.keys() & test.keys())}:
+            raise RecordingError(
+                f"identify.test: {min(shared)} is also among identify.recordings; judge by runs that were not fitted to"
+            )
+
+    def _cut(self, stage: Stage, horizons_s: Sequence[float]) -> open_loop.Windows | None:
+        if not stage.test and self.identify.folds:
+            return None
+        shortest, longest = (
+            (horizons_s[0], horizons_s[-1]) if horizons_s else (HORIZONS_S[0], HORIZONS_S[0])
+        )
+        return open_loop.windows(
+            members(stage.test), self.machine, longest, self.identify.stride_s, shortest
+        )
+
+    def _fitted(
+        self,
+        stage: Stage,
+        name: str,
+        fit: ActuatorFit,
+        cut: open_loop.Windows | None,
+        device: torch.device,
+    ) -> Fitted:
+        folder = stage.folder if name == self.fit.name else stage.folder / "baselines" / name
+        return fitted(stage, name, fit, folder, self.machine, cut, device)
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Limits torch to `count` CPU threads within the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(min(count, before))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _show(result: Mapping, findings: Sequence[Finding], folder: Path) -> None:
+    horizons = list(result["overall"][result["model"]])
+    table = Table(
+        title="error at the end of free runs on unseen runs (RMSE, rad or m; last rows: % of travel)",
+        box=None,
+    )
+    for column in ("joint", "model", *(f"{horizon} s" for horizon in horizons), "dead time"):
+        table.add_column(
+            column, justify="left" if column in ("joint", "model") else "right", no_wrap=True
+        )
+    blocks = [
+        (joint, models, "rmse", 4, result["delay_s"][joint])
+        for joint, models in result["joints"].items()
+    ]
+    for joint, models, key, digits, delay in (
+        *blocks,
+        ("all joints", result["overall"], "percent", 2, None),
+    ):
+        for row, name in enumerate(models):
+            cells = []
+            for horizon in horizons:
+                given = {
+                    other: rows[horizon][key] for other, rows in models.items() if rows[horizon]
+                }
+                text = f"{given[name]:.{digits}f}" if given else "–"
+                cells.append(
+                    f"[bold]{text}[/]" if given and given[name] == min(given.values()) else text
+                )
+            table.add_row(
+                "" if row else joint,
+                name,
+                *cells,
+                "" if row or delay is None else f"{delay['value']:.2f} s",
+            )
+    console = Console()
+    console.print(table)
+    for finding in findings:
+        if finding is findings[0] or finding.tone in ("bad", "warn"):
+            console.print(finding.text, style=TONES[finding.tone], highlight=False)
+    console.print(f"report: {folder / page.PAGE}", highlight=False)

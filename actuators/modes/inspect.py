@@ -1,0 +1,389 @@
+"""`brokk mode=inspect`: shows what is in recordings, broken ones too, before any physics is fitted to them."""
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from actuators.identify import dead_time
+from actuators.recordings import inspection_picture
+from brokk_rl import record
+from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.inspection import KINDS, Inspection, Thresholds, inspect
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.recording_validation import Breach
+from brokk_rl.report import Page
+from brokk_rl.session import Session, write_json
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+FILES = ["file", "minutes", "rate", "jitter", "breaches", "findings"]
+
+
+@spec
+class Subject:
+    """What to inspect.
+
+    Attributes:
+        recordings: Glob, or list of globs, of recordings.
+        pictures: One picture a recording up to so many recordings, beyond that those with the most
+            findings; an overview always.
+    """
+
+    recordings: str | tuple[str, ...]
+    pictures: int
+
+    def check(self) -> None:
+        if self.pictures < 0:
+            raise ConfigError(f"inspect.pictures: expected 0 or more, got {self.pictures}")
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """One file: what could be read of it, what breaks the format, and what is in it."""
+
+    path: Path
+    recording: Recording | None
+    breaches: list[Breach]
+    inspection: Inspection | None
+
+    @property
+    def num_remarks(self) -> int:
+        """Number of breaches and findings."""
+        return len(self.breaches) + (len(self.inspection.findings) if self.inspection else 0)
+
+    def plain(self) -> dict[str, Any]:
+        """Returns it as plain JSON data."""
+        metadata = dict(self.recording.metadata) if self.recording else {}
+        return {
+            "path": str(self.path),
+            "run": self.recording.run if self.recording else None,
+            "num_samples": self.recording.num_samples if self.recording else None,
+            "source": metadata.get("source"),
+            "created": metadata.get("created"),
+            "oil_c": _range(self.recording.extra.get("oil_c")) if self.recording else None,
+            "breaches": [asdict(breach) for breach in self.breaches],
+            **(
+                asdict(self.inspection)
+                if self.inspection
+                else {"timing": None, "joints": None, "findings": []}
+            ),
+        }
+
+
+@spec
+class Inspect:
+    """Shows what is in recordings: rates, gaps, ranges, noise, breaches of the format, stretches that want an explanation."""
+
+    session: Session
+    machine: Machine
+    inspect: Subject
+    thresholds: Thresholds
+
+    def run(self) -> None:
+        """Writes `inspection.json`, `inspection.html` and pictures into the run folder, and prints the tables.
+
+        Raises:
+            RecordingError: no recording matches; a broken one is no error here.
+            StorageError: a file could not be written.
+        """
+        paths = record.matching(self.inspect.recordings, "recording")
+        inspected = [self._look(path) for path in track(paths, "inspecting", transient=True)]
+        folder = self.session.folder
+        result = {
+            "schema": 1,
+            "machine": self.machine.name,
+            "delay_s": self._delays(
+                [one.recording for one in inspected if one.recording and not one.breaches]
+            ),
+            "joints": self._overall(inspected),
+            "remarks": [*_resampled(inspected), *_clocks(inspected)],
+            "recordings": [one.plain() for one in inspected],
+        }
+        write_json(folder / "inspection.json", result)
+        pictures = {"overview": folder / "overview.png"}
+        inspection_picture.overview(
+            pictures["overview"], {one.path.stem: _drawn(one) for one in inspected}
+        )
+        for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
+            if one.recording and one.inspection:
+                pictures[one.path.name] = folder / f"{one.path.stem}.png"
+                inspection_picture.recording(
+                    pictures[one.path.name],
+                    one.recording,
+                    self.machine,
+                    one.inspection,
+                    one.breaches,
+                )
+        self._page(result, inspected, pictures).write(folder / "inspection.html")
+        self._show(result, inspected)
+        log.info("report: %s", folder / "inspection.html")
+
+    def _look(self, path: Path) -> Inspected:
+        recording, breaches = record.examine(path, self.machine)
+        if recording is None or recording.num_samples < 2:
+            return Inspected(path, None, breaches, None)
+        return Inspected(
+            path, recording, breaches, inspect(recording, self.machine, self.thresholds)
+        )
+
+    def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
+        """Returns the dead time of each joint from all sound recordings, `None` where they do not tell."""
+        try:
+            found = dead_time.delays(recordings, self.machine, self.session.generator("delay"))
+        except RecordingError:
+            return dict.fromkeys(self.machine.joint_names)
+        return {
+            name: None
+            if delay is None
+            else {"value": delay.value_s, "ci95": list(delay.ci95_s), "explained": delay.explained}
+            for name, delay in found.items()
+        }
+
+    def _overall(self, inspected: Sequence[Inspected]) -> dict[str, dict[str, float | None]]:
+        """Returns the figures of each joint over all recordings: extremes, and means weighted by duration."""
+        table = {}
+        known = [one for one in inspected if one.inspection]
+        hours = np.array(
+            [one.inspection.timing["duration_s"] or 0.0 for one in known if one.inspection]
+        )
+        for name, lower, upper in zip(
+            self.machine.joint_names, self.machine.lower, self.machine.upper, strict=True
+        ):
+            rows = [one.inspection.joints[name] for one in known if one.inspection]
+            entry: dict[str, float | None] = {
+                "lower_limit": float(lower),
+                "upper_limit": float(upper),
+            }
+            for key in rows[0] if rows else ():
+                values = np.array(
+                    [np.nan if row[key] is None else row[key] for row in rows], dtype=float
+                )
+                there = np.isfinite(values)
+                if not there.any():
+                    entry[key] = None
+                elif key in ("lowest", "highest", "fastest"):
+                    entry[key] = float(
+                        values[there].min() if key == "lowest" else values[there].max()
+                    )
+                elif key in ("noise", "step"):
+                    entry[key] = float(np.median(values[there]))
+                else:
+                    entry[key] = float(
+                        np.average(values[there], weights=np.maximum(hours[there], 1e-9))
+                    )
+            counts = Counter(
+                f.kind
+                for one in known
+                if one.inspection
+                for f in one.inspection.findings
+                if f.joint == name
+            )
+            table[name] = {
+                **entry,
+                **{f"num_{kind.replace(' ', '_')}": counts[kind] for kind in KINDS},
+            }
+        return table
+
+    def _figures(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+        """Returns heading and cells of the table of joints."""
+        head = [
+            "joint",
+            "measured",
+            "limits",
+            "commanded",
+            "at limit",
+            "noise",
+            "step",
+            "dead time",
+        ]
+        rows = []
+        for joint in self.machine.joints:
+            entry, delay = result["joints"][joint.name], result["delay_s"][joint.name]
+            rows.append([
+                joint.name,
+                f"{_number(entry.get('lowest'), 2)} … {_number(entry.get('highest'), 2)} {joint.unit}",
+                f"{_number(entry['lower_limit'], 2)} … {_number(entry['upper_limit'], 2)}",
+                *(_percent(entry.get(key)) for key in ("commanded", "at_limit")),
+                *(_number(entry.get(key), 2) for key in ("noise", "step")),
+                "–" if delay is None else f"{delay['value']:.2f} s",
+            ])  # fmt: skip
+        return head, rows
+
+    def _counts(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+        """Returns heading and cells of the table of findings by joint."""
+        counts = Counter(
+            (f["joint"], f["kind"]) for entry in result["recordings"] for f in entry["findings"]
+        )
+        names = [*self.machine.joint_names, None]
+        return ["joint", *KINDS], [
+            [name or "all at once", *(str(counts[name, kind] or "–") for kind in KINDS)]
+            for name in names
+        ]
+
+    def _show(self, result: dict[str, Any], inspected: Sequence[Inspected]) -> None:
+        console = Console()
+        tables = {
+            "recordings": (FILES, [_file_row(one) for one in inspected]),
+            "joints, all recordings": self._figures(result),
+            "findings": self._counts(result),
+        }
+        for title, (head, rows) in tables.items():
+            table = Table(title=title, box=None, padding=(0, 1, 0, 0), title_justify="left")
+            for name in head:
+                table.add_column(
+                    name, justify="left" if name in ("file", "joint") else "right", overflow="fold"
+                )
+            for row in rows:
+                table.add_row(*row)
+            console.print(table)
+        for one in inspected:
+            for breach in one.breaches:
+                console.print(
+                    f"{one.path}: {breach}", markup=False, highlight=False, soft_wrap=True
+                )
+        for remark in result["remarks"]:
+            console.print(remark, markup=False, highlight=False, soft_wrap=True)
+
+    def _page(
+        self, result: dict[str, Any], inspected: Sequence[Inspected], pictures: dict[str, Path]
+    ) -> Page:
+        broken = sum(bool(one.breaches) for one in inspected)
+        minutes = (
+            sum((one.inspection.timing["duration_s"] or 0.0) for one in inspected if one.inspection)
+            / 60.0
+        )
+        counts = Counter(
+            f.kind for one in inspected if one.inspection for f in one.inspection.findings
+        )
+        told = (
+            ", ".join(f"{count} × {kind}" for kind, count in counts.most_common())
+            or "nothing that wants an explanation"
+        )
+        summary = f"{len(inspected)} recordings, {minutes:.1f} minutes; {broken} break the format. Found: {told}."
+        page = Page(f"Recordings of {self.machine.name}", summary, "bad" if broken else "plain")
+        page.heading("Joints")
+        page.table(
+            *self._figures(result),
+            "Shares are of the time; noise and step in the unit of the joint.",
+        )
+        page.heading("Findings")
+        page.table(*self._counts(result))
+        page.items([f"{kind}: {meaning}" for kind, meaning in KINDS.items()])
+        page.heading("Recordings")
+        page.table(FILES, [_file_row(one) for one in inspected])
+        if result["remarks"]:
+            page.items(result["remarks"])
+        for name, path in pictures.items():
+            lines = "" if name == "overview" else ", breaches of the format are vertical lines"
+            page.picture(path, f"{name}: findings are shaded{lines}")
+        for one in inspected:
+            if one.num_remarks:
+                page.heading(one.path.name, 3)
+            if one.breaches:
+                page.items([str(breach) for breach in one.breaches])
+            if one.inspection and one.inspection.findings:
+                rows = [
+                    [
+                        f.kind,
+                        f.joint or "all",
+                        str(f.row),
+                        str(f.num_rows),
+                        f"{f.t_s:.2f}",
+                        f"{f.duration_s:.2f}",
+                        f.text,
+                    ]
+                    for f in one.inspection.findings
+                ]
+                with page.details(f"{len(rows)} findings"):
+                    page.table(["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows)
+        return page
+
+
+def _resampled(inspected: Sequence[Inspected]) -> list[str]:
+    """Returns at what rates logs of other programs were, whose recordings have even periods only since they were converted."""
+    rates = {
+        one.recording.run: one.recording.metadata.get("resampled_from")
+        for one in inspected
+        if one.recording
+    }
+    return [f"run {run}: resampled from {rate}" for run, rate in rates.items() if rate]
+
+
+def _clocks(inspected: Sequence[Inspected]) -> list[str]:
+    """Returns what the start times of the parts of each run say against them."""
+    remarks, parts = [], {}
+    for one in inspected:
+        if one.recording:
+            parts.setdefault(one.recording.run, []).append(one)
+    without = [
+        one.path.name
+        for one in inspected
+        if one.recording and "created" not in one.recording.metadata
+    ]
+    if without:
+        remarks.append(
+            f"{len(without)} recordings do not say when they began (brokk.created): no warm-up can be read across files"
+        )
+    for run, members in parts.items():
+        try:
+            starts = sorted(
+                (datetime.fromisoformat(one.recording.metadata["created"]), one) for one in members
+            )  # type: ignore[union-attr]
+        except (KeyError, ValueError, TypeError):
+            continue
+        for (begin, one), (following, other) in pairwise(starts):
+            overlap_s = (
+                one.recording.duration_s - (following - begin).total_seconds()
+                if one.recording
+                else 0.0
+            )
+            if overlap_s > 1.0:
+                remarks.append(
+                    f"run {run}: {other.path.name} begins {overlap_s:.1f} s before {one.path.name} ends; look at the clock"
+                )
+    return remarks
+
+
+def _drawn(one: Inspected) -> inspection_picture.Line:
+    duration_s = one.recording.duration_s if one.recording else 0.0
+    return inspection_picture.Line(
+        duration_s, one.inspection.findings if one.inspection else [], len(one.breaches)
+    )
+
+
+def _file_row(one: Inspected) -> list[str]:
+    timing = one.inspection.timing if one.inspection else {}
+    rate_hz, jitter_s = timing.get("rate_hz"), timing.get("jitter_s")
+    return [
+        one.path.name,
+        f"{(timing.get('duration_s') or 0.0) / 60.0:.1f}",
+        "–" if rate_hz is None else f"{rate_hz:.2f} Hz",
+        "–" if jitter_s is None else f"{1000.0 * jitter_s:.1f} ms",
+        str(len(one.breaches) or "–"),
+        str(len(one.inspection.findings) or "–") if one.inspection else "–",
+    ]
+
+
+def _range(values: np.ndarray | None) -> list[float] | None:
+    there = values[np.isfinite(values)] if values is not None else np.empty(0)
+    return [float(there.min()), float(there.max())] if len(there) else None
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "–" if value is None else f"{value:.{digits}g}"
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{100.0 * value:.1f} %"

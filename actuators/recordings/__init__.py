@@ -1,0 +1,1 @@
+"""Recordings: look at them, import them from other formats."""

@@ -1,0 +1,147 @@
+"""Pictures of recordings with what was found in them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from brokk_rl.inspection import KINDS, Finding, Inspection
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.recording_validation import Breach
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# distinguishable by those who see no red or green (Okabe and Ito)
+COLOURS = dict(
+    zip(KINDS, ("#e69f00", "#cc79a7", "#56b4e9", "#0072b2", "#d55e00", "#009e73"), strict=True)
+)
+BREACH = "#b00020"
+THINNEST = 0.002
+"""A finding is drawn at least this wide, as a part of the picture, so that a single row can be
+seen."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One recording in the overview.
+
+    Attributes:
+        duration_s: Its length.
+        findings: What was found in it.
+        num_breaches: How often it breaks the format.
+    """
+
+    duration_s: float
+    findings: Sequence[Finding]
+    num_breaches: int
+
+
+def recording(
+    path: Path,
+    recording: Recording,
+    machine: Machine,
+    inspection: Inspection,
+    breaches: Sequence[Breach],
+) -> None:
+    """Draws commands and positions of each joint, findings shaded, breaches of the format as vertical lines; writes a PNG."""
+    from matplotlib.figure import Figure
+
+    count = machine.num_joints
+    figure = Figure(figsize=(14, 1.1 + 1.7 * count), layout="constrained")
+    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    t_s = recording.t_s
+    begin_s, span_s = float(np.nanmin(t_s)), max(float(np.nanmax(t_s) - np.nanmin(t_s)), 1e-9)
+    for j, (joint, axis) in enumerate(zip(machine.joints, axes, strict=True)):
+        commands = axis.twinx()
+        axis.set_zorder(commands.get_zorder() + 1)
+        axis.patch.set_visible(False)
+        commands.step(t_s, recording.u[:, j], where="post", color="0.62", linewidth=0.8)
+        commands.set_ylim(-1.15, 1.15)
+        commands.set_yticks([-1, 0, 1])
+        commands.tick_params(labelsize=8, colors="0.45")
+        axis.plot(t_s, recording.q[:, j], color="black", linewidth=1.1)
+        axis.set_ylabel(f"{joint.name} [{joint.unit}]")
+        low, high = axis.get_ylim()
+        for limit in (joint.lower.value, joint.upper.value):
+            if low - 0.2 * (high - low) < limit < high + 0.2 * (high - low):
+                axis.axhline(limit, color="0.3", linewidth=0.7, linestyle=":")
+        for finding in inspection.findings:
+            if finding.joint in (joint.name, None):
+                width_s = max(finding.duration_s, THINNEST * span_s)
+                commands.axvspan(
+                    finding.t_s,
+                    finding.t_s + width_s,
+                    color=COLOURS[finding.kind],
+                    alpha=0.35,
+                    linewidth=0,
+                )
+        own = {f"u_{joint.name}", f"q_{joint.name}_{joint.unit}", "t_s"}
+        for breach in breaches:
+            if breach.row is not None and breach.column in own and np.isfinite(t_s[breach.row]):
+                commands.axvline(t_s[breach.row], color=BREACH, linewidth=1.0)
+    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlim(begin_s, begin_s + span_s)
+    name = recording.path.name if recording.path else "recording"
+    figure.suptitle(f"{name}: measured position (black), command in [-1, 1] (grey)", fontsize=11)
+    _legend(
+        figure,
+        {finding.kind for finding in inspection.findings},
+        any(breach.row is not None for breach in breaches),
+    )
+    figure.savefig(path, dpi=100)
+
+
+def overview(path: Path, lines: Mapping[str, Line]) -> None:
+    """Draws one line a recording with its findings; writes a PNG."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 1.2 + 0.26 * len(lines)), layout="constrained")
+    axis = figure.subplots()
+    longest_s = max((line.duration_s for line in lines.values()), default=0.0) or 1.0
+    for place, line in enumerate(lines.values()):
+        axis.barh(place, line.duration_s, height=0.7, color="0.9")
+        for finding in sorted(
+            line.findings, key=lambda finding: -finding.duration_s
+        ):  # none hides a shorter one
+            width_s = max(finding.duration_s, THINNEST * longest_s)
+            axis.barh(place, width_s, left=finding.t_s, height=0.7, color=COLOURS[finding.kind])
+        if line.num_breaches:
+            text = (
+                f" breaks the format {line.num_breaches} ×"
+                if line.num_breaches > 1
+                else " breaks the format"
+            )
+            axis.text(line.duration_s, place, text, color=BREACH, va="center", fontsize=8)
+    axis.set_yticks(range(len(lines)), list(lines), fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlim(
+        0.0, longest_s * (1.25 if any(line.num_breaches for line in lines.values()) else 1.0)
+    )
+    axis.set_xlabel("time [s]")
+    _legend(figure, {finding.kind for line in lines.values() for finding in line.findings}, False)
+    figure.savefig(path, dpi=100)
+
+
+def _legend(figure: "Figure", kinds: set[str], has_breaches: bool) -> None:
+    """Explains the colours that occur."""
+    from matplotlib.patches import Patch
+
+    patches = [
+        Patch(color=colour, alpha=0.6, label=kind)
+        for kind, colour in COLOURS.items()
+        if kind in kinds
+    ]
+    if has_breaches:
+        patches.append(Patch(color=BREACH, label="breaks the format"))
+    if patches:
+        figure.legend(
+            handles=patches,
+            loc="outside lower center",
+            ncols=len(patches),
+            fontsize=9,
+            frameon=False,
+        )

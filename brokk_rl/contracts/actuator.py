@@ -1,0 +1,200 @@
+"""Actuator models, what is fitted and recorded for them, effects and followers.
+
+`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
+extensions.
+Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe
+a target.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    import numpy as np
+    import torch
+
+    from brokk_rl.history import History
+    from brokk_rl.machine import Machine
+    from brokk_rl.record import Recording
+
+
+class ActuatorModel(Protocol):
+    """From the last `H` positions and commands to the next joint position, for all environments at once.
+
+    A model with a state of its own (spool position, pressure) keeps it in tensors of fixed shape
+    listed by `state`. `step` works without a host synchronisation and without data-dependent
+    shapes, so that it can be captured in a CUDA graph.
+    """
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Internal state by name, each of shape `(N, …)`; written in place. Empty for a model without memory."""
+        ...
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Puts the environments of `mask`, shape `(N,)` bool, into the state of a machine at rest."""
+        ...
+
+    def step(self, history: History) -> torch.Tensor:
+        """Returns the joint positions one control period later, shape `(N, J)` in rad or m.
+
+        `history.u[:, -1]` is the command that has just come into force, `history.q[:, -1]` the
+        position at this moment.
+        """
+        ...
+
+
+class SensingModel(ActuatorModel, Protocol):
+    """An actuator model that also says what is seen of the motion; what effects on sensors and geometry make of a model.
+
+    A loop asks an actuator for `sides` (absent: none) and calls `measure` and `misplacement` only
+    where they do something, once a control period, after `reset`. `step` is given true positions.
+    """
+
+    @property
+    def sides(self) -> frozenset[str]:
+        """`measurement` where `measure` matters, `kinematics` where `misplacement` does."""
+        ...
+
+    def measure(self, q: torch.Tensor) -> torch.Tensor:
+        """Returns what the sensors say at the true positions `q`, `(N, J)`."""
+        ...
+
+    def truth(self, q: torch.Tensor) -> torch.Tensor:
+        """Returns the likeliest true positions where the sensors say `q`, `(N, J)` or `(N, H, J)`."""
+        ...
+
+    def misplacement(self, q: torch.Tensor) -> torch.Tensor:
+        """Returns how far off the controller believes a target near the tool at the true positions `q`, `(N, 3)` in m."""
+        ...
+
+
+class Actuator(Protocol):
+    """A spec in `conf/actuator`: builds an actuator model."""
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
+        """Returns a model for `num_envs` environments on `device`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A piece of an excitation: a pose and the commands that are played from it. Pure data for one machine.
+
+    Attributes:
+        name: What it is, different from all others of its plan, e.g. `ramps_q3_02`.
+        start: Joint positions from which it is played, `(J,)`, rad or m.
+        u: The program, `(T, J)` in [-1, 1]; row `k` is in force in control period `k`. Exclusive
+            joints never together with others.
+        stops: What happens when a joint is about to come to rest closer to its stop than
+            `stop_margin`. `home`: everything goes
+            back to `start` and waits until the program, which runs on by the clock, next passes
+                zero. `inward`: this joint is
+            driven the other way until its program next passes zero.
+        stop_margin: Distance from the stops, as a part of the joint's travel.
+        repeat_of: Name of an earlier segment of the same length, of which this one repeats what was
+            really sent.
+    """
+
+    name: str
+    start: np.ndarray
+    u: np.ndarray
+    stops: Literal["home", "inward"]
+    stop_margin: float
+    repeat_of: str | None = None
+
+
+class Excitation(Protocol):
+    """A spec in `conf/excitation`: commands that show what an actuator does. Numpy only: it also runs on the machine's computer."""
+
+    def weight(self, before: float) -> float:
+        """Returns its part of the time, relative to the others of the plan; those before it have `before` in all."""
+        ...
+
+    def segments(
+        self,
+        machine: Machine,
+        duration_s: float,
+        generator: np.random.Generator,
+        before: Sequence[Segment],
+    ) -> list[Segment]:
+        """Returns segments whose programs last `duration_s` in all, or as much of it as whole segments fill.
+
+        Args:
+            machine: Gives limits, speeds, weights, and the joints that never move together with
+                others.
+            duration_s: Time for the programs, without the ways to their start poses.
+            generator: The only source of chance.
+            before: Segments that are already planned.
+
+        Raises:
+            ConfigError: not a single segment fits into `duration_s`.
+        """
+        ...
+
+
+class ActuatorFit(Protocol):
+    """A spec in `conf/fit`: learns an actuator model from recordings."""
+
+    name: str
+    """Name of the model in tables and files."""
+
+    def fit(
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        validation: Sequence[Recording],
+        folder: Path,
+        seed: int,
+        device: torch.device,
+    ) -> Actuator:
+        """Fits to `train`, chooses by `validation`, leaves what it learned in `folder`, returns the fitted actuator."""
+        ...
+
+
+class Effect(Protocol):
+    """A spec in `conf/effect`: something a simulator leaves out; wraps an actuator model and is again one."""
+
+    def wrap(
+        self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
+    ) -> ActuatorModel:
+        """Returns `model` with the effect added; with the effect's neutral value nothing changes."""
+        ...
+
+
+class FollowerModel(Protocol):
+    """From the command that the policy proposes to the one that is given, as a person at the levers does it, in `N` environments.
+
+    `step` works without a host synchronisation and without data-dependent shapes, so that it can be
+    captured in a CUDA graph.
+    """
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Everything needed to go on exactly, by name, each `(N, …)`; written in place. Empty for a follower without memory."""
+        ...
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Puts a new person at the levers in the environments of `mask`, shape `(N,)` bool, who has seen nothing yet."""
+        ...
+
+    def step(self, proposed: torch.Tensor) -> torch.Tensor:
+        """Returns the command given during the coming control period, `(N, J)` in [-1, 1].
+
+        `proposed`, `(N, J)`, is what the policy shows from now on. Where no proposal moves an
+        exclusive joint together with others, what is given does not either.
+        """
+        ...
+
+
+class Follower(Protocol):
+    """A spec in `conf/follower`: builds what stands between policy and machine."""
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> FollowerModel:
+        """Returns followers for `num_envs` environments on `device`."""
+        ...

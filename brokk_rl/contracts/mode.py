@@ -1,0 +1,22 @@
+"""Modes: what the command runs.
+
+`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
+extensions.
+Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe
+a target.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    pass
+
+
+class Mode(Protocol):
+    """What `brokk mode=…` runs."""
+
+    def run(self) -> float | None:
+        """Does the work; returns the objective of a sweep, or `None`."""
+        ...

@@ -1,0 +1,60 @@
+"""Parallel worlds of the simulator.
+
+`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
+extensions.
+Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe
+a target.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    import torch
+
+    from brokk_rl.machine import Machine
+
+
+class World(Protocol):
+    """Parallel physics: the machine, pushed along by its drive, beside a block with a borehole.
+
+    All tensors are float32 on `device`, of fixed address, and refreshed in place by `step` and
+    `reset`.
+    """
+
+    num_worlds: int
+    device: torch.device
+    q: torch.Tensor
+    """Joint positions, `(N, J)`, rad or m."""
+    contact_force_n: torch.Tensor
+    """Peak force between tool and surroundings over the last control period, `(N,)`."""
+    faults: torch.Tensor
+    """Worlds that diverged, lost contacts to a full buffer, or became NaN since their last reset,
+    `(N,)` bool."""
+    supports_graphs: bool
+    """True when `step` and `reset` may be captured in a CUDA graph."""
+
+    def step(self, increment: torch.Tensor) -> None:
+        """Advances one control period; the drive moves each joint by `increment`, `(N, J)`, unless something blocks it."""
+        ...
+
+    def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
+        """Puts the worlds of `mask`, `(N,)` bool, at rest at `q`, `(N, J)`, in the scenes of `scene`, `(N, S)`; see `sim.scene`."""
+        ...
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Returns copies of everything that must be stored to go on exactly."""
+        ...
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Restores what `state_dict` returned."""
+        ...
+
+
+class Simulator(Protocol):
+    """A spec in `conf/sim`: builds a world."""
+
+    def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> World:
+        """Returns a world on `device`; `num_worlds` overrides the configured number."""
+        ...

@@ -1,0 +1,1 @@
+"""The guard between a proposed command and the valves."""

@@ -1,0 +1,242 @@
+"""The guard: the last to see a command before it is sent.
+
+Pure: no clock, no bus, no file, no tensor; the caller hands in everything.
+
+    SILENT   nothing is sent. The default.
+    LATCHED  zero is sent. Left only by hand: dead-man released, levers in neutral, nothing wrong.
+    READY    zero is sent, until the dead-man is pressed, levers in neutral.
+    ACTIVE   what is asked for is sent, within the limits.
+
+    SILENT --armed on purpose--> LATCHED --released, neutral, healthy--> READY --pressed, neutral,
+    healthy--> ACTIVE ACTIVE --released--> READY; ACTIVE or READY --anything wrong--> LATCHED; any
+    --no longer armed--> SILENT
+
+Away from zero a command grows by no more than `max_rate_1_s`; towards zero it may fall at once.
+Nothing is ever sent that the guard has not seen in the same cycle.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+from deploy.guard.limits import Body, Limits, Numbers
+
+
+class State(Enum):
+    """What the guard lets pass; the number travels on the bus."""
+
+    SILENT = 0
+    LATCHED = 1
+    READY = 2
+    ACTIVE = 3
+
+
+class Trip(Enum):
+    """Why the guard does not let pass what is asked for."""
+
+    NONE = "nothing"
+    BUS_DOWN = "bus down"
+    TIME_GAP = "time stood still"
+    ESTOP = "emergency stop"
+    STATUS_STALE = "machine status missing"
+    LEVERS_STALE = "remote missing"
+    JOINTS_STALE = "joint positions missing"
+    JOINTS_INVALID = "joint positions not plausible"
+    CHANNEL_INVALID = "messages corrupted"
+    SECOND_SENDER = "somebody else sends commands"
+    LEVER = "operator moves a lever"
+    IGNORED = "the gateway does not follow"
+    DEADMAN = "dead-man released"
+    REQUEST_STALE = "no fresh command"
+    REQUEST_INVALID = "command is no number, or beyond full"
+    REQUEST_EXCLUSIVE = "exclusive joint together with others"
+    NOT_ARMED = "not armed"
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is known in one cycle. Ages in s, infinite where nothing has come yet.
+
+    Attributes:
+        q: Joint positions, `(J,)`, rad or m.
+        joints_age_s: Age of the oldest of them.
+        joints_plausible: Whether the sensors call them valid and they did not jump.
+        trusted: Whether all channels are to be believed.
+        levers_age_s: Age of the remote's message.
+        lever: Largest deflection of the operator's own levers, of full.
+        deadman: Whether the dead-man is held.
+        status_age_s: Age of the machine's status.
+        estop: Whether an emergency stop is on.
+        bus_up: Whether the bus works.
+        alone: Whether nobody else sends valve commands.
+        followed: Whether the gateway says that it goes by our commands.
+    """
+
+    q: Numbers
+    joints_age_s: float
+    joints_plausible: bool
+    trusted: bool
+    levers_age_s: float
+    lever: float
+    deadman: bool
+    status_age_s: float
+    estop: bool
+    bus_up: bool
+    alone: bool
+    followed: bool
+
+
+@dataclass(frozen=True)
+class Request:
+    """A command that somebody wants sent.
+
+    Attributes:
+        u: Commands, `(J,)`.
+        age_s: Since it was made.
+    """
+
+    u: Numbers
+    age_s: float
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the guard makes of it.
+
+    Attributes:
+        state: See the module.
+        u: What to send, `(J,)`; all zero unless ACTIVE.
+        trip: Why not what was asked for, now.
+        cause: What latched it last.
+    """
+
+    state: State
+    u: Numbers
+    trip: Trip
+    cause: Trip
+
+    @property
+    def sends(self) -> bool:
+        """Whether anything is sent at all."""
+        return self.state is not State.SILENT
+
+
+class Guard:
+    """See the module.
+
+    Args:
+        limits: What is allowed.
+        body: The machine.
+    """
+
+    def __init__(self, limits: Limits, body: Body) -> None:
+        self._limits, self._body = limits, body
+        self._still = (0.0,) * len(body.lower)
+        self._state, self._cause = State.SILENT, Trip.NONE
+        self._sent, self._before_s, self._followed_s = (
+            self._still,
+            math.nan,
+            math.nan,
+        )  # never: no comparison with nan holds
+
+    def decide(self, now_s: float, armed: bool, seen: Seen, request: Request | None) -> Decision:
+        """Returns what to send in this cycle.
+
+        Args:
+            now_s: Monotonic time.
+            armed: Whether somebody wants commands sent, on purpose.
+            seen: What is known.
+            request: What is asked for, `None` for nothing yet.
+        """
+        elapsed_s, self._before_s = now_s - self._before_s, now_s
+        wrong = self._health(seen, elapsed_s)
+        if seen.followed or self._state is not State.ACTIVE:
+            self._followed_s = now_s
+        elif now_s - self._followed_s > self._limits.ignored_s and wrong is Trip.NONE:
+            wrong = Trip.IGNORED
+        if not armed:
+            self._state, self._cause = State.SILENT, Trip.NONE
+            return self._say(self._still, wrong if wrong is not Trip.NONE else Trip.NOT_ARMED)
+        if self._state is State.SILENT:
+            self._state, self._cause = State.LATCHED, Trip.NOT_ARMED
+        if wrong is Trip.NONE and self._state is State.ACTIVE and seen.deadman:
+            wrong = self._objection(request)
+        if wrong is not Trip.NONE:
+            if self._state is not State.LATCHED:
+                self._state, self._cause = State.LATCHED, wrong
+            return self._say(self._still, wrong)
+        if not seen.deadman:
+            self._state = State.READY  # released, in neutral, nothing wrong: may be pressed
+            return self._say(self._still, Trip.DEADMAN)
+        if self._state is State.LATCHED:
+            return self._say(self._still, self._cause)
+        if self._state is State.READY:
+            self._state, self._cause = State.ACTIVE, Trip.NONE
+            return self._say(self._still, Trip.NONE)
+        assert request is not None
+        return self._say(self._limited(request.u, seen.q, elapsed_s), Trip.NONE)
+
+    def stops(self, seen: Seen) -> bool:
+        """Says whether what is seen now ends a motion: then the caller decides at once, not in its next cycle."""
+        return self._state is State.ACTIVE and (
+            not seen.deadman or self._health(seen, 0.0) is not Trip.NONE
+        )
+
+    def _health(self, seen: Seen, elapsed_s: float) -> Trip:
+        """Returns the first thing that is wrong, whatever is asked for."""
+        limits = self._limits
+        checks = (
+            (seen.bus_up, Trip.BUS_DOWN),
+            (0.0 <= elapsed_s <= limits.gap_s, Trip.TIME_GAP),
+            (not seen.estop, Trip.ESTOP),
+            (seen.trusted, Trip.CHANNEL_INVALID),
+            (seen.status_age_s <= limits.status_s, Trip.STATUS_STALE),
+            (seen.levers_age_s <= limits.levers_s, Trip.LEVERS_STALE),
+            (seen.joints_age_s <= limits.joints_s, Trip.JOINTS_STALE),
+            (seen.joints_plausible and all(map(math.isfinite, seen.q)), Trip.JOINTS_INVALID),
+            (seen.alone, Trip.SECOND_SENDER),
+            (seen.lever <= limits.neutral, Trip.LEVER),
+        )
+        return next((trip for fine, trip in checks if not fine), Trip.NONE)
+
+    def _objection(self, request: Request | None) -> Trip:
+        """Returns what is wrong with a request."""
+        if request is None or not request.age_s <= self._limits.request_s:
+            return Trip.REQUEST_STALE
+        full = 1.0 + self._limits.overrun
+        if len(request.u) != len(self._still) or not all(
+            -full <= value <= full for value in request.u
+        ):
+            return Trip.REQUEST_INVALID
+        moved = {
+            exclusive
+            for exclusive, value in zip(self._body.exclusive, request.u, strict=True)
+            if value != 0
+        }
+        alone = sum(value != 0 for value in request.u) == 1
+        if True in moved and not alone:
+            return Trip.REQUEST_EXCLUSIVE
+        return Trip.NONE
+
+    def _limited(self, u: Numbers, q: Numbers, elapsed_s: float) -> Numbers:
+        """Returns the command within magnitude, growth and joint limits."""
+        limits, body = self._limits, self._body
+        most = limits.max_rate_1_s * elapsed_s
+        values = []
+        for wanted, sent, at, lower, upper in zip(
+            u, self._sent, q, body.lower, body.upper, strict=True
+        ):
+            value = max(-limits.max_command, min(limits.max_command, wanted))
+            start = abs(sent) if value * sent > 0 else 0.0
+            value = math.copysign(min(abs(value), start + most), value)
+            outward = (value > 0 and at >= upper - limits.stop_margin) or (
+                value < 0 and at <= lower + limits.stop_margin
+            )
+            values.append(0.0 if outward else value)
+        return tuple(values)
+
+    def _say(self, u: Numbers, trip: Trip) -> Decision:
+        self._sent = u
+        return Decision(self._state, u, trip, self._cause)

@@ -1,0 +1,154 @@
+"""What a sitting needs of the loop: see the machine, say where the hole is, put the twin, record."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.session import write_json
+from deploy.policy.adviser import REASONS, Advised
+from deploy.recorder import reading
+from deploy.recorder.capture import MCAP
+from deploy.recorder.conversion import CaptureLog
+from deploy.runtime.shm_layout import Exchange
+from deploy.study.design import Hole
+from deploy.twin.faults import ask
+
+FRESH_S = 0.3
+"""Age of positions and advice from which they are not there."""
+CLOSING_S = 15.0
+"""How long a capture may take to be closed before what is there is read."""
+GAP_S, LONGEST_GAP_S = 0.2, 1.0
+"""Silence of the bus in a trial from which it is said, and the longest that is filled in between
+its ends."""
+FILLED = "filled"
+"""Metadata of a recording that says so."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What is known of the machine now.
+
+    Attributes:
+        q: Joint positions, `(J,)`; `None` where nothing fresh is known.
+        advised: Why there is no advice; `valid` where there is.
+        recording: Whether it is recorded.
+    """
+
+    q: np.ndarray | None
+    advised: str
+    recording: bool
+
+
+class Stage(Protocol):
+    """Where trials take place."""
+
+    def sight(self) -> Sight:
+        """Returns what is known now."""
+        ...
+
+    def prepare(self, hole: Hole, start: np.ndarray) -> None:
+        """Makes the hole known to the policy; a twin is put to the start, a machine has to be driven there."""
+        ...
+
+    def record(self, folder: Path | None) -> None:
+        """Begins a recording in `folder`, or ends it."""
+        ...
+
+    def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
+        """Returns what was recorded in `folder` between two times, once the recording has been closed.
+
+        Where the bus was silent for a moment, positions go straight from one end of it to the
+        other; the metadata `filled` says so.
+
+        Raises:
+            RecordingError: it cannot be used.
+        """
+        ...
+
+
+class LoopStage:
+    """The loop's machine or twin.
+
+    Args:
+        exchange: Of the loop.
+        machine: The machine.
+        target: File that says to the loop where the hole is.
+        port: Where the twin can be told to be put elsewhere; `None` on a machine.
+    """
+
+    def __init__(
+        self, exchange: Exchange, machine: Machine, target: Path, port: int | None
+    ) -> None:
+        self._exchange, self._machine, self._target, self._port = exchange, machine, target, port
+
+    def sight(self) -> Sight:
+        """See `Stage`."""
+        state, advice, controls = (
+            self._exchange.state.read(),
+            self._exchange.advice.read(),
+            self._exchange.controls.read(),
+        )
+        now_s = time.monotonic()
+        fresh = (
+            state is not None
+            and now_s - float(state["q_t_s"]) < FRESH_S
+            and bool(state["q_plausible"])
+        )
+        advised = Advised.NO_STATE
+        if advice is not None and now_s - float(advice["t_s"]) < FRESH_S:
+            advised = REASONS[int(advice["reason"])]
+        recording = controls is not None and bool(controls["recording"])
+        return Sight(
+            np.array(state["q"]) if fresh and state is not None else None, advised.value, recording
+        )
+
+    def prepare(self, hole: Hole, start: np.ndarray) -> None:
+        """See `Stage`."""
+        write_json(self._target, {"center_in_base_m": list(hole.center_in_base_m)})
+        if self._port is not None:
+            place = {"q": start.tolist(), "hole_in_base_m": list(hole.center_in_base_m)}
+            try:
+                ask(self._port, {"place": place}, timeout_s=2.0)
+            except OSError as error:
+                raise RecordingError(
+                    f"the twin does not answer on port {self._port} ({error}); is it running?"
+                ) from error
+
+    def record(self, folder: Path | None) -> None:
+        """See `Stage`."""
+        wish = (
+            {"kind": "record", "value": "off"}
+            if folder is None
+            else {"kind": "record", "value": "on", "into": str(folder)}
+        )
+        self._exchange.wishes.put(json.dumps(wish).encode())
+
+    def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
+        """See `Stage`."""
+        path, patience_s = folder / MCAP, time.monotonic() + CLOSING_S
+        while not (path.exists() and reading.is_whole(path)) and time.monotonic() < patience_s:
+            time.sleep(0.2)
+        try:
+            return CaptureLog(longest_gap_s=GAP_S, shortest_s=0.0).between(
+                path, self._machine, begin_s, end_s
+            )
+        except RecordingError:
+            found = CaptureLog(longest_gap_s=LONGEST_GAP_S, shortest_s=0.0).between(
+                path, self._machine, begin_s, end_s
+            )
+        return replace(
+            found,
+            metadata={
+                **found.metadata,
+                FILLED: f"silences of up to {LONGEST_GAP_S:g} s are filled in",
+            },
+        )

@@ -1,0 +1,106 @@
+"""Free runs of a simulator beside the recordings that they were cut from.
+
+Labels of what a joint was doing are made on whole recordings and then cut as the free runs were, so
+that what happened before a
+window is not forgotten. Axes: `W` windows, `K` steps, `J` joints, `T` rows of a recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from brokk_rl import open_loop
+from brokk_rl.contracts.actuator import Actuator
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+
+@dataclass(frozen=True)
+class FreeRuns:
+    """Free runs, each begun at what was measured.
+
+    Attributes:
+        recordings: Where the windows come from.
+        source: Number of the recording of each window, `(W,)`.
+        row: Row of its first simulated position, `(W,)`; the row before is the measured one that it
+            starts at.
+        simulated: Positions, `(W, K, J)`, rad or m.
+    """
+
+    recordings: Sequence[Recording]
+    source: np.ndarray
+    row: np.ndarray
+    simulated: np.ndarray
+
+    @property
+    def num_windows(self) -> int:
+        """Number of windows, `W`."""
+        return len(self.row)
+
+    def cut(self, values: Sequence[np.ndarray]) -> np.ndarray:
+        """Returns the part of each recording's values, `(T, …)`, that lies in each window, `(W, K, …)`; NaN after the end."""
+        steps = self.simulated.shape[1]
+        found = np.full((self.num_windows, steps, *values[0].shape[1:]), np.nan)
+        for window, (source, row) in enumerate(zip(self.source, self.row, strict=True)):
+            part = values[source][row : row + steps]
+            found[window, : len(part)] = part
+        return found
+
+    @cached_property
+    def measured(self) -> np.ndarray:
+        """Measured positions, `(W, K, J)`, NaN after the end of the recording."""
+        return self.cut([recording.q for recording in self.recordings])
+
+    @cached_property
+    def error(self) -> np.ndarray:
+        """Simulated less measured, `(W, K, J)`, NaN after the end of the recording."""
+        return self.simulated - self.measured
+
+    @cached_property
+    def elapsed_s(self) -> np.ndarray:
+        """Time of each window since the first recording began, as far as the recordings say when they were made, `(W,)`."""
+        begun = [recording.metadata.get("created") for recording in self.recordings]
+        if all(begun):
+            stamps = [datetime.fromisoformat(text).timestamp() for text in begun if text]
+            offset_s = np.array(stamps) - min(stamps)
+        else:
+            offset_s = np.zeros(len(self.recordings))
+        return np.array(
+            [offset_s[s] + self.recordings[s].t_s[r] for s, r in zip(self.source, self.row, strict=True)]
+        )  # fmt: skip
+
+
+def free_runs(
+    actuator: Actuator,
+    recordings: Sequence[Recording],
+    machine: Machine,
+    horizon_s: float,
+    device: torch.device,
+) -> FreeRuns:
+    """Runs a simulator through recordings from one end to the other, begun anew every `horizon_s`; the last may be shorter.
+
+    Raises:
+        RecordingError: no recording is long enough.
+    """
+    before, steps = open_loop.num_before(machine), round(horizon_s / machine.period_s)
+    cuts, source, row = [], [], []
+    for number, recording in enumerate(recordings):
+        if recording.num_samples <= before:
+            continue
+        cut = open_loop.windows([recording], machine, horizon_s, horizon_s, machine.period_s)
+        cuts.append(cut)
+        source += [number] * len(cut.q)
+        row += [before + steps * window for window in range(len(cut.q))]
+    if not cuts:
+        raise RecordingError(
+            f"too little data: a free run needs recordings of more than {before * machine.period_s:g} s"
+        )
+    simulated = open_loop.free_run(actuator, machine, open_loop.joined(cuts), device)
+    return FreeRuns(recordings, np.array(source), np.array(row), simulated.astype(float))

@@ -1,0 +1,1 @@
+"""Modes of the diagnosis: `diagnose`, `close_gap`, `rehearse`."""

@@ -1,0 +1,209 @@
+"""`brokk mode=close_gap`: what found effects are worth to a policy, before and after retraining with them."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from brokk_rl.contracts.actuator import Actuator, Effect, Follower
+from brokk_rl.contracts.task import Task
+from brokk_rl.contracts.world import Simulator
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.modes.compare import EVALUATION
+from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
+from brokk_rl.modes.train import Train
+from brokk_rl.rl.policy import CONTRACT, Trained
+from brokk_rl.rl.runner import Training
+from brokk_rl.rl.tracking import Tracking
+from brokk_rl.rl.vec_env import Plant
+from brokk_rl.session import Session, write_json
+from brokk_rl.spec import spec
+from diagnosis import downstream, downstream_page
+
+log = logging.getLogger(__name__)
+
+RETRAINED = "retrained"
+
+
+@spec
+class StandIn:
+    """What stands in for the machine: an actuator with effects that the simulator does not know.
+
+    Attributes:
+        actuator: Its actuator.
+        effect: Effects by name, the first nearest to the machine.
+    """
+
+    actuator: Actuator
+    effect: dict[str, Effect]
+
+
+@spec
+class CloseGap:
+    """Evaluates a policy in the simulator, in the repaired one and on the machine's stand-in; retrains it with the found effects.
+
+    Attributes:
+        session: Folder, seed, device.
+        machine: The machine.
+        sim: Physics.
+        task: What to do.
+        actuator: The simulator's actuator, as it was.
+        effect: Its effects, as it was.
+        found: Effects that the diagnosis found; the repaired simulator has them too.
+        randomisation: Effects around these while training, so that the policy does not rely on
+            exact numbers.
+        stand_in: The machine.
+        follower: Who stands between policy and machine.
+        policy: The policy as it was.
+        panel: Policies beside it, by name, to see whether simulator and machine put them in the
+            same order.
+        warm: Retrain from the network of `policy`; false: from a fresh one.
+        rl: How to train.
+        tracking: Where figures of the training go beside the run folder.
+        evaluation: How to evaluate.
+        resume: Run folder of an interrupted run to go on with; the same as `session.out`.
+    """
+
+    session: Session
+    machine: Machine
+    sim: Simulator
+    task: Task
+    actuator: Actuator
+    effect: dict[str, Effect]
+    found: dict[str, Effect]
+    randomisation: dict[str, Effect]
+    stand_in: StandIn
+    follower: Follower
+    policy: Trained
+    panel: dict[str, PolicySpec]
+    warm: bool
+    rl: Training
+    tracking: Tracking
+    evaluation: Evaluation
+    resume: str | None
+
+    def check(self) -> None:
+        if not self.found:
+            raise ConfigError(
+                "close_gap: there is no effect to retrain with; give 'effect@found=[@<effects.yaml of mode=diagnose>]'. "
+                "A diagnosis that says none or unknown leaves nothing to repair."
+            )
+        for name in (downstream.BEFORE, downstream.AFTER):
+            if name in self.panel:
+                raise ConfigError(f"panel.{name}: this name is taken; give another")
+        for one, other in (("effect", self.effect), ("randomisation", self.randomisation)):
+            if both := sorted(set(other) & set(self.found)):
+                raise ConfigError(
+                    f"close_gap: {', '.join(both)} stands in '{one}' and in 'found'; rename it in one of them"
+                )
+        if self.resume is not None and Path(self.resume).resolve() != self.session.folder.resolve():
+            raise ConfigError(
+                f"resume={self.resume}: an interrupted run goes on in its folder; add session.out={self.resume}"
+            )
+
+    def run(self) -> float:
+        """Writes `close_gap.json`, `.html` and `.png`; returns the strict success of the retrained policy on the machine.
+
+        Below the run folder lie `retrained/` (as `mode=train` leaves it) and an `evaluation.json`
+        for each plant.
+        """
+        folder = self.session.folder
+        policies: dict[str, PolicySpec] = {
+            downstream.BEFORE: self.policy,
+            downstream.AFTER: Trained(folder=str(self._retrained())),
+            **self.panel,
+        }
+        plants = self._plants()
+        evaluations = {
+            name: self._evaluated(name, plant, policies) for name, plant in plants.items()
+        }
+        trained = json.loads((folder / RETRAINED / CONTRACT).read_text())["trained"]
+        found = downstream.compare(evaluations) | {
+            "plants": {name: _described(plant) for name, plant in plants.items()},
+            "retraining": {
+                "began with": self.policy.folder if self.warm else "a fresh network",
+                "trained with": _described(self._training_plant()),
+                "control steps": trained["env_steps"],
+                "seconds": trained["seconds"],
+                "device": trained["device"],
+                "seed": self.session.seed,
+            },
+        }
+        write_json(folder / downstream.FILE, found)
+        downstream_page.write(found, folder)
+        _show(found, folder)
+        return float(found["achieved"]["mean"])
+
+    def _plants(self) -> dict[str, Plant]:
+        known = Plant(
+            machine=self.machine,
+            sim=self.sim,
+            task=self.task,
+            actuator=self.actuator,
+            effects=self.effect,
+            follower=self.follower,
+        )
+        return {
+            "simulator": known,
+            "repaired": replace(known, effects=self.effect | self.found),
+            "machine": replace(
+                known, actuator=self.stand_in.actuator, effects=self.stand_in.effect
+            ),
+        }
+
+    def _training_plant(self) -> Plant:
+        known = self._plants()["repaired"]
+        return replace(known, effects=self.effect | self.randomisation | self.found)
+
+    def _retrained(self) -> Path:
+        """Returns the folder of the retrained policy; trains it unless an interrupted run has done so."""
+        place = self.session.folder / RETRAINED
+        if (place / EVALUATION).exists():
+            return place
+        place.mkdir(exist_ok=True)
+        plant = self._training_plant()
+        log.info("retraining with %s", ", ".join(self.found))
+        Train(
+            session=replace(self.session, out=str(place)), machine=self.machine, sim=self.sim, task=self.task,
+            actuator=plant.actuator, effect=plant.effects, follower=self.follower, rl=self.rl, tracking=self.tracking,
+            evaluation=self.evaluation, start_from=self.policy.folder if self.warm else None,
+            resume=str(place) if self.resume else None,
+        ).run()  # fmt: skip
+        return place
+
+    def _evaluated(
+        self, name: str, plant: Plant, policies: dict[str, PolicySpec]
+    ) -> dict[str, Any]:
+        """Returns `evaluation.json` on a plant; one that an interrupted run has written is kept."""
+        place = self.session.folder / name
+        if (place / EVALUATION).exists():
+            return json.loads((place / EVALUATION).read_text())
+        place.mkdir(exist_ok=True)
+        log.info("on the %s", downstream_page.WORDS[name])
+        return evaluate_policies(
+            plant, self.evaluation, replace(self.session, out=str(place)), policies
+        )[0]
+
+
+def _described(plant: Plant) -> str:
+    return " + ".join([type(plant.actuator).__name__.lower(), *plant.effects])
+
+
+def _show(found: dict[str, Any], folder: Path) -> None:
+    console = Console()
+    view = Table(
+        "strict success", *(downstream_page.WORDS[plant] for plant in downstream.PLANTS), box=None
+    )
+    for policy, shares in found["success"].items():
+        name = downstream_page.NAMES.get(policy, policy)
+        view.add_row(name, *(downstream.said(shares[plant]) for plant in downstream.PLANTS))
+    console.print(downstream.headline(found)[0], style="bold", highlight=False)
+    console.print(view)
+    console.print(f"report: {folder / downstream_page.PAGE}", highlight=False)

@@ -1,0 +1,167 @@
+"""`brokk mode=diagnose`: where the gap between a simulator and the machine lies, which effects cause it, how far they close it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from brokk_rl.contracts.actuator import Actuator, ActuatorFit, Excitation
+from brokk_rl.errors import ConfigError
+from brokk_rl.inspection import Thresholds
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from diagnosis import already, answer, case, library, page, prescription, simulator
+from diagnosis.answer import Answer
+from diagnosis.case import Case
+from diagnosis.certainty import Certainty
+from diagnosis.conclusion import Diagnosis
+from diagnosis.engine import Prices
+from diagnosis.library import Kind
+from diagnosis.simulator import Base
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class Subject:
+    """What is diagnosed.
+
+    Attributes:
+        case: Folder with `reference/` and `field/`; or `null`.
+        field: Glob or globs of recordings of the machine as it is, held against `actuator`; instead
+            of a case.
+        unseen: Glob or globs of further recordings of the machine as it is, to which nothing is
+            fitted: how far the effects carry.
+        effects: Names of the effects to choose among; `null`: all that are registered.
+        prices: What an effect must earn.
+        certainty: How sure what is said is.
+    """
+
+    case: str | None
+    field: str | tuple[str, ...] | None
+    unseen: str | tuple[str, ...] | None
+    effects: tuple[str, ...] | None
+    prices: Prices
+    certainty: Certainty
+
+    def check(self) -> None:
+        if (self.case is None) == (self.field is None):
+            raise ConfigError(
+                "diagnosis: give either case=<folder with reference/ and field/>, or field=<glob> and actuator=<simulator>"
+            )
+
+
+@spec
+class Diagnose:
+    """Holds a simulator against recordings and says what it lacks.
+
+    Attributes:
+        session: Folder, seed, device.
+        machine: The machine that was recorded.
+        fit: How the simulator is made from `reference/`; without one, the flexible model that tells
+            what could be explained at all.
+        actuator: The simulator that `diagnosis.field` is held against.
+        thresholds: When a stretch of a recording is worth telling.
+        excitation: Experiments that could follow, by name.
+        diagnosis: What is diagnosed.
+    """
+
+    session: Session
+    machine: Machine
+    fit: ActuatorFit
+    actuator: Actuator | None
+    thresholds: Thresholds
+    excitation: dict[str, Excitation]
+    diagnosis: Subject
+
+    def run(self) -> None:
+        """Writes `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
+
+        Raises:
+            RecordingError: a recording cannot be used, or there is too little data to fit a
+                simulator to.
+            ConfigError: neither a case nor an actuator is given, or an effect is unknown.
+            StorageError: something could not be written.
+        """
+        self.session.seed_all()
+        given = self._case()
+        kinds = library.load(self.machine, self.diagnosis.effects)
+        torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
+        with Progress(transient=True) as progress:
+            task = progress.add_task("simulator", total=1.0)
+            base = self._base(given, kinds)
+            generator = self.session.generator("diagnosis")
+            prices, certainty = self.diagnosis.prices, self.diagnosis.certainty
+            work = Diagnosis(
+                given, base, kinds, prices, certainty, self.thresholds, self.excitation, generator
+            )
+            outcome = work.run(
+                lambda doing, done: progress.update(task, description=doing, completed=done)
+            )
+        folder = self.session.folder
+        outcome.save(folder)
+        prescription.write(outcome.answer, kinds, folder / prescription.FILE)
+        page.write(outcome, folder, self.machine)
+        _show(outcome.answer, folder)
+
+    def _case(self) -> Case:
+        subject = self.diagnosis
+        unseen = case.recorded(subject.unseen, self.machine) if subject.unseen else ()
+        if subject.case is not None:
+            return replace(case.load(Path(subject.case), self.machine), unseen=unseen)
+        assert subject.field is not None, "checked by Subject"
+        if self.actuator is None:
+            raise ConfigError(
+                "diagnosis.field needs a simulator to hold it against: add actuator=<name>"
+            )
+        return Case(self.machine, [], case.recorded(subject.field, self.machine), unseen)
+
+    def _base(self, given: Case, kinds: Sequence[Kind]) -> Base:
+        seed, device, folder = (
+            self.session.stream("base"),
+            self.session.torch_device(),
+            self.session.folder,
+        )
+        if given.reference:
+            return simulator.fitted(
+                given,
+                self.fit,
+                folder / "base",
+                seed,
+                device,
+                lambda base: already.refined(base, kinds, self.machine),
+            )
+        assert self.actuator is not None, "there is one where there is no reference"
+        return simulator.given(given, self.actuator, self.fit, folder / "flexible", seed, device)
+
+
+def _show(found: Answer, folder: Path) -> None:
+    console = Console()
+    table = Table("effect", "joints", "probability", "numbers", "closes", "same as", box=None)
+    for one in found.selected:
+        told = [
+            f"{name} {joint} {value.mean:.4g} ({value.ci95[0]:.4g} to {value.ci95[1]:.4g})"
+            for name, values in one.parameters.items()
+            for joint, value in values.items()
+        ]
+        closes = f"{100 * one.gap_closed.mean:.0f} %" if one.gap_closed else ""
+        table.add_row(
+            one.effect,
+            " ".join(one.joints),
+            f"{one.probability:.2f}",
+            "\n".join(told),
+            closes,
+            " ".join(one.same_as),
+        )
+    console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False)
+    if found.selected:
+        console.print(table)
+    console.print(f"report: {folder / page.PAGE}, answer: {folder / answer.FILE}", highlight=False)

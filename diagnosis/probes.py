@@ -1,0 +1,261 @@
+"""Residual probes: figures that a person can read as evidence for one family of effects or another.
+
+What the simulator's speed has too much, over `SPAN_S`, is explained by what each effect would leave
+behind: the acceleration (the machine moves later), the speed itself (gain), its size (asymmetry),
+the speed at small or large commands, with others moving, under load, later in the day. Each is
+fitted together with gain and timing, which every simulator gets a little wrong, and compared with
+the same figure on the reference. These figures point; which effect it is, is decided by fitting it.
+Axes: `W` windows, `K` steps, `J` joints, `S` samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from brokk_rl.gravity import Gravity
+from brokk_rl.machine import Machine
+from brokk_rl.split import COMMANDED
+from diagnosis import edges
+from diagnosis.blocks import parts
+from diagnosis.free_runs import FreeRuns
+from diagnosis.occasions import CREEP, REGIMES, in_force, regimes
+
+SPAN_S = 0.25
+FULL = 0.7
+"""Commands beyond this are large."""
+CLEAR = 4.0
+"""A figure that differs from the reference's by so many standard errors is worth a sentence."""
+FEWEST = 40
+"""Samples with the condition below which a probe says nothing."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One figure.
+
+    Attributes:
+        effect: Family of effects that would leave it behind.
+        joint: The joint.
+        value: The figure on the field recordings, in the unit that `text` says.
+        reference: The same on reference recordings; 0 without any.
+        z: Difference over its standard error, from leaving out parts of recordings.
+        text: The figure as a sentence.
+    """
+
+    effect: str
+    joint: str
+    value: float
+    reference: float
+    z: float
+    text: str
+
+    @property
+    def is_clear(self) -> bool:
+        """Says whether it stands out."""
+        return abs(self.z) > CLEAR
+
+    def plain(self) -> dict[str, Any]:
+        """Returns it as plain JSON data."""
+        return asdict(self)
+
+
+PERCENT, MILLI = 1e2, 1e3
+TEXTS = {
+    "dead_time": (
+        "moves {:.0f} ms later than simulated",
+        "moves {:.0f} ms earlier than simulated",
+        MILLI,
+    ),
+    "flow_gain": (
+        "moves {:.0f} % slower than simulated",
+        "moves {:.0f} % faster than simulated",
+        PERCENT,
+    ),
+    "asymmetry": (
+        "is {:.0f} % slower extending, faster retracting",
+        "is {:.0f} % faster extending, slower retracting",
+        PERCENT,
+    ),
+    "dead_band": (
+        "is {:.0f} % slower at small commands",
+        "is {:.0f} % faster at small commands",
+        PERCENT,
+    ),
+    "saturation": (
+        "is {:.0f} % slower at large commands",
+        "is {:.0f} % faster at large commands",
+        PERCENT,
+    ),
+    "flow_sharing": (
+        "is {:.0f} % slower while others move",
+        "is {:.0f} % faster while others move",
+        PERCENT,
+    ),
+    "load_dependence": (
+        "is {:.0f} % slower against its full load",
+        "is {:.0f} % faster against its full load",
+        PERCENT,
+    ),
+    "thermal_drift": (
+        "loses {:.0f} % of its speed in time",
+        "gains {:.0f} % of speed in time",
+        PERCENT,
+    ),
+    "backlash": (
+        "falls {:.1f} m{unit} short after reversals",
+        "goes {:.1f} m{unit} further after reversals",
+        MILLI,
+    ),
+    "delay_jitter": ("starts after times that vary by {:.0f} ms", "", MILLI),
+    "compliance": ("shakes by {:.2f} m{unit} after stops", "", MILLI),
+    "creep": (
+        "sinks by {:.2f} m{unit}/s without command",
+        "rises by {:.2f} m{unit}/s without command",
+        MILLI,
+    ),
+}
+"""What a coefficient above and below 0 says, and its factor."""
+
+
+def probes(
+    runs: FreeRuns, reference: FreeRuns | None, machine: Machine, dead_time_s: np.ndarray
+) -> list[Probe]:
+    """Returns all figures, those that stand out most first.
+
+    Args:
+        runs: Free runs through field recordings.
+        reference: The same simulator's through reference recordings; `None`: figures are compared
+            with 0.
+        machine: Gives joints and masses.
+        dead_time_s: Time from command to motion of each joint, `(J,)`.
+    """
+    mine, other = (
+        _coefficients(side, machine, dead_time_s) | edges.figures(side, machine, dead_time_s)
+        if side
+        else {}
+        for side in (runs, reference)
+    )
+    found = []
+    for (effect, joint), (value, error) in mine.items():
+        base, base_error = other.get((effect, joint), (0.0, 0.0))
+        unit = machine.joints[machine.joint_names.index(joint)].unit
+        text = f"{joint} {_said(effect, value, unit)}"
+        text += f"; on the reference it {_said(effect, base, unit)}" if other else ""
+        z = (value - base) / max(float(np.hypot(error, base_error)), np.finfo(float).tiny)
+        found.append(Probe(effect, joint, value, base, z, text))
+    return sorted(found, key=lambda probe: -abs(probe.z))
+
+
+def _said(effect: str, value: float, unit: str) -> str:
+    above, below, factor = TEXTS[effect]
+    return (below if value < 0 else above).format(abs(factor * value), unit=unit)
+
+
+def _coefficients(
+    runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """Returns the coefficient of each probe and its standard error, by effect and joint."""
+    span = max(1, round(SPAN_S / machine.period_s))
+    lacks = _change(runs.error, span) / SPAN_S
+    speed = _change(runs.simulated, span) / SPAN_S
+    acceleration = _change(speed, span) / SPAN_S
+    clues = _Clues(runs, machine, dead_time_s)
+    block = np.broadcast_to(parts(runs)[:, None], lacks.shape[:2])
+    found = {}
+    for j, name in enumerate(machine.joint_names):
+        given = np.isfinite(lacks[..., j]) & np.isfinite(acceleration[..., j])
+        always = np.stack([acceleration[..., j][given], speed[..., j][given]], 1)
+        for effect, values in clues.of(j, speed[..., j]):
+            column = np.nan_to_num(values[given])
+            rows = (
+                always
+                if effect in ("dead_time", "flow_gain")
+                else np.concatenate([always, column[:, None]], 1)
+            )
+            if (np.abs(column) > 0).sum() < FEWEST:
+                continue
+            place = {"dead_time": 0, "flow_gain": 1}.get(effect, 2)
+            found[effect, name] = _jackknifed(rows, lacks[..., j][given], block[given], place)
+    return found
+
+
+class _Clues:
+    """What each effect would leave behind in the speed that the simulator has too much, `(W, K)` for each joint."""
+
+    def __init__(self, runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> None:
+        acting = [in_force(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
+        self._u = runs.cut(acting)
+        self._regime = runs.cut(
+            [
+                regimes(u, r.q, machine, r.rate_hz)
+                for u, r in zip(acting, runs.recordings, strict=True)
+            ]
+        )
+        self._load = None
+        if machine.has_bodies:
+            gravity = Gravity(machine, torch.device("cpu"))
+            loads = [
+                gravity.load(torch.as_tensor(r.q, dtype=torch.float32)).numpy()
+                for r in runs.recordings
+            ]
+            self._load = runs.cut([load / np.maximum(np.abs(load).max(0), 1.0) for load in loads])
+        late_s = runs.elapsed_s - runs.elapsed_s.mean()
+        self._late = (late_s / max(float(np.ptp(late_s)), 1e-9))[:, None]
+
+    def of(self, joint: int, speed: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+        """Yields effect and clue of one joint, whose simulated speed is `speed`, `(W, K)`."""
+        u, regime = self._u[..., joint], self._regime[..., joint]
+        moving, size = np.abs(u) > COMMANDED, np.abs(u)
+        others = (np.abs(self._u) > COMMANDED).sum(2) - moving > 0
+        if self._load is not None and np.nanmax(np.abs(self._load[..., joint])) > 0.05:
+            yield "creep", -np.sign(self._load[..., joint]) * (regime == REGIMES.index("hold"))
+        if moving.sum() < FEWEST:
+            return
+        yield "dead_time", speed
+        yield "flow_gain", speed
+        yield "asymmetry", np.abs(speed)
+        yield "dead_band", speed * (moving & (size < CREEP))
+        yield "saturation", speed * (size > FULL)
+        yield "flow_sharing", speed * others
+        yield "thermal_drift", speed * self._late
+        yield (
+            "backlash",
+            np.sign(u) * (regime == REGIMES.index("after a reversal")) / 0.6,
+        )  # rad lacking, over the time it takes
+        if self._load is not None and np.nanmax(np.abs(self._load[..., joint])) > 0.05:
+            load = self._load[..., joint]
+            yield "load_dependence", -np.sign(u) * load * np.abs(speed)
+
+
+def _change(values: np.ndarray, span: int) -> np.ndarray:
+    """Returns the change over the last `span` steps, `(W, K, J)`, NaN before there are so many."""
+    found = np.full(values.shape, np.nan)
+    found[:, span:] = values[:, span:] - values[:, :-span]
+    return found
+
+
+def _jackknifed(
+    rows: np.ndarray, target: np.ndarray, block: np.ndarray, place: int
+) -> tuple[float, float]:
+    """Returns one coefficient of a least-squares fit, and its standard error from leaving out one block at a time."""
+    names = np.unique(block)
+    grams = np.stack([rows[block == b].T @ rows[block == b] for b in names])
+    crosses = np.stack([rows[block == b].T @ target[block == b] for b in names])
+
+    def solved(gram: np.ndarray, cross: np.ndarray) -> float:
+        ridge = 1e-9 * np.trace(gram) / len(gram) + 1e-15
+        return float(np.linalg.solve(gram + ridge * np.eye(len(gram)), cross)[place])
+
+    value = solved(grams.sum(0), crosses.sum(0))
+    count = len(names)
+    if count < 2:
+        return value, float("inf")
+    left = np.array(
+        [solved(grams.sum(0) - g, crosses.sum(0) - c) for g, c in zip(grams, crosses, strict=True)]
+    )
+    return value, float(np.sqrt((count - 1) / count * ((left - left.mean()) ** 2).sum()))

@@ -1,0 +1,292 @@
+"""The search over sets of effects: joint by joint over subsets, then over the names that all joints share.
+
+A set is judged by what it earns on recordings that it was not fitted to, less its price: what the
+same effect earns on reference recordings, where there is nothing to find. Saturation may pay only
+together with a dead band, so sets are never grown from one
+effect alone: each joint keeps the best few of each size.
+Axes: `J` joints, `E` entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from diagnosis.sizes import Plain, Shape, alone, earned, predicted
+
+MOST = 4
+"""Effects in a set."""
+KEPT = 5
+"""Subsets of each size that a joint goes on from."""
+NAMES = 12
+"""Names among which whole sets are chosen."""
+LEAST = 0.15
+"""Smallest size, over the typical one, that is worth naming: what is smaller any simulator gets
+wrong."""
+SURELY = 1.0
+"""Standard errors by which a set must earn more than a simpler one."""
+TRIED = 14
+"""Subsets of each joint that are tried on the reference too."""
+
+Subset = frozenset[str]
+Price = Callable[[int, Subset], float]
+"""What a subset costs on a joint, by its number."""
+
+
+@dataclass
+class Scored:
+    """What a subset of effects earns on a joint.
+
+    Attributes:
+        gain: Entry by entry, `(E,)`.
+        sizes: By effect, along each of its rays.
+    """
+
+    gain: np.ndarray
+    sizes: dict[str, np.ndarray]
+
+    @property
+    def total(self) -> float:
+        """What it earns in all, nats."""
+        return float(self.gain.sum())
+
+
+@dataclass
+class Table:
+    """Subsets of effects that were tried on one joint, and what they earn.
+
+    Attributes:
+        joint: The joint's errors over the noise.
+        shapes: By effect: one shape a ray; effects that do nothing to the joint are absent.
+        block: Part of the recordings, the same for neighbours, of each entry.
+        scored: What subsets earn, as far as they were tried.
+        single: Best sizes of shapes by themselves, by their identity.
+    """
+
+    joint: Plain
+    shapes: dict[str, list[Shape]]
+    block: np.ndarray
+    scored: dict[Subset, Scored] = field(default_factory=dict)
+    single: dict[int, float] = field(default_factory=dict)
+
+    def score(self, subset: Subset) -> Scored:
+        """Returns what a subset earns."""
+        if subset not in self.scored:
+            names = sorted(subset)
+            shapes = [shape for name in names for shape in self.shapes[name]]
+            if not shapes:
+                return Scored(np.zeros(len(self.joint.z)), {})
+            found = [earned(self.joint, shapes, start) for start in self._starts(names)]
+            gain, sizes = max(found, key=lambda one: one[0].sum())
+            ends = np.cumsum([len(self.shapes[name]) for name in names])[:-1]
+            self.scored[subset] = Scored(gain, dict(zip(names, np.split(sizes, ends), strict=True)))
+        return self.scored[subset]
+
+    def _starts(self, names: Sequence[str]) -> list[np.ndarray]:
+        """Returns sizes at which a fit of several effects may begin: all somewhat smaller than alone, and the best smaller set.
+
+        What begins at a threshold does nothing below it, and a fit that begins there stays there.
+        So a set also begins where the best set with one effect less ended, with the other at what
+        explains best what that one leaves.
+        """
+        every = [shape for name in names for shape in self.shapes[name]]
+        starts = [
+            np.array([self.alone(shape) for shape in every]) * (1.0 if len(every) == 1 else 0.7)
+        ]
+        tried = self.score if len(names) == 2 else self.scored.get
+        smaller = [
+            (one, new)
+            for new in names
+            if len(names) > 1 and (one := tried(frozenset(names) - {new}))
+        ]
+        if smaller:
+            best, new = max(smaller, key=lambda pair: pair[0].total)
+            known = [shape for name in sorted(best.sizes) for shape in self.shapes[name]]
+            left = self.joint.z - predicted(
+                known, np.concatenate([best.sizes[name] for name in sorted(best.sizes)])
+            )
+            added = [alone(left, shape) for shape in self.shapes[new]]
+            starts.append(
+                np.concatenate([added if name == new else best.sizes[name] for name in names])
+            )
+        return starts
+
+    def alone(self, shape: Shape) -> float:
+        """Returns the size of a shape that explains the joint's errors best by itself."""
+        if id(shape) not in self.single:
+            self.single[id(shape)] = alone(self.joint.z, shape)
+        return self.single[id(shape)]
+
+    def explore(self, price: Mapping[str, float], most: int) -> None:
+        """Tries all single effects, and larger subsets that contain one of the best of the size below."""
+
+        def net(subset: Subset) -> float:
+            return self.score(subset).total - sum(price[name] for name in subset)
+
+        single = sorted((frozenset({name}) for name in self.shapes), key=net, reverse=True)
+        level = [a | b for a, b in combinations(single[: KEPT + 1], 2)]
+        best = sorted([*single, *level], key=net, reverse=True)[:KEPT]
+        if not best or net(best[0]) <= 0.0:
+            return  # a joint without a gap
+        for _ in range(2, most + 1):
+            before = net(best[0])
+            level = {
+                one | {name}
+                for one in best
+                for name in self.shapes
+                if name not in one and len(one) < most
+            }
+            best = sorted({*best, *level}, key=net, reverse=True)[:KEPT]
+            if net(best[0]) <= before:
+                return
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A set of effects, joint by joint.
+
+    Attributes:
+        subsets: Effects of each joint.
+        worth: What they earn in all, less their prices.
+    """
+
+    subsets: tuple[Subset, ...]
+    worth: float
+
+    @property
+    def names(self) -> Subset:
+        """All effects of the set."""
+        return frozenset().union(*self.subsets)
+
+
+def choose(
+    tables: Sequence[Table],
+    price: Price,
+    name_price: float,
+    share: float,
+    shared: Subset = frozenset(),
+    partial: float = 0.0,
+    least: float = 0.0,
+) -> Chosen:
+    """Returns the set that is worth most, or one of fewer effects that is not surely worth less.
+
+    Args:
+        tables: What was tried on each joint.
+        price: What a subset costs on a joint.
+        name_price: What each effect costs once, however many joints have it.
+        share: Part of what a joint's subset earns that each of its effects must add.
+        shared: Effects with one cause for all joints; they cost once, as `name_price`.
+        partial: What such an effect costs for each joint that could show it and does not.
+        least: No effect that is not shared costs less on a joint; what earns less is not priced at
+            all.
+    """
+    worth: list[dict[Subset, float]] = []
+    for j, table in enumerate(tables):
+        priced = {
+            subset: table.scored[subset].total - price(j, subset)
+            for subset in promising(table, least, share, shared)
+        }
+        worth.append(
+            {subset: value for subset, value in priced.items() if value > 0 or subset <= shared}
+        )
+    felt = [shared & table.shapes.keys() for table in tables]
+    best = _best(worth, felt, name_price, partial)
+    while simpler := _simpler(best, worth, tables, felt, name_price, partial, share):
+        best = simpler
+    return best
+
+
+def _best(
+    worth: Sequence[Mapping[Subset, float]],
+    felt: Sequence[Subset],
+    name_price: float,
+    partial: float,
+) -> Chosen:
+    """Returns the set of at most `MOST` names that is worth most; each joint takes the best subset of them."""
+    names = sorted(
+        {name for by_subset in worth for subset in by_subset for name in subset},
+        key=lambda n: -_sum(worth, n),
+    )[:NAMES]
+    best = Chosen((frozenset(),) * len(worth), 0.0)
+    for size in range(1, MOST + 1):
+        for chosen in combinations(names, size):
+            among = frozenset(chosen)
+            total, subsets = -name_price * size, []
+            for w, every in zip(worth, felt, strict=True):
+                net = {s: w[s] - partial * len(among & every - s) for s in w if s <= among}
+                net[frozenset()] = -partial * len(among & every)
+                subsets.append(max(net, key=net.__getitem__))
+                total += net[subsets[-1]]
+            if total > best.worth and frozenset().union(*subsets) == among:
+                best = Chosen(tuple(subsets), total)
+    return best
+
+
+def _simpler(
+    best: Chosen,
+    worth: Sequence[Mapping[Subset, float]],
+    tables: Sequence[Table],
+    felt: Sequence[Subset],
+    name_price: float,
+    partial: float,
+    share: float,
+) -> Chosen | None:
+    """Returns a set with fewer names whose loss is within what chance does between blocks, or a small part of the whole."""
+    for name in sorted(best.names):
+        other = _best(
+            [{s: value for s, value in w.items() if name not in s} for w in worth],
+            felt,
+            name_price,
+            partial,
+        )
+        if len(other.names) >= len(best.names) or not other.names:
+            continue
+        lost, whole, blocks = 0.0, 0.0, np.zeros(int(tables[0].block.max()) + 1)
+        for table, mine, others in zip(tables, best.subsets, other.subsets, strict=True):
+            if mine != others:
+                difference = table.score(mine).gain - table.score(others).gain
+                lost, whole = lost + difference.sum(), whole + table.score(mine).total
+                blocks += np.bincount(table.block, difference, len(blocks))
+        if lost < max(SURELY * blocks.std() * np.sqrt(len(blocks)), share * whole):
+            return other
+    return None
+
+
+def promising(
+    table: Table, least: float, share: float, shared: Subset = frozenset()
+) -> list[Subset]:
+    """Returns the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most.
+
+    An effect that is `shared` by all joints may earn little on each.
+    """
+
+    def pays(subset: Subset) -> bool:
+        own = subset - shared
+        return table.scored[subset].total > least * len(own) and _each_adds(
+            subset, own, table, share
+        )
+
+    paying = [subset for subset in list(table.scored) if subset and pays(subset)]
+    paying.sort(key=lambda s: table.scored[s].total, reverse=True)
+    return [s for place, s in enumerate(paying) if place < TRIED or len(s) == 1]
+
+
+def _each_adds(subset: Subset, own: Subset, table: Table, share: float) -> bool:
+    """Says whether each of the effects `own` has a size worth naming and adds its share: else it mends the form of another."""
+    total, sizes = table.scored[subset].total, table.scored[subset].sizes
+    if any(np.abs(sizes[name]).max() < LEAST for name in own):
+        return False
+    return len(subset) == 1 or all(
+        total - table.score(subset - {name}).total >= share * total for name in own
+    )
+
+
+def _sum(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
+    """Returns the most that a subset with `name` is worth, summed over joints."""
+    return sum(
+        max([value for subset, value in by_subset.items() if name in subset], default=0.0)
+        for by_subset in worth
+    )

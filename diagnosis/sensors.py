@@ -1,0 +1,169 @@
+"""Noise and coarse steps of a sensor: too small for free runs to show, plain in how the samples scatter.
+
+Each recording is summed up by a few statistics a joint. An effect is put onto recordings of the
+reference, at several sizes; the size whose statistics are nearest to those of the field is the most
+likely one.
+Axes: `T` time, `J` joints, `P` parts of the reference, `F` statistics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from diagnosis.answer import Estimate
+from diagnosis.case import Case, parts
+from diagnosis.found import Found, interval
+from diagnosis.library import Kind, Still
+
+SIZES = np.geomspace(0.05, 6.0, 25)
+AT_REST, MOVING = 0.01, 0.08
+"""Mean speed over a second, of full speed, below which a joint rests and above which it moves."""
+FEWEST = 20
+"""Fewer steps do not show the smallest."""
+BLUR = np.array([0.08, 0.08, 0.03, 0.03, 0.08, 0.08])
+"""Differences in the statistics that say nothing: sensors are not quite the same from day to
+day."""
+MOST = 60.0
+"""Evidence is not counted beyond this: the statistics are no exact likelihood."""
+WHITE = 6.0
+"""Variance of the second differences of white noise, over its own."""
+TINY = 2e-6
+"""Noise that float32 cannot hold, rad or m."""
+
+
+def statistics(q: np.ndarray, machine: Machine) -> np.ndarray:
+    """Returns, by joint, at rest and in motion: scatter of second differences, share of equal neighbours, smallest steps, `(J, F)`.
+
+    Scatter and steps are logarithms. The smallest steps are those of the sensor, where it has any.
+    """
+    second = max(2, round(1.0 / machine.period_s))
+    speed = np.zeros_like(q)
+    speed[second // 2 : second // 2 + len(q) - second] = (q[second:] - q[:-second]) / second
+    speed = np.abs(speed) / (machine.max_speed * machine.period_s)
+    bend, step = np.abs(np.diff(q, 2, axis=0)), np.abs(np.diff(q, axis=0))[1:]
+    found = np.full((q.shape[1], 6), np.nan)
+    for j in range(q.shape[1]):
+        for place, rows in enumerate((speed[1:-1, j] < AT_REST, speed[1:-1, j] > MOVING)):
+            if rows.sum() >= 3 * second:
+                cut = np.minimum(bend[rows, j], 4 * np.sqrt(np.mean(bend[rows, j] ** 2)))
+                found[j, place] = np.log(np.sqrt(np.mean(cut**2)) + TINY)
+                found[j, 2 + place] = np.mean(step[rows, j] < TINY / 2)
+                moved = step[rows, j][step[rows, j] >= TINY / 2]
+                found[j, 4 + place] = np.log(
+                    np.quantile(moved, 0.2) if len(moved) > FEWEST else TINY
+                )
+    return found
+
+
+def readings(
+    field: Sequence[Recording], reference: Sequence[Recording], machine: Machine
+) -> np.ndarray:
+    """Returns how far positions in the field scatter as they are read, beyond those of the reference, rad or m, `(J,)`.
+
+    Seen in second differences, at rest or in motion, whichever is more: a joint that rests between
+    two steps of a coarse sensor flickers.
+    """
+    squares = []
+    for some in (field, reference):
+        seen = np.exp(2.0 * np.stack([statistics(r.q.astype(float), machine)[:, :2] for r in some]))
+        told = np.isfinite(seen)
+        squares.append(np.where(told, seen, 0.0).sum(0) / np.maximum(told.sum(0), 1))
+    now, then = squares
+    return np.sqrt(np.maximum(now - then, 0.0).max(1) / WHITE)
+
+
+def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -> list[Found]:
+    """Returns the effects on sensors that the scatter of the field's samples shows."""
+    field, reference, machine = case.field, parts(case.reference), case.machine
+    if len(reference) < 2:
+        return []
+    kinds = [
+        kind
+        for kind in kinds
+        if kind.target.side == "measurement" and (kind.target.stochastic or not kind.target.smooth)
+    ]
+    seen = np.nanmean([statistics(r.q.astype(float), machine) for r in field], 0)
+    plain = np.stack([statistics(r.q.astype(float), machine) for r in reference])  # (P, J, F)
+    none = _likelihood(seen, plain, plain)
+    drawn = {kind.name: [_with(kind, size, reference, machine) for size in SIZES] for kind in kinds}
+    likelihood = {
+        name: np.stack([_likelihood(seen, one, plain) for one in by_size])
+        for name, by_size in drawn.items()
+    }
+    highest = {name: values.max(0) for name, values in likelihood.items()}
+    gain = {name: np.minimum(values - none, MOST) for name, values in highest.items()}
+    best = (
+        [max(highest, key=lambda name: highest[name][j]) for j in range(machine.num_joints)]
+        if highest
+        else []
+    )
+    found = []
+    for kind in kinds:
+        mask = np.array(
+            [best[j] == kind.name and gain[kind.name][j] > price for j in range(machine.num_joints)]
+        )
+        worth = float((gain[kind.name][mask] - price).sum()) - name_price
+        if worth <= 0:
+            continue
+        parameters: dict[str, dict[str, Estimate]] = {}
+        for j in np.flatnonzero(mask):
+            ends = np.array(interval(SIZES, likelihood[kind.name][:, j]))
+            for name in kind.fitted:
+                mean, low, high = kind.numbers[name].none + kind.size(name) * ends
+                parameters.setdefault(name, {})[machine.joint_names[j]] = Estimate(
+                    float(mean), (float(low), float(high))
+                )
+        earned = float(gain[kind.name][mask].sum())
+        rivals = {
+            name: earned - float((highest[kind.name] - highest[name])[mask].sum())
+            for name in gain
+            if name != kind.name
+        }
+        after = np.stack(
+            [
+                drawn[kind.name][int(np.argmax(row))].mean(0)[j]
+                for j, row in enumerate(likelihood[kind.name].T)
+            ]
+        )
+        closed = 1.0 - np.nansum(np.square((seen - after) / BLUR)[mask]) / np.nansum(
+            np.square((seen - plain.mean(0)) / BLUR)[mask]
+        )
+        found.append(
+            Found(kind, mask, parameters, worth, earned, float(np.clip(closed, 0.0, 1.0)), rivals)
+        )
+    return found
+
+
+def _likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
+    """Returns the log likelihood of the field's statistics `(J, F)` where those of the parts `(P, J, F)` are typical, `(J,)`.
+
+    Parts scatter at least as they do without an effect, `plain` `(P, J, F)`: a few of them may
+    agree by chance.
+    """
+    variance = (
+        np.fmax(np.nanvar(drawn, 0, ddof=1), np.nanvar(plain, 0, ddof=1)) * (1.0 + 1.0 / len(drawn))
+        + BLUR**2
+    )
+    off = np.square(seen - np.nanmean(drawn, 0)) / variance
+    return -0.5 * np.nansum(off + np.where(np.isfinite(off), np.log(variance), 0.0), 1)
+
+
+def _with(kind: Kind, size: float, reference: Sequence[Recording], machine: Machine) -> np.ndarray:
+    """Returns the statistics of the reference with an effect on all joints, `(P, J, F)`."""
+    found = []
+    for recording in reference:
+        q = torch.as_tensor(recording.q, dtype=torch.float32)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            model = kind.wrap(Still(), machine, len(q), torch.device("cpu"))
+        for name in kind.fitted:
+            value = kind.clipped(name, np.array(kind.numbers[name].none + size * kind.size(name)))
+            model.parameters[name].fill_(float(value))
+        with torch.inference_mode():
+            found.append(statistics(model.measure(q).numpy().astype(float), machine))
+    return np.stack(found)

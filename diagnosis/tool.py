@@ -1,0 +1,316 @@
+"""Errors of geometry and of encoders, by measured tool points: no simulator takes part, only forward kinematics.
+
+The errors are small, so their doings add up: sets of them are compared by least squares.
+Axes: `S` samples (one a second), `J` joints, `D` coordinates of all samples, `S` times 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import torch
+
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from diagnosis.answer import Estimate
+from diagnosis.case import Case
+from diagnosis.found import Found
+from diagnosis.library import Kind, Still
+
+COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
+FEWEST = 40
+"""Seconds with measured tool points that tell something."""
+TURNS = 3
+"""Times that sets of errors are compared: about nothing, then about what was found."""
+MOST = 3
+"""Errors in a set."""
+STEP = 0.2
+"""Finite difference, of the typical size."""
+LEAST_M = 3e-4
+"""No instrument is better."""
+LEAST = 0.3
+"""Smallest size, over the typical one, that is worth naming: trackers see millimetres that no
+drawing and no zero hold."""
+
+
+Fit = tuple[float, np.ndarray, np.ndarray]
+"""What a set of errors earns, their numbers, and the covariance of these."""
+
+
+@dataclass(frozen=True)
+class _Cause:
+    """One error: an effect on one joint, or of the whole machine; `columns` `(D, P)` per unit of `names`."""
+
+    kind: Kind
+    joint: int | None
+    names: tuple[str, ...]
+    columns: np.ndarray
+
+
+def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
+    """Says whether the recordings hold enough measured tool points of a machine whose geometry is known."""
+    if not machine.has_bodies:
+        return False
+    given = [
+        np.isfinite(np.stack([r.extra[column] for column in COLUMNS])).all(0).sum() / r.rate_hz
+        for r in recordings
+        if _is_seen(r)
+    ]
+    return sum(given) >= FEWEST
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What measured tool points show.
+
+    Attributes:
+        found: Errors of geometry and encoders.
+        left: Root mean square of what they leave over that of the reference; 1 where nothing is
+            measured.
+    """
+
+    found: Sequence[Found]
+    left: float
+
+
+def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -> Seen:
+    """Returns the errors of geometry and encoders that the measured tool points of the field show; none where there are none."""
+    field, reference, machine = case.field, case.reference, case.machine
+    if not is_tracked(field, machine):
+        return Seen([], 1.0)
+    kinds = [
+        k
+        for k in kinds
+        if not k.target.stochastic
+        and k.target.smooth
+        and k.target.side in ("kinematics", "measurement")
+    ]
+    q, seen, ways = _samples(field, machine)
+    off, causes = (
+        _untimed((seen - _points(None, {}, q, machine)).ravel(), ways),
+        _causes(kinds, q, ways, machine),
+    )
+    everything = np.concatenate([cause.columns for cause in causes], 1)
+    size_m = usual_m = max(
+        LEAST_M, float(np.std(off - everything @ np.linalg.lstsq(everything, off, rcond=1e-9)[0]))
+    )
+    if is_tracked(reference, machine):
+        at, known, moved = _samples(reference, machine)
+        usual_m = max(
+            LEAST_M,
+            float(np.std(_untimed((known - _points(None, {}, at, machine)).ravel(), moved))),
+        )
+        size_m = max(size_m, usual_m)
+    straight, chosen = off, ()
+    for _ in range(TURNS):  # what errors do is straight about what was found, not about nothing
+        fits, worth = _compared(causes, straight, size_m, price, name_price)
+        before, chosen = chosen, max(worth, key=worth.__getitem__)
+        if chosen in ((), before):
+            break
+        values = _split(causes, chosen, fits[chosen][1])
+        bent = [_bent(causes[c], own, q, machine) for c, own in zip(chosen, values, strict=True)]
+        straight = off - _untimed(np.sum(bent, 0), ways)
+    sizes = zip(chosen, _split(causes, chosen, fits[chosen][1]), strict=False)
+    large = tuple(c for c, own in sizes if _size(causes[c], own) >= LEAST)
+    names = dict.fromkeys(causes[c].kind.name for c in large)
+    left = (
+        straight - np.concatenate([causes[c].columns for c in chosen], 1) @ fits[chosen][1]
+        if chosen
+        else straight
+    )
+    return Seen(
+        [_found(name, large, causes, fits, worth, machine) for name in names],
+        float(np.std(left)) / usual_m,
+    )
+
+
+def _compared(
+    causes: Sequence[_Cause], off: np.ndarray, size_m: float, price: float, name_price: float
+) -> tuple[dict[tuple[int, ...], Fit], dict[tuple[int, ...], float]]:
+    """Returns all sets of causes, by their numbers, and what they are worth."""
+    fits: dict[tuple[int, ...], Fit] = {(): (0.0, np.zeros(0), np.zeros((0, 0)))}
+    worth: dict[tuple[int, ...], float] = {(): 0.0}
+    for count in range(1, MOST + 1):
+        for chosen in combinations(range(len(causes)), count):
+            fits[chosen] = _fit([causes[c] for c in chosen], off, size_m)
+            names = {causes[c].kind.name for c in chosen}
+            worth[chosen] = fits[chosen][0] - price * count - name_price * len(names)
+    return fits, worth
+
+
+def _found(
+    name: str,
+    best: tuple[int, ...],
+    causes: Sequence[_Cause],
+    fits: Mapping[tuple[int, ...], Fit],
+    worth: Mapping[tuple[int, ...], float],
+    machine: Machine,
+) -> Found:
+    gain, values, covariance = fits[best]
+    deviation, parameters, mask, place = (
+        np.sqrt(np.diag(covariance)),
+        {},
+        np.zeros(machine.num_joints, dtype=bool),
+        0,
+    )
+    kind = next(causes[c].kind for c in best if causes[c].kind.name == name)
+    for c in best:
+        cause = causes[c]
+        for number in cause.names:
+            if cause.kind is kind:
+                mean, half = kind.numbers[number].none + values[place], 1.96 * deviation[place]
+                joint = "machine" if cause.joint is None else machine.joint_names[cause.joint]
+                estimate = Estimate(float(mean), (float(mean - half), float(mean + half)))
+                parameters.setdefault(number, {})[joint] = estimate
+                mask[slice(None) if cause.joint is None else cause.joint] = True
+            place += 1
+    mine = tuple(c for c in best if causes[c].kind is kind)
+    rest = tuple(c for c in best if c not in mine)
+    own = gain - fits[rest][0]
+    rivals = {}
+    for c, cause in enumerate(causes):
+        swapped = tuple(sorted({*rest, c}))
+        if cause.kind is not kind and swapped in fits:
+            rivals[cause.kind.name] = max(
+                rivals.get(cause.kind.name, -np.inf), fits[swapped][0] - fits[rest][0]
+            )
+    without = max(
+        value for chosen, value in worth.items() if not any(causes[c].kind is kind for c in chosen)
+    )
+    closed = float(np.clip(own / max(gain, 1e-9), 0.0, 1.0))
+    return Found(kind, mask, parameters, worth[best] - without, own, closed, rivals)
+
+
+def _causes(
+    kinds: Sequence[Kind], q: np.ndarray, ways: np.ndarray, machine: Machine
+) -> list[_Cause]:
+    """Returns the errors that move the tool point at all, other than along the ways that it goes."""
+    plain, found = _points(None, {}, q, machine), []
+    for kind in kinds:
+        joined = all(not kind.numbers[name].per_joint for name in kind.fitted)
+        for joint in [None] if joined else range(machine.num_joints):
+            columns = []
+            for name in kind.fitted:
+                step = STEP * kind.size(name)
+                moved = (
+                    _points(kind, {name: _value(kind, name, joint, step, machine)}, q, machine)
+                    - plain
+                )
+                columns.append(_untimed(moved.ravel() / step, ways))
+            column = np.stack(columns, 1)
+            if np.abs(column).max() > 1e-6:
+                found.append(_Cause(kind, joint, kind.fitted, column))
+    return found
+
+
+def _value(kind: Kind, name: str, joint: int | None, by: float, machine: Machine) -> np.ndarray:
+    """Returns a number of an effect that is `by` more than neutral on a joint, or on all, `(J,)` or `(1,)`."""
+    value = np.full(
+        machine.num_joints if kind.numbers[name].per_joint else 1,
+        kind.numbers[name].none,
+        dtype=float,
+    )
+    value[slice(None) if joint is None else joint] += by
+    return value
+
+
+def _bent(cause: _Cause, values: np.ndarray, q: np.ndarray, machine: Machine) -> np.ndarray:
+    """Returns by how much an error of some size moves the tool point other than in proportion, `(D,)`."""
+    given = {
+        n: _value(cause.kind, n, cause.joint, value, machine)
+        for n, value in zip(cause.names, values, strict=True)
+    }
+    steps = {n: STEP * cause.kind.size(n) for n in cause.names}
+    small = [
+        _points(cause.kind, {n: _value(cause.kind, n, cause.joint, by, machine)}, q, machine)
+        for n, by in steps.items()
+    ]
+    plain = _points(None, {}, q, machine)
+    line = sum(
+        (
+            value / by * (one - plain)
+            for value, by, one in zip(values, steps.values(), small, strict=True)
+        ),
+        np.zeros(()),
+    )
+    return (_points(cause.kind, given, q, machine) - plain - line).ravel()
+
+
+def _untimed(off: np.ndarray, ways: np.ndarray) -> np.ndarray:
+    """Returns errors `(D,)` without their part along the ways `(D, 2)` that the tool point goes.
+
+    Instruments beside the machine have a clock of their own: a period between them and the encoders
+    moves the tool by centimetres.
+    """
+    return off - ways @ np.linalg.lstsq(ways, off, rcond=1e-9)[0]
+
+
+def _fit(causes: Sequence[_Cause], off: np.ndarray, size_m: float) -> Fit:
+    """Returns what a set of errors earns, their numbers (as differences from neutral), and their covariance."""
+    x = np.concatenate([cause.columns for cause in causes], 1)
+    unit = np.concatenate(
+        [[abs(cause.kind.size(name)) for name in cause.names] for cause in causes]
+    )
+    # instruments err together for a while: a sample a second counts as a third of one
+    normal = x.T @ x / size_m**2 / 3.0 + np.diag(1.0 / (3.0 * unit) ** 2)
+    covariance = np.linalg.inv(normal)
+    values = covariance @ (x.T @ off) / size_m**2 / 3.0
+    left = off - x @ values
+    return float((off @ off - left @ left) / 2.0 / size_m**2 / 3.0), values, covariance
+
+
+def _split(causes: Sequence[_Cause], chosen: Sequence[int], values: np.ndarray) -> list[np.ndarray]:
+    return np.split(values, np.cumsum([len(causes[c].names) for c in chosen])[:-1])
+
+
+def _size(cause: _Cause, values: np.ndarray) -> float:
+    return max(
+        abs(value / cause.kind.size(name)) for name, value in zip(cause.names, values, strict=True)
+    )
+
+
+def _samples(
+    recordings: Sequence[Recording], machine: Machine
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns positions, measured tool points and the ways of a period to and from them, `(D, 2)`, about once a second."""
+    having = [r for r in recordings if _is_seen(r)]
+    every = max(1, round(having[0].rate_hz))
+    seen = np.concatenate(
+        [np.stack([r.extra[column] for column in COLUMNS], 1)[::every] for r in having]
+    ).astype(float)
+    q = [r.q.astype(float) for r in having]
+    steps = [np.diff(_points(None, {}, one, machine), axis=0) for one in q]
+    none = np.zeros((1, 3))
+    ways = [
+        np.stack([np.concatenate([none, one]), np.concatenate([one, none])], -1)[::every]
+        for one in steps
+    ]
+    given = np.isfinite(seen).all(1)
+    return (
+        np.concatenate([one[::every] for one in q])[given],
+        seen[given],
+        np.concatenate(ways)[given].reshape(-1, 2),
+    )
+
+
+def _is_seen(recording: Recording) -> bool:
+    return all(column in recording.extra for column in COLUMNS)
+
+
+def _points(
+    kind: Kind | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine
+) -> np.ndarray:
+    """Returns where the tool point is at measured positions, with an effect or none, `(S, 3)`."""
+    at, device = torch.as_tensor(q, dtype=torch.float32), torch.device("cpu")
+    kinematics = Kinematics(machine, device)
+    if kind is None:
+        return kinematics.pose(at).tip_in_base_m.numpy().astype(float)
+    model = kind.wrap(Still(), machine, len(q), device)
+    for name, value in values.items():
+        model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
+    true = model.truth(at)
+    return model.tool(kinematics.pose(true).tip_in_base_m, true).numpy().astype(float)

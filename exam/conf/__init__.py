@@ -1,0 +1,1 @@
+"""Configuration of the exam: what an extension registers by the entry point `brokk_rl.conf`."""

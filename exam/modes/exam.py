@@ -1,0 +1,402 @@
+"""`brokk mode=exam`: makes sealed cases, has each diagnosed by a process that cannot read the labels, and marks the answers."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import secrets
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from actuators.excite.plan.schedule import Approach
+from brokk_rl import record
+from brokk_rl.contracts.actuator import ActuatorFit, Excitation
+from brokk_rl.errors import ConfigError, RecordingError, choices
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session, write_json, write_text
+from brokk_rl.spec import spec
+from diagnosis import answer, library
+from diagnosis.certainty import Certainty
+from diagnosis.engine import Prices
+from exam import ledger, marking, oracle, page, paper, seal, sitting
+from exam.calibration import Calibration, halves, items
+from exam.making import Half, Workshop
+from exam.mix import Mix, Question
+from exam.sitting import Candidate
+from exam.specimen import PlantFamily
+from exam.tally import tally
+
+log = logging.getLogger(__name__)
+
+ORACLE = "oracle.json"
+
+
+@spec
+class Examination:
+    """What to do, and with which cases.
+
+    Attributes:
+        do: `make` cases into the run folder, `run` a candidate on them, ask the `oracle`, `score`
+            the answers of one or several, run and score all `baselines`, `calibrate` prices by the
+            answers to development exams.
+        folder: The exam that all but `make` are about: the folder that `make` left.
+        candidate: Who answers.
+        baselines: Who answers for comparison, by name.
+        workers: Cases answered, recorded or weighed at once.
+        answers: What `score` compares: a name for each candidate, and the run folder with its
+            answers. `calibrate`: answers of the diagnosis to one or several exams.
+        prices: Of `calibrate`: prices that it begins at.
+        certainty: The same of the weights that say how sure an answer is.
+        trials: Of `calibrate`: other prices that it tries.
+        oracle: Fit of the simulator whose gap the oracle closes; that of the candidate.
+        oracles: Of `score`: run folder of `exam.do=oracle`; `null`: nobody asked it.
+        ledger: File to which `score` appends its headlines; `null`: none.
+        mix: Which cases there are.
+        plants: Machines that share no equations with what is examined.
+        roughness: How much of a machine no tidy model has: a name of the family's, `mild` or
+            `strong`.
+        reference: How the machine as it is believed to be is recorded.
+        field: How the machine as it is is recorded.
+        approach: How start poses are taken up.
+        first_sealed_seed: Seeds (`session.seed`) from here on are for exams, smaller ones for
+            development.
+        sealed: Allows a seed of an exam; its cases cannot be made again from the seed without the
+            salt among the labels.
+        salt: That salt, to make the cases of an opened exam again; `null` draws one.
+    """
+
+    do: Literal["make", "run", "oracle", "baselines", "score", "calibrate"]
+    folder: str | None
+    candidate: Candidate
+    baselines: dict[str, Candidate]
+    workers: int
+    answers: dict[str, str]
+    oracle: ActuatorFit
+    oracles: str | None
+    ledger: str | None
+    prices: Prices
+    certainty: Certainty
+    trials: int
+    mix: Mix
+    plants: PlantFamily
+    roughness: str
+    reference: Half
+    field: Half
+    approach: Approach
+    first_sealed_seed: int
+    sealed: bool
+    salt: str | None
+
+    def check(self) -> None:
+        if self.do not in ("make", "calibrate") and self.folder is None:
+            raise ConfigError(
+                f"exam.do={self.do}: expected exam.folder=<folder>, the one that exam.do=make wrote"
+            )
+        if self.do in ("score", "calibrate") and not self.answers:
+            raise ConfigError(
+                f"exam.do={self.do}: expected +exam.answers.<name>=<folder>, a folder that exam.do=run wrote; one or several"
+            )
+        for name in ("workers", "trials"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"exam.{name}: expected 1 or more, got {getattr(self, name)}")
+        for name in self.mix.troubles:
+            if name not in self.plants.effects:
+                raise ConfigError(
+                    f"exam.mix.troubles: no plant has '{name}'; {choices(name, self.plants.effects)}"
+                )
+
+
+@spec
+class Exam:
+    """Examines the diagnosis on cases whose cause is withheld: makes them, has them answered, scores the answers.
+
+    Attributes:
+        session: Folder and seed.
+        machine: The machine of all cases.
+        excitation: What is played, by name; `exam.reference` and `exam.field` say in which file.
+        exam: What to do.
+        resume: Run folder of an interrupted `exam.do=run`, `oracle` or `baselines` to go on with;
+            the same as `session.out`.
+    """
+
+    session: Session
+    machine: Machine
+    excitation: dict[str, Excitation]
+    exam: Examination
+    resume: str | None
+
+    def check(self) -> None:
+        if self.resume is None:
+            return
+        if Path(self.resume).resolve() != self.session.folder.resolve() or self.exam.do not in (
+            "run",
+            "oracle",
+            "baselines",
+        ):
+            raise ConfigError(
+                f"resume={self.resume}: exam.do=run, oracle or baselines goes on in its own folder; add session.out={self.resume} "
+                "and give exam.do as before"
+            )
+
+    def run(self) -> None:
+        """Does what `exam.do` says, in the run folder."""
+        getattr(self, f"_{self.exam.do}")()
+
+    def _make(self) -> None:
+        """Writes `cases/`, `labels.sealed.json` (mode 0600), `labels.sha256` and `exam.json`."""
+        settings, folder = self.exam, self.session.folder
+        is_exam = self.session.seed >= settings.first_sealed_seed
+        if is_exam != settings.sealed:
+            raise ConfigError(
+                f"session.seed={self.session.seed} with exam.sealed={str(settings.sealed).lower()}: seeds from "
+                f"{settings.first_sealed_seed} on are for exams and need exam.sealed=true, smaller ones are for development"
+            )
+        salt = settings.salt or secrets.token_hex(16)
+        questions = self.questions(salt)
+        workshop = Workshop(
+            self.machine, settings.plants, settings.roughness, self.excitation, settings.approach
+        )
+        total = len(questions) * (len(settings.reference.programs) + len(settings.field.programs))
+        with Progress(transient=True) as progress:
+            task = progress.add_task(f"{len(questions)} cases", total=total)
+            labels = paper.write(
+                workshop,
+                questions,
+                settings.reference,
+                settings.field,
+                self.machine,
+                folder,
+                settings.workers,
+                lambda n: progress.advance(task, n),
+            )
+        facts = {
+            "schema": 1,
+            "seed": self.session.seed,
+            "sealed": is_exam,
+            "roughness": settings.roughness,
+            "num_cases": len(labels),
+        }
+        found = seal.seal(folder, {**facts, "cases": labels}, salt)
+        write_json(folder / "exam.json", {**facts, "labels_sha256": found})
+        log.info(
+            "%d cases in %s, labels sealed: sha256 %s", len(labels), folder / paper.CASES, found
+        )
+
+    def questions(self, salt: str) -> list[Question]:
+        """Returns the cases; those of an exam hang on the salt too, which nobody knows before the labels are opened."""
+        entropy = [self.session.seed, *(salt.encode() if self.exam.sealed else b"")]
+        return self.exam.mix.questions(
+            self.machine, self.exam.plants.ailments, np.random.default_rng(entropy)
+        )
+
+    def _run(self) -> None:
+        """Writes `<case>/diagnosis.json` and `<case>/sitting.json` for each case."""
+        settings = self.exam
+        cases = self._cases()
+        with Progress(transient=True) as progress:
+            task = progress.add_task(f"{len(cases)} cases", total=len(cases))
+            failed = sitting.sit(
+                settings.candidate,
+                cases,
+                self.session.folder,
+                self.machine,
+                settings.workers,
+                lambda: progress.advance(task),
+            )
+        if failed:
+            log.warning(
+                "%d of %d cases have no answer; why stands in their %s",
+                failed,
+                len(cases),
+                sitting.NOTE,
+            )
+        log.info("answers in %s; exam.do=score opens the labels", self.session.folder)
+
+    def _cases(self) -> list[Path]:
+        found = sorted(path for path in (self._folder / paper.CASES).glob("*") if path.is_dir())
+        if not found:
+            raise RecordingError(
+                f"exam.folder={self._folder}: expected cases in {paper.CASES}/, as exam.do=make writes them"
+            )
+        return found
+
+    @property
+    def _folder(self) -> Path:
+        return Path(self.exam.folder or "")
+
+    def _oracle(self) -> None:
+        """Opens the labels; writes `oracle.json`, the share of the gap that the true effects of each case close."""
+        labels = [
+            label
+            for label in seal.opened(self._folder)["cases"]
+            if label["kind"] in ("one", "several")
+        ]
+        place, found = self.session.folder / ORACLE, {}
+        if place.is_file():
+            found = json.loads(place.read_text())  # of a run that was interrupted
+        todo = [label for label in labels if label["case"] not in found]
+        job = partial(oracle.of_label, self._folder / paper.CASES, self.exam.oracle, self.machine)
+        with Progress(transient=True) as progress, ProcessPoolExecutor(self.exam.workers) as pool:
+            task = progress.add_task(
+                f"{len(labels)} cases", total=len(labels), completed=len(labels) - len(todo)
+            )
+            for label, share in zip(todo, pool.map(job, todo), strict=True):
+                found[label["case"]] = share
+                write_json(place, found)
+                progress.advance(task)
+        shares = [share for share in found.values() if share is not None]
+        log.info(
+            "the true effects close %.2f of the gap (median of %d cases with one)",
+            np.median(shares or [0.0]),
+            len(shares),
+        )
+
+    def _baselines(self) -> None:
+        """Has every baseline answer every case, each into `<name>/`, then scores them beside `exam.answers`."""
+        cases, settings = self._cases(), self.exam
+        usable = {
+            name: one
+            for name, one in settings.baselines.items()
+            if getattr(one, "exam", "") is not None
+        }
+        for name in settings.baselines.keys() - usable.keys():
+            log.warning(
+                "%s is left out: it learns from another exam, exam.baselines.%s.exam=<development exam>",
+                name,
+                name,
+            )
+        with Progress(transient=True) as progress:
+            for name, candidate in usable.items():
+                task = progress.add_task(name, total=len(cases))
+                folder = self.session.folder / name
+                sitting.sit(
+                    candidate,
+                    cases,
+                    folder,
+                    self.machine,
+                    settings.workers,
+                    partial(progress.advance, task),
+                )
+        self._scored(settings.answers | {name: str(self.session.folder / name) for name in usable})
+
+    def _calibrate(self) -> None:
+        """Opens the labels of development exams; writes `prices.yaml`, `certainty.yaml`; prints what answers were and would be."""
+        settings = self.exam
+        cases = items([Path(folder) for folder in settings.answers.values()])
+        classes, of_machine = settings.mix.classes, self._of_machine()
+        seed, kinds = self.session.stream("prices"), library.load(self.machine)
+        fit = Calibration(
+            self.machine, kinds, classes, of_machine, settings.trials, seed, settings.workers
+        )
+        with Progress(transient=True) as progress:
+            task = progress.add_task(
+                f"{settings.trials} prices on {len(cases)} cases", total=settings.trials // 2 * 2
+            )
+            found = fit.fitted(
+                cases, settings.prices, settings.certainty, lambda: progress.advance(task)
+            )
+            parts = halves(cases)
+            apart = [
+                fit.fitted(part, settings.prices, settings.certainty, lambda: None)
+                for part in parts
+            ]
+        before, after = (
+            tally(fit.marks(cases, *each))
+            for each in ((settings.prices, settings.certainty), found)
+        )
+        crosswise = tally(
+            [mark for half in (0, 1) for mark in fit.marks(parts[1 - half], *apart[half])]
+        )
+        for name, one in zip(("prices", "certainty"), found, strict=True):
+            numbers = {
+                "_target_": f"{type(one).__module__}.{type(one).__name__}",
+                **dataclasses.asdict(one),
+            }  # pyright: ignore[reportArgumentType]
+            write_text(
+                self.session.folder / f"{name}.yaml", yaml.safe_dump(numbers, sort_keys=False)
+            )
+        write_json(
+            self.session.folder / "calibration.json",
+            {"cases": len(cases), "before": before, "after": after, "cross": crosswise},
+        )
+        _show({"before": before, "after": after, "after, on the other half": crosswise})
+        log.info(
+            "%s: prices.yaml and certainty.yaml; they stand in conf/prices, conf/certainty",
+            self.session.folder,
+        )
+
+    def _of_machine(self) -> list[str]:
+        return [name for name, trouble in self.exam.mix.troubles.items() if trouble.joints == "all"]
+
+    def _score(self) -> None:
+        self._scored(self.exam.answers)
+
+    def _scored(self, answers: Mapping[str, str]) -> None:
+        """Opens the labels; writes `marks.json`, `exam.html` and pictures, appends to the ledger, and prints the table."""
+        labels = seal.opened(self._folder)
+        facts = json.loads((self._folder / "exam.json").read_text())
+        tables = {
+            name: self._table(Path(folder), labels["cases"]) for name, folder in answers.items()
+        }
+        write_json(self.session.folder / "marks.json", {"exam": facts, "candidates": tables})
+        page.write(self.session.folder, facts, tables)
+        if self.exam.ledger is not None:
+            for name, table in tables.items():
+                ledger.append(Path(self.exam.ledger), record.now(), facts, name, table)
+        _show(tables)
+        log.info("report: %s", self.session.folder / page.PAGE)
+
+    def _table(self, folder: Path, labels: list[dict[str, Any]]) -> dict[str, Any]:
+        """Returns the figures of the answers in `folder`."""
+        mix, marks = self.exam.mix, []
+        best = (
+            {}
+            if self.exam.oracles is None
+            else json.loads((Path(self.exam.oracles) / ORACLE).read_text())
+        )
+        of_machine = self._of_machine()
+        begun = [label for label in labels if sitting.is_begun(folder / label["case"])]
+        if len(begun) < len(labels):
+            log.warning(
+                "%s: %d of %d cases sat; the others are left out", folder, len(begun), len(labels)
+            )
+        for label in begun:
+            place = folder / label["case"]
+            said = answer.read(place / answer.FILE) if (place / answer.FILE).is_file() else None
+            marks.append(
+                marking.mark(
+                    label,
+                    said,
+                    mix.classes,
+                    of_machine,
+                    sitting.seconds(place),
+                    best.get(label["case"]),
+                )
+            )
+        if all(mark.verdict == "failed" for mark in marks):
+            raise RecordingError(
+                f"exam.answers: {folder} holds no answer to any case of {self._folder}"
+            )
+        return tally(marks, len(labels) - len(begun))
+
+
+def _show(tables: dict[str, dict[str, Any]]) -> None:
+    shown = Table("", *tables)
+    row: list[Any]
+    for row in page.rows(tables):
+        words, *cells = row
+        shown.add_row(
+            str(words),
+            *(f"{cell.value} ({cell.note})" if cell.note else str(cell.value) for cell in cells),
+        )
+    Console().print(shown)

@@ -1,0 +1,127 @@
+"""Behind the cylinder: an elastic boom, play in the pins, the weight of the arm, and where its tool is.
+
+All arrays begin with `N` runs. Each run has a base that may stand tilted and links that may differ
+from the drawing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from brokk_rl.machine import Machine
+from exam.plants.anatomy import TAU_HZ, Anatomy
+
+GRAVITY_M_S2 = 9.81
+RIGID_S = 0.05
+"""Period of oscillation up to which a boom is as good as rigid at the rate of a recording."""
+HARDENS_AT = 0.05
+"""Deflection in rad (m) at which the spring of the boom is twice as stiff as at rest."""
+
+
+class Boom:
+    """The joint behind the actuator: a hardening spring where it is soft, then play.
+
+    Args:
+        numbers: `soft_s`, `soft_damping`, `gap_rad`, `(N, J)`.
+        q: Where the joints are, `(N, J)`.
+        elastic: Whether a soft joint bends here, `(N, 1)`; a make with chambers is soft in its oil.
+    """
+
+    def __init__(self, numbers: Anatomy, q: np.ndarray, elastic: np.ndarray) -> None:
+        soft_s = np.where(elastic, numbers["soft_s"], 0.0)
+        self._soft, self._omega = soft_s > RIGID_S, TAU_HZ / np.maximum(soft_s, 1e-6)
+        self._fade = 2.0 * numbers["soft_damping"] * self._omega
+        self._half = 0.5 * numbers["gap_rad"]
+        self._bent, self._rate, self._q = q.copy(), np.zeros_like(q), q.copy()
+
+    def step(self, q: np.ndarray, speed: np.ndarray, dt_s: float) -> np.ndarray:
+        """Returns the positions of the links, `(N, J)`, whose actuators are at `q` and move with `speed`."""
+        if self._soft.any():
+            bend = q - self._bent
+            pull = self._omega**2 * bend * (1.0 + (bend / HARDENS_AT) ** 2) + self._fade * (
+                speed - self._rate
+            )
+            self._rate = np.where(self._soft, self._rate + dt_s * pull, 0.0)
+            self._bent = np.where(self._soft, self._bent + dt_s * self._rate, q)
+            q = self._bent
+        self._q = np.clip(self._q, q - self._half, q + self._half)
+        return self._q
+
+
+class Arm:
+    """Weight and tool of a serial machine.
+
+    Args:
+        machine: Axes, origins, masses.
+        numbers: `extra_m`, `roll_rad`, `pitch_rad`, `(N, J)`; the tilt of a base is that of the
+            first column.
+    """
+
+    def __init__(self, machine: Machine, numbers: Anatomy) -> None:
+        self._axes = [np.array(body.axis) for body in machine.bodies]
+        self._hinge = [joint.kind == "hinge" for joint in machine.joints]
+        self._mass_kg = [body.mass_kg.value for body in machine.bodies]
+        self._com_m = [np.array(body.com_m) for body in machine.bodies]
+        self._yield = np.array([body.yield_force.value for body in machine.bodies])
+        drawn = [np.array([d.value for d in body.origin_m]) for body in machine.bodies] + [
+            machine.tip_m
+        ]
+        extra_m = numbers["extra_m"]
+        # link j reaches from joint j to the next one, or to the tip
+        self._reach_m = [drawn[0][None]] + [
+            drawn[j + 1]
+            * (1.0 + extra_m[:, j, None] / max(float(np.linalg.norm(drawn[j + 1])), 1e-9))
+            for j in range(len(drawn) - 1)
+        ]
+        self._base = _turn(np.array([0.0, 1.0, 0.0]), numbers["pitch_rad"][:, 0]) @ _turn(
+            np.array([1.0, 0.0, 0.0]), numbers["roll_rad"][:, 0]
+        )
+        self._down = self._base.transpose(0, 2, 1) @ np.array([0.0, 0.0, -GRAVITY_M_S2])
+
+    def load(self, q: np.ndarray) -> np.ndarray:
+        """Returns the weight on each joint in its positive direction, over its yield force, at `q`, `(N, J)`."""
+        at_m, axes, _ = self._chain(q)
+        weight = np.zeros_like(q)
+        for k, com_m in enumerate(self._centres):
+            force = self._mass_kg[k] * self._down
+            for j in range(k + 1):
+                push = np.cross(com_m - at_m[j], force) if self._hinge[j] else force
+                weight[:, j] += (axes[j] * push).sum(1)
+        return weight / self._yield
+
+    def tool(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the tip as instruments beside the machine see it, `(N, 3)` m, and its angle below the horizontal, `(N,)`."""
+        at_m, _, tip_m = self._chain(q)
+        tip_m, last_m = ((self._base @ point[..., None])[..., 0] for point in (tip_m, at_m[-1]))
+        along = tip_m - last_m
+        heading = np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], 1)
+        return tip_m, np.arctan2(-along[:, 2], (along[:, :2] * heading).sum(1))
+
+    def _chain(self, q: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
+        """Returns origins and axes of the joints and the tip, in the frame of the base; the centres of mass go to `_centres`."""
+        turned, at_m = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
+        origins, axes, self._centres = [], [], []
+        for j, axis in enumerate(self._axes):
+            at_m = (
+                at_m + (turned @ np.broadcast_to(self._reach_m[j], (len(q), 3))[..., None])[..., 0]
+            )
+            if not self._hinge[j]:
+                at_m = at_m + q[:, j, None] * (turned @ axis)
+            origins.append(at_m)
+            axes.append(turned @ axis)
+            if self._hinge[j]:
+                turned = turned @ _turn(axis, q[:, j])
+            self._centres.append(at_m + turned @ self._com_m[j])
+        tip_m = at_m + (turned @ np.broadcast_to(self._reach_m[-1], (len(q), 3))[..., None])[..., 0]
+        return origins, axes, tip_m
+
+
+def _turn(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Returns the rotations about a unit axis by each angle, `(N, 3, 3)`."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return (
+        np.eye(3)
+        + np.sin(angle)[:, None, None] * cross
+        + (1.0 - np.cos(angle))[:, None, None] * (cross @ cross)
+    )

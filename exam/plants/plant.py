@@ -1,0 +1,194 @@
+"""The plants of an exam at work: `N` runs of machines of one make, side by side, behind the link that a collection drives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+from scipy.signal import lfilter
+
+from brokk_rl.machine import Machine
+from brokk_rl.signals import Command, JointState
+from exam.plants.anatomy import Anatomy
+from exam.plants.chambers import Chambers
+from exam.plants.compensated import Compensated
+from exam.plants.line import Line
+from exam.plants.linkage import Arm, Boom
+from exam.plants.sensors import TRACKER_M, TRACKER_RAD, Encoders
+from exam.plants.strangers import Strangers
+from exam.plants.throttled import Throttled
+from exam.plants.valve import Valve
+
+POWER = {"chambers": Chambers, "compensated": Compensated, "throttled": Throttled}
+MOVING = 0.01
+"""Speed, of full speed, from which a joint moves."""
+DROOP_S = 1.5
+"""Time in which the supply gives way and recovers."""
+WARM_S = 900.0
+"""Time constant of the tank's temperature."""
+
+
+class Plant:
+    """A `Link` to simulated machines of one make.
+
+    Args:
+        machine: Geometry, masses, limits.
+        make: See `anatomy.MAKES`.
+        anatomies: Numbers of each run's machine.
+        strangers: Kind of ailment outside the library of each run, or `None`; its severity is the
+            number `stranger`.
+        seeds: Chance of each run.
+        elapsed_s: How long each machine has run before.
+        tracked: Whether the tool of each run is measured.
+        steps: Control periods of the longest run.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        make: str,
+        anatomies: Sequence[Anatomy],
+        strangers: Sequence[str | None],
+        seeds: Sequence[int],
+        elapsed_s: np.ndarray,
+        tracked: Sequence[bool],
+        steps: int,
+    ) -> None:
+        self._machine, self._n = (
+            machine,
+            {name: np.stack([a[name] for a in anatomies]) for name in anatomies[0]},
+        )
+        n, count, joints = self._n, len(anatomies), machine.num_joints
+        self._chance = [
+            _Chance(seed, anatomy, steps, machine)
+            for seed, anatomy in zip(seeds, anatomies, strict=True)
+        ]
+        self._wander = np.stack([chance.wander for chance in self._chance], 1)
+        self._noise = np.stack([chance.noise for chance in self._chance], 1)
+        self._luck = np.stack([chance.luck for chance in self._chance], 1)
+        self._line, self._valve = Line(n, machine.period_s), Valve(n)
+        self._power = POWER[make](n, machine)
+        self._strangers = Strangers(machine, list(strangers), n["stranger"], self._luck[:, :, 2])
+        self._arm, self._encoders = Arm(machine, n), Encoders(n, machine.period_s)
+        self._q = np.tile(machine.home, (count, 1))
+        self._boom = Boom(n, self._q, np.full((count, 1), make != "chambers"))
+        self._true, self._earlier = self._q.copy(), self._q.copy()
+        self._flow, self._droop = np.zeros((count, joints)), np.zeros((count, 1))
+        self._k, self._elapsed_s, self._tracked = (
+            0,
+            np.asarray(elapsed_s, dtype=float),
+            np.array(tracked),
+        )
+        self._starving = make == "compensated"
+        self._power.begin(self._arm.load(self._true))
+
+    @property
+    def q(self) -> np.ndarray:
+        """True positions of the links, `(N, J)`."""
+        return self._true
+
+    def read(self) -> JointState:
+        """Returns what the encoders show now."""
+        shown = self._strangers.shown(self._true), self._strangers.shown(self._earlier)
+        return JointState(
+            self._k * self._machine.period_s, self._encoders.read(*shown, self._noise[self._k])
+        )
+
+    def extra(self) -> Mapping[str, np.ndarray]:
+        """Returns the measured tool, NaN where nobody measures it; empty where that is so in all runs."""
+        if not self._tracked.any():
+            return {}
+        tip_m, pitch_rad = self._arm.tool(self._true)
+        seen = np.concatenate([tip_m, pitch_rad[:, None]], 1)
+        noise = np.stack([chance.tool[self._k] for chance in self._chance])
+        seen = np.where(
+            self._tracked[:, None],
+            seen + noise * [TRACKER_M, TRACKER_M, TRACKER_M, TRACKER_RAD],
+            np.nan,
+        )
+        return dict(zip(("ee_x_m", "ee_y_m", "ee_z_m", "ee_pitch_rad"), seen.T, strict=True))
+
+    def send(self, command: Command) -> Command:
+        """Moves on by one control period with these commands, `(N, J)`."""
+        machine, n, k = self._machine, self._n, self._k
+        power, dt_s = self._power, self._power.dt_s
+        t_s, run_s = k * machine.period_s, self._elapsed_s + k * machine.period_s
+        u = self._strangers.command(np.asarray(command.u, dtype=float))
+        luck = self._luck[k]
+        self._line.send(u, t_s, luck[:, :1], luck[:, 1:2], self._strangers.later_s(u, run_s))
+        tempo, load = self._tempo(k, run_s), self._arm.load(self._true)
+        self._earlier = self._true
+        for i in range(round(machine.period_s / dt_s)):
+            moving = np.abs(power.speed) > MOVING
+            opening = self._valve.step(
+                self._line.at(t_s + i * dt_s), dt_s, self._strangers.bend, moving, load
+            )
+            self._flow = self._shared(opening, load)
+            speed = power.step(self._flow * tempo, load) * machine.max_speed
+            lever = 1.0 + n["lever"] * np.sin(
+                np.pi * (self._q - machine.lower) / (machine.upper - machine.lower)
+                + n["lever_phase"]
+            )
+            moved = self._q + dt_s * speed * lever
+            self._q = np.clip(moved, machine.lower, machine.upper)
+            power.stopped(self._q != moved)
+            self._true = self._boom.step(
+                self._q, np.where(self._q == moved, speed * lever, 0.0), dt_s
+            )
+        self._k += 1
+        return command
+
+    def _tempo(self, k: int, run_s: np.ndarray) -> np.ndarray:
+        """Returns a factor on all flows in this control period, `(N, J)`: oil, supply, chance, and what nobody has a name for."""
+        n = self._n
+        work = np.minimum((np.abs(self._flow) * n["demand"]).sum(1, keepdims=True), 1.0)
+        self._droop += (work - self._droop) * self._machine.period_s / DROOP_S
+        warm = 1.0 + n["warm_up"] * (1.0 - np.exp(-run_s / WARM_S))[:, None]
+        drifted = 1.0 + n["drift"] * (1.0 - np.exp(-run_s[:, None] / n["drift_s"]))
+        tempo = (1.0 + self._wander[k]) * warm * drifted * (1.0 - n["droop"] * self._droop)
+        return np.maximum(tempo * self._strangers.tempo(k, self._true, self._flow), 0.0)
+
+    def _shared(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
+        """Returns the flows that the pump can give of those asked for, `(N, J)`."""
+        asked = np.abs(opening) * self._n["demand"]
+        total = asked.sum(1, keepdims=True)
+        if not (total > 1.0).any():
+            return opening
+        if not self._starving:
+            return opening / np.maximum(total, 1.0)
+        # oil takes the easiest way: what is missing is missing where the load is heaviest
+        heavy = asked * np.exp(-2.0 * np.sign(opening) * load)
+        given = np.maximum(
+            asked
+            - np.maximum(total - 1.0, 0.0) * heavy / np.maximum(heavy.sum(1, keepdims=True), 1e-9),
+            0.0,
+        )
+        return opening * given / np.maximum(asked, 1e-9)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        pass
+
+
+class _Chance:
+    """All random numbers of one run, drawn beforehand, so that a run is the same whatever runs beside it."""
+
+    def __init__(self, seed: int, anatomy: Anatomy, steps: int, machine: Machine) -> None:
+        generator = np.random.default_rng(seed)
+        shape = (steps + 1, machine.num_joints)
+        keep = np.exp(-machine.period_s / anatomy["wander_s"])
+        white, first = (
+            generator.standard_normal(shape),
+            generator.standard_normal(machine.num_joints),
+        )
+        wander = [
+            lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white[:, j], zi=[a * first[j]])[0]
+            for j, a in enumerate(keep.tolist())
+        ]
+        self.wander = (np.stack(wander, 1) * anatomy["wander"]).astype(np.float32)
+        self.noise = generator.standard_normal(shape, dtype=np.float32)
+        self.luck = generator.random((steps + 1, 3), dtype=np.float32)
+        self.tool = generator.standard_normal((steps + 1, 4), dtype=np.float32)

@@ -1,0 +1,1 @@
+"""Benchmarks of finder and detectors against ground truth."""

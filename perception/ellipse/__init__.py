@@ -1,0 +1,1 @@
+"""Ellipse detection in grey pictures."""

@@ -1,0 +1,1 @@
+"""Labels for real footage from a board, clicks and touched points."""

@@ -1,0 +1,1 @@
+"""Modes of perception: `perceive`, `render`, `train_perception`, `label`, `calibrate`."""

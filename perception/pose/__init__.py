@@ -1,0 +1,1 @@
+"""Pose of a borehole from an ellipse, depth and camera."""

@@ -1,0 +1,337 @@
+"""The face's plane from both pictures at once: the one by which the right picture, brought onto the left, agrees with it best.
+
+A matcher answers for each pixel, by its neighbourhood, with whatever its sub-pixel step gets wrong;
+where all of a face is known to be one plane, three numbers are left to be found from all of its
+pixels, each of which counts as much as the picture is steep there (Lucas and Kanade 1981, with the
+plane's homography as the warp). What does not agree by that warp, inside a rim, lies deeper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from brokk_rl.signals import Frame
+from perception.ellipse import conic
+from perception.pose.plane import Plane, inverse_depth, middle, parted, sandwich, yielding
+
+SMOOTH_PX = 1.0
+"""Blur of both pictures: noise would shrink the slope."""
+WINDOW_PX = 31
+"""Of which the mean is taken off."""
+MOST = 30_000
+"""Pixels that are compared; of more, whole rows are left out."""
+WIDE_PX = 1000
+"""A part of the picture that is wider than this is looked at in a coarser resolution."""
+ROUNDS, SETTLED_PX = 3, 0.004
+"""Steps at most, and the last one's length, px: each is a fifth of the one before."""
+TUKEY = 4.685
+MARGIN_PX, BORDER_PX, SATURATED = 6, 4, 248.0
+"""Around what stands before the face, where a matcher bleeds; within its border, where blur mixes
+it with what lies behind; and the grey level from which a picture shows nothing."""
+LEAST, LEAST_INSIDE = 200, 24
+"""Pixels in which a plane is aligned, and in which an inside is compared."""
+ALIKE = 0.7
+"""Correlation of left and right below which they do not show the same; in haze and in the dark it
+is still 0.96."""
+LARGEST_PX = 1.0
+"""Shift of the whole face beyond which the pictures agree on something else."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A part of both pictures, smooth, in a resolution in which it is small.
+
+    Attributes:
+        left: `(h, w)` float32.
+        right: `(h, W)` float32, of the same rows.
+        shrink: Pixels of the picture to one of these.
+        corner: Column and row of the picture at which `left` begins, `(2,)`.
+        right_column: Column at which `right` begins.
+        camera_matrix: `(3, 3)` of the whole picture.
+        pull_px: Focal length times baseline, px m: disparity for inverse depth.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    shrink: int
+    corner: tuple[int, int]
+    right_column: int
+    camera_matrix: np.ndarray
+    pull_px: float
+
+    def places(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns columns `(1, w)` and rows `(h, 1)` in the picture of those of `left`, `(w,)` and `(h,)`."""
+        u, v = (
+            (some + 0.5) * self.shrink - 0.5 + corner
+            for some, corner in zip((columns, rows), self.corner, strict=True)
+        )
+        return u[None, :], v[:, None]
+
+    def on_plane(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
+        """Returns where `right` shows the points of a plane that the left one has at such places, columns `(h, w)`."""
+        return (
+            u - self.pull_px * inverse_depth(m, self.camera_matrix, u, v) - self.right_column + 0.5
+        ) / self.shrink - 0.5
+
+    def seen(
+        self, u: np.ndarray, v: np.ndarray, row: np.ndarray, m: np.ndarray, picture: np.ndarray
+    ) -> np.ndarray:
+        """Returns what a picture like `right`, of one channel or more, shows of the points of a plane; `row` as `remap` has it."""
+        return cv2.remap(picture, self.on_plane(u, v, m).astype(np.float32), row, cv2.INTER_CUBIC)
+
+    def column(self, u: float) -> float:
+        """Returns the column of `left` of a column of the picture."""
+        return (u - self.corner[0] + 0.5) / self.shrink - 0.5
+
+    def row(self, v: float) -> float:
+        """Returns the row of `left` of a row of the picture."""
+        return (v - self.corner[1] + 0.5) / self.shrink - 0.5
+
+    def inside(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
+        """Says which of these points the right one shows too, with room for the slope."""
+        x = self.on_plane(u, v, m)
+        return (x > 3) & (x < self.right.shape[1] - 4)
+
+
+def pair(
+    frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, outer: float
+) -> Pair | None:
+    """Returns the surroundings of an ellipse `(5,)`, up to `outer` of its radii, in both pictures; `None` without a right one."""
+    if frame.right is None or frame.baseline_m is None or frame.right.shape != frame.color.shape:
+        return None
+    height, width = gray.shape
+    x, y, reach = ellipse[0], ellipse[1], ellipse[2] * outer
+    left, right = max(0, int(x - reach)), min(width, int(x + reach) + 2)
+    top, bottom = max(0, int(y - reach)), min(height, int(y + reach) + 2)
+    if right - left < 16 or bottom - top < 16:
+        return None
+    shrink = max(1, -(-(right - left) // WIDE_PX))
+    pull_px = float(frame.camera_matrix[0, 0]) * frame.baseline_m
+    shift = pull_px * inverse_depth(
+        m, frame.camera_matrix, np.array([[left, right]]), np.array([[top], [bottom]])
+    )
+    first = max(0, int(left - shift.max()) - 8 * shrink)
+    last = min(width, int(right - shift.min()) + 8 * shrink)
+    rows, columns = (bottom - top) // shrink, (right - left) // shrink
+    others = (last - first) // shrink
+    if others < 16:
+        return None
+    partner = cv2.cvtColor(
+        np.ascontiguousarray(
+            frame.right[top : top + rows * shrink, first : first + others * shrink]
+        ),
+        cv2.COLOR_RGB2GRAY,
+    )
+    mine = gray[top : top + rows * shrink, left : left + columns * shrink]
+    small = [cv2.resize(picture, (size, rows), interpolation=cv2.INTER_AREA) if shrink > 1 else picture
+             for picture, size in ((mine, columns), (partner, others))]  # fmt: skip
+    one, other = (
+        cv2.GaussianBlur(picture.astype(np.float32), (0, 0), SMOOTH_PX) for picture in small
+    )
+    return Pair(one, other, shrink, (left, top), first, frame.camera_matrix, pull_px)
+
+
+def aligned(
+    both: Pair,
+    face: Plane,
+    frame: Frame,
+    allowed: np.ndarray,
+    ellipse: np.ndarray,
+    inner: float,
+    cell_px: int,
+    bias_per_m: float,
+) -> Plane | None:
+    """Returns the plane by which the two pictures agree best on the face; `face` itself where too little of it is in sight.
+
+    `None` where they do not agree: the right picture is another's, or shifted.
+
+    What dust, exposure and vignetting add to one of them varies slowly, so only what departs from
+    the mean of a window counts.
+    The slopes of a noisy picture are larger than those of what it shows: steps by them are too
+    short, and the plane would seem too sure. So differences are held against the slopes of the left
+    picture, whose noise is another (instrumental variables).
+
+    Args:
+        both: The face in both pictures.
+        face: Where to begin.
+        frame: For depth.
+        allowed: Pixels of the face, `(h, w)` bool.
+        ellipse: `(5,)`.
+        inner: In radii of it; nearer to it the rim is seen from two sides.
+        cell_px: Side of the squares within which errors may be alike.
+    """
+    height, width = both.left.shape
+    stride = max(1, round(height * width / MOST))
+    lines = np.arange(0, height, stride)
+    u, v = both.places(np.arange(width), lines)
+    pixel = np.ix_(
+        np.rint(v[:, 0]).astype(int).clip(0, allowed.shape[0] - 1),
+        np.rint(u[0]).astype(int).clip(0, allowed.shape[1] - 1),
+    )
+    depth = frame.depth_m[pixel]
+    radii = conic.radii(ellipse, u, v)
+    with np.errstate(invalid="ignore"):
+        off = np.abs(1.0 / depth - face.inverse_depth(both.camera_matrix, u, v))
+        on = allowed[pixel] & (off < 3.0 * face.sigma) & (radii > inner) & (radii < face.extent)
+        other = (off > 8.0 * face.sigma).astype(np.uint8)
+    other = cv2.morphologyEx(other, cv2.MORPH_OPEN, np.ones((1 if stride > 1 else 3, 3), np.uint8))
+    margin = np.ones((2 * round(MARGIN_PX / stride) + 1, 2 * MARGIN_PX + 1), np.uint8)
+    on &= (
+        (cv2.dilate(np.asarray(other), margin) == 0)
+        & both.inside(u, v, face.m)
+        & (both.left[::stride] < SATURATED)
+    )
+    whole = cv2.morphologyEx(on.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 5), np.uint8))
+    on &= (
+        cv2.erode(whole, np.ones((2 * round(BORDER_PX / stride) + 1, 2 * BORDER_PX + 1), np.uint8))
+        > 0
+    )
+    at = np.flatnonzero(on)
+    if len(at) < LEAST:
+        return face
+    weight = on.astype(np.float32)
+    window = (WINDOW_PX, max(3, WINDOW_PX // stride | 1))
+    counted = np.maximum(cv2.boxFilter(weight, -1, window), 1e-3)
+    weight, counted = weight[..., None], counted[..., None]
+
+    def departing(values: np.ndarray) -> np.ndarray:
+        """Returns what two pictures `(h, w, 2)` show on the face, less the mean of a window, `(2, P)`."""
+        departs = values - cv2.boxFilter(values * weight, -1, window) / counted
+        return departs.reshape(-1, 2)[at].T.astype(float)
+
+    left, right = (
+        cv2.merge([picture, cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
+        for picture in (both.left, both.right)
+    )
+    mine, instrument = departing(left[::stride])
+    row = np.repeat(lines.astype(np.float32)[:, None], width, 1)
+    line, column = np.divmod(at, width)
+    u_on, v_on = u[0, column], v[line, 0]
+    ray = np.linalg.inv(both.camera_matrix) @ np.stack([u_on, v_on, np.ones(len(at))])
+    m, seen = face.m, mine
+    for _ in range(ROUNDS):
+        seen, rise = departing(both.seen(u, v, row, m, right))
+        push, heavy = (
+            np.vstack([ray * (-both.pull_px / both.shrink * slope), -mine])
+            for slope in (rise, instrument)
+        )
+        gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
+        off = seen - gain * mine
+        scale = 1.4826 * middle(np.abs(off)) + 1e-6
+        heavy *= np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
+        step = np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
+        m = m - step
+        if both.pull_px * np.abs(step @ ray).max() < SETTLED_PX:
+            break
+    likeness = float(seen @ mine) / max(float(np.sqrt((seen @ seen) * (mine @ mine))), 1e-9)
+    if likeness < ALIKE:
+        return None
+    moved_px = both.pull_px * np.abs((m - face.m) @ ray).max()
+    if (
+        not np.isfinite(m).all()
+        or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px
+    ):
+        return face
+    cell = (v_on // cell_px).astype(np.int64) * 10_000 + (u_on // cell_px).astype(np.int64)
+    slopes = (push[:3] * yielding(off / (TUKEY * scale))).T
+    cov = sandwich(slopes, heavy[:3].T, off, parted(cell))
+    return face if cov is None else merged(face, replace(face, m=m, cov=cov), bias_per_m)
+
+
+def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:
+    """Returns the plane between two, each weighted by what it knows best; the whole of the first may be off by a bias."""
+    doubt = first.cov + np.diag([0.0, 0.0, bias_per_m**2])
+    weights = [np.linalg.inv(cov) for cov in (doubt, second.cov)]
+    cov = np.linalg.inv(weights[0] + weights[1])
+    return replace(second, m=cov @ (weights[0] @ first.m + weights[1] @ second.m), cov=cov)
+
+
+def disagreement(
+    both: Pair,
+    face: Plane,
+    depth_m: np.ndarray,
+    ellipse: np.ndarray,
+    inner: float,
+    ring: tuple[float, float],
+) -> tuple[float, float]:
+    """Returns how much the pictures differ inside an ellipse by the plane's warp, over how much they do on the face around it.
+
+    A flat disc looks the same from both cameras, the inside of a hole does not. NaN where too
+    little of it can be seen. With it, the part of the inside that something hides from the right
+    camera alone.
+
+    Args:
+        both: The ellipse's surroundings in both pictures.
+        face: The plane of the face.
+        depth_m: `(h, w)`; what stands before the face is left out.
+        ellipse: `(5,)`.
+        inner: Radii within which it is the inside.
+        ring: Radii between which it is the face.
+    """
+    reach = ring[1] * ellipse[2] / both.shrink
+    across, down = (
+        (max(0, int(middle - reach)), min(size, int(middle + reach) + 2))
+        for middle, size in zip(
+            (both.column(ellipse[0]), both.row(ellipse[1])), both.left.shape[::-1], strict=True
+        )
+    )
+    part = np.s_[down[0] : down[1], across[0] : across[1]]
+    if down[1] <= down[0] or across[1] <= across[0]:
+        return float("nan"), 0.0
+    u, v = both.places(np.arange(*across), np.arange(*down))
+    radii = conic.radii(ellipse, u, v)
+    rows, columns = (
+        np.rint(some).astype(int).clip(0, most - 1)
+        for some, most in zip((v[:, 0], u[0]), depth_m.shape, strict=True)
+    )
+    depth = depth_m[np.ix_(rows, columns)]
+    with np.errstate(invalid="ignore"):
+        before = (
+            1.0 / depth - face.inverse_depth(both.camera_matrix, u, v) > 4 * face.sigma
+        ).astype(np.uint8)
+    shown = both.inside(u, v, face.m) & (cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0)
+    hidden = shown & (radii < inner) & _hidden(both, face, depth_m, u, v)
+    covered = float(hidden.sum() / max(np.count_nonzero(shown & (radii < inner)), 1))
+    shown &= ~hidden
+    within, around = shown & (radii < inner), shown & (radii > ring[0]) & (radii < ring[1])
+    if within.sum() < LEAST_INSIDE or around.sum() < LEAST_INSIDE:
+        return float("nan"), covered
+    row = np.repeat(np.arange(*down, dtype=np.float32)[:, None], across[1] - across[0], 1)
+    mine, seen = both.left[part], both.seen(u, v, row, face.m, both.right)
+    within &= seen < np.median(
+        seen[around]
+    )  # the right camera may see there what stands before a disc
+    if within.sum() < LEAST_INSIDE:
+        return float("nan"), covered
+    off = mine - seen * (np.median(mine[around]) / max(float(np.median(seen[around])), 1.0))
+    usual = 1.4826 * float(np.median(np.abs(off[around] - np.median(off[around]))))
+    return float(np.std(off[within])) / max(usual, 0.1), covered
+
+
+def _hidden(
+    both: Pair, face: Plane, depth_m: np.ndarray, u: np.ndarray, v: np.ndarray
+) -> np.ndarray:
+    """Says which points of a face, `(h, w)`, seen by the left camera, something nearer hides from the right one."""
+    rows = np.rint(v[:, 0]).astype(int).clip(0, len(depth_m) - 1)
+    columns = np.arange(
+        max(0, int(u[0, 0])), depth_m.shape[1]
+    )  # what hides them from the right camera lies to their right
+    depth = depth_m[rows, columns[0] :]
+    here = face.inverse_depth(both.camera_matrix, columns[None, :], rows[:, None]).astype(
+        np.float32
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        row, column = np.nonzero(1.0 / depth - here > 4 * face.sigma)
+    shadow = np.zeros((len(rows), depth_m.shape[1]), np.uint8)
+    place = np.rint(columns[column] - both.pull_px / depth[row, column]).astype(int)
+    on = (place >= 0) & (place < shadow.shape[1])
+    shadow[row[on], place[on]] = 1
+    shadow = cv2.dilate(shadow, np.ones((3, 2 * MARGIN_PX + 1), np.uint8))
+    away = both.pull_px * face.inverse_depth(both.camera_matrix, u, v)
+    return (
+        np.take_along_axis(shadow, np.rint(u - away).astype(int).clip(0, shadow.shape[1] - 1), 1)
+        > 0
+    )

@@ -1,0 +1,172 @@
+"""What tells a hole from a flat dark disc: darkness, and how brightness and depth go on inside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from perception.ellipse import conic
+from perception.pose.plane import Plane
+
+INSIDE, RING = 0.8, (1.15, 1.8)
+"""Radii: the inside without the rim's blur, and the ring around that shows how bright the face
+is."""
+WIDE = 8.0
+"""Radii: its surroundings, in which something else is dark too, unless there is dust."""
+CLEARLY_M = 0.03
+"""How far behind the face depth must be to be taken for the inside of a hole, whatever the
+noise."""
+
+
+@dataclass(frozen=True)
+class Interior:
+    """What an ellipse looks like inside.
+
+    Attributes:
+        darkness: Brightness of its darkest quarter over that of the face around it.
+        slope: Change of brightness over one radius in the direction in which the hole goes on
+            behind the face, over the contrast between face and darkest quarter. Of the wall the
+            camera sees the sunlit or sky-lit end near the rim on the far side of
+            the hole and the dark depth on the near side: clearly negative in a hole, about zero on
+                a disc.
+        deeper: Part of the known depth inside that lies clearly behind the face.
+        unknown: Part of the inside without depth.
+        around: Brightness of the darkest hundredth of what surrounds it, over that of the face;
+            before the face there is less dust, and what stands there does not count.
+        contrast: By how much its darkest quarter is darker than the darker part of the face, in
+            standard deviations of the grain.
+    """
+
+    darkness: float
+    slope: float
+    deeper: float
+    unknown: float
+    around: float
+    contrast: float
+
+
+def interior(
+    gray: np.ndarray,
+    depth_m: np.ndarray,
+    ellipse: np.ndarray,
+    camera_matrix: np.ndarray,
+    plane: Plane | None,
+) -> Interior:
+    """Returns what is seen inside an ellipse `(5,)`; slope and depth need the plane of the face."""
+    x, y, a = ellipse[:3]
+    reach = a * RING[1] + 2
+    top, left = max(0, int(y - reach)), max(0, int(x - reach))
+    bottom, right = min(gray.shape[0], int(y + reach) + 2), min(gray.shape[1], int(x + reach) + 2)
+    part = gray[top:bottom, left:right].astype(np.float32)
+    rows, columns = np.ogrid[top:bottom, left:right]
+    radii = conic.radii(ellipse, columns, rows)
+    inside, ring = radii < INSIDE, (radii > RING[0]) & (radii < RING[1])
+    if inside.sum() < 8 or ring.sum() < 8:
+        return Interior(*[np.nan] * 6)
+    face = max(float(np.median(part[ring])), 1.0)
+    smooth = cv2.GaussianBlur(
+        part, (0, 0), max(0.15 * float(np.sqrt(ellipse[2] * ellipse[3])), 0.6)
+    )
+    inside &= smooth < face  # what is brighter is the lit arm before it, where it has no depth
+    depth = depth_m[top:bottom, left:right]
+    known = np.isfinite(depth)
+    if plane is not None:
+        behind = plane.inverse_depth(camera_matrix, columns, rows) - 1.0 / np.where(
+            known, depth, np.inf
+        )
+        before = (known & (behind < -4 * plane.sigma)).astype(
+            np.uint8
+        )  # an arm that hides a part of it
+        inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
+    if inside.sum() < 8:
+        return Interior(*[np.nan] * 6)
+    values = smooth[inside]
+    darkness = float(np.percentile(values, 25.0)) / face
+    unknown = float(np.mean(~known[inside]))
+    slope = deeper = np.nan
+    if plane is not None:
+        middle = np.linalg.solve(camera_matrix, np.array([x, y, 1.0]))
+        clearly = max(4 * plane.sigma, CLEARLY_M * float(plane.m @ middle) ** 2)
+        deeper = float(np.mean(behind[inside & known] > clearly)) if (inside & known).any() else 0.0
+        into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
+        away = _places(inside, left, top) - (x, y)
+        along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
+        drift = _gradient(part[ring], _places(ring, left, top) - (x, y)) * min(
+            darkness, 1.0
+        )  # of dust, over hole and face alike
+        values = values - away @ drift
+        apart = along - along.mean()
+        slope = float(apart @ values / max(float(apart @ apart), 1e-9)) / max(
+            face * (1.0 - darkness), 1.0
+        )
+    around = _darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
+    return Interior(
+        darkness, slope, deeper, unknown, around, _contrast(smooth[ring], face * darkness)
+    )
+
+
+def _contrast(ring: np.ndarray, dark: float) -> float:
+    """Returns by how much `dark` is darker than a ring, in standard deviations of its grain.
+
+    The edge of a shadow across the ring is no grain: the darker of its two parts (Otsu 1979)
+    counts, by what varies within it.
+    """
+    limit = cv2.threshold(
+        np.rint(ring).clip(0, 255).astype(np.uint8).reshape(-1, 1),
+        0,
+        255,
+        cv2.THRESH_BINARY + cv2.THRESH_OTSU,
+    )[0]
+    part = ring[ring <= limit + 0.5]
+    part = part if len(part) > 0.2 * len(ring) else ring
+    level = float(np.median(part))
+    grain = 1.4826 * float(np.median(np.abs(part - level)))
+    return (level - dark) / max(grain, 1.0)
+
+
+def _darkest_around(
+    gray: np.ndarray,
+    depth_m: np.ndarray,
+    ellipse: np.ndarray,
+    camera_matrix: np.ndarray,
+    plane: Plane | None,
+) -> float:
+    """Returns the grey level of the darkest hundredth of what is on or behind the face around an ellipse; 0 where nothing is."""
+    x, y, wide = ellipse[0], ellipse[1], WIDE * ellipse[2]
+    step = max(2, int(wide / 60))
+    rows, columns = (
+        np.arange(max(0, int(middle - wide)), min(size, int(middle + wide)), step)
+        for middle, size in ((y, len(gray)), (x, len(gray[0])))
+    )
+    near = gray[np.ix_(rows, columns)]
+    if plane is not None:
+        here = plane.inverse_depth(camera_matrix, columns[None, :], rows[:, None])
+        behind = (
+            here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma
+        )  # false where depth is unknown
+        near = near[cv2.erode(behind.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0]
+    return float(np.percentile(near, 1.0)) if near.size else 0.0
+
+
+def _places(there: np.ndarray, left: int, top: int) -> np.ndarray:
+    """Returns column and row of the pixels of a part of a picture, `(P, 2)`."""
+    line, column = np.nonzero(there)
+    return np.column_stack([column + left, line + top])
+
+
+def _gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """Returns the mean slope of brightness `(P,)` over places of a ring `(P, 2)`, `(2,)` grey levels a pixel.
+
+    What departs much from it does not count.
+    """
+    away, values = np.column_stack([away, np.ones(len(away))]), values.astype(float)
+    weight = np.ones(len(values))
+    fitted = np.zeros(3)
+    for _ in range(3):
+        heavy = away * weight[:, None]
+        fitted = np.linalg.lstsq(heavy.T @ away, heavy.T @ values, rcond=None)[0]
+        off = np.abs(values - away @ fitted)
+        weight = 1.0 / (1.0 + (off / max(1.5 * float(np.median(off)), 0.3)) ** 2)
+    return fitted[:2]

@@ -1,0 +1,1 @@
+"""Segmenters: which pixels show the block and the inside of its holes."""

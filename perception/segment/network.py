@@ -1,0 +1,226 @@
+"""The block and the mouths of its holes by a network: in onnxruntime as shipped, or in torch as trained.
+
+The network looks twice: at the whole picture for the block, then at the block alone, where a mouth
+has several times the pixels; once more if more of the block came to light then, and at parts of the
+picture where it saw none in the whole.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from brokk_rl.contracts.vision import Masks
+from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.session import Session
+from brokk_rl.signals import Frame
+from brokk_rl.spec import spec
+from perception.segment.window import Window, around, block_box, halves, whole
+
+SHIPPED = Path(__file__).parents[1] / "weights"
+"""Folder of the networks that come with the package."""
+SCHEMA = 1
+PREFIX = "brokk."
+"""Of our entries among the metadata of an ONNX file; each is JSON."""
+THRESHOLD = 0.5
+SMALLEST_PIECE = 0.2
+"""Of the pieces of a block that something hides in part, those below this share of the largest do
+not move the second look."""
+CLOSER_LOOKS, STAYS = 2, 0.1
+"""Looks at the block alone, at most; and by how much of its size its box changes if there is to be
+another one."""
+
+Infer = Callable[[np.ndarray], np.ndarray]
+"""From a picture `(3, h, w)` float32 in [0, 1] to the probabilities of block and mouth, `(2, h,
+w)`."""
+
+
+@spec
+class Onnx:
+    """Runs an exported network in onnxruntime; needs no torch.
+
+    Attributes:
+        weights: An ONNX file of `mode=train_perception`: a path, or the name of one that ships with
+            the package.
+        margin: Room around the block at the second look, as a part of its box; `null`: no second
+            look.
+        threads: CPU threads.
+    """
+
+    weights: str
+    margin: float | None
+    threads: int
+
+    def check(self) -> None:
+        _check_margin(self.margin)
+        if self.threads < 1:
+            raise ConfigError(f"segmenter.threads: expected 1 or more, got {self.threads}")
+
+    def build(self) -> NetworkSegmenter:
+        """Returns the segmenter.
+
+        Raises:
+            CheckpointError: there is no such network, or it is none of ours.
+        """
+        import onnxruntime
+        from onnxruntime.capi.onnxruntime_pybind11_state import (
+            Fail,
+            InvalidArgument,
+            InvalidProtobuf,
+            NoSuchFile,
+        )
+
+        path = found(self.weights)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = self.threads
+        try:
+            session = onnxruntime.InferenceSession(
+                path.read_bytes(), options, providers=["CPUExecutionProvider"]
+            )
+        except (Fail, InvalidArgument, InvalidProtobuf, NoSuchFile) as error:
+            raise CheckpointError(
+                f"{path}: corrupt or no ONNX file ({error}); copy it again or train a new one"
+            ) from error
+        meta = session.get_modelmeta().custom_metadata_map
+        header = {
+            key.removeprefix(PREFIX): json.loads(value)
+            for key, value in meta.items()
+            if key.startswith(PREFIX)
+        }
+        size_px = checked_size(path, header)
+
+        def infer(picture: np.ndarray) -> np.ndarray:
+            return session.run(None, {"picture": picture[None]})[0][0]  # type: ignore[index]
+
+        return NetworkSegmenter(infer, size_px, self.margin)
+
+
+@spec
+class Unet:
+    """Runs the network of a checkpoint in torch, on a GPU where there is one.
+
+    Attributes:
+        weights: A safetensors file of `mode=train_perception`: a path, or the name of one that
+            ships with the package.
+        margin: Room around the block at the second look, as a part of its box; `null`: no second
+            look.
+        device: `cpu`, `cuda` or `cuda:<index>`.
+    """
+
+    weights: str
+    margin: float | None
+    device: str
+
+    def check(self) -> None:
+        _check_margin(self.margin)
+
+    def build(self) -> NetworkSegmenter:
+        """Returns the segmenter.
+
+        Raises:
+            CheckpointError: there is no such network, or it is none of ours.
+            DeviceError: there is no such device.
+        """
+        from perception.train import export
+
+        device = Session(out=".", seed=0, device=self.device).torch_device()
+        network, header = export.read(found(self.weights))
+        return NetworkSegmenter(
+            export.inference(network.to(device), device),
+            checked_size(Path(self.weights), header),
+            self.margin,
+        )
+
+
+class NetworkSegmenter:
+    """A network at work on frames of any size.
+
+    Args:
+        infer: The network.
+        size_px: Width and height of its picture.
+        margin: Room around the block at the second look; `None` for one look.
+    """
+
+    def __init__(self, infer: Infer, size_px: tuple[int, int], margin: float | None) -> None:
+        self._infer, self._size_px, self._margin = infer, size_px, margin
+
+    def segment(self, frame: Frame) -> Masks:
+        """Returns both masks."""
+        window = whole(frame.color.shape, self._size_px)
+        block, mouth = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
+        self._look(frame, window, block, mouth)
+        if self._margin is None:
+            return Masks(block, mouth)
+        box = block_box(block, THRESHOLD, SMALLEST_PIECE)
+        if box is None:
+            part = np.zeros_like(block)
+            for half in halves(block.shape, self._size_px):
+                self._look(frame, half, part, np.zeros_like(part))
+                np.maximum(block, part, out=block)
+            box = block_box(block, THRESHOLD, SMALLEST_PIECE)
+        for _ in range(CLOSER_LOOKS):
+            closer = window if box is None else around(box, self._size_px, self._margin)
+            if box is None or closer.width >= window.width:
+                break
+            mouth[:] = 0.0
+            self._look(frame, closer, block, mouth)
+            before, box = box, block_box(block, THRESHOLD, SMALLEST_PIECE)
+            if box is not None and np.abs(np.subtract(box, before)).max() < STAYS * max(before[2:]):
+                break
+        return Masks(block, mouth)
+
+    def _look(self, frame: Frame, window: Window, block: np.ndarray, mouth: np.ndarray) -> None:
+        """Writes what the network says of a window where it belongs in both masks."""
+        seen = self._infer(as_input(window.take(frame.color, self._size_px)))
+        window.put(seen[0], block)
+        window.put(seen[1], mouth)
+
+
+def as_input(picture: np.ndarray) -> np.ndarray:
+    """Returns what a network takes, `(3, h, w)` float32 in [0, 1], of a picture `(h, w, 3)` uint8."""
+    return np.ascontiguousarray(picture.transpose(2, 0, 1)).astype(np.float32) / np.float32(255.0)
+
+
+def found(weights: str) -> Path:
+    """Returns the path of a network: as given if it exists, else the one of that name that ships with the package.
+
+    Raises:
+        CheckpointError: there is neither.
+    """
+    for path in (Path(weights), SHIPPED / weights):
+        if path.is_file():
+            return path
+    shipped = ", ".join(sorted(path.name for path in SHIPPED.glob("*.*"))) or "none"
+    raise CheckpointError(
+        f"segmenter.weights: there is no file '{weights}' (seen from {Path.cwd()}), nor one of that name in the package "
+        f"({shipped}). `brokk mode=train_perception` makes one; perception/segmenter=depth_plane needs none."
+    )
+
+
+def checked_size(path: Path, header: dict) -> tuple[int, int]:
+    """Returns width and height of a network's picture from the header of its file.
+
+    Raises:
+        CheckpointError: the header is not that of a segmenter that we can run.
+    """
+    if (
+        header.get("schema") != SCHEMA
+        or header.get("channels") != ["block", "mouth"]
+        or len(header.get("size_px", ())) != 2
+    ):
+        raise CheckpointError(
+            f"{path}: no segmenter of ours: expected schema {SCHEMA} and channels block, mouth, got schema "
+            f"{header.get('schema')} and {header.get('channels')}; train one with `brokk mode=train_perception`"
+        )
+    width, height = header["size_px"]
+    return int(width), int(height)
+
+
+def _check_margin(margin: float | None) -> None:
+    if margin is not None and margin < 0:
+        raise ConfigError(
+            f"segmenter.margin: expected 0 or more, or null for one look, got {margin}"
+        )

@@ -1,0 +1,328 @@
+"""The block from depth alone: bounded planes that stand in front of what surrounds them.
+
+Inverse depth is the natural coordinate: on a plane `n · P = d` it is linear in the picture, `1/z =
+(n / d) · (x, y, 1)` with `(x, y)` the pixel over the focal length, and a stereo matcher's noise in
+it is the same at every distance.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from brokk_rl.contracts.vision import Masks
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.signals import Frame
+from brokk_rl.spec import spec
+from perception.pose.plane import DEGENERATE
+from perception.segment.grid import Grid, squares
+
+
+@spec
+class DepthPlane:
+    """Takes planes that stand in front of their surroundings for the block; needs depth and no training.
+
+    Attributes:
+        width_px: Width of the picture in which planes are looked for.
+        min_known: Part of the pixels whose depth must be known; a frame with less is refused.
+        noise_per_m: Standard deviation of inverse depth, 1/m: disparity noise in px over focal
+            length in px and baseline in m.
+        num_sigma: A pixel belongs to a plane within so many standard deviations.
+        num_trials: Planes through three pixels that are tried for each plane that is kept.
+        num_samples: Pixels that judge a trial.
+        num_planes: Planes that are kept at most.
+        neighbourhood: Width of the window from which the three pixels are drawn, as a part of the
+            picture's width.
+        min_area: Smallest face, as a part of the picture.
+        min_extent_m: Smallest extent of a face.
+        max_extent_m: Largest extent of a face; what is larger is ground or wall.
+        max_tilt_rad: Largest angle between the face's normal and the line of sight.
+        min_front: Of the surroundings that are not in the plane, at least this part must lie behind
+            it where the plane also holds something wider than a face.
+        edge_px: Radius of the filter that moves the mask's edge onto the picture's edge, in px of
+            the small picture.
+        edge_contrast: Grey step, of 1, below which the picture does not move the mask's edge.
+        seed: Of the trials; the same frame always gives the same mask.
+    """
+
+    width_px: int
+    min_known: float
+    noise_per_m: float
+    num_sigma: float
+    num_trials: int
+    num_samples: int
+    num_planes: int
+    neighbourhood: float
+    min_area: float
+    min_extent_m: float
+    max_extent_m: float
+    max_tilt_rad: float
+    min_front: float
+    edge_px: int
+    edge_contrast: float
+    seed: int
+
+    def check(self) -> None:
+        counts = (self.width_px, self.num_trials, self.num_samples, self.num_planes, self.edge_px)
+        if (
+            min(counts) < 1
+            or min(self.noise_per_m, self.num_sigma, self.neighbourhood, self.edge_contrast) <= 0
+        ):
+            raise ConfigError(
+                "perception/segmenter=depth_plane: sizes, counts and noise must be above 0"
+            )
+        if not 0 < self.min_extent_m < self.max_extent_m:
+            raise ConfigError(
+                f"segmenter: expected 0 < min_extent_m < max_extent_m, got {self.min_extent_m} and {self.max_extent_m}"
+            )
+
+    def build(self) -> PlaneSegmenter:
+        """Returns the segmenter."""
+        return PlaneSegmenter(self)
+
+
+class PlaneSegmenter:
+    """Finds the block's faces in the depth picture."""
+
+    def __init__(self, settings: DepthPlane) -> None:
+        self._settings = settings
+        self._tolerance = settings.num_sigma * settings.noise_per_m
+
+    def segment(self, frame: Frame) -> Masks:
+        """Returns the block's mask; nobody has looked for mouths.
+
+        Raises:
+            FrameError: too little depth is known.
+        """
+        height, width = frame.depth_m.shape
+        step = max(1, round(width / self._settings.width_px))
+        inverse, known = _shrunk(frame.depth_m, step)
+        if known.mean() < self._settings.min_known:
+            raise FrameError(
+                f"{frame.name or 'frame'}: depth is known in {known.mean():.1%} of the pixels, depth_plane needs "
+                f"{self._settings.min_known:.0%}; check the depth camera, or segment by colour (perception/segmenter=onnx)"
+            )
+        grid = Grid.of(frame.camera_matrix, inverse.shape, step)
+        face = np.zeros(inverse.shape, np.uint8)
+        for plane in self._planes(grid, inverse, known):
+            face |= self._faces(plane, grid, inverse, known)
+        mask = np.zeros((height, width), np.float32)
+        left, top, wide, high = cv2.boundingRect(face)
+        if wide:
+            rim = 3 * self._settings.edge_px + 1  # beyond, its edges move nothing
+            right, bottom = min(left + wide + rim, len(face[0])), min(top + high + rim, len(face))
+            left, top = max(0, left - rim), max(0, top - rim)
+            part = np.s_[
+                top * step : bottom * step, left * step : right * step
+            ]  # the last cells may be smaller ones
+            size = (min(right * step, width) - left * step, min(bottom * step, height) - top * step)
+            color = cv2.resize(
+                frame.color[part], (size[0] // 2, size[1] // 2), interpolation=cv2.INTER_AREA
+            )
+            gray, small = (
+                cv2.cvtColor(color, cv2.COLOR_RGB2GRAY),
+                face[top:bottom, left:right].astype(np.float32),
+            )
+            sharp = onto_edges(small, gray, self._settings.edge_px, self._settings.edge_contrast)
+            mask[part] = cv2.resize(sharp, size, interpolation=cv2.INTER_LINEAR)
+        return Masks(mask, None)
+
+    def _planes(self, grid: Grid, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
+        """Returns planes `n / d`, `(3,)`, the best supported first: each explains pixels that those before it do not."""
+        settings, generator = self._settings, np.random.default_rng(self._settings.seed)
+        found, rest = [], known.copy()
+        for _ in range(settings.num_planes):
+            there = np.flatnonzero(rest)
+            if len(there) < settings.min_area * known.size:
+                break
+            trials = self._trials(grid, inverse, rest, there, generator)
+            judge = there[generator.integers(len(there), size=settings.num_samples)]
+            rows, columns = np.divmod(judge, inverse.shape[1])
+            votes = np.count_nonzero(
+                np.abs(trials @ grid.sight(rows, columns).T - inverse[rows, columns])
+                < self._tolerance,
+                axis=1,
+            )
+            best = int(votes.argmax()) if len(votes) else 0
+            if (
+                not len(votes)
+                or votes[best] / settings.num_samples * len(there) < settings.min_area * known.size
+            ):
+                break
+            found.append(self._refined(trials[best], grid, inverse, rest))
+            rest &= np.abs(grid.inverse(found[-1]) - inverse) >= self._tolerance
+        return found
+
+    def _trials(
+        self,
+        grid: Grid,
+        inverse: np.ndarray,
+        rest: np.ndarray,
+        there: np.ndarray,
+        generator: np.random.Generator,
+    ) -> np.ndarray:
+        """Returns planes through three pixels of `rest` that lie near each other, at many scales, `(trials, 3)`."""
+        count, (height, width) = self._settings.num_trials, inverse.shape
+        row, column = np.divmod(there[generator.integers(len(there), size=count)], width)
+        reach = width * self._settings.neighbourhood * generator.uniform(0.2, 1.0, count)
+        shift = np.rint(generator.uniform(-1.0, 1.0, (2, 2, count)) * reach).astype(int)
+        corner_rows = np.stack([row, *np.clip(row + shift[0], 0, height - 1)])
+        corner_columns = np.stack([column, *np.clip(column + shift[1], 0, width - 1)])
+        x, y, value = (
+            grid.x[corner_columns],
+            grid.y[corner_rows],
+            inverse[corner_rows, corner_columns],
+        )  # (3 pixels, trials)
+        usable = rest[corner_rows, corner_columns].all(0)
+        dx, dy = (some[1:] - some[0] for some in (x, y))
+        rise = value[1:] - value[0]
+        area = dx[0] * dy[1] - dx[1] * dy[0]
+        usable &= np.abs(area) > 1e-5
+        dx, dy, rise, area = dx[:, usable], dy[:, usable], rise[:, usable], area[usable]
+        across = (rise[0] * dy[1] - rise[1] * dy[0]) / area
+        down = (dx[0] * rise[1] - dx[1] * rise[0]) / area
+        return np.stack(
+            [across, down, value[0, usable] - across * x[0, usable] - down * y[0, usable]], -1
+        )
+
+    def _refined(
+        self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray
+    ) -> np.ndarray:
+        """Returns the least-squares plane of the pixels that agree with `plane`."""
+        grid, inverse, known = grid.half, inverse[::2, ::2], known[::2, ::2]
+        across, down = grid.powers
+        for _ in range(2):
+            inside = (known & (np.abs(grid.inverse(plane) - inverse) < self._tolerance)).astype(
+                float
+            )
+            sums = squares(down @ inside @ across.T)  # of x^i y^j over the pixels, [j, i]
+            if np.linalg.cond(sums) > DEGENERATE:
+                break
+            held = down[:2] @ (inside * inverse) @ across[:2].T
+            plane = np.linalg.solve(sums, np.array([held[0, 1], held[1, 0], held[0, 0]]))
+        return plane
+
+    def _faces(
+        self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray
+    ) -> np.ndarray:
+        """Returns where connected pieces of a plane look like a face of a block, `(h, w)` uint8 of 0 and 1."""
+        settings = self._settings
+        excess = inverse - grid.inverse(plane)  # > 0: nearer than the plane
+        support = (known & (np.abs(excess) < self._tolerance)).astype(np.uint8)
+        support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=4)
+        large = [
+            label
+            for label in range(1, count)
+            if stats[label, cv2.CC_STAT_AREA] >= settings.min_area * support.size
+        ]
+        nearer = (known & (excess > self._tolerance)).astype(np.uint8)
+        nearer = np.asarray(cv2.morphologyEx(nearer, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
+        pieces = [_filled((labels == label).astype(np.uint8), nearer) for label in large]
+        pieces = [piece for piece in pieces if piece[::2, ::2].any()]
+        faces = np.zeros_like(support)
+        # ground or wall? so are the pieces of it that something before them cuts off; of a face
+        # that may hide all surroundings
+        extents_m = [_extents(piece, plane, grid) for piece in pieces]
+        wide = any(extent.prod() > settings.max_extent_m**2 for extent in extents_m)
+        for piece, extent in zip(pieces, extents_m, strict=True):
+            if self._fits(piece, extent, plane, grid) and (
+                not wide or self._front(piece, excess, known) >= settings.min_front
+            ):
+                faces |= piece
+        # an arm before a face cuts it in pieces, of which the smaller ones have little but the arm
+        # around them
+        for piece in pieces if faces.any() else ():
+            if _extents(faces | piece, plane, grid).max() <= settings.max_extent_m:
+                faces |= piece
+        return faces
+
+    def _fits(
+        self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, grid: Grid
+    ) -> bool:
+        """Says whether a piece of a plane has the size of a face and looks at the camera."""
+        if (
+            extents_m.min() < self._settings.min_extent_m
+            or extents_m.max() > self._settings.max_extent_m
+        ):
+            return False
+        sums = cv2.moments(piece, binaryImage=True)
+        sight = grid.sight(
+            np.array(round(sums["m01"] / sums["m00"])), np.array(round(sums["m10"] / sums["m00"]))
+        )
+        tilt_rad = np.arccos(
+            np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0)
+        )
+        return bool(tilt_rad <= self._settings.max_tilt_rad)
+
+    def _front(self, piece: np.ndarray, excess: np.ndarray, known: np.ndarray) -> float:
+        """Returns which part of what surrounds a piece lies behind its plane, a half where nothing speaks for either side."""
+        near, far = (cv2.dilate(piece, np.ones((size, size), np.uint8)) for size in (5, 9))
+        ring = (far > near) & known
+        behind = np.count_nonzero(excess[ring] < -self._tolerance)
+        before = np.count_nonzero(excess[ring] > self._tolerance)
+        doubt = 0.05 * np.count_nonzero(ring) + 1.0
+        return (behind + 0.5 * doubt) / (behind + before + doubt)
+
+
+def onto_edges(mask: np.ndarray, gray: np.ndarray, radius_px: int, contrast: float) -> np.ndarray:
+    """Moves the edges of a small mask onto those of a larger picture by a guided filter (He and Sun, Fast Guided Filter, 2015).
+
+    Args:
+        mask: `(h, w)` float32 in [0, 1].
+        gray: The same view, larger, uint8.
+        radius_px: Radius of the filter in px of the mask.
+        contrast: Grey step, of 1, below which the picture does not count.
+
+    Returns:
+        The mask in the size of `gray`, float32 in [0, 1].
+    """
+    height, width = mask.shape
+    guide = (
+        cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+    )
+    size = (2 * radius_px + 1, 2 * radius_px + 1)
+    mean_guide, mean_mask = cv2.blur(guide, size), cv2.blur(mask, size)
+    slope = (cv2.blur(guide * mask, size) - mean_guide * mean_mask) / (
+        cv2.blur(guide * guide, size) - mean_guide**2 + contrast**2
+    )
+    offset = cv2.blur(mean_mask - slope * mean_guide, size)
+    full = (gray.shape[1], gray.shape[0])
+    slope = cv2.resize(cv2.blur(slope, size), full, interpolation=cv2.INTER_LINEAR)
+    return np.clip(
+        slope * (gray * np.float32(1 / 255))
+        + cv2.resize(offset, full, interpolation=cv2.INTER_LINEAR),
+        0.0,
+        1.0,
+    )
+
+
+def _shrunk(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns inverse depth in 1/m at the middle of each `step` x `step` cell, `(h, w)` float32, and where it is known."""
+    depth = depth_m[step // 2 :: step, step // 2 :: step]
+    known = np.isfinite(depth) & (depth > 0)
+    return np.divide(1.0, depth, out=np.zeros(depth.shape, np.float32), where=known), known
+
+
+def _filled(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
+    """Fills a piece's holes (a mouth, lost depth), except where something stands in front of it."""
+    outlines, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    whole = cv2.drawContours(np.zeros_like(piece), outlines, -1, 1, cv2.FILLED)
+    return np.where(nearer > 0, np.uint8(0), np.asarray(whole, np.uint8))
+
+
+def _extents(piece: np.ndarray, plane: np.ndarray, grid: Grid) -> np.ndarray:
+    """Returns the two extents in m that a rectangle with the piece's second moments would have."""
+    depth = piece[::2, ::2] / np.maximum(grid.half.inverse(plane), 1e-6)
+    across, down = grid.half.powers
+    first, second = (
+        down[:2] @ depth @ across[:2].T,
+        down @ (depth * depth) @ across.T,
+    )  # of x^i y^j, [j, i]
+    number = np.count_nonzero(depth)
+    middle = np.array([first[0, 1], first[1, 0], first[0, 0]]) / number
+    spread = np.linalg.eigvalsh(squares(second) / number - np.outer(middle, middle))[
+        1:
+    ]  # the smallest is the plane's own thickness
+    return np.sqrt(12.0 * np.maximum(spread, 0.0))

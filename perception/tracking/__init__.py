@@ -1,0 +1,1 @@
+"""Tracking of one borehole over many frames."""

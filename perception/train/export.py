@@ -1,0 +1,150 @@
+"""Networks in files: safetensors to go on with in torch, ONNX to run anywhere, and the proof that both say the same."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import warnings
+from collections.abc import Mapping
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from brokk_rl.errors import CheckpointError, StorageError
+from perception.segment.network import PREFIX, SCHEMA, Infer
+from perception.segment.unet import CHANNELS, Probabilities, UNet
+
+TENSORS, ONNX = "segmenter.safetensors", "segmenter.onnx"
+TOLERANCE = 1e-3
+"""Largest difference of a probability between torch and onnxruntime."""
+
+
+def header_of(network: UNet, size_px: tuple[int, int], facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what stands in a network's files: what it takes and gives, and `facts` about its training, JSON."""
+    return {
+        "schema": SCHEMA,
+        "channels": list(CHANNELS),
+        "size_px": list(size_px),
+        "widths": list(network.widths),
+        "input": "RGB, (1, 3, height, width) float32 in [0, 1], the frame scaled to fit, black around it",
+        "output": "probabilities, (1, 2, height, width)",
+        **facts,
+    }
+
+
+def write(path: Path, network: UNet, header: Mapping[str, Any]) -> None:
+    """Writes a checkpoint in one step.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    tensors = {
+        name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
+    }
+    write_bytes(path, save(tensors, metadata={"brokk": json.dumps(header)}))
+
+
+def read(path: Path) -> tuple[UNet, dict[str, Any]]:
+    """Returns the network of a checkpoint, on the CPU and ready to use, and its header.
+
+    Raises:
+        CheckpointError: it is corrupt or holds something else.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {})["brokk"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        network = UNet(header["widths"])
+        network.load_state_dict(tensors)
+    except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{path}: corrupt or no segmenter of ours ({error}); `brokk mode=train_perception` makes one"
+        ) from error
+    return network.eval().requires_grad_(False), header
+
+
+def inference(network: UNet, device: torch.device) -> Infer:
+    """Returns the network as a function from one picture to probabilities."""
+    module = Probabilities(network).eval()
+
+    def infer(picture: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return module(torch.from_numpy(picture)[None].to(device))[0].cpu().numpy()
+
+    return infer
+
+
+def write_onnx(
+    path: Path, network: UNet, header: Mapping[str, Any], pictures: torch.Tensor
+) -> float:
+    """Writes an ONNX file with the header as metadata, and compares it with the network.
+
+    Args:
+        path: Where to.
+        network: The network, on the CPU.
+        header: What `header_of` returned.
+        pictures: On which file and network are compared, `(B, 3, h, w)` float32 in [0, 1].
+
+    Returns:
+        The largest difference of a probability.
+
+    Raises:
+        CheckpointError: the file says something else than the network; nothing is written.
+        StorageError: it could not be written.
+    """
+    import onnx
+    import onnxruntime
+
+    module, log = Probabilities(network).eval(), logging.getLogger("torch.onnx")
+    level, part = log.level, path.with_name(f".{path.name}.exported")
+    with warnings.catch_warnings(), redirect_stdout(io.StringIO()), torch.no_grad():
+        warnings.simplefilter("ignore")  # the exporter warns about its own internals
+        log.setLevel(logging.ERROR)
+        torch.onnx.export(
+            module, (pictures[:1],), str(part), input_names=["picture"], output_names=["probability"],
+            dynamic_axes={"picture": {0: "batch"}, "probability": {0: "batch"}}, opset_version=18, dynamo=False,
+        )  # fmt: skip
+        log.setLevel(level)
+        expected = module(pictures).numpy()
+    model = onnx.load(part)
+    part.unlink()
+    onnx.helper.set_model_props(
+        model, {f"{PREFIX}{key}": json.dumps(value) for key, value in header.items()}
+    )
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    largest = float(
+        np.abs(np.asarray(session.run(None, {"picture": pictures.numpy()})[0]) - expected).max()
+    )
+    if not largest <= TOLERANCE:
+        raise CheckpointError(
+            f"the exported network differs from the one in torch by {largest:.3g} of probability, over {TOLERANCE}; {path} was not "
+            "written. This is a bug of the exporter or of a layer."
+        )
+    write_bytes(path, model.SerializeToString())
+    return largest
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file in one step.
+
+    Raises:
+        StorageError: it could not be written; one that was there before is untouched.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(content)
+        part.replace(path)
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
