@@ -14,15 +14,15 @@ from brokk_rl.spec import spec
 
 
 @spec
-class Nobody:
+class NoFollower:
     """Nobody: the policy's command is given as it is, at once."""
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> Direct:
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> NoFollowerModel:
         """Returns the follower that changes nothing; see `brokk_rl.contracts.actuator.Follower`."""
-        return Direct()
+        return NoFollowerModel()
 
 
-class Direct:
+class NoFollowerModel:
     """Gives what is proposed."""
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Direct:
         return proposed
 
 
-def moved_levers(priority: torch.Tensor, most: torch.Tensor | int) -> torch.Tensor:
+def select_levers(priority: torch.Tensor, most: torch.Tensor | int) -> torch.Tensor:
     """Returns which levers are moved, `(N, J)` bool: the `most`, a number or `(N, 1)`, of highest `priority`, `(N, J)`.
 
     Of equals the first.

@@ -18,7 +18,7 @@ from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import BrokkError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import Windows
+from brokk_rl.open_loop import FreeRunWindows
 from diagnosis.library import Kind
 
 ROWS = 1536
@@ -43,7 +43,7 @@ class Candidates:
 
     base: Actuator
     machine: Machine
-    cut: Windows
+    cut: FreeRunWindows
     running_s: np.ndarray
     seed: int
     fixed: Sequence[tuple[Kind, Values]] = ()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.contracts.actuator import Excitation
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from diagnosis import certainty, engine, separation, verdict, weighing
 from diagnosis.answer import Answer, Estimate, NextExperiment, Ranked, Selected, Where
 from diagnosis.case import Case
@@ -57,7 +57,7 @@ class Diagnosis:
     kinds: Sequence[Kind]
     prices: Prices
     certainty: Certainty
-    thresholds: Thresholds
+    thresholds: InspectionThresholds
     excitations: Mapping[str, Excitation]
     generator: np.random.Generator
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brokk_rl.inspection import Finding, Thresholds
+from brokk_rl.inspection import InspectionThresholds, RecordingFinding
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
-from brokk_rl.recording_validation import runs
+from brokk_rl.record import Recording, find_stretches
 
 FEWEST = 5
 """Ignored stretches below which a condition that they share may be a coincidence."""
@@ -41,10 +40,10 @@ class Interlock:
 
 
 def interlock(
-    inspected: Sequence[tuple[Recording, Sequence[Finding]]],
+    inspected: Sequence[tuple[Recording, Sequence[RecordingFinding]]],
     machine: Machine,
     joint: int,
-    thresholds: Thresholds,
+    thresholds: InspectionThresholds,
 ) -> Interlock | None:
     """Returns the one condition that tells ignored commands of a joint from obeyed ones, `None` where no simple one does.
 
@@ -61,7 +60,7 @@ def interlock(
         ]
         for finding in mine:
             mask[finding.row : finding.row + finding.num_rows] = True
-        for row, count in runs(np.abs(recording.u[:, joint]) > thresholds.driving):
+        for row, count in find_stretches(np.abs(recording.u[:, joint]) > thresholds.driving):
             held[row + lead : row + count] = True
         speed = (
             (np.roll(recording.q[:, joint], -SPAN) - np.roll(recording.q[:, joint], SPAN))
@@ -106,7 +105,7 @@ def _shares(
     condition: np.ndarray,
     ignores: np.ndarray,
     obeys: np.ndarray,
-    thresholds: Thresholds,
+    thresholds: InspectionThresholds,
     machine: Machine,
 ) -> tuple[float, float]:
     """Returns the parts of the ignored and of the obeyed time in which a condition holds, where it has not just changed."""
@@ -120,7 +119,7 @@ def _shares(
 
 
 def _conditions(
-    u: np.ndarray, q: np.ndarray, machine: Machine, joint: int, thresholds: Thresholds
+    u: np.ndarray, q: np.ndarray, machine: Machine, joint: int, thresholds: InspectionThresholds
 ) -> Iterator[tuple[str, np.ndarray]]:
     commanded = np.abs(u) > thresholds.commanded
     others = np.delete(commanded, joint, axis=1)

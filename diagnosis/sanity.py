@@ -15,10 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from brokk_rl.inspection import Finding, Thresholds, inspect
+from brokk_rl.inspection import InspectionThresholds, RecordingFinding, inspect_recording
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
-from brokk_rl.recording_validation import runs
+from brokk_rl.record import Recording, find_stretches
 from diagnosis.interlock import Interlock, interlock
 
 Severity = Literal["note", "warn", "bad"]
@@ -145,11 +144,12 @@ NAMES = {
 
 
 def examine(
-    recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds
+    recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
 ) -> list[Remark]:
     """Returns what is to be said about recordings of `machine`, the gravest first."""
     inspected = [
-        (recording, inspect(recording, machine, thresholds).findings) for recording in recordings
+        (recording, inspect_recording(recording, machine, thresholds).findings)
+        for recording in recordings
     ]
     locks = list(
         filter(
@@ -207,10 +207,10 @@ def _remark(
     )
 
 
-def _grouped(recording: Recording, findings: Sequence[Finding]) -> Iterator[Remark]:
+def _grouped(recording: Recording, findings: Sequence[RecordingFinding]) -> Iterator[Remark]:
     """Yields one remark for all stretches of one kind and joint."""
 
-    def key(finding: Finding) -> tuple[str, str]:
+    def key(finding: RecordingFinding) -> tuple[str, str]:
         return finding.kind, finding.joint or ""
 
     for (kind, joint), group in groupby(sorted(findings, key=key), key):
@@ -264,7 +264,9 @@ def _clock(recording: Recording) -> Iterator[Remark]:
         )
 
 
-def _saturated(recording: Recording, machine: Machine, thresholds: Thresholds) -> Iterator[Remark]:
+def _saturated(
+    recording: Recording, machine: Machine, thresholds: InspectionThresholds
+) -> Iterator[Remark]:
     margin, back = (
         thresholds.at_limit * (machine.upper - machine.lower),
         round(machine.dead_time_s * recording.rate_hz),
@@ -278,7 +280,7 @@ def _saturated(recording: Recording, machine: Machine, thresholds: Thresholds) -
             if abs(stop - extreme) < margin[j]:
                 continue
             driven = outward * acting > thresholds.driving
-            stuck = [run for run in runs((q == extreme) & driven) if run[1] >= AT_EXTREME]
+            stuck = [run for run in find_stretches((q == extreme) & driven) if run[1] >= AT_EXTREME]
             if stuck:
                 rows = sum(count for _, count in stuck)
                 span_s = recording.t_s[stuck[0][0]], recording.t_s[sum(stuck[-1]) - 1]
@@ -287,7 +289,7 @@ def _saturated(recording: Recording, machine: Machine, thresholds: Thresholds) -
 
 
 def _at_rest(
-    recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds
+    recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
 ) -> Iterator[Remark]:
     if not recordings:
         return

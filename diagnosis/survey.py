@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from diagnosis.answer import JointGap, RegimeGap, Where
 from diagnosis.budget import Budget, account
@@ -68,7 +68,7 @@ def survey(
     floor: FreeRuns | None,
     after: FreeRuns | None,
     machine: Machine,
-    thresholds: Thresholds,
+    thresholds: InspectionThresholds,
     dead_time_s: np.ndarray,
     generator: np.random.Generator,
     whole: FreeRuns | None = None,

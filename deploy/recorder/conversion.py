@@ -110,7 +110,7 @@ class CaptureLog:
             q=np.stack([np.interp(grid_s, q[name][0], q[name][1]) for name in machine.joint_names], 1).astype(np.float32),
             extra=_extra(contents, grid_s, machine),
             metadata={
-                "source": f"capture: {contents.facts.get('source', path.name)}", "fingerprint": record.stamp(machine),
+                "source": f"capture: {contents.facts.get('source', path.name)}", "fingerprint": record.format_fingerprint(machine),
                 "run": f"{path.resolve().parent.name}/{path.stem}", "created": created.isoformat(timespec="milliseconds"),
             },
             path=None,

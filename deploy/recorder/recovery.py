@@ -35,7 +35,7 @@ class Recovery:
             RecordingError: nothing matches, two would have the same name, or nothing can be read of
                 one.
         """
-        matching = record.matching(self.input, "capture")
+        matching = record.find_files(self.input, "capture")
         paths = [path for path in matching if path.suffix in KINDS]
         if not paths:
             raise RecordingError(

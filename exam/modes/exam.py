@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from actuators.excite.plan.schedule import Approach
+from actuators.excite.schedule import Approach
 from brokk_rl import record
 from brokk_rl.contracts.actuator import ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError, RecordingError, choices
@@ -352,7 +352,7 @@ class Exam:
         page.write(self.session.folder, facts, tables)
         if self.exam.ledger is not None:
             for name, table in tables.items():
-                ledger.append(Path(self.exam.ledger), record.now(), facts, name, table)
+                ledger.append(Path(self.exam.ledger), record.format_now(), facts, name, table)
         _show(tables)
         log.info("report: %s", self.session.folder / page.PAGE)
 

@@ -113,7 +113,7 @@ def read(path: Path, machine: Machine) -> Track:
         RecordingError: the recording breaks the format.
     """
     if path.suffix == ".parquet":
-        recording = record.read(path, machine)
+        recording = record.read_recording(path, machine)
         return Track(np.asarray(recording.t_s, float), np.asarray(recording.q, float), None)
     try:
         told = yaml.safe_load(path.read_text())

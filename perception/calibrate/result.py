@@ -58,7 +58,7 @@ def stored(
     return {
         "schema": SCHEMA,
         "kind": kind,
-        "created": record.now(),
+        "created": record.format_now(),
         "machine": machine.name,
         "T_base_cam": plain(base_from_camera),
         "covariance": plain(
