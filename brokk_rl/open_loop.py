@@ -44,7 +44,7 @@ class FreeRunWindows:
     q: np.ndarray
     run: np.ndarray
     num_history: int
-    count_samples_before: int
+    num_before: int
 
     @property
     def measured(self) -> np.ndarray:

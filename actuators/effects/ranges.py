@@ -42,7 +42,7 @@ class EffectNumber:
     none: float | None
     typical: float
     bounds: tuple[float, float]
-    expand_per_joint: bool = True
+    per_joint: bool = True
 
 
 class ParameterRanges:

@@ -75,7 +75,7 @@ class FittedModel:
 
     predicted: np.ndarray
     seconds: float
-    find_overrides: str
+    use: str
 
 
 def list_recordings(part: Mapping[str, Sequence[Recording]]) -> list[Recording]:

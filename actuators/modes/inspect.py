@@ -87,7 +87,7 @@ class Inspect:
 
     session: Session
     machine: Machine
-    inspect_recording: InspectionRequest
+    inspect: InspectionRequest
     thresholds: InspectionThresholds
 
     def run(self) -> None:
