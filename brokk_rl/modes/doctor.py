@@ -25,7 +25,16 @@ from brokk_rl.sim import probe
 from brokk_rl.spec import spec
 
 DISTRIBUTION = "brokk-rl"
-IMPORT_NAMES = ("brokk_rl", "conf", "tasks", "actuators", "perception", "deploy")
+IMPORT_NAMES = (
+    "brokk_rl",
+    "conf",
+    "tasks",
+    "actuators",
+    "perception",
+    "deploy",
+    "diagnosis",
+    "exam",
+)
 COLORS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
 

@@ -49,16 +49,16 @@ def examine(
 ) -> dict[str, DoctorFinding]:
     """Runs the doctor with these probes, all others silent."""
     for name in (
-        "python",
-        "packages",
-        "processor",
-        "torch_devices",
-        "cuda_graphs",
-        "warp",
-        "rendering",
-        "disk",
-        "import_names",
-        "extensions",
+        "check_python",
+        "check_packages",
+        "check_processor",
+        "check_torch_devices",
+        "check_cuda_graphs",
+        "check_warp",
+        "check_rendering",
+        "check_disk",
+        "check_import_names",
+        "check_extensions",
     ):
         monkeypatch.setattr(doctor, name, probes.get(name, lambda *_: iter(())))
     return dict(Doctor(doctor=DoctorLimits(folder="runs", min_free_gib=0.0)).findings())
@@ -72,7 +72,7 @@ def test_a_probe_that_breaks_is_a_warning_and_the_others_go_on(
         yield
 
     found = examine(
-        monkeypatch, warp=breaks, extensions=lambda: iter([DoctorFinding("ok", "none")])
+        monkeypatch, check_warp=breaks, check_extensions=lambda: iter([DoctorFinding("ok", "none")])
     )
     assert found["Warp"].level == "warn"
     assert "no such library" in found["Warp"].text
@@ -82,7 +82,7 @@ def test_a_probe_that_breaks_is_a_warning_and_the_others_go_on(
 def test_the_doctor_leaves_with_1_when_something_essential_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    examine(monkeypatch, python=lambda: iter([DoctorFinding("fail", "too old")]))
+    examine(monkeypatch, check_python=lambda: iter([DoctorFinding("fail", "too old")]))
     with pytest.raises(SystemExit) as left:
         Doctor(doctor=DoctorLimits(folder="runs", min_free_gib=0.0)).run()
     assert left.value.code == 1
@@ -109,9 +109,9 @@ def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
         "CUDA graphs",
         "Warp",
         "kernel cache",
-        "rendering",
-        "disk",
+        "check_rendering",
+        "check_disk",
         "import names",
-        "extensions",
+        "check_extensions",
     ):
         assert topic in done.out
