@@ -17,7 +17,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session
 from brokk_rl.signals import Command
 from deploy.study.twins import BEFORE_S, desks
-from deploy.twin.faults import Faults
+from deploy.twin.faults import ActiveFaults
 
 MACHINE = option("machine", "brokk170")
 GROUND = option("ground", "twin")
@@ -91,7 +91,7 @@ def test_a_twin_is_put_elsewhere_with_its_block(tmp_path: Path) -> None:
 
 
 def test_a_place_is_asked_for_once_and_nonsense_refused() -> None:
-    faults = Faults()
+    faults = ActiveFaults()
     faults.request(
         json.dumps({"place": {"q": [0.0] * 5, "hole_in_base_m": [2.6, 0.0, 0.75]}}).encode(), 0.0
     )
