@@ -33,8 +33,8 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from brokk_rl import distributed, extensions, gpu_pool, registry
-from brokk_rl.errors import BrokkError, ConfigError, choices
-from brokk_rl.session import earlier, remove_empty
+from brokk_rl.errors import BrokkError, ConfigError, list_choices
+from brokk_rl.session import read_earlier_job, remove_empty_folders
 from brokk_rl.sweep import SweepFolder
 
 log = logging.getLogger(__name__)
@@ -60,11 +60,13 @@ def main() -> int:
         signal.SIGTERM, signal.default_int_handler
     )  # a run that a scheduler stops ends like one stopped by hand
     try:
-        with _hydra_raises():
-            extensions.register(sys.argv[1:])
-            hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")(job)()
+        with _make_hydra_raise():
+            extensions.register_options(sys.argv[1:])
+            hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")(
+                run_job
+            )()
     except KeyboardInterrupt:
-        if _speaks():
+        if _is_first_process():
             sys.stderr.write("interrupted\n")
         return 130
     except (Stopped, Exception) as error:
@@ -74,18 +76,18 @@ def main() -> int:
         if trace or message is None:
             traceback.print_exception(cause)
         if message is not None and (
-            _speaks() or not isinstance(cause, ConfigError)
+            _is_first_process() or not isinstance(cause, ConfigError)
         ):  # the first has said what is wrong for all
             sys.stderr.write(f"error: {message}\n")
         return 1 if message is None else 2
     return 0
 
 
-def job(cfg: DictConfig) -> float | None:
+def run_job(cfg: DictConfig) -> float | None:
     """Runs one composed configuration: all of `brokk`, or one job of a sweep."""
     set_up_logging()  # a launcher may run the job in a process of its own
     try:
-        with gpu_pool.taken():
+        with gpu_pool.take_place():
             return _run(cfg)
     except Exception as error:
         if HydraConfig.get().mode is not RunMode.MULTIRUN:
@@ -101,13 +103,13 @@ def job(cfg: DictConfig) -> float | None:
 
 def _run(cfg: DictConfig) -> float | None:
     """Instantiates the mode and runs it within its session, where it has one."""
-    cfg, sweep = _taken_in(cfg), HydraConfig.get().mode is RunMode.MULTIRUN
+    cfg, sweep = _drop_consumed_groups(cfg), HydraConfig.get().mode is RunMode.MULTIRUN
     if "session" not in cfg:
         distributed.check_together(get_class(str(cfg._target_)), sweep)
         return instantiate(cfg, _convert_="all").run()
-    folder, resolved = run_folder(cfg), _resolved(cfg)
+    folder, resolved = choose_run_folder(cfg), _format_resolved(cfg)
     try:
-        before = earlier(folder, resolved) if sweep else None
+        before = read_earlier_job(folder, resolved) if sweep else None
         if before and before.get("outcome") == "finished":
             log.info("job %s is done already: %s", HydraConfig.get().job.num, folder)
             return before.get("objective")
@@ -115,7 +117,7 @@ def _run(cfg: DictConfig) -> float | None:
         mode = instantiate(cfg, session={"out": str(folder)}, **again, _convert_="all")
         distributed.check_together(type(mode), sweep)
         resume = bool(before or getattr(mode, "resume", None))
-        with mode.session.start(resolved, _facts(cfg, mode), resume) as record:
+        with mode.session.start(resolved, _collect_facts(cfg, mode), resume) as record:
             objective = mode.run()
             record.fields["objective"] = (
                 objective if objective is not None and math.isfinite(objective) else None
@@ -125,19 +127,19 @@ def _run(cfg: DictConfig) -> float | None:
         if sweep:
             # made by Hydra, in several levels where an override holds a path; what the job or the
             # sweep has written into stays
-            remove_empty([folder, *folder.parents])
+            remove_empty_folders([folder, *folder.parents])
         raise
 
 
-def _speaks() -> bool:
+def _is_first_process() -> bool:
     """Whether this process shows a person how things go; of several only the first."""
     try:
-        return distributed.own().first
+        return distributed.read_rank().first
     except ConfigError:
         return True
 
 
-def _taken_in(cfg: DictConfig) -> DictConfig:
+def _drop_consumed_groups(cfg: DictConfig) -> DictConfig:
     """Returns the configuration without groups that are only taken in by another node (`actuator: ${actuator}`), not by the mode.
 
     So an option can bring groups of its own, such as `link=simulated` the actuator that it
@@ -152,7 +154,7 @@ def _taken_in(cfg: DictConfig) -> DictConfig:
     return OmegaConf.create({key: value for key, value in whole.items() if key not in taken})
 
 
-def _facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
+def _collect_facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
     """Returns what `session.json` says about how the run was put together."""
     settings = HydraConfig.get()
     made = OmegaConf.to_container(settings.runtime.choices)
@@ -167,13 +169,17 @@ def _facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
         key, _, value = override.partition("=")
         if value.startswith("["):  # Hydra keeps no record of options that were chosen as a list
             chosen.setdefault(key, value)
-    facts: dict[str, Any] = {"mode": _mode_name(cfg), "choices": chosen, "overrides": overrides}
+    facts: dict[str, Any] = {
+        "mode": _read_mode_name(cfg),
+        "choices": chosen,
+        "overrides": overrides,
+    }
     if machine := getattr(mode, "machine", None):
         facts |= {"machine": machine.name, "fingerprint": machine.fingerprint()}
     return facts
 
 
-def run_folder(cfg: DictConfig) -> Path:
+def choose_run_folder(cfg: DictConfig) -> Path:
     """Returns where a run writes: the job's folder in a sweep, else `session.out`, else a new folder under `runs`."""
     settings = HydraConfig.get()
     if settings.mode is RunMode.MULTIRUN:
@@ -183,7 +189,9 @@ def run_folder(cfg: DictConfig) -> Path:
         return Path(out)
     name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
     name = Path(name).stem if name else None  # an option may be a file, experiment=@<path>
-    stem = "_".join(filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", _mode_name(cfg), name)))
+    stem = "_".join(
+        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", _read_mode_name(cfg), name))
+    )
     return Path("runs") / stem
 
 
@@ -196,14 +204,16 @@ def set_up_logging() -> None:
         omit_repeated_times=False,
     )
     logging.basicConfig(
-        level=logging.INFO if _speaks() else logging.ERROR, format="%(message)s", handlers=[handler]
+        level=logging.INFO if _is_first_process() else logging.ERROR,
+        format="%(message)s",
+        handlers=[handler],
     )
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # tells of its font cache otherwise
 
 
 def explain(error: BaseException) -> str | None:
     """Returns what to tell a person about `error`, `None` when it is our own fault and deserves its traceback."""
-    chain = list(_causes(error))
+    chain = list(_iterate_causes(error))
     ours = next((e for e in chain if isinstance(e, BrokkError)), None)
     full = next((e for e in chain if isinstance(e, OSError) and e.errno == errno.ENOSPC), None)
     missing = next((e for e in chain if isinstance(e, MissingMandatoryValue)), None)
@@ -215,16 +225,16 @@ def explain(error: BaseException) -> str | None:
     ):  # torch's, without importing torch for it
         return f"the memory of the GPU is full: use fewer environments, or session.device=cpu ({error})"
     if ours:
-        return f"{ours}{_node(error)}"
+        return f"{ours}{_locate_node(error)}"
     if missing:
         key = str(missing.full_key or missing)
         return f"{key} has no default and must be given: {key}=<value>"
     if isinstance(error, MissingConfigException):
-        return _no_such_option(error)
+        return _explain_missing_option(error)
     if isinstance(error, InstantiationException):
-        return _bad_node(error)
+        return _explain_bad_node(error)
     if isinstance(error, ConfigCompositionException):
-        return _bad_override(error)
+        return _explain_bad_override(error)
     if isinstance(error, (HydraException, OmegaConfBaseException)) or str(error).startswith(
         "Config group override must"
     ):
@@ -232,27 +242,27 @@ def explain(error: BaseException) -> str | None:
     return None
 
 
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
+def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__
 
 
-def _no_such_option(error: MissingConfigException) -> str:
+def _explain_missing_option(error: MissingConfigException) -> str:
     group, _, name = str(error.missing_cfg_file).rpartition("/")
     if not group:
         return str(error).split("\nConfig search path")[0]
     if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
         return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
     offered = error.options or [
-        option.name for option in registry.options() if option.group == group
+        option.name for option in registry.list_options() if option.group == group
     ]  # Hydra: none for a list
     if not offered:
         return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
-    return f"there is no {group}={name}; {choices(name, offered)}"
+    return f"there is no {group}={name}; {list_choices(name, offered)}"
 
 
-def _bad_node(error: InstantiationException) -> str:
+def _explain_bad_node(error: InstantiationException) -> str:
     """Explains a node that cannot be built: a field that its spec does not have, one that it lacks, a target that is not there."""
     cause = error.__cause__
     called = re.search(r"call to target '([\w.]+)'", str(error))
@@ -260,13 +270,13 @@ def _bad_node(error: InstantiationException) -> str:
         known = list(getattr(get_class(called[1]), "__dataclass_fields__", ()))
         name = called[1].rpartition(".")[2]
         if unknown := re.search(r"unexpected keyword argument '(\w+)'", str(cause)):
-            return f"{name} has no field '{unknown[1]}'; {choices(unknown[1], known)}{_node(error)}"
+            return f"{name} has no field '{unknown[1]}'; {list_choices(unknown[1], known)}{_locate_node(error)}"
         if lacking := re.search(r"missing \d+ required keyword-only arguments?: (.+)", str(cause)):
-            return f"{name} lacks {lacking[1]}{_node(error)}"
+            return f"{name} lacks {lacking[1]}{_locate_node(error)}"
     return str(error)
 
 
-def _node(error: BaseException) -> str:
+def _locate_node(error: BaseException) -> str:
     """Returns where in the configuration an object could not be built, as the tail of a message."""
     found = (
         re.search(r"full_key: (\S+)", str(error))
@@ -276,7 +286,7 @@ def _node(error: BaseException) -> str:
     return f" (in '{found[1]}': change {found[1]}.<field>=… or its file)" if found else ""
 
 
-def _bad_override(error: ConfigCompositionException) -> str:
+def _explain_bad_override(error: ConfigCompositionException) -> str:
     """Explains an override of something that the configuration does not hold."""
     text = str(error)
     found = re.search(r"(?:In '([^']+)': )?Could not override '([^']+)'", text)
@@ -297,12 +307,12 @@ def _bad_override(error: ConfigCompositionException) -> str:
     with contextlib.suppress(
         Exception
     ):  # the mode itself may not compose; then the short answer must do
-        cfg = _mode_alone()
+        cfg = _compose_mode()
         if "No match in the defaults list" in text or key in {
-            option.group for option in registry.options()
+            option.group for option in registry.list_options()
         }:
             groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra")]
-            return f"{source} '{key}', but mode={_mode_name(cfg)} does not use such a group; {choices(key, groups)}"
+            return f"{source} '{key}', but mode={_read_mode_name(cfg)} does not use such a group; {list_choices(key, groups)}"
         parent, _, leaf = key.rpartition(".")
         while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:
             parent, _, leaf = parent.rpartition(".")
@@ -311,22 +321,22 @@ def _bad_override(error: ConfigCompositionException) -> str:
             if isinstance(node, DictConfig)
             else []
         )
-        return f"{source} '{key}', but '{parent or f'mode={_mode_name(cfg)}'}' has no '{leaf}'; {choices(leaf, names)}"
+        return f"{source} '{key}', but '{parent or f'mode={_read_mode_name(cfg)}'}' has no '{leaf}'; {list_choices(leaf, names)}"
     return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --cfg job` shows what it has"
 
 
-def _mode_alone() -> DictConfig:
+def _compose_mode() -> DictConfig:
     """Composes the mode of the command line without any other override, to see what it offers."""
     modes = [arg for arg in sys.argv[1:] if arg.startswith("mode=")]
     with hydra.initialize_config_module("conf", version_base="1.3"):
         return hydra.compose("config", overrides=modes[-1:], return_hydra_config=True)
 
 
-def _mode_name(cfg: DictConfig) -> str:
+def _read_mode_name(cfg: DictConfig) -> str:
     return str(cfg._target_).split(".")[-2]
 
 
-def _resolved(cfg: DictConfig) -> str:
+def _format_resolved(cfg: DictConfig) -> str:
     """Returns the text of `resolved.yaml`, which runs again in a new folder."""
     values = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
     values.session.out = "???"
@@ -338,7 +348,7 @@ def _resolved(cfg: DictConfig) -> str:
 
 
 @contextlib.contextmanager
-def _hydra_raises() -> Iterator[None]:
+def _make_hydra_raise() -> Iterator[None]:
     """Makes Hydra raise its errors instead of printing them and leaving."""
     name = "HYDRA_FULL_ERROR"
     before = os.environ.get(name)

@@ -32,7 +32,7 @@ class Rank:
         return self.index == 0
 
 
-def own() -> Rank:
+def read_rank() -> Rank:
     """Returns what `torchrun` has said about this process (`RANK`, `LOCAL_RANK`, `WORLD_SIZE`).
 
     Raises:
@@ -61,7 +61,7 @@ def check_together(mode: type, sweep: bool) -> None:
     Raises:
         ConfigError: There are several for a mode that is the work of one, or for a sweep.
     """
-    if own().count == 1:
+    if read_rank().count == 1:
         return
     if not getattr(mode, "together", False):
         raise ConfigError(f"{mode.__name__} is the work of one process: start it without torchrun")

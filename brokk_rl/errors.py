@@ -48,7 +48,7 @@ class StorageError(BrokkError):
     """A file could not be written; nothing half-written is left behind."""
 
 
-def choices(name: str, known: Iterable[str]) -> str:
+def list_choices(name: str, known: Iterable[str]) -> str:
     """Returns the tail of a message about an unknown name: the nearest choices first, then all of them."""
     names = sorted(known)
     near = get_close_matches(name, names, n=1)

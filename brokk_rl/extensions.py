@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from brokk_rl import registry
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 
 GROUP = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>.*)", re.DOTALL)
 """An override of a config group: group, package, value."""
@@ -39,33 +39,33 @@ class Extensions(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Called by Hydra while it looks for the configuration."""
-        for package in registry.packages():
+        for package in registry.find_packages():
             if package != registry.CORE:
                 search_path.append(provider=package, path=f"pkg://{package}")
 
 
-def register(arguments: Sequence[str]) -> None:
+def register_options(arguments: Sequence[str]) -> None:
     """Makes the options of installed extensions, and the files that `arguments` name, known to Hydra.
 
     Raises:
         ConfigError: two packages offer the same option (Hydra itself would silently take the
             first), or a file cannot be used.
     """
-    options = registry.options()
+    options = registry.list_options()
     Plugins.instance().register(Extensions)
     groups = {option.group for option in options}
     for argument in arguments:
         override = GROUP.fullmatch(argument)
         if override and override["group"] in groups:
             for found in FILE.finditer(override["value"]):
-                _offer(
+                _offer_file(
                     override["group"],
                     (found["double"] or found["single"] or found["plain"]).strip(),
                     options,
                 )
 
 
-def _offer(group: str, name: str, options: Sequence[registry.Option]) -> None:
+def _offer_file(group: str, name: str, options: Sequence[registry.Option]) -> None:
     """Puts the file `name` into Hydra's store as the option `@<name>` of `group`."""
     node, package = _read(group, name, options)
     folder, _, stem = f"@{name}".rpartition("/")
@@ -100,23 +100,23 @@ def _read(
     node = OmegaConf.to_container(loaded, resolve=False) if isinstance(loaded, DictConfig) else None
     if not isinstance(node, dict) or not node:
         raise ConfigError(f"{where}: expected a mapping, as in a file of conf/{group}")
-    for place, value in _leaves(node):
+    for place, value in _iterate_leaves(node):
         _check_plain(where, place, value)
     mine = {
         str(shipped["_target_"]): package
-        for shipped, package in _shipped(options, group)
+        for shipped, package in _iterate_shipped(options, group)
         if "_target_" in shipped
     }
     ours = {
         str(target)
-        for shipped, _ in _shipped(options)
-        for place, target in _leaves(shipped)
+        for shipped, _ in _iterate_shipped(options)
+        for place, target in _iterate_leaves(shipped)
         if place[-1] == "_target_"
     }
-    package = _package(
-        where, group, text, node, mine, {package for _, package in _shipped(options, group)}
+    package = _find_package(
+        where, group, text, node, mine, {package for _, package in _iterate_shipped(options, group)}
     )
-    for place, target in _leaves(node):
+    for place, target in _iterate_leaves(node):
         if place[-1] == "_target_":
             # the option itself, or those of a file that holds several by name
             itself = package != EVERYWHERE and len(place) == (1 if "_target_" in node else 2)
@@ -124,7 +124,7 @@ def _read(
             if target not in known:
                 kind = f"no {group}" if itself else "nothing of ours"
                 raise ConfigError(
-                    f"{where}: '{'.'.join(place)}: {target}' is {kind}; {choices(str(target), known)}"
+                    f"{where}: '{'.'.join(place)}: {target}' is {kind}; {list_choices(str(target), known)}"
                 )
     return {str(key): value for key, value in node.items()}, package
 
@@ -147,7 +147,7 @@ def _check_plain(where: str, place: tuple[str, ...], value: Any) -> None:
         raise ConfigError(f"{named} changes Hydra's own settings, which a file given by @ cannot")
 
 
-def _package(
+def _find_package(
     where: str,
     group: str,
     text: str,
@@ -168,7 +168,7 @@ def _package(
     return EVERYWHERE if used == {EVERYWHERE} else None
 
 
-def _shipped(
+def _iterate_shipped(
     options: Sequence[registry.Option], group: str | None = None
 ) -> Iterator[tuple[dict[Any, Any], str | None]]:
     """Yields content and stated package of each option, of one group or of all."""
@@ -179,13 +179,15 @@ def _shipped(
             yield yaml.safe_load(text) or {}, stated[1] if stated else None
 
 
-def _leaves(node: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def _iterate_leaves(
+    node: Any, place: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yields what is neither mapping nor list (or an empty one) with the keys that lead to it; list items have their list's."""
     if isinstance(node, dict) and node:
         for key, value in node.items():
-            yield from _leaves(value, (*place, str(key)))
+            yield from _iterate_leaves(value, (*place, str(key)))
     elif isinstance(node, list) and node:
         for value in node:
-            yield from _leaves(value, place)
+            yield from _iterate_leaves(value, place)
     else:
         yield place, node

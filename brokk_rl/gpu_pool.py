@@ -28,7 +28,7 @@ POLL_S = 0.5
 log = logging.getLogger(__name__)
 
 
-def offer() -> None:
+def offer_places() -> None:
     """Says to the jobs of this sweep which places there are: those that a person has named, else each visible GPU, else one."""
     if OFFERED in os.environ:
         return
@@ -41,14 +41,14 @@ def offer() -> None:
 
 
 @contextmanager
-def taken() -> Iterator[str | None]:
+def take_place() -> Iterator[str | None]:
     """Waits for a free place in a job that submitit started locally, and shows it that GPU alone; elsewhere does nothing."""
     offered = os.environ.get(OFFERED)
     if not offered or os.environ.get("SUBMITIT_EXECUTOR") != "local":
         yield None
         return
     names = [name.strip() for name in offered.split(",")]
-    file, gpu = _wait(names)
+    file, gpu = _wait_for_place(names)
     try:
         os.environ["CUDA_VISIBLE_DEVICES"] = "" if gpu == NO_GPU else gpu
         yield gpu
@@ -56,7 +56,7 @@ def taken() -> Iterator[str | None]:
         file.close()
 
 
-def _wait(names: list[str]) -> tuple[IO[str], str]:
+def _wait_for_place(names: list[str]) -> tuple[IO[str], str]:
     """Returns the open, locked file of the first place that is free, and its GPU."""
     folder = Path(tempfile.gettempdir()) / f"brokk_places_{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)

@@ -11,7 +11,7 @@ from scipy import stats
 CONFIDENCE = 0.95
 
 
-def wilson(successes: float, trials: int) -> tuple[float, float]:
+def compute_wilson_interval(successes: float, trials: int) -> tuple[float, float]:
     """Returns the Wilson score interval of a rate; right also at 0 and 1, where the usual formula gives an interval of width 0.
 
     Source: Wilson 1927, equation (10), without continuity correction.
@@ -25,7 +25,7 @@ def wilson(successes: float, trials: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def student(values: Sequence[float]) -> tuple[float, float] | None:
+def compute_student_interval(values: Sequence[float]) -> tuple[float, float] | None:
     """Returns Student's interval of the mean of independent values, such as one per seed; `None` for fewer than two."""
     count = len(values)
     if count < 2:

@@ -257,7 +257,7 @@ class Machine:
             )
 
 
-def exclusive_mask(is_exclusive: Any, positioning: Any) -> Any:
+def mask_exclusive_joints(is_exclusive: Any, positioning: Any) -> Any:
     """Returns which joints may be commanded: the exclusive ones while positioning, else all the others.
 
     These are the paper's masks [0, 1, 0, 0, 0] and [1, 0, 1, 1, 1]; tasks, excitations, guard and

@@ -47,29 +47,33 @@ class Option:
         text = self.path.read_text()
         target = (yaml.safe_load(text) or {}).get("_target_")
         shared = self.group in SAME_SPEC
-        return (_docstring_line(target) if target and not shared else "") or _comment(text)
+        return (_read_docstring_line(target) if target and not shared else "") or _read_comment(
+            text
+        )
 
 
-def packages() -> dict[str, Path]:
+def find_packages() -> dict[str, Path]:
     """Returns the folder of each config package: ours first, then those of installed extensions by entry point.
 
     Raises:
         ConfigError: An extension names a package that cannot be found.
     """
-    found = {CORE: _folder(CORE, "brokk_rl")}
+    found = {CORE: _find_folder(CORE, "brokk_rl")}
     for point in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
-        found[point.value] = _folder(point.value, f"entry point '{point.name}' of {ENTRY_POINTS}")
+        found[point.value] = _find_folder(
+            point.value, f"entry point '{point.name}' of {ENTRY_POINTS}"
+        )
     return found
 
 
-def options() -> list[Option]:
+def list_options() -> list[Option]:
     """Returns every option of every group, sorted by group and name.
 
     Raises:
         ConfigError: Two packages offer the same option.
     """
     found: dict[tuple[str, str], Option] = {}
-    for package, folder in packages().items():
+    for package, folder in find_packages().items():
         for path in sorted(folder.rglob("*.yaml")):
             group, name = path.parent.relative_to(folder).as_posix(), path.stem
             if group == "." or group.split("/")[0] in SETTINGS:
@@ -82,7 +86,7 @@ def options() -> list[Option]:
     return [found[key] for key in sorted(found)]
 
 
-def _folder(package: str, who: str) -> Path:
+def _find_folder(package: str, who: str) -> Path:
     try:
         place = util.find_spec(package)
     except ModuleNotFoundError:
@@ -94,7 +98,7 @@ def _folder(package: str, who: str) -> Path:
     return Path(next(iter(place.submodule_search_locations)))
 
 
-def _docstring_line(target: str) -> str:
+def _read_docstring_line(target: str) -> str:
     """Returns the first line of the docstring of the class or function `target`, '' where it cannot be found."""
     module, _, name = str(target).rpartition(".")
     try:
@@ -109,7 +113,7 @@ def _docstring_line(target: str) -> str:
     return ""
 
 
-def _comment(text: str) -> str:
+def _read_comment(text: str) -> str:
     """Returns the first sentence of the comment on top of a file, '' where there is none."""
     lines = []
     for line in text.splitlines():

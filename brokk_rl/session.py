@@ -81,7 +81,7 @@ class Session:
         import torch
 
         kind, _, index = self.device.partition(":")
-        rank = distributed.own()
+        rank = distributed.read_rank()
         if rank.count > 1:
             if index:
                 raise DeviceError(
@@ -113,7 +113,7 @@ class Session:
         Of several processes the first has the streams of a process that is alone, each other one
         streams of its own.
         """
-        rank = distributed.own().index
+        rank = distributed.read_rank().index
         key = f"{self.seed}/{name}" + (f"/rank{rank}" if rank else "")
         return int.from_bytes(hashlib.sha256(key.encode()).digest()[:4], "little")
 
@@ -138,7 +138,9 @@ class Session:
         torch.manual_seed(self.stream("torch"))
 
     @contextmanager
-    def start(self, resolved: str, facts: dict[str, Any], resume: bool = False) -> Iterator[Record]:
+    def start(
+        self, resolved: str, facts: dict[str, Any], resume: bool = False
+    ) -> Iterator[SessionRecord]:
         """Makes the run folder, writes `resolved.yaml` and keeps `session.json` up to date until the block ends.
 
         Args:
@@ -152,8 +154,8 @@ class Session:
             StorageError: The folder holds a run already and `resume` is false, or cannot be
                 written.
         """
-        if not distributed.own().first:
-            yield Record(self.folder)
+        if not distributed.read_rank().first:
+            yield SessionRecord(self.folder)
             return
         before = read_record(self.folder) if self.folder.is_dir() else None
         if before and not resume:
@@ -162,15 +164,15 @@ class Session:
                 "Give another folder with session.out=<folder>, or delete this one."
             )
         fields = {
-            "schema": 1, "outcome": "running", "objective": None, "started": _now(), "ended": None,
+            "schema": 1, "outcome": "running", "objective": None, "started": _format_now(), "ended": None,
             "command": ["brokk", *sys.argv[1:]], **facts,
-            "seed": self.seed, "device": self.device, "commit": commit(), "versions": versions(), "pid": os.getpid(),
+            "seed": self.seed, "device": self.device, "commit": describe_commit(), "versions": read_versions(), "pid": os.getpid(),
         }  # fmt: skip
         if before:
             fields["started"] = before.get("started", fields["started"])
-            fields["resumed"] = [*before.get("resumed", []), _now()]
-        record = Record(self.folder, fields)
-        new_folders = missing_folders(self.folder)
+            fields["resumed"] = [*before.get("resumed", []), _format_now()]
+        record = SessionRecord(self.folder, fields)
+        new_folders = list_missing_folders(self.folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_text(self.folder / RESOLVED, resolved)
@@ -193,7 +195,7 @@ class Session:
             raise
         finally:
             if record:
-                record.fields |= {"outcome": outcome, "ended": _now()}
+                record.fields |= {"outcome": outcome, "ended": _format_now()}
                 record.write()
 
     def _take_back(self, new_folders: Sequence[Path]) -> bool:
@@ -202,12 +204,12 @@ class Session:
             return False
         for name in (RECORD, RESOLVED):
             (self.folder / name).unlink()
-        remove_empty(new_folders)
+        remove_empty_folders(new_folders)
         return True
 
 
 @dataclass
-class Record:
+class SessionRecord:
     """`session.json` of a running session.
 
     Attributes:
@@ -233,7 +235,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         raise StorageError(f"{folder / RECORD} is not readable as JSON: {error}") from error
 
 
-def earlier(folder: Path, resolved: str) -> dict[str, Any] | None:
+def read_earlier_job(folder: Path, resolved: str) -> dict[str, Any] | None:
     """Returns what `session.json` says of the same job of the same sweep, run earlier; `None` where there is none.
 
     So a sweep that is run again, into the same `session.out`, skips what is finished and goes on
@@ -270,19 +272,19 @@ def write_text(path: Path, text: str) -> None:
         part.unlink(missing_ok=True)
 
 
-def missing_folders(folder: Path) -> list[Path]:
+def list_missing_folders(folder: Path) -> list[Path]:
     """Returns `folder` and those above it that do not exist yet, the innermost first."""
     return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
-def remove_empty(folders: Sequence[Path]) -> None:
+def remove_empty_folders(folders: Sequence[Path]) -> None:
     """Removes folders, innermost first, until one holds something."""
     with suppress(OSError):
         for folder in folders:
             folder.rmdir()
 
 
-def versions() -> dict[str, str]:
+def read_versions() -> dict[str, str]:
     """Returns the installed versions of Python and of the packages that decide the result."""
     found = {"python": ".".join(map(str, sys.version_info[:3]))}
     for name in STAMPED:
@@ -293,7 +295,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def commit() -> str | None:
+def describe_commit() -> str | None:
     """Returns the commit of the checkout that this code runs from, `-dirty` after it when files differ; `None` outside one."""
     root = Path(__file__).parents[1]
     if not (root / ".git").exists():  # an installed wheel may lie inside someone else's checkout
@@ -316,5 +318,5 @@ def commit() -> str | None:
         return None
 
 
-def _now() -> str:
+def _format_now() -> str:
     return datetime.now().astimezone().isoformat(timespec="seconds")

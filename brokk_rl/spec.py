@@ -28,19 +28,19 @@ def _post_init(self: Any) -> None:
     for field in fields(self):
         where = f"{type(self).__name__}.{field.name}"
         object.__setattr__(
-            self, field.name, _fitted(getattr(self, field.name), hints[field.name], where)
+            self, field.name, _convert(getattr(self, field.name), hints[field.name], where)
         )
     if check := getattr(self, "check", None):
         check()
 
 
-def _fitted(value: Any, hint: Any, where: str) -> Any:
+def _convert(value: Any, hint: Any, where: str) -> Any:
     """Returns `value` as `hint` wants it, or raises a `ConfigError`."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return value
     if origin in (Union, types.UnionType):
-        return _first_fit(value, args, where, hint)
+        return _convert_union(value, args, where, hint)
     if origin is typing.Literal:
         if value not in args:
             raise ConfigError(
@@ -54,12 +54,12 @@ def _fitted(value: Any, hint: Any, where: str) -> Any:
                 f"{where}: expected {len(inner)} values, got {len(value)}: {list(value)}"
             )
         return tuple(
-            _fitted(v, h, f"{where}[{i}]")
+            _convert(v, h, f"{where}[{i}]")
             for i, (v, h) in enumerate(zip(value, inner, strict=True))
         )
     if origin is dict and isinstance(value, dict):
         return {
-            _fitted(k, args[0], where): _fitted(v, args[1], f"{where}.{k}")
+            _convert(k, args[0], where): _convert(v, args[1], f"{where}.{k}")
             for k, v in value.items()
         }
     plain = origin or hint
@@ -75,14 +75,14 @@ def _fitted(value: Any, hint: Any, where: str) -> Any:
     return value
 
 
-def _first_fit(value: Any, hints: tuple[Any, ...], where: str, whole: Any) -> Any:
+def _convert_union(value: Any, hints: tuple[Any, ...], where: str, whole: Any) -> Any:
     for hint in hints:
         if hint is type(None):
             if value is None:
                 return None
             continue
         try:
-            return _fitted(value, hint, where)
+            return _convert(value, hint, where)
         except ConfigError:
             continue
     raise ConfigError(f"{where}: expected {whole}, got {type(value).__name__} {value!r}")

@@ -9,7 +9,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from brokk_rl import gpu_pool
-from brokk_rl.session import missing_folders, remove_empty
+from brokk_rl.session import list_missing_folders, remove_empty_folders
 
 
 class SweepFolder(Callback):
@@ -19,9 +19,9 @@ class SweepFolder(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Called by Hydra before it makes the folder."""
-        type(self).new = tuple(missing_folders(Path(str(config.hydra.sweep.dir))))
+        type(self).new = tuple(list_missing_folders(Path(str(config.hydra.sweep.dir))))
         if str(config.hydra.launcher._target_).endswith(".LocalLauncher"):
-            gpu_pool.offer()
+            gpu_pool.offer_places()
 
     @classmethod
     def drop_if_unused(cls) -> None:
@@ -32,5 +32,5 @@ class SweepFolder(Callback):
             and {path.name for path in cls.new[0].iterdir()} <= {"multirun.yaml"}
         ):
             (cls.new[0] / "multirun.yaml").unlink(missing_ok=True)
-            remove_empty(cls.new)
+            remove_empty_folders(cls.new)
         cls.new = ()

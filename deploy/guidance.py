@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Lever, Machine
 from brokk_rl.spec import spec
 
@@ -98,7 +98,7 @@ class LeverMap:
         for lever in levers:
             if lever.joint not in names:
                 raise ConfigError(
-                    f"guidance: machine '{machine.name}' has no joint '{lever.joint}'; {choices(lever.joint, names)}"
+                    f"guidance: machine '{machine.name}' has no joint '{lever.joint}'; {list_choices(lever.joint, names)}"
                 )
         by_joint = {lever.joint: lever for lever in levers}
         if missing := [name for name in names if name not in by_joint]:

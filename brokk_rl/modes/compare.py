@@ -17,19 +17,19 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from brokk_rl.comparison_picture import (
+from brokk_rl.comparison import (
     MEASURES,
     RATES,
     REACHED,
     SUCCESS,
     Curve,
-    as_table,
-    draw,
+    build_table,
+    describe_differences,
+    draw_comparison,
     draw_learning,
-    unlike_most,
 )
 from brokk_rl.errors import ConfigError
-from brokk_rl.intervals import student, wilson
+from brokk_rl.intervals import compute_student_interval, compute_wilson_interval
 from brokk_rl.session import RESOLVED, Session, read_record, write_json, write_text
 from brokk_rl.spec import spec
 
@@ -48,7 +48,7 @@ EVALUATED_ON = "evaluated on"
 
 
 @spec
-class Runs:
+class RunSelection:
     """Which runs to compare.
 
     Attributes:
@@ -63,32 +63,34 @@ class Compare:
     """Compares runs: what differs, success with 95 % intervals, other figures, how they learned; as tables and pictures."""
 
     session: Session
-    compare: Runs
+    compare: RunSelection
 
     def run(self) -> None:
         """Prints the table and writes `comparison.{json,csv,png}`, and `learning.{csv,png}` where runs trained."""
         patterns = (self.compare.runs,) if isinstance(self.compare.runs, str) else self.compare.runs
-        runs = [load(folder) for folder in find(patterns)]
-        columns = differing(runs)
+        runs = [load_run(folder) for folder in find_runs(patterns)]
+        columns = find_differences(runs)
         results = [result for run in runs for result in run.results(columns)]
-        groups = grouped(results)
+        groups = group_results(results)
         folder = self.session.folder
         write_json(
             folder / "comparison.json",
             {"schema": 1, "columns": columns, "groups": groups, "runs": results},
         )
-        write_text(folder / "comparison.csv", as_csv(columns, results))
-        draw(groups).savefig(folder / "comparison.png", dpi=150)
+        write_text(folder / "comparison.csv", format_csv(columns, results))
+        draw_comparison(groups).savefig(folder / "comparison.png", dpi=150)
         self._learning(runs, columns)
         console = Console()
-        console.print(as_table(columns, groups), width=None if console.is_terminal else FILE_WIDTH)
+        console.print(
+            build_table(columns, groups), width=None if console.is_terminal else FILE_WIDTH
+        )
         log.info("%d runs compared in %s", len(runs), folder)
 
-    def _learning(self, runs: Sequence[Run], columns: Sequence[str]) -> None:
-        trained = [(run, curve) for run in runs if (curve := progress(run.folder))]
+    def _learning(self, runs: Sequence[EvaluatedRun], columns: Sequence[str]) -> None:
+        trained = [(run, curve) for run in runs if (curve := read_progress(run.folder))]
         if not trained:
             return
-        variations = unlike_most(
+        variations = describe_differences(
             [{"variation": {column: run.says(column) for column in columns}} for run, _ in trained]
         )
         curves: dict[str, list[Curve]] = {}
@@ -121,7 +123,7 @@ class Compare:
 
 
 @dataclass(frozen=True)
-class Run:
+class EvaluatedRun:
     """One evaluated run.
 
     Attributes:
@@ -136,7 +138,7 @@ class Run:
     evaluation: dict[str, Any]
     record: dict[str, Any]
     values: dict[str, Any]
-    training: Run | None = None
+    training: EvaluatedRun | None = None
 
     @property
     def choices(self) -> dict[str, Any]:
@@ -179,11 +181,11 @@ class Run:
                 "seed": seed,
                 "variation": variation,
             }
-            found.append({**about, **_figures(self.folder, figures)})
+            found.append({**about, **_collect_figures(self.folder, figures)})
         return found
 
 
-def find(patterns: Sequence[str]) -> list[Path]:
+def find_runs(patterns: Sequence[str]) -> list[Path]:
     """Returns the run folders that hold an evaluation, in natural order of their paths.
 
     Raises:
@@ -200,7 +202,7 @@ def find(patterns: Sequence[str]) -> list[Path]:
     return sorted(found, key=lambda path: [part.zfill(9) for part in re.split(r"(\d+)", str(path))])
 
 
-def load(folder: Path) -> Run:
+def load_run(folder: Path) -> EvaluatedRun:
     """Reads what a run folder says.
 
     Raises:
@@ -210,15 +212,17 @@ def load(folder: Path) -> Run:
     try:
         evaluation = json.loads(path.read_text())
         path = folder / RESOLVED
-        values = _flat(yaml.safe_load(path.read_text())) if path.exists() else {}
+        values = _flatten(yaml.safe_load(path.read_text())) if path.exists() else {}
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise ConfigError(
             f"{path} cannot be read ({error}); evaluate the run again or leave it out of compare.runs"
         ) from error
-    return Run(folder, evaluation, read_record(folder) or {}, values, _training(folder, values))
+    return EvaluatedRun(
+        folder, evaluation, read_record(folder) or {}, values, _find_training_run(folder, values)
+    )
 
 
-def progress(folder: Path) -> Curve | None:
+def read_progress(folder: Path) -> Curve | None:
     """Returns the learning curve of a run; none where nothing was trained."""
     path = folder / "progress.csv"
     if not path.is_file():
@@ -237,7 +241,7 @@ def progress(folder: Path) -> Curve | None:
         ) from error
 
 
-def differing(runs: Sequence[Run]) -> list[str]:
+def find_differences(runs: Sequence[EvaluatedRun]) -> list[str]:
     """Returns what differs between the runs: choices of groups first, then single values that were overridden.
 
     An evaluation of a trained policy counts as what the policy was trained with; on what it was
@@ -260,7 +264,7 @@ def differing(runs: Sequence[Run]) -> list[str]:
     return groups + keys + elsewhere
 
 
-def _training(folder: Path, values: dict[str, Any]) -> Run | None:
+def _find_training_run(folder: Path, values: dict[str, Any]) -> EvaluatedRun | None:
     """Returns the run whose policy was evaluated in a folder; runs may have been moved together."""
     named = values.get("policy.folder")
     if not isinstance(named, str):
@@ -271,11 +275,11 @@ def _training(folder: Path, values: dict[str, Any]) -> Run | None:
             and (place / EVALUATION).is_file()
             and (place / RESOLVED).is_file()
         ):
-            return load(place)
+            return load_run(place)
     return None
 
 
-def grouped(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def group_results(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Returns one entry for each policy and variation, over its seeds.
 
     A rate of several seeds has Student's interval over the seeds, as training differs from seed to
@@ -291,7 +295,7 @@ def grouped(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             "seeds": [member["seed"] for member in members],
             "runs": len(members),
             **{
-                name: _over_seeds([member[name] for member in members], name in RATES)
+                name: _average_seeds([member[name] for member in members], name in RATES)
                 for name in (*RATES, *MEASURES)
             },
         }
@@ -299,7 +303,7 @@ def grouped(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def as_csv(columns: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
+def format_csv(columns: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
     """Returns one line for each run and policy."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -324,46 +328,46 @@ def as_csv(columns: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def _figures(folder: Path, evaluation: dict[str, Any]) -> dict[str, Any]:
+def _collect_figures(folder: Path, evaluation: dict[str, Any]) -> dict[str, Any]:
     """Returns the compared figures of one policy, each with mean and interval."""
     try:
         episodes = int(evaluation["episodes"])
-        rates = {name: _number(evaluation[name]) for name in RATES}
+        rates = {name: _read_number(evaluation[name]) for name in RATES}
     except (KeyError, TypeError) as error:
         raise ConfigError(f"{folder / EVALUATION} lacks {error}; evaluate the run again") from error
     found: dict[str, Any] = {"episodes": episodes}
     for name, rate in rates.items():
         found[name] = {
             "mean": rate,
-            "ci95": None if rate is None else wilson(rate * episodes, episodes),
+            "ci95": None if rate is None else compute_wilson_interval(rate * episodes, episodes),
         }
     for name in MEASURES:
-        found[name] = {"mean": _number(evaluation.get(name)), "ci95": None}
+        found[name] = {"mean": _read_number(evaluation.get(name)), "ci95": None}
     return found
 
 
-def _number(value: Any) -> float | None:
+def _read_number(value: Any) -> float | None:
     """Returns a figure of `evaluation.json`: a number, or the middle of a distribution."""
     if isinstance(value, dict):
         value = value.get("median", value.get("mean"))
     return None if value is None else float(value)
 
 
-def _over_seeds(figures: Sequence[dict[str, Any]], is_rate: bool) -> dict[str, Any]:
+def _average_seeds(figures: Sequence[dict[str, Any]], is_rate: bool) -> dict[str, Any]:
     if len(figures) == 1:
         return figures[0]
     values = [figure["mean"] for figure in figures if figure["mean"] is not None]
-    interval = student(values)
+    interval = compute_student_interval(values)
     if interval and is_rate:
         interval = max(0.0, interval[0]), min(1.0, interval[1])
     return {"mean": float(np.mean(values)) if values else None, "ci95": interval}
 
 
-def _flat(node: Any, prefix: str = "") -> dict[str, Any]:
+def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:
     if not isinstance(node, dict):
         return {prefix: node}
     return {
         key: value
         for name, child in node.items()
-        for key, value in _flat(child, f"{prefix}.{name}" if prefix else str(name)).items()
+        for key, value in _flatten(child, f"{prefix}.{name}" if prefix else str(name)).items()
     }

@@ -25,12 +25,21 @@ from brokk_rl.sim import probe
 from brokk_rl.spec import spec
 
 DISTRIBUTION = "brokk-rl"
-IMPORT_NAMES = ("brokk_rl", "conf", "tasks", "actuators", "perception", "deploy")
+IMPORT_NAMES = (
+    "brokk_rl",
+    "conf",
+    "tasks",
+    "actuators",
+    "perception",
+    "deploy",
+    "diagnosis",
+    "exam",
+)
 COLORS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
 
 @dataclass(frozen=True)
-class Finding:
+class DoctorFinding:
     """One line of the report.
 
     Attributes:
@@ -46,7 +55,7 @@ class Finding:
 
 
 @spec
-class Limits:
+class DoctorLimits:
     """Where the doctor looks and what it finds too little.
 
     Attributes:
@@ -62,7 +71,7 @@ class Limits:
 class Doctor:
     """Says what works here: versions, GPU, CUDA graphs, kernel cache, rendering, disk, owners of the import names."""
 
-    doctor: Limits
+    doctor: DoctorLimits
 
     def run(self) -> None:
         """Prints the report.
@@ -82,19 +91,19 @@ class Doctor:
         if failed:
             raise SystemExit(1)
 
-    def findings(self) -> Iterator[tuple[str, Finding]]:
+    def findings(self) -> Iterator[tuple[str, DoctorFinding]]:
         """Yields topic and finding, the most basic first; a probe that breaks becomes a warning."""
-        probes: tuple[tuple[str, Callable[[], Iterator[Finding]]], ...] = (
-            ("Python", python),
-            ("packages", packages),
-            ("processor", processor),
-            ("torch", torch_devices),
-            ("CUDA graphs", cuda_graphs),
-            ("Warp", warp),
-            ("rendering", rendering),
-            ("disk", lambda: disk(Path(self.doctor.folder), self.doctor.min_free_gib)),
-            ("import names", import_names),
-            ("extensions", extensions),
+        probes: tuple[tuple[str, Callable[[], Iterator[DoctorFinding]]], ...] = (
+            ("Python", check_python),
+            ("packages", check_packages),
+            ("processor", check_processor),
+            ("torch", check_torch_devices),
+            ("CUDA graphs", check_cuda_graphs),
+            ("Warp", check_warp),
+            ("rendering", check_rendering),
+            ("disk", lambda: check_disk(Path(self.doctor.folder), self.doctor.min_free_gib)),
+            ("import names", check_import_names),
+            ("extensions", check_extensions),
         )
         for topic, examine in probes:
             try:
@@ -103,29 +112,29 @@ class Doctor:
             except (
                 Exception
             ) as error:  # whatever breaks in a foreign package must not hide the rest of the report
-                yield topic, Finding("warn", f"cannot tell: {type(error).__name__}: {error}")
+                yield topic, DoctorFinding("warn", f"cannot tell: {type(error).__name__}: {error}")
 
 
-def python() -> Iterator[Finding]:
+def check_python() -> Iterator[DoctorFinding]:
     """The interpreter against what the project asks for."""
     text = f"{platform.python_version()} on {platform.platform(terse=True)}"
-    about = _metadata()
+    about = _read_metadata()
     wanted = SpecifierSet(about["Requires-Python"] if about else "")
     if wanted.contains(platform.python_version()):
-        yield Finding("ok", text)
+        yield DoctorFinding("ok", text)
     else:
-        yield Finding(
+        yield DoctorFinding(
             "fail",
             f"{text}, but the project wants {wanted}",
             "make again the environment with such a Python: make clean setup",
         )
 
 
-def packages() -> Iterator[Finding]:
+def check_packages() -> Iterator[DoctorFinding]:
     """Installed packages against what the project asks for."""
-    about = _metadata()
+    about = _read_metadata()
     if about is None:
-        yield Finding(
+        yield DoctorFinding(
             "warn",
             f"{DISTRIBUTION} runs from its sources and is not installed; versions are not checked",
             "make setup",
@@ -142,20 +151,22 @@ def packages() -> Iterator[Finding]:
         try:
             version = metadata.version(requirement.name)
         except metadata.PackageNotFoundError:
-            yield Finding("fail", f"{requirement.name} is missing", "make setup")
+            yield DoctorFinding("fail", f"{requirement.name} is missing", "make setup")
             continue
         if requirement.specifier.contains(version, prereleases=True):
             fit += 1
         else:
-            yield Finding(
+            yield DoctorFinding(
                 "warn",
                 f"{requirement.name} {version} is installed, the project wants {requirement.specifier}",
                 "make setup",
             )
-    yield Finding("ok", f"{fit} of {len(wanted)} as wanted; {DISTRIBUTION} {about['Version']}")
+    yield DoctorFinding(
+        "ok", f"{fit} of {len(wanted)} as wanted; {DISTRIBUTION} {about['Version']}"
+    )
 
 
-def processor() -> Iterator[Finding]:
+def check_processor() -> Iterator[DoctorFinding]:
     """Cores that this process may use, and threads that torch does use."""
     import torch
 
@@ -164,32 +175,34 @@ def processor() -> Iterator[Finding]:
     )
     text = f"{cores} cores ({os.cpu_count()} in all), torch uses {torch.get_num_threads()} threads"
     if torch.get_num_threads() > cores:
-        yield Finding(
+        yield DoctorFinding(
             "warn", text, f"more threads than cores slow each other down: OMP_NUM_THREADS={cores}"
         )
     else:
-        yield Finding("ok", text)
+        yield DoctorFinding("ok", text)
 
 
-def torch_devices() -> Iterator[Finding]:
+def check_torch_devices() -> Iterator[DoctorFinding]:
     """GPUs that torch can use, and the driver behind them."""
     import torch
 
     built = f"{torch.__version__}, built for CUDA {torch.version.cuda or 'none'}"
-    driver = driver_version()
+    driver = read_driver_version()
     if torch.cuda.is_available():
         names = ", ".join(
             torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())
         )
-        yield Finding("ok", f"{built}, driver {driver or 'unknown'}: {names}")
+        yield DoctorFinding("ok", f"{built}, driver {driver or 'unknown'}: {names}")
     elif driver:
         advice = "the driver may be too old for this CUDA, or CUDA_VISIBLE_DEVICES hides the GPU"
-        yield Finding("warn", f"{built}: there is a driver {driver}, but torch sees no GPU", advice)
+        yield DoctorFinding(
+            "warn", f"{built}: there is a driver {driver}, but torch sees no GPU", advice
+        )
     else:
-        yield Finding("ok", f"{built}; no NVIDIA GPU here, everything runs on the CPU")
+        yield DoctorFinding("ok", f"{built}; no NVIDIA GPU here, everything runs on the CPU")
 
 
-def driver_version() -> str | None:
+def read_driver_version() -> str | None:
     """Returns the version of the NVIDIA driver, `None` when there is none."""
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
@@ -201,21 +214,21 @@ def driver_version() -> str | None:
     return lines[0] if lines else None
 
 
-def cuda_graphs() -> Iterator[Finding]:
+def check_cuda_graphs() -> Iterator[DoctorFinding]:
     """Whether a control step can be captured in a CUDA graph; without that a GPU is several times slower."""
     import torch
 
     if not torch.cuda.is_available():
-        yield Finding("ok", "not needed without a GPU")
+        yield DoctorFinding("ok", "not needed without a GPU")
         return
     try:
-        yield Finding("ok", f"captured and replayed one on {probe.capture_graph()}")
+        yield DoctorFinding("ok", f"captured and replayed one on {probe.capture_graph()}")
     except Exception as error:
         advice = "training works, several times slower; a newer driver usually mends it"
-        yield Finding("warn", f"cannot capture: {error}", advice)
+        yield DoctorFinding("warn", f"cannot capture: {error}", advice)
 
 
-def warp() -> Iterator[Finding]:
+def check_warp() -> Iterator[DoctorFinding]:
     """Version of Warp, and its kernel cache, which saves a minute or two of compiling at each start."""
     cache = probe.kernel_cache()
     size = (
@@ -223,32 +236,34 @@ def warp() -> Iterator[Finding]:
         if cache.exists()
         else 0
     )
-    yield Finding("ok", f"{probe.warp_version()}, kernel cache {cache} ({size / 2**20:.1f} MiB)")
+    yield DoctorFinding(
+        "ok", f"{probe.warp_version()}, kernel cache {cache} ({size / 2**20:.1f} MiB)"
+    )
 
 
-def rendering() -> Iterator[Finding]:
+def check_rendering() -> Iterator[DoctorFinding]:
     """Whether MuJoCo can draw pictures, which only videos need."""
     name = probe.working_renderer()
     if name:
-        yield Finding("ok", f"MuJoCo draws with MUJOCO_GL={name}")
+        yield DoctorFinding("ok", f"MuJoCo draws with MUJOCO_GL={name}")
     else:
         asked = os.environ.get("MUJOCO_GL")
         tried = f"MUJOCO_GL={asked}" if asked else f"any of {', '.join(probe.RENDERERS)}"
-        yield Finding(
+        yield DoctorFinding(
             "warn",
             f"MuJoCo cannot draw with {tried}: no videos",
             "install libegl1 and libgl1, or libosmesa6",
         )
 
 
-def disk(folder: Path, min_free_gib: float) -> Iterator[Finding]:
+def check_disk(folder: Path, min_free_gib: float) -> Iterator[DoctorFinding]:
     """Whether runs can be written, and how much room there is."""
     place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     try:
         with tempfile.TemporaryFile(dir=place):
             pass
     except OSError as error:
-        yield Finding(
+        yield DoctorFinding(
             "fail",
             f"cannot write into {place}: {error.strerror}",
             "work in a folder of your own, or give session.out=<folder>",
@@ -257,13 +272,13 @@ def disk(folder: Path, min_free_gib: float) -> Iterator[Finding]:
     free_gib = shutil.disk_usage(place).free / 2**30
     text = f"{free_gib:.1f} GiB free for {folder}"
     yield (
-        Finding("ok", text)
+        DoctorFinding("ok", text)
         if free_gib >= min_free_gib
-        else Finding("warn", text, "checkpoints and recordings need more; free some space")
+        else DoctorFinding("warn", text, "checkpoints and recordings need more; free some space")
     )
 
 
-def import_names() -> Iterator[Finding]:
+def check_import_names() -> Iterator[DoctorFinding]:
     """Whether our import names are ours: names such as `tasks` or `conf` are taken by other packages as well."""
     home = Path(brokk_rl.__file__).parents[1]
     owned = 0
@@ -276,7 +291,7 @@ def import_names() -> Iterator[Finding]:
         )
         if folder != home / name:
             place = folder or (found.origin if found else None)
-            yield Finding(
+            yield DoctorFinding(
                 "fail",
                 f"'{name}' is {place or 'missing'}, not {home / name}",
                 "install the project in an environment of its own",
@@ -289,26 +304,26 @@ def import_names() -> Iterator[Finding]:
             path.parts[0].removesuffix(".py") for path in distribution.files or () if path.parts
         }
         if name != DISTRIBUTION and (clash := sorted(tops.intersection(IMPORT_NAMES))):
-            yield Finding(
+            yield DoctorFinding(
                 "warn",
                 f"the package {name} also installs {', '.join(clash)}",
                 f"pip uninstall {name}, or use separate environments",
             )
-    yield Finding("ok", f"{owned} of {len(IMPORT_NAMES)} come from {home}")
+    yield DoctorFinding("ok", f"{owned} of {len(IMPORT_NAMES)} come from {home}")
 
 
-def extensions() -> Iterator[Finding]:
+def check_extensions() -> Iterator[DoctorFinding]:
     """Installed packages that add options by entry point."""
     try:
-        others = [package for package in registry.packages() if package != registry.CORE]
-        registry.options()
+        others = [package for package in registry.find_packages() if package != registry.CORE]
+        registry.list_options()
     except BrokkError as error:
-        yield Finding("fail", str(error))
+        yield DoctorFinding("fail", str(error))
         return
-    yield Finding("ok", ", ".join(others) or "none installed")
+    yield DoctorFinding("ok", ", ".join(others) or "none installed")
 
 
-def _metadata() -> metadata.PackageMetadata | None:
+def _read_metadata() -> metadata.PackageMetadata | None:
     try:
         return metadata.metadata(DISTRIBUTION)
     except metadata.PackageNotFoundError:

@@ -4,12 +4,12 @@ from rich.console import Console
 from rich.table import Table
 
 from brokk_rl import registry
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.spec import spec
 
 
 @spec
-class Selection:
+class ListSelection:
     """What to list.
 
     Attributes:
@@ -20,18 +20,18 @@ class Selection:
 
 
 @spec
-class List:
+class ListOptions:
     """Prints the options of every config group, those of installed extensions too."""
 
-    list: Selection
+    list: ListSelection
 
     def run(self) -> None:
         """Prints the list."""
-        entries = registry.options()
+        entries = registry.list_options()
         groups = sorted({option.group for option in entries})
         if self.list.group and self.list.group not in groups:
             raise ConfigError(
-                f"list.group: there is no group '{self.list.group}'; {choices(self.list.group, groups)}"
+                f"list.group: there is no group '{self.list.group}'; {list_choices(self.list.group, groups)}"
             )
         table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
         table.add_column(no_wrap=True)

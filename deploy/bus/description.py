@@ -20,7 +20,7 @@ import cantools
 from cantools.database import Database
 from cantools.database.can import Message
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from deploy.bus.protection import Fault, crc8
 
@@ -115,7 +115,7 @@ class Description:
         """
         if signal not in self._home:
             raise ConfigError(
-                f"bus: {self.name} has no signal '{signal}'; {choices(signal, self._home)}"
+                f"bus: {self.name} has no signal '{signal}'; {list_choices(signal, self._home)}"
             )
         return self._home[signal]
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
@@ -90,7 +90,7 @@ class Sitting:
         there = [who for who in data.plan["participants"] if who not in data.plan.get("erased", {})]
         if participant is not None and participant not in there:
             raise ConfigError(
-                f"study.participant={participant}: nobody of the plan; {choices(participant, there)}"
+                f"study.participant={participant}: nobody of the plan; {list_choices(participant, there)}"
             )
         target = session.folder / TARGET
         loop = replace(

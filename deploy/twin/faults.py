@@ -14,7 +14,7 @@ import socket
 import time
 from dataclasses import dataclass, field
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from deploy.bus.description import Layout
 from deploy.bus.wire import Wired
 
@@ -89,7 +89,7 @@ class Faults:
                 f"fault: expected JSON with 'fault', got {text[:80]!r} ({error})"
             ) from error
         if fault not in KNOWN:
-            raise ConfigError(f"fault: there is no '{fault}'; {choices(str(fault), KNOWN)}")
+            raise ConfigError(f"fault: there is no '{fault}'; {list_choices(str(fault), KNOWN)}")
         if fault == "none":
             self.until_s.clear()
         else:

@@ -36,12 +36,12 @@ Curve = dict[str, list[float]]
 """Columns of a run's progress: seconds, control steps and strict success of training episodes."""
 
 
-def as_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Table:
+def build_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Table:
     """Returns the table for a person."""
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
     settings = [[str(group["variation"][column]) for column in columns] for group in groups]
     if len(columns) > MOST_COLUMNS:
-        columns, settings = [UNLIKE_MOST], [[text] for text in unlike_most(groups)]
+        columns, settings = [UNLIKE_MOST], [[text] for text in describe_differences(groups)]
     for heading in ("policy", *columns, "seeds"):
         wide = UNLIKE_MOST_WIDTH if heading == UNLIKE_MOST else None
         table.add_column(heading, no_wrap=heading == "policy", overflow="fold", min_width=wide)
@@ -49,13 +49,14 @@ def as_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Table:
         table.add_column(HEADINGS[name], justify="right", min_width=7)
     for group, setting in zip(groups, settings, strict=True):
         figures = [
-            _text(group[name], SCALES.get(name, 1.0), name in RATES) for name in (*RATES, *MEASURES)
+            _format_value(group[name], SCALES.get(name, 1.0), name in RATES)
+            for name in (*RATES, *MEASURES)
         ]
         table.add_row(group["policy"], *setting, str(group["runs"]), *figures)
     return table
 
 
-def unlike_most(groups: Sequence[dict[str, Any]]) -> list[str]:
+def describe_differences(groups: Sequence[dict[str, Any]]) -> list[str]:
     """Returns, for each group, the values that it does not share with most others; of values all equally frequent, each is said."""
     counts = {
         column: Counter(repr(group["variation"][column]) for group in groups).most_common()
@@ -66,7 +67,7 @@ def unlike_most(groups: Sequence[dict[str, Any]]) -> list[str]:
         for column, found in counts.items()
         if len(found) == 1 or found[0][1] > found[1][1]
     }
-    names = _shortest(list(counts))
+    names = _format_shortest(list(counts))
     return [
         ", ".join(
             f"{names[key]} {value}"
@@ -77,11 +78,11 @@ def unlike_most(groups: Sequence[dict[str, Any]]) -> list[str]:
     ]
 
 
-def draw(groups: Sequence[dict[str, Any]]) -> Figure:
+def draw_comparison(groups: Sequence[dict[str, Any]]) -> Figure:
     """Draws success with its interval, peak force and valve travel, one row for each policy and variation."""
     labels = [
         ", ".join(filter(None, (group["policy"], text)))
-        for group, text in zip(groups, unlike_most(groups), strict=True)
+        for group, text in zip(groups, describe_differences(groups), strict=True)
     ]
     figure = Figure(figsize=(11.0, 1.4 + 0.42 * len(groups)), layout="constrained")
     success, *others = figure.subplots(1, 3, sharey=True, width_ratios=(2, 1, 1))
@@ -90,7 +91,7 @@ def draw(groups: Sequence[dict[str, Any]]) -> Figure:
         (0.14, "success_strict", "#1f5f8b", "o"),
         (-0.14, "success_paper", "#c27c2c", "s"),
     ):
-        _marks(
+        _pick_marks(
             success,
             rows + shift,
             [group[rate] for group in groups],
@@ -100,7 +101,7 @@ def draw(groups: Sequence[dict[str, Any]]) -> Figure:
             HEADINGS[rate],
         )
     for axes, name in zip(others, ("peak_force_n", "valve_travel"), strict=True):
-        _marks(
+        _pick_marks(
             axes,
             rows,
             [group[name] for group in groups],
@@ -161,7 +162,7 @@ def draw_learning(curves: Mapping[str, Sequence[Curve]]) -> Figure:
     return figure
 
 
-def _marks(
+def _pick_marks(
     axes: Axes,
     rows: np.ndarray,
     figures: Sequence[dict[str, Any]],
@@ -190,7 +191,7 @@ def _marks(
             )
 
 
-def _shortest(columns: Sequence[str]) -> dict[str, str]:
+def _format_shortest(columns: Sequence[str]) -> dict[str, str]:
     """Returns the shortest ends of dotted keys that still tell them apart."""
     parts = {column: column.split(".") for column in columns}
 
@@ -208,7 +209,7 @@ def _shortest(columns: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _text(figure: dict[str, Any], scale: float, with_interval: bool) -> str:
+def _format_value(figure: dict[str, Any], scale: float, with_interval: bool) -> str:
     if figure["mean"] is None:
         return "–"
     text = f"{figure['mean'] * scale:.3g}"
