@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from brokk_rl.chain import tool
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
@@ -118,7 +118,7 @@ class DemoFeed:
         path = ()
         if machine.has_bodies and self._guiding:
             path = plan_approach(
-                tool(machine, q).tip_in_base_m,
+                compute_tool_kinematics(machine, q).tip_in_base_m,
                 np.array(chosen.center_in_base_m),
                 np.array(chosen.axis_in_base),
             )

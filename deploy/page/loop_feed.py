@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.chain import tool
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
@@ -280,7 +280,7 @@ class LoopFeed:
     def _path(self, q: tuple[float, ...], target: BoreholeChoice) -> tuple[Vector, ...]:
         if not self._guiding or not self._beside.machine.has_bodies:
             return ()
-        tip_m = tool(self._beside.machine, np.array(q)).tip_in_base_m
+        tip_m = compute_tool_kinematics(self._beside.machine, np.array(q)).tip_in_base_m
         return plan_approach(
             tip_m, np.array(target.center_in_base_m), np.array(target.axis_in_base)
         )

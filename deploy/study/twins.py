@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 
-from brokk_rl.chain import tool
 from brokk_rl.contracts.link import Connection
 from brokk_rl.contracts.operator import OperatorModel, OperatorView, TrialBatch
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
@@ -132,7 +132,7 @@ def desks(
 
 
 def _inserted(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray:
-    away = tool(machine, q).tip_in_base_m - trials.rim_in_base_m
+    away = compute_tool_kinematics(machine, q).tip_in_base_m - trials.rim_in_base_m
     return (np.hypot(away[:, 0], away[:, 1]) <= trials.clearance_m) & (
         away[:, 2] <= -trials.depth_m
     )
