@@ -7,6 +7,8 @@ other is a departure.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from brokk_rl.machine import Machine
@@ -16,6 +18,8 @@ from brokk_rl.spec import spec
 @spec
 class NoFollower:
     """Nobody: the policy's command is given as it is, at once."""
+
+    label: ClassVar = "nobody"
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> NoFollowerModel:
         """Returns the follower that changes nothing; see `brokk_rl.contracts.actuator.Follower`."""

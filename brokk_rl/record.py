@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from brokk_rl.errors import RecordingError, StorageError, choices
+from brokk_rl.errors import RecordingError, StorageError, list_choices
 from brokk_rl.machine import Machine
 
 SCHEMA = "1"
@@ -79,7 +79,7 @@ def check_names(required: Sequence[str], present: Sequence[str]) -> Iterator[Bre
     """Yields the columns that are missing."""
     for name in required:
         if name not in present:
-            yield Breach(f"column '{name}' is missing; {choices(name, present)}", name)
+            yield Breach(f"column '{name}' is missing; {list_choices(name, present)}", name)
 
 
 def check_columns(

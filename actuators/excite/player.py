@@ -11,7 +11,7 @@ import numpy as np
 from actuators.excite.schedule import Approach, ExcitationPlan
 from brokk_rl.contracts.link import Link
 from brokk_rl.errors import ConfigError, LinkError
-from brokk_rl.machine import Machine, exclusive_mask
+from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.spec import spec
@@ -244,7 +244,7 @@ class PlanPlayer:
             np.abs(error) / (self._speed * approach.settle_s), approach.smallest, approach.level
         )
         first = far[:, ~exclusive].any(1)
-        return np.sign(error) * size * far * exclusive_mask(exclusive, ~first)
+        return np.sign(error) * size * far * mask_exclusive_joints(exclusive, ~first)
 
     def _guarded(self, u: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Returns the commands within the guards; exclusive joints wait for the others, whatever a program says."""

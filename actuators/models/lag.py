@@ -1,5 +1,7 @@
 """The actuator without any imperfection: what a simulator assumes that knows nothing of hydraulics."""
 
+from typing import ClassVar
+
 import torch
 
 from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
@@ -66,6 +68,8 @@ class FirstOrderLag:
         spread: Relative half width, by field name, of what is drawn per environment and joint at
             reset.
     """
+
+    label: ClassVar = "lag"
 
     dead_time_s: PerJoint | None
     dead_band_extend: PerJoint

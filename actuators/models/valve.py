@@ -15,6 +15,8 @@ The curve takes in dead bands, gain, asymmetry, notches and saturation; load and
 cylinder are in the pose.
 """
 
+from typing import ClassVar
+
 import numpy as np
 import torch
 
@@ -54,6 +56,8 @@ class ValveActuator:
         spread: Relative half width, by field name, of what is drawn per environment and joint at
             reset.
     """
+
+    label: ClassVar = "valve"
 
     dead_time_s: PerJoint | None
     play: PerJoint

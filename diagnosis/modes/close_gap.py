@@ -11,12 +11,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from brokk_rl.comparison import EVALUATION
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.compare import EVALUATION
 from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
 from brokk_rl.modes.train import Train
 from brokk_rl.rl.policy import CONTRACT, Trained
@@ -24,7 +24,7 @@ from brokk_rl.rl.runner import Training
 from brokk_rl.rl.tracking import Tracking
 from brokk_rl.rl.vec_env import Plant
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 from diagnosis import downstream, downstream_page
 
 log = logging.getLogger(__name__)
@@ -193,7 +193,7 @@ class CloseGap:
 
 
 def _described(plant: Plant) -> str:
-    return " + ".join([type(plant.actuator).__name__.lower(), *plant.effects])
+    return " + ".join([name_spec(plant.actuator), *plant.effects])
 
 
 def _show(found: dict[str, Any], folder: Path) -> None:
