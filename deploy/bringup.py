@@ -32,7 +32,7 @@ from deploy.recorder import reading
 from deploy.recorder.capture import MCAP, Capture
 from deploy.runtime.process_group import Children, Listener
 from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import Aim
+from deploy.runtime.target import TargetSelector
 
 log = logging.getLogger(__name__)
 
@@ -233,7 +233,9 @@ class _Checks:
 
     def _shadow(self) -> Finding:
         self._say("shadow run: the policy runs along, nothing is shown")
-        Aim(self._bringup.target.build(), self._exchange.target, self._exchange.holes).refresh()
+        TargetSelector(
+            self._bringup.target.build(), self._exchange.target, self._exchange.holes
+        ).refresh()
         reasons: list[str] = []
         end_s, number = time.monotonic() + self._bringup.shadow_s, -1
         while time.monotonic() < end_s:

@@ -37,10 +37,10 @@ from deploy.page.scene import approach
 from deploy.page.settings import LINK, OperatorPage
 from deploy.runtime import operator_state
 from deploy.runtime.bus_process import TEXT
-from deploy.runtime.perception_process import frame_of
+from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import Place, holes_of, nearest, place_of
+from deploy.runtime.target import TargetPosition, find_nearest, locate_hole, read_holes
 
 log = logging.getLogger(__name__)
 
@@ -171,7 +171,7 @@ class LoopFeed:
         slot, taken_s = self._exchange.frame, self._frame_t_s()
         if slot is None or taken_s is None or taken_s <= after_s or (record := slot.read()) is None:
             return None
-        return frame_of(record)
+        return read_frame(record)
 
     def wish(self, wish: Wish) -> bool:
         """See `Feed`."""
@@ -234,8 +234,8 @@ class LoopFeed:
 
     def _targets(self, aim: Any | None) -> tuple[Target, ...]:
         """Returns the boreholes that perception knows, and the one that the advice is for, whoever named it."""
-        holes = holes_of(self._exchange.holes)
-        chosen = None if aim is None else nearest(holes, np.array(aim["center_in_base_m"]))
+        holes = read_holes(self._exchange.holes)
+        chosen = None if aim is None else find_nearest(holes, np.array(aim["center_in_base_m"]))
         found = [
             Target(
                 str(int(hole["name"])), _vector(hole["center_in_base_m"]), _vector(hole["axis_in_base"]), float(hole["radius_m"]),
@@ -258,23 +258,23 @@ class LoopFeed:
             )
         return tuple(found)
 
-    def _named(self, name: str) -> Place | None:
+    def _named(self, name: str) -> TargetPosition | None:
         """Returns where the borehole of that name is."""
         one = next(
-            (hole for hole in holes_of(self._exchange.holes) if str(int(hole["name"])) == name),
+            (hole for hole in read_holes(self._exchange.holes) if str(int(hole["name"])) == name),
             None,
         )
-        return None if one is None else place_of(one)
+        return None if one is None else locate_hole(one)
 
-    def _pointed(self, value: str) -> Place | None:
+    def _pointed(self, value: str) -> TargetPosition | None:
         """Returns the borehole that a person points at: one that perception knows, else what is measured there."""
         frame = self.frame(-1.0)
         x, y = (float(part) for part in value.split(","))
         found = frame and borehole_at(frame, x, y, self._beside.page.borehole_radius_m)
         if not frame or not found:
             return None
-        known = nearest(holes_of(self._exchange.holes), found[0])
-        return Place(*found, frame.t_s) if known is None else place_of(known)
+        known = find_nearest(read_holes(self._exchange.holes), found[0])
+        return TargetPosition(*found, frame.t_s) if known is None else locate_hole(known)
 
     def _path(self, q: tuple[float, ...], target: Target) -> tuple[Vector, ...]:
         if not self._guiding or not self._beside.machine.has_bodies:

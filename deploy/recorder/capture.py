@@ -29,7 +29,7 @@ from deploy.bus.description import Description, Layout, located
 from deploy.bus.protection import Fault
 from deploy.picture import jpeg
 from deploy.runtime.bus_process import FRAME, FRAMES
-from deploy.runtime.perception_process import frame_of
+from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import Exchange, wall_offset_ns
@@ -261,7 +261,7 @@ class Pictures:
         record = self._slot.read()
         if record is None:
             return None
-        frame = frame_of(record)
+        frame = read_frame(record)
         return frame.t_s, jpeg(frame.color, JPEG_QUALITY)
 
 

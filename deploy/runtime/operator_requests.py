@@ -13,7 +13,7 @@ import numpy as np
 from brokk_rl.errors import ConfigError
 from deploy.runtime.process import Child
 from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import Aim, Place
+from deploy.runtime.target import TargetPosition, TargetSelector
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +94,12 @@ class Wanted:
     """
 
     def __init__(
-        self, exchange: Exchange, recorder: Recorder, aim: Aim, armed: bool, commands: bool
+        self,
+        exchange: Exchange,
+        recorder: Recorder,
+        aim: TargetSelector,
+        armed: bool,
+        commands: bool,
     ) -> None:
         self._exchange, self._recorder, self._aim = exchange, recorder, aim
         self._armed, self._commands = armed, commands
@@ -108,7 +113,7 @@ class Wanted:
                 self._recorder.into = Path(wish["into"]) if "into" in wish else self._recorder.into
             elif "center_in_base_m" in wish:
                 self._aim.choose(
-                    Place(np.array(wish["center_in_base_m"]), wish["std_m"], wish["t_s"])
+                    TargetPosition(np.array(wish["center_in_base_m"]), wish["std_m"], wish["t_s"])
                 )
             else:
                 self._armed = self._commands and wish["kind"] == "start"

@@ -18,7 +18,7 @@ from deploy.policy.bundle import Bundle
 from deploy.runtime.bus_process import Setting
 from deploy.runtime.process import Child
 from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import TargetSource
+from deploy.runtime.target import TargetSpec
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +105,7 @@ class Listener:
     limits: Limits
     guidance: Guidance
     policy: str
-    target: TargetSource
+    target: TargetSpec
     realtime: bool
 
     def refuse(self, machine: Machine) -> None:

@@ -29,11 +29,11 @@ from deploy.page.settings import OperatorPage
 from deploy.recorder.capture import Capture
 from deploy.runtime.operator_requests import Recorder, Wanted
 from deploy.runtime.operator_state import view
-from deploy.runtime.perception_process import Camera
+from deploy.runtime.perception_process import CameraConfig
 from deploy.runtime.process import Child
 from deploy.runtime.process_group import PATIENCE_S, Children, Listener
 from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import Aim, Seen
+from deploy.runtime.target import DetectedTarget, TargetSelector
 from deploy.runtime.terminal import table
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ class Loop(Listener):
     seconds: float | None
     show: bool
     page: OperatorPage | None
-    camera: Camera | None
+    camera: CameraConfig | None
 
     def check(self) -> None:
         if self.armed and not self.commands:
@@ -75,7 +75,9 @@ class Loop(Listener):
             )
         if self.seconds is not None and self.seconds <= 0:
             raise ConfigError(f"deploy.seconds: expected more than 0, or null, got {self.seconds}")
-        if isinstance(self.target, Seen) and (self.camera is None or self.camera.finder is None):
+        if isinstance(self.target, DetectedTarget) and (
+            self.camera is None or self.camera.finder is None
+        ):
             raise ConfigError(
                 "target=seen: there is no camera that looks for boreholes; choose camera=… as well"
             )
@@ -109,7 +111,7 @@ class Loop(Listener):
             self._start(children, machine, session)
             recorder.refresh()
             write_json(session.folder / PROCESSES, children.pids | recorder.pids)
-            aim = Aim(self.target.build(), exchange.target, exchange.holes)
+            aim = TargetSelector(self.target.build(), exchange.target, exchange.holes)
             full_rad = full_angles_rad(self.guidance.levers or machine.levers)
             self._watch(
                 children,

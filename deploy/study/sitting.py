@@ -15,7 +15,7 @@ from brokk_rl.spec import spec
 from deploy.page.from_loop import Beside
 from deploy.page.settings import OperatorPage
 from deploy.runtime.supervisor import Companion, Loop
-from deploy.runtime.target import File
+from deploy.runtime.target import FileTarget
 from deploy.study import folder as folders
 from deploy.study.conductor import Words
 from deploy.study.participant import Participant
@@ -94,7 +94,7 @@ class Sitting:
             )
         target = session.folder / TARGET
         loop = replace(
-            self.loop, page=None, record=False, show=False, target=File(path=str(target))
+            self.loop, page=None, record=False, show=False, target=FileTarget(path=str(target))
         )
         limits, operators = (
             loop.limits,

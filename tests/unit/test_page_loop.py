@@ -20,7 +20,7 @@ from deploy.policy.adviser import REASONS, Advised
 from deploy.runtime.bus_process import TEXT, TRIPS
 from deploy.runtime.operator_requests import Recorder, Wanted
 from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import Aim, File
+from deploy.runtime.target import FileTarget, TargetSelector
 
 MACHINE = option("machine", "brokk170")
 FULL_RAD = 0.35
@@ -175,7 +175,9 @@ def wanted(
         started.append(Process(folder))
         return started[-1]
 
-    aim = Aim(File(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes)
+    aim = TargetSelector(
+        FileTarget(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes
+    )
     return Wanted(
         exchange, Recorder(exchange, tmp_path, start), aim, armed=False, commands=commands
     ), started
