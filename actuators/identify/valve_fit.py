@@ -225,34 +225,22 @@ class SpeedData:
         if all((o > 0.05).sum(1).max() < 2 for o in opening):
             return np.zeros(joints)  # never two at once
 
-        def left(demand: np.ndarray) -> np.ndarray:
-            moved = [
-                p * _compute_pump_share(demand, o)[:, None]
-                for p, o in zip(posed, opening, strict=True)
-            ]
-            ways = np.concatenate(
-                [
-                    self._increments(
-                        np.stack(
-                            [
-                                lag_signal(m[:, j], dynamics[j, 3], self._period_s)
-                                for j in range(joints)
-                            ],
-                            1,
-                        )
-                    )
-                    for m in moved
-                ]
-            )
-            return ((self.way - ways.T) * weight).ravel()
+        def compute_residual(demand: np.ndarray) -> np.ndarray:
+            parts = []
+            for factor, opened in zip(posed, opening, strict=True):
+                moved = factor * _compute_pump_share(demand, opened)[:, None]
+                for j in range(joints):
+                    moved[:, j] = lag_signal(moved[:, j], dynamics[j, 3], self._period_s)
+                parts.append(self._increments(moved))
+            return ((self.way - np.concatenate(parts).T) * weight).ravel()
 
         starts = [
             start,
             *(np.full(joints, level) for level in (0.3, 0.55, 0.8) if (start == start[0]).all()),
         ]
-        best = min(starts, key=lambda demand: float(np.square(left(demand)).sum()))
+        best = min(starts, key=lambda demand: float(np.square(compute_residual(demand)).sum()))
         return least_squares(
-            left, np.clip(best, 0.0, 1.99), bounds=(0.0, 2.0), diff_step=1e-3, max_nfev=12
+            compute_residual, np.clip(best, 0.0, 1.99), bounds=(0.0, 2.0), diff_step=1e-3, max_nfev=12
         ).x
 
     def _factor(self, n: int, j: int, out: np.ndarray, pose: np.ndarray) -> np.ndarray:
