@@ -18,8 +18,8 @@ from diagnosis.evidence import Evidence, Ray
 from diagnosis.found import Found
 from diagnosis.library import Kind
 from diagnosis.repair import Repair, repair
-from diagnosis.search import MOST, Chosen, Price, Table, choose
-from diagnosis.shapes import SMALL, Nulls, add, plain_joints, rays_of
+from diagnosis.search import MOST, Chosen, Nulls, Price, Table, choose
+from diagnosis.shapes import SMALL, add, plain_joints, rays_of
 from diagnosis.simulator import Base
 from diagnosis.sizes import Shape
 from diagnosis.tied import tied
@@ -130,7 +130,7 @@ class Search:
             evidence, tool.is_tracked(self.case.field, self.case.machine)
         )
         small = {name: rays_of(ways[0].kind, SMALL) for name, ways in grown.items()}
-        known = Nulls(self.base, small, grown, plain_joints(evidence), shapes, self.shared)
+        known = Nulls(nulls, self.base.field.evidence.z.shape[1], small, grown, plain_joints(evidence), shapes, self.shared)
 
         def price(j: int, subset: frozenset[str]) -> float:
             known_there = max(prices.reference * known.earned(j, subset), known.repeated(j, subset))

@@ -10,12 +10,14 @@ Axes: `J` joints, `E` entries.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 
-from diagnosis.sizes import Plain, Shape, alone, earned, predicted
+from diagnosis.evidence import Evidence, Ray
+from diagnosis.shapes import add, plain_joints
+from diagnosis.sizes import Plain, Shape, alone, earned, plain, predicted
 
 MOST = 4
 """Effects in a set."""
@@ -30,6 +32,10 @@ SURELY = 1.0
 """Standard errors by which a set must earn more than a simpler one."""
 TRIED = 14
 """Subsets of each joint that are tried on the reference too."""
+
+THERE = 3.0
+"""Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be
+there already."""
 
 Subset = frozenset[str]
 Price = Callable[[int, Subset], float]
@@ -290,3 +296,71 @@ def _sum(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
         max([value for subset, value in by_subset.items() if name in subset], default=0.0)
         for by_subset in worth
     )
+
+
+@dataclass
+class Nulls:
+    """What sets of effects earn on reference recordings; an effect is simulated there when it is first asked for.
+
+    Attributes:
+        parts: The simulator against parts of the reference that it was not fitted to.
+        num_entries: Entries of the field, `E`.
+        rays: Ways in which each effect grows, at small sizes.
+        grown: The same as they are simulated in the field.
+        plain: Errors of each joint in the field.
+        shapes: What each effect does to each joint in the field.
+        shared: Effects with one cause for all joints.
+        tables: Of each part and joint.
+        known: Effects that were simulated on the reference.
+    """
+
+    parts: Sequence[Evidence]
+    num_entries: int
+    rays: Mapping[str, Sequence[Ray]]
+    grown: Mapping[str, Sequence[Ray]]
+    plain: Sequence[Plain]
+    shapes: Sequence[Mapping[str, Sequence[Shape]]]
+    shared: frozenset[str]
+    tables: list[list[Table]] = field(default_factory=list)
+    known: set[str] = field(default_factory=set)
+
+    def _scored(self, j: int, subset: frozenset[str]) -> list[tuple[Scored, float]]:
+        """Returns what the subset earns on joint `j` in each part of the reference, and the length of the field over the part's."""
+        if not self.tables:
+            self.tables = [
+                [Table(joint, {}, part.block) for joint in plain_joints(part)]
+                for part in self.parts
+            ]
+        for name in subset - self.known:
+            ways = [
+                replace(ray, shape=self.grown[name][0].shape) for ray in self.rays[name]
+            ]  # shaped as they are in the field
+            for tables, part in zip(self.tables, self.parts, strict=True):
+                add([table.shapes for table in tables], name, ways, part)
+            self.known.add(name)
+        found = []
+        for mine in (tables[j] for tables in self.tables):
+            usable = frozenset(name for name in subset if name in mine.shapes)
+            found.append((mine.score(usable), self.num_entries / len(mine.joint.z)))
+        return found
+
+    def earned(self, j: int, subset: frozenset[str]) -> float:
+        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
+
+        Of a cause that all joints share the mean: its price adds up over the joints, and the most
+        of each adds up to too much.
+        """
+        found = [max(0.0, scored.total * part) for scored, part in self._scored(j, subset)]
+        return float((np.mean if subset <= self.shared else max)(found)) if found else 0.0
+
+    def repeated(self, j: int, subset: frozenset[str]) -> float:
+        """Returns what the subset earns in the field at the sizes that it has on the reference already; 0 where it has none."""
+        parts = [scored for scored, _ in self._scored(j, subset)]
+        if not parts or sum(scored.total for scored in parts) < THERE:
+            return 0.0
+        joint, change = self.plain[j], np.zeros(len(self.plain[j].z))
+        for name in subset & self.shapes[j].keys():
+            if sizes := [scored.sizes[name] for scored in parts if name in scored.sizes]:
+                change = change + predicted(self.shapes[j][name], np.mean(sizes, 0))
+        left = plain(joint.z - change, joint.faults)
+        return max(0.0, float(joint.loss.sum() - left.loss.sum()) + joint.price - left.price)
