@@ -1,10 +1,11 @@
-"""The search over sets of effects: joint by joint over subsets, then over the names that all joints share.
+"""The search over sets of effects: joint by joint over subsets, then over the names of all joints.
 
-A set is judged by what it earns on recordings that it was not fitted to, less its price: what the
-same effect earns on reference recordings, where there is nothing to find. Saturation may pay only
-together with a dead band, so sets are never grown from one
-effect alone: each joint keeps the best few of each size.
-Axes: `J` joints, `E` entries.
+A set is judged by its log-likelihood gain less its penalty, which depends on the gain of the same
+effect on reference recordings, where there is nothing to find. A saturation may be worth its
+penalty only beside a dead band, so each joint keeps the best few subsets of each number of effects.
+An effect with one cause for all joints (a clock offset, a worn pump) is first sized joint by joint;
+once it is chosen, the joints share its size within `PLAY`.
+Axes: `J` joints, `E` entries, `S` sizes of a growth path.
 """
 
 from __future__ import annotations
@@ -15,9 +16,8 @@ from itertools import combinations
 
 import numpy as np
 
-from diagnosis.evidence import Evidence, Ray
-from diagnosis.shapes import add, plain_joints
-from diagnosis.sizes import Plain, Shape, alone, earned, plain, predicted
+from diagnosis.residuals import Evidence, Ray
+from diagnosis.responses import Plain, Shape, add, alone, earned, plain, plain_joints, predicted
 
 MOST = 4
 """Effects in a set."""
@@ -364,3 +364,47 @@ class Nulls:
                 change = change + predicted(self.shapes[j][name], np.mean(sizes, 0))
         left = plain(joint.z - change, joint.faults)
         return max(0.0, float(joint.loss.sum() - left.loss.sum()) + joint.price - left.price)
+
+
+PLAY = 0.3
+"""Sizes may differ by so much of what they have in common: an effect's form is not quite the same
+on all joints."""
+
+Rays = Mapping[str, Sequence[Ray]]
+Shapes = Sequence[Mapping[str, Sequence[Shape]]]
+
+
+def bind_shared_sizes(
+    names: Subset, tables: Sequence[Table], grown: Rays, shapes: Shapes
+) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
+    """Returns rays and shapes with those of the effects `names` bounded to about the size that the joints agree on."""
+    rays, narrow = (
+        {name: list(ways) for name, ways in grown.items()},
+        [{n: list(s) for n, s in mine.items()} for mine in shapes],
+    )
+    for name in names:
+        scored = [table.score(frozenset({name})) for table in tables if name in table.shapes]
+        for place, ray in enumerate(rays[name]):
+            size = np.array([one.sizes[name][place] for one in scored])
+            told = np.array([max(one.total, 0.0) for one in scored]) / np.maximum(
+                np.square(size), 1e-6
+            )
+            common = weighted_median(size, told)
+            if common == 0.0:
+                continue
+            ends = np.sort(common * np.array([1.0 - PLAY, 1.0, 1.0 + PLAY]))
+            rays[name][place] = replace(ray, sizes=ends, is_tied=True)
+            for mine in narrow:
+                if name in mine:
+                    shape = mine[name][place]
+                    mine[name][place] = Shape(
+                        ends, np.stack([shape.at(float(size))[0] for size in ends])
+                    )
+    return rays, narrow
+
+
+def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """Returns the weighted median: a joint that has another effect too is far off."""
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(below, 0.5 * below[-1])]) if below[-1] > 0 else 0.0
