@@ -160,7 +160,7 @@ class Plain:
 
     z: np.ndarray
     faults: np.ndarray
-    robust_loss: np.ndarray
+    loss: np.ndarray
     price: float
 
 
