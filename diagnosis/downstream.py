@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from brokk_rl.intervals import wilson
+from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.report import Tone
 
 FILE = "close_gap.json"
@@ -64,7 +64,7 @@ def _share(row: Mapping[str, Any]) -> Share:
     """Returns a rate with its Wilson interval."""
     episodes = int(row["episodes"])
     rate = float(row["success_strict"]["mean"])
-    low, high = wilson(round(rate * episodes), episodes)
+    low, high = compute_wilson_interval(round(rate * episodes), episodes)
     return {"mean": rate, "ci95": [low, high]}
 
 

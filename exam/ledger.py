@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from brokk_rl.errors import StorageError
-from brokk_rl.session import commit
+from brokk_rl.session import describe_commit
 
 HEADLINES = (
     "top1", "top1_strictly", "macro_f1", "joints", "exact_set", "set_f1", "false_alarms", "unknown_recall", "unknown_auroc",
@@ -35,7 +35,7 @@ def append(path: Path, when: str, exam: dict[str, Any], name: str, table: dict[s
     }
     line = {
         "when": when,
-        "commit": commit(),
+        "commit": describe_commit(),
         "candidate": name,
         **exam,
         **{key: _short(value) for key, value in figures.items()},

@@ -15,7 +15,7 @@ from rich.console import Console
 from brokk_rl.contracts.actuator import Effect
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import BrokkError, ConfigError, choices
+from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.modes.evaluate import Evaluation
 from brokk_rl.rl.runner import Training
 from brokk_rl.session import RESOLVED, Session, read_record, write_text
@@ -56,7 +56,7 @@ class Stage:
         for name in self.takes:
             if name not in (*HANDED_ON, "device"):
                 raise ConfigError(
-                    f"a stage takes '{name}', which the story does not have; {choices(name, (*HANDED_ON, 'device'))}"
+                    f"a stage takes '{name}', which the story does not have; {list_choices(name, (*HANDED_ON, 'device'))}"
                 )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from exam.plants import anatomy, strangers
@@ -51,7 +51,7 @@ class Valves:
             if specimen.roughness not in self.roughness:
                 raise ConfigError(
                     f"exam: no roughness '{specimen.roughness}' in exam.plants.roughness; "
-                    f"{choices(specimen.roughness, self.roughness)}"
+                    f"{list_choices(specimen.roughness, self.roughness)}"
                 )
             make, numbers = anatomy.drawn(
                 machine, specimen.seed, self.roughness[specimen.roughness]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from exam.plants.anatomy import Anatomy
 from exam.plants.valve import LAND_LEAK
 
@@ -144,6 +144,8 @@ def afflicted(numbers: Anatomy, faults: Mapping[str, Sizes]) -> Anatomy:
     found = {name: value.copy() for name, value in numbers.items()}
     for name, size in faults.items():
         if name not in FAULTS:
-            raise ConfigError(f"exam: no plant has the effect '{name}'; {choices(name, FAULTS)}")
+            raise ConfigError(
+                f"exam: no plant has the effect '{name}'; {list_choices(name, FAULTS)}"
+            )
         FAULTS[name](found, size)
     return found
