@@ -31,7 +31,7 @@ from deploy.recorder import capture_reader
 from deploy.recorder.capture import MCAP, CaptureConfig
 from deploy.runtime.process_group import BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.runtime.target import Aim
+from deploy.runtime.target import TargetSelector
 
 log = logging.getLogger(__name__)
 
@@ -245,7 +245,9 @@ class _Checks:
 
     def _shadow(self) -> BringupResult:
         self._say("shadow run: the policy runs along, nothing is shown")
-        Aim(self._bringup.target.build(), self._memory.target, self._memory.holes).refresh()
+        TargetSelector(
+            self._bringup.target.build(), self._memory.target, self._memory.holes
+        ).refresh()
         reasons: list[str] = []
         end_s, number = time.monotonic() + self._bringup.shadow_s, -1
         while time.monotonic() < end_s:

@@ -36,10 +36,10 @@ from deploy.page.scene import locate_borehole, plan_approach
 from deploy.page.settings import LINK, PageSettings
 from deploy.runtime import operator_state
 from deploy.runtime.bus_process import TEXT
-from deploy.runtime.perception_process import frame_of
+from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.runtime.target import Place, holes_of, nearest, place_of
+from deploy.runtime.target import TargetPosition, find_nearest, locate_hole, read_holes
 
 log = logging.getLogger(__name__)
 
@@ -173,7 +173,7 @@ class LoopFeed:
         slot, taken_s = self._memory.frame, self._frame_t_s()
         if slot is None or taken_s is None or taken_s <= after_s or (record := slot.read()) is None:
             return None
-        return frame_of(record)
+        return read_frame(record)
 
     def wish(self, wish: OperatorRequest) -> bool:
         """See `Feed`."""
@@ -236,8 +236,8 @@ class LoopFeed:
 
     def _targets(self, aim: Any | None) -> tuple[BoreholeChoice, ...]:
         """Returns the boreholes that perception knows, and the one that the advice is for, whoever named it."""
-        holes = holes_of(self._memory.holes)
-        chosen = None if aim is None else nearest(holes, np.array(aim["center_in_base_m"]))
+        holes = read_holes(self._memory.holes)
+        chosen = None if aim is None else find_nearest(holes, np.array(aim["center_in_base_m"]))
         found = [
             BoreholeChoice(
                 str(int(hole["name"])), _to_vector(hole["center_in_base_m"]), _to_vector(hole["axis_in_base"]),
@@ -260,22 +260,23 @@ class LoopFeed:
             )
         return tuple(found)
 
-    def _named(self, name: str) -> Place | None:
+    def _named(self, name: str) -> TargetPosition | None:
         """Returns where the borehole of that name is."""
         one = next(
-            (hole for hole in holes_of(self._memory.holes) if str(int(hole["name"])) == name), None
+            (hole for hole in read_holes(self._memory.holes) if str(int(hole["name"])) == name),
+            None,
         )
-        return None if one is None else place_of(one)
+        return None if one is None else locate_hole(one)
 
-    def _pointed(self, value: str) -> Place | None:
+    def _pointed(self, value: str) -> TargetPosition | None:
         """Returns the borehole that a person points at: one that perception knows, else what is measured there."""
         frame = self.frame(-1.0)
         x, y = (float(part) for part in value.split(","))
         found = frame and locate_borehole(frame, x, y, self._beside.page.borehole_radius_m)
         if not frame or not found:
             return None
-        known = nearest(holes_of(self._memory.holes), found[0])
-        return Place(*found, frame.t_s) if known is None else place_of(known)
+        known = find_nearest(read_holes(self._memory.holes), found[0])
+        return TargetPosition(*found, frame.t_s) if known is None else locate_hole(known)
 
     def _path(self, q: tuple[float, ...], target: BoreholeChoice) -> tuple[Vector, ...]:
         if not self._guiding or not self._beside.machine.has_bodies:

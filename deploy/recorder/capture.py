@@ -29,7 +29,7 @@ from deploy.bus.description import BusDescription, MessageLayout, resolve_packag
 from deploy.bus.protection import MessageFault
 from deploy.picture import encode_jpeg
 from deploy.runtime.bus_process import FRAME, FRAMES
-from deploy.runtime.perception_process import frame_of
+from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import LoopMemory, measure_wall_offset_ns
@@ -265,7 +265,7 @@ class PictureSampler:
         record = self._slot.read()
         if record is None:
             return None
-        frame = frame_of(record)
+        frame = read_frame(record)
         return frame.t_s, encode_jpeg(frame.color, JPEG_QUALITY)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from brokk_rl.errors import ConfigError
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.runtime.target import Aim, Place
+from deploy.runtime.target import TargetPosition, TargetSelector
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +96,12 @@ class RequestHandler:
     """
 
     def __init__(
-        self, memory: LoopMemory, recorder: RecordingControl, aim: Aim, armed: bool, commands: bool
+        self,
+        memory: LoopMemory,
+        recorder: RecordingControl,
+        aim: TargetSelector,
+        armed: bool,
+        commands: bool,
     ) -> None:
         self._memory, self._recorder, self._aim = memory, recorder, aim
         self._armed, self._commands = armed, commands
@@ -110,7 +115,7 @@ class RequestHandler:
                 self._recorder.into = Path(wish["into"]) if "into" in wish else self._recorder.into
             elif "center_in_base_m" in wish:
                 self._aim.choose(
-                    Place(np.array(wish["center_in_base_m"]), wish["std_m"], wish["t_s"])
+                    TargetPosition(np.array(wish["center_in_base_m"]), wish["std_m"], wish["t_s"])
                 )
             else:
                 self._armed = self._commands and wish["kind"] == "start"

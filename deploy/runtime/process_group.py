@@ -18,7 +18,7 @@ from deploy.policy.policy_process import PolicyProcessConfig
 from deploy.runtime.bus_process import BusProcessConfig
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.runtime.target import TargetSource
+from deploy.runtime.target import TargetSpec
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +105,7 @@ class BusAndPolicySettings:
     limits: GuardLimits
     guidance: LeverGuidance
     policy: str
-    target: TargetSource
+    target: TargetSpec
     realtime: bool
 
     def refuse(self, machine: Machine) -> None:

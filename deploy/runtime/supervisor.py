@@ -32,11 +32,11 @@ from deploy.page.settings import PageSettings
 from deploy.recorder.capture import CaptureConfig
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.operator_state import LoopSnapshot, read_snapshot
-from deploy.runtime.perception_process import Camera
+from deploy.runtime.perception_process import CameraConfig
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.process_group import PATIENCE_S, BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.runtime.target import Aim, Seen
+from deploy.runtime.target import DetectedTarget, TargetSelector
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ class DeploymentLoop(BusAndPolicySettings):
     seconds: float | None
     show: bool
     page: PageSettings | None
-    camera: Camera | None
+    camera: CameraConfig | None
 
     def check(self) -> None:
         if self.armed and not self.commands:
@@ -77,7 +77,9 @@ class DeploymentLoop(BusAndPolicySettings):
             )
         if self.seconds is not None and self.seconds <= 0:
             raise ConfigError(f"deploy.seconds: expected more than 0, or null, got {self.seconds}")
-        if isinstance(self.target, Seen) and (self.camera is None or self.camera.finder is None):
+        if isinstance(self.target, DetectedTarget) and (
+            self.camera is None or self.camera.finder is None
+        ):
             raise ConfigError(
                 "target=seen: there is no camera that looks for boreholes; choose camera=… as well"
             )
@@ -113,7 +115,7 @@ class DeploymentLoop(BusAndPolicySettings):
             self._start(children, machine, session)
             recorder.refresh()
             write_json(session.folder / PROCESSES, children.pids | recorder.pids)
-            aim = Aim(self.target.build(), memory.target, memory.holes)
+            aim = TargetSelector(self.target.build(), memory.target, memory.holes)
             full_rad = find_full_angles_rad(self.guidance.levers or machine.levers)
             self._watch(
                 children,

@@ -15,7 +15,7 @@ from brokk_rl.spec import spec
 from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
 from deploy.runtime.supervisor import CompanionProcess, DeploymentLoop
-from deploy.runtime.target import File
+from deploy.runtime.target import FileTarget
 from deploy.study import folder as folders
 from deploy.study.conductor import Words
 from deploy.study.participant import Participant
@@ -24,7 +24,7 @@ from deploy.study.trial import Times
 from deploy.twin.bench import TwinBench
 
 LOCK, TARGET = ".sitting", "target.json"
-"""File in the study's folder that one program at a time holds; file in the run folder that says to
+"""FileTarget in the study's folder that one program at a time holds; file in the run folder that says to
 the loop where the hole is."""
 
 
@@ -94,7 +94,7 @@ class Sitting:
             )
         target = session.folder / TARGET
         loop = replace(
-            self.loop, page=None, record=False, show=False, target=File(path=str(target))
+            self.loop, page=None, record=False, show=False, target=FileTarget(path=str(target))
         )
         limits, operators = (
             loop.limits,

@@ -17,8 +17,7 @@ from brokk_rl.contracts.vision import HolePose
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from deploy.page.demo import BLOCK_M, TARGETS
-from deploy.page.demo import DemoCamera as DemoCamera
+from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
 from deploy.page.loop_feed import GIVEN, LoopFeed, PageProcessConfig
 from deploy.page.protocol import OperatorRequest
 from deploy.page.scene import locate_borehole
@@ -26,9 +25,9 @@ from deploy.recorder import capture_reader
 from deploy.recorder.capture import CaptureConfig, CaptureWriter, PictureSampler
 from deploy.runtime import perception_process
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
-from deploy.runtime.perception_process import Camera, KnownHoles, frame_of
+from deploy.runtime.perception_process import CameraConfig, KnownHoles, read_frame
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.runtime.target import Aim, File, Given, Seen
+from deploy.runtime.target import DetectedTarget, FileTarget, GivenTarget, TargetSelector
 
 MACHINE = option("machine", "brokk170")
 FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).frame(0, 12.0)
@@ -80,12 +79,12 @@ def test_a_frame_is_handed_on_whole_or_shrunk_with_its_camera(exchange: LoopMemo
     assert exchange.frame is not None and exchange.frame.peek("t_s") is None
     perception_process._publish(exchange.frame, FRAME, PIXELS, 5.0)
     assert exchange.frame.peek("t_s") == 5.0 and exchange.frame.number == 1
-    whole = frame_of(exchange.frame.read())
+    whole = read_frame(exchange.frame.read())
     assert np.array_equal(whole.color, FRAME.color) and np.array_equal(
         whole.depth_m, FRAME.depth_m, equal_nan=True
     )
     perception_process._publish(exchange.frame, FRAME, PIXELS // 4, 6.0)
-    small = frame_of(exchange.frame.read())
+    small = read_frame(exchange.frame.read())
     assert small.color.shape == (180, 320, 3) and exchange.frame.number == 2
     center_m = np.array(TARGETS[0].center_in_base_m)
     assert seen_at(small, center_m) == pytest.approx(seen_at(FRAME, center_m), abs=0.003)
@@ -151,7 +150,7 @@ def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(
     exchange: LoopMemory, tmp_path: Path
 ) -> None:
     path = tmp_path / "target.json"
-    aim = Aim(File(path=str(path)).build(), exchange.target, exchange.holes)
+    aim = TargetSelector(FileTarget(path=str(path)).build(), exchange.target, exchange.holes)
     aim.refresh()
     assert exchange.target.read() is None
     path.write_text('{"center_in_base_m": [2.6, 0.0, 0.75]}')
@@ -173,21 +172,23 @@ def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(
 
 
 def eyes_place(exchange: LoopMemory, row: int) -> Any:
-    from deploy.runtime.target import holes_of, place_of
+    from deploy.runtime.target import locate_hole, read_holes
 
-    return place_of(holes_of(exchange.holes)[row])
+    return locate_hole(read_holes(exchange.holes)[row])
 
 
 def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(
     exchange: LoopMemory,
 ) -> None:
-    aim = Aim(Given(center_in_base_m=(2.6, 0.0, 0.4)).build(), exchange.target, exchange.holes)
+    aim = TargetSelector(
+        GivenTarget(center_in_base_m=(2.6, 0.0, 0.4)).build(), exchange.target, exchange.holes
+    )
     aim.refresh()
     first = exchange.target.peek("t_s")
     aim.refresh()
     again = exchange.target.peek("t_s")
     assert first is not None and again is not None and again > first
-    aim = Aim(Seen(score=0.5).build(), exchange.target, exchange.holes)
+    aim = TargetSelector(DetectedTarget(score=0.5).build(), exchange.target, exchange.holes)
     show(exchange, pose(2.6, 0.0, score=0.4))
     aim.refresh()
     assert aimed(exchange) == [2.6, 0.0, 0.4]
@@ -221,7 +222,9 @@ def feed(exchange: LoopMemory, tmp_path: Path) -> LoopFeed:
 def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     exchange: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
-    aim = Aim(File(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes)
+    aim = TargetSelector(
+        FileTarget(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes
+    )
     wanted = RequestHandler(
         exchange,
         RecordingControl(exchange, tmp_path, lambda folder: None),
@@ -278,9 +281,9 @@ class Blinking:
     def find(self, frame: Frame) -> None: ...
 
     def look(self, frame: Frame) -> Any:
-        from brokk_rl.contracts.vision import Sighting
+        from brokk_rl.contracts.vision import FrameDetections
 
-        return Sighting([pose(2.6, 0.0)], [], [], None)
+        return FrameDetections([pose(2.6, 0.0)], [], [], None)
 
 
 def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recorded(
@@ -295,8 +298,8 @@ def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recor
     ] == [2.6, 0.0, 0.75]
 
 
-def camera(source: Any) -> Camera:
-    return Camera(
+def camera(source: Any) -> CameraConfig:
+    return CameraConfig(
         source=source, finder=source, rate_hz=100.0, num_px=PIXELS, forget_s=10.0, stale_s=1.0, record_hz=1.0
     )  # fmt: skip
 

@@ -33,7 +33,7 @@ from deploy.runtime.operator_state import read_snapshot
 from deploy.runtime.process import CycleTimer
 from deploy.runtime.shared_memory import Pipe, Slot
 from deploy.runtime.shm_layout import LoopMemory, build_state_fields
-from deploy.runtime.target import File
+from deploy.runtime.target import FileTarget
 
 SHIPPED = "tasks:policies/borehole_insertion"
 FIELDS = np.dtype([("a", float), ("b", float, (3,))])
@@ -362,7 +362,7 @@ def test_an_answer_that_makes_no_sense_is_not_shown(
 
 def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_path: Path) -> None:
     path = tmp_path / "target.json"
-    target = File(path=str(path)).build()
+    target = FileTarget(path=str(path)).build()
     assert target.news([]) is None
     path.write_text('{"center_in_base_m": [2.5, 0.1, 0.7]}')
     os.utime(path, ns=(time.time_ns() - 5 * 10**9,) * 2)

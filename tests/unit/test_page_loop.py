@@ -21,7 +21,7 @@ from deploy.policy.policy_process import REASONS, AdviceStatus
 from deploy.runtime.bus_process import TEXT, TRIPS
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.runtime.target import Aim, File
+from deploy.runtime.target import FileTarget, TargetSelector
 
 MACHINE = option("machine", "brokk170")
 FULL_RAD = 0.35
@@ -176,7 +176,9 @@ def wanted(
         started.append(Process(folder))
         return started[-1]
 
-    aim = Aim(File(path=str(tmp_path / "none.json")).build(), memory.target, memory.holes)
+    aim = TargetSelector(
+        FileTarget(path=str(tmp_path / "none.json")).build(), memory.target, memory.holes
+    )
     return RequestHandler(
         memory, RecordingControl(memory, tmp_path, start), aim, armed=False, commands=commands
     ), started
