@@ -133,7 +133,9 @@ def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[K
             found[option.name] = Kind(option.name, target, machine.num_joints)
     for name in names or ():
         if name not in found:
-            raise ConfigError(f"diagnosis.effects: '{name}' is no effect; {list_choices(name, found)}")
+            raise ConfigError(
+                f"diagnosis.effects: '{name}' is no effect; {list_choices(name, found)}"
+            )
     usable = []
     for kind in (found[name] for name in names or found):
         try:
