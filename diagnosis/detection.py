@@ -12,7 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from brokk_rl.spec import spec
-from diagnosis import effect_library, refine, residual_model, sensors, timing, tool
+from diagnosis import (
+    effect_library,
+    nonadditive_refit,
+    refine,
+    residual_model,
+    sensors,
+    timing,
+    tool,
+)
 from diagnosis.baseline import Base
 from diagnosis.case import Case
 from diagnosis.effect_library import Found, Kind
@@ -144,7 +152,7 @@ class Search:
         scatter = np.ones(self.case.machine.num_joints)
         tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)
         wide = None
-        if repaired and refine.is_needed(evidence, repaired, _promised(tables, chosen)):
+        if repaired and nonadditive_refit.is_needed(evidence, repaired, _promised(tables, chosen)):
             wide, tables, chosen, repaired = self._around(evidence, grown, chosen, repaired, price)
             grown = wide[1]
         self.tell("frames", 0.8)
@@ -167,7 +175,11 @@ class Search:
                 late
             ):  # what delays change depends on when commands act, and so on what else delays them
                 evidence = timing.expected(evidence, late, repaired.effects() if repaired else [])
-                wide = refine.simulated(evidence, grown, repaired) if wide and repaired else None
+                wide = (
+                    nonadditive_refit.simulated(evidence, grown, repaired)
+                    if wide and repaired
+                    else None
+                )
             z, grown, shapes = wide or (None, grown, shapes)
             tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter, z)
         self.tell("what is left", 0.92)
@@ -272,27 +284,32 @@ class Search:
         chosen: Chosen,
         repaired: Repair,
         price: Price,
-    ) -> tuple[refine.Around, list[Table], Chosen, Repair | None]:
+    ) -> tuple[nonadditive_refit.Around, list[Table], Chosen, Repair | None]:
         """Goes on from a set whose effects do not add up: simulates all others in its company, fits sizes together."""
         tried, scatter = [repaired], np.ones(self.case.machine.num_joints)
-        wide = refine.simulated(evidence, grown, repaired)
+        wide = nonadditive_refit.simulated(evidence, grown, repaired)
         for turn in range(TURNS):
             self.tell("simulating around what was found", 0.72 + 0.04 * turn)
             before = chosen
             tables, chosen, now = self._round(evidence, *wide[1:], price, scatter, wide[0])
             tried += [now] if now else []
-            more = now and refine.grown(evidence, wide[1], tables, chosen, now, self.prices.joint)
+            more = now and nonadditive_refit.grown(
+                evidence, wide[1], tables, chosen, now, self.prices.joint
+            )
             tried += [more] if more else []
             if now is None or (more is None and chosen.subsets == before.subsets):
                 break
-            wide = refine.simulated(evidence, grown, more or now)
-        best = refine.best(evidence, wide[1], tried, price)
+            wide = nonadditive_refit.simulated(evidence, grown, more or now)
+        best = nonadditive_refit.best(evidence, wide[1], tried, price)
         if best is None:
             return wide, tables, Chosen((frozenset(),) * len(tables), 0.0), None
         for drops in (True, False):
-            wide, subsets = refine.simulated(evidence, grown, best), refine.subsets_of(best)
+            wide, subsets = (
+                nonadditive_refit.simulated(evidence, grown, best),
+                refine.subsets_of(best),
+            )
             tables = self._tables(evidence, *wide[1:], scatter, wide[0])
-            paying = refine.paying(tables, subsets, price, self.prices.name)
+            paying = nonadditive_refit.paying(tables, subsets, price, self.prices.name)
             if not drops or paying == subsets or not any(paying):
                 break
             best = refine.without(evidence, wide[1], best, paying)

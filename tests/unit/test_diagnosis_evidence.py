@@ -9,7 +9,7 @@ import torch
 from actuators.models.valve import Pose
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
-from diagnosis import effect_library, gap, refine, residuals
+from diagnosis import effect_library, gap, nonadditive_refit, residuals
 from diagnosis.residuals import ErrorCovariance, rays
 from diagnosis.responses import Shape, earned, fitted, plain, rays_of
 from diagnosis.search import Table, bind_shared_sizes, choose
@@ -266,11 +266,13 @@ def test_of_two_effects_that_are_alike_one_stays() -> None:
             "c": [line(random.standard_normal(800))],
         },
     )
-    kept = refine.paying([table], [frozenset("abc")], lambda j, subset: 4.0 * len(subset), 5.0)
-    assert len(kept[0]) == 1 and kept[0] <= frozenset("ab")
-    assert refine.paying([table], [frozenset("c")], lambda j, subset: 4.0 * len(subset), 5.0) == (
-        frozenset(),
+    kept = nonadditive_refit.paying(
+        [table], [frozenset("abc")], lambda j, subset: 4.0 * len(subset), 5.0
     )
+    assert len(kept[0]) == 1 and kept[0] <= frozenset("ab")
+    assert nonadditive_refit.paying(
+        [table], [frozenset("c")], lambda j, subset: 4.0 * len(subset), 5.0
+    ) == (frozenset(),)
 
 
 def test_an_effect_that_rings_is_simulated_at_sizes_so_close_that_those_between_are_in_step(
