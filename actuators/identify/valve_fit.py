@@ -240,7 +240,11 @@ class SpeedData:
         ]
         best = min(starts, key=lambda demand: float(np.square(compute_residual(demand)).sum()))
         return least_squares(
-            compute_residual, np.clip(best, 0.0, 1.99), bounds=(0.0, 2.0), diff_step=1e-3, max_nfev=12
+            compute_residual,
+            np.clip(best, 0.0, 1.99),
+            bounds=(0.0, 2.0),
+            diff_step=1e-3,
+            max_nfev=12,
         ).x
 
     def _factor(self, n: int, j: int, out: np.ndarray, pose: np.ndarray) -> np.ndarray:
