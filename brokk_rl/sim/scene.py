@@ -29,7 +29,7 @@ so hold every smaller one."""
 GROUND = "ground"
 """The plane on which the chisel stops: the ground, or the bottom of a hole that goes deeper than
 the ground."""
-POST_M = 0.02
+POST_HALF_THICKNESS_M = 0.02
 """Half the thickness of the posts; more than the largest radius times (sqrt(2) - 1) / 2, so that
 they reach the corners of the square."""
 
@@ -42,7 +42,7 @@ _DIAGONAL = float(np.sqrt(0.5))
 
 
 @dataclass(frozen=True)
-class Block:
+class BlockGeoms:
     """Geoms of the block in its own frame.
 
     Attributes:
@@ -58,14 +58,14 @@ class Block:
     yaw_rad: np.ndarray
 
 
-def nominal(num_worlds: int, device: torch.device | str = "cpu") -> torch.Tensor:
+def make_nominal_scenes(num_worlds: int, device: torch.device | str = "cpu") -> torch.Tensor:
     """Returns scenes with the nominal block in front of the machine, `(N, S)`."""
     return torch.tensor([2.6, 0.0, HEIGHT_M, 0.0, 1.0, HOLE_RADIUS_M], device=device).repeat(
         num_worlds, 1
     )
 
 
-def collision_block(scale: float, radius_m: float) -> Block:
+def build_collision_geoms(scale: float, radius_m: float) -> BlockGeoms:
     """Returns the colliding boxes of a block; sizes and positions are affine in both arguments."""
     length, width, middle = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale, -HEIGHT_M / 2
     parts: list[tuple[str, tuple[float, float, float], tuple[float, float, float], float]] = []
@@ -89,11 +89,18 @@ def collision_block(scale: float, radius_m: float) -> Block:
         )
     for i in range(4):
         angle = np.pi / 4 + i * np.pi / 2
-        x, y = (radius_m + POST_M) * np.cos(angle), (radius_m + POST_M) * np.sin(angle)
+        x, y = (
+            (radius_m + POST_HALF_THICKNESS_M) * np.cos(angle),
+            (radius_m + POST_HALF_THICKNESS_M) * np.sin(angle),
+        )
         parts.append(
             (
                 f"post_{i}",
-                (POST_M, radius_m * np.tan(np.pi / 8) + POST_M, -middle),
+                (
+                    POST_HALF_THICKNESS_M,
+                    radius_m * np.tan(np.pi / 8) + POST_HALF_THICKNESS_M,
+                    -middle,
+                ),
                 (x, y, middle),
                 angle,
             )
@@ -102,10 +109,10 @@ def collision_block(scale: float, radius_m: float) -> Block:
     parts.append(("plug", (radius_m, radius_m, plug), (0, 0, -HOLE_DEPTH_M - plug), 0.0))
     parts.append(("block_envelope", (length, width, -middle), (0, 0, middle), 0.0))
     names, size, pos, yaw = zip(*parts, strict=True)
-    return Block(names, np.array(size, float), np.array(pos, float), np.array(yaw, float))
+    return BlockGeoms(names, np.array(size, float), np.array(pos, float), np.array(yaw, float))
 
 
-def drilled_wall(radius_m: float, num_parts: int = 24) -> Block:
+def build_visual_wall(radius_m: float, num_parts: int = 24) -> BlockGeoms:
     """Returns thin boxes that make the octagon look like a drilled hole, ending just below its rim."""
     half = (
         radius_m * (np.sqrt(2.0) - 1.0) / 2 + 0.002
@@ -122,16 +129,18 @@ def drilled_wall(radius_m: float, num_parts: int = 24) -> Block:
         ],
         1,
     )
-    return Block(tuple(f"wall_{i}" for i in range(num_parts)), size, pos, angles)
+    return BlockGeoms(tuple(f"wall_{i}" for i in range(num_parts)), size, pos, angles)
 
 
 def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
     """Adds the mocap body `block` with its geoms, as large as a scene may make it; `visual` adds what only the eye needs."""
-    body = spec.worldbody.add_body(name="block", mocap=True, pos=nominal(1)[0, :3].numpy())
-    block = collision_block(1.0, HOLE_RADIUS_M)
+    body = spec.worldbody.add_body(
+        name="block", mocap=True, pos=make_nominal_scenes(1)[0, :3].numpy()
+    )
+    block = build_collision_geoms(1.0, HOLE_RADIUS_M)
     largest = np.max(
         [
-            collision_block(scale, radius).size
+            build_collision_geoms(scale, radius).size
             for scale in SCALE_BOUNDS
             for radius in HOLE_RADIUS_BOUNDS_M
         ],
@@ -141,7 +150,7 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
         is_envelope = name == "block_envelope"
         is_shown = name.startswith("slab") or name == "plug"
         body.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn(yaw), contype=0,
+            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn_about_z(yaw), contype=0,
             conaffinity=_ARM if is_envelope else _TOOL, friction=_FRICTION, group=1 if is_shown else 3,
             material="hole_bottom" if name == "plug" else "concrete",
         )  # fmt: skip
@@ -150,10 +159,10 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
         friction=_FRICTION, group=3,
     )  # fmt: skip
     if visual:
-        wall = drilled_wall(HOLE_RADIUS_M)
+        wall = build_visual_wall(HOLE_RADIUS_M)
         for name, size, pos, yaw in zip(wall.names, wall.size, wall.pos, wall.yaw_rad, strict=True):
             body.add_geom(
-                name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn(yaw), contype=0, conaffinity=0, group=2,
+                name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn_about_z(yaw), contype=0, conaffinity=0, group=2,
                 material="concrete",
             )  # fmt: skip
         body.add_camera(
@@ -165,11 +174,11 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
         )
 
 
-def _turn(yaw_rad: float) -> tuple[float, float, float, float]:
+def _turn_about_z(yaw_rad: float) -> tuple[float, float, float, float]:
     return (float(np.cos(yaw_rad / 2)), 0.0, 0.0, float(np.sin(yaw_rad / 2)))
 
 
-class Placement:
+class ScenePlacement:
     """Turns scenes into MuJoCo's numbers, batched in torch.
 
     Args:
@@ -182,9 +191,9 @@ class Placement:
         self, model: mujoco.MjModel, device: torch.device | str, dtype: torch.dtype
     ) -> None:
         nominal, wider, larger = (
-            collision_block(0.0, 0.0),
-            collision_block(0.0, 1.0),
-            collision_block(1.0, 0.0),
+            build_collision_geoms(0.0, 0.0),
+            build_collision_geoms(0.0, 1.0),
+            build_collision_geoms(1.0, 0.0),
         )
         # affine in scale and radius, hence three evaluations give the whole map
         stack = [np.concatenate([b.size, b.pos], axis=1) for b in (nominal, larger, wider)]
