@@ -12,12 +12,13 @@ T = TypeVar("T")
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def spec(cls: type[T]) -> type[T]:
-    """Makes `cls` a spec: a frozen, keyword-only dataclass whose fields are checked against their annotations.
+    """Turn `cls` into a spec: a frozen, keyword-only dataclass that checks its field types.
 
-    A YAML list becomes a tuple, an integer given for a float becomes a float, and a whole number
-    such as 48e6 given for an integer an integer; any other mismatch is a `ConfigError` that names
-    the field, what was expected and what came. A spec may define `check(self)` for rules between
-    fields. Specs are pure data: a number lives in one YAML file, so fields have no defaults here.
+    A YAML list becomes a tuple. An integer given for a float becomes a float, and a whole number
+    such as 48e6 given for an integer becomes an integer. Any other mismatch raises a `ConfigError`
+    that names the field, the expected type and the value. A spec may define `check(self)` for
+    rules between fields. Specs are pure data: a number lives in one YAML file, so fields have no
+    defaults here.
     """
     cls.__post_init__ = _post_init  # type: ignore[attr-defined]
     return dataclass(frozen=True, kw_only=True)(cls)
@@ -35,7 +36,7 @@ def _post_init(self: Any) -> None:
 
 
 def _convert(value: Any, hint: Any, where: str) -> Any:
-    """Returns `value` as `hint` wants it, or raises a `ConfigError`."""
+    """Return `value` converted to the annotated type, or raise a `ConfigError`."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return value

@@ -1,4 +1,4 @@
-"""`brokk mode=doctor`: what works on this computer, and what to do about the rest."""
+"""`brokk mode=doctor`: report which parts work on this computer, with advice for the others."""
 
 from __future__ import annotations
 
@@ -43,10 +43,9 @@ class DoctorFinding:
     """One line of the report.
 
     Attributes:
-        level: `fail` where something essential does not work, `warn` where something optional does
-            not.
-        text: What was found.
-        advice: What to do about it.
+        level: `fail` if an essential part does not work, `warn` if an optional part does not.
+        text: The finding.
+        advice: How to correct it.
     """
 
     level: Literal["ok", "warn", "fail"]
@@ -56,7 +55,7 @@ class DoctorFinding:
 
 @spec
 class DoctorLimits:
-    """Where the doctor looks and what it finds too little.
+    """Folder and limits of the checks.
 
     Attributes:
         folder: Folder in which runs will be written.
@@ -69,15 +68,15 @@ class DoctorLimits:
 
 @spec
 class Doctor:
-    """Says what works here: versions, GPU, CUDA graphs, kernel cache, rendering, disk, owners of the import names."""
+    """Report which parts work on this computer: GPU, CUDA graphs, rendering, disk, packages."""
 
     doctor: DoctorLimits
 
     def run(self) -> None:
-        """Prints the report.
+        """Print the report.
 
         Raises:
-            SystemExit: With code 1, when something essential does not work.
+            SystemExit: With code 1 if an essential part does not work.
         """
         table = Table(box=None, show_header=False, padding=(0, 1, 0, 0))
         failed = False
@@ -92,7 +91,7 @@ class Doctor:
             raise SystemExit(1)
 
     def findings(self) -> Iterator[tuple[str, DoctorFinding]]:
-        """Yields topic and finding, the most basic first; a probe that breaks becomes a warning."""
+        """Yield topic and finding, the most basic first; a failing probe becomes a warning."""
         probes: tuple[tuple[str, Callable[[], Iterator[DoctorFinding]]], ...] = (
             ("Python", check_python),
             ("packages", check_packages),
@@ -109,14 +108,13 @@ class Doctor:
             try:
                 for finding in examine():
                     yield topic, finding
-            except (
-                Exception
-            ) as error:  # whatever breaks in a foreign package must not hide the rest of the report
+            # A failure inside another package must not hide the rest of the report.
+            except Exception as error:
                 yield topic, DoctorFinding("warn", f"cannot tell: {type(error).__name__}: {error}")
 
 
 def check_python() -> Iterator[DoctorFinding]:
-    """The interpreter against what the project asks for."""
+    """Compare the Python version with the required one."""
     text = f"{platform.python_version()} on {platform.platform(terse=True)}"
     about = _read_metadata()
     wanted = SpecifierSet(about["Requires-Python"] if about else "")
@@ -126,12 +124,12 @@ def check_python() -> Iterator[DoctorFinding]:
         yield DoctorFinding(
             "fail",
             f"{text}, but the project wants {wanted}",
-            "make again the environment with such a Python: make clean setup",
+            "make the environment again with such a Python: make clean setup",
         )
 
 
 def check_packages() -> Iterator[DoctorFinding]:
-    """Installed packages against what the project asks for."""
+    """Compare installed packages with the required versions."""
     about = _read_metadata()
     if about is None:
         yield DoctorFinding(
@@ -167,7 +165,7 @@ def check_packages() -> Iterator[DoctorFinding]:
 
 
 def check_processor() -> Iterator[DoctorFinding]:
-    """Cores that this process may use, and threads that torch does use."""
+    """Report the cores of this process and the threads of torch."""
     import torch
 
     cores = (
@@ -203,7 +201,7 @@ def check_torch_devices() -> Iterator[DoctorFinding]:
 
 
 def read_driver_version() -> str | None:
-    """Returns the version of the NVIDIA driver, `None` when there is none."""
+    """Return the version of the NVIDIA driver, `None` without one."""
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
         lines = subprocess.run(
@@ -215,7 +213,7 @@ def read_driver_version() -> str | None:
 
 
 def check_cuda_graphs() -> Iterator[DoctorFinding]:
-    """Whether a control step can be captured in a CUDA graph; without that a GPU is several times slower."""
+    """Check that a control step can be captured; without CUDA graphs a GPU is several times slower."""
     import torch
 
     if not torch.cuda.is_available():
@@ -229,7 +227,7 @@ def check_cuda_graphs() -> Iterator[DoctorFinding]:
 
 
 def check_warp() -> Iterator[DoctorFinding]:
-    """Version of Warp, and its kernel cache, which saves a minute or two of compiling at each start."""
+    """Report the version of Warp and its kernel cache, which saves minutes of compilation."""
     cache = probe.find_kernel_cache()
     size = (
         sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
@@ -242,7 +240,7 @@ def check_warp() -> Iterator[DoctorFinding]:
 
 
 def check_rendering() -> Iterator[DoctorFinding]:
-    """Whether MuJoCo can draw pictures, which only videos need."""
+    """Check that MuJoCo can render, which only videos need."""
     name = probe.find_renderer()
     if name:
         yield DoctorFinding("ok", f"MuJoCo draws with MUJOCO_GL={name}")
@@ -257,7 +255,7 @@ def check_rendering() -> Iterator[DoctorFinding]:
 
 
 def check_disk(folder: Path, min_free_gib: float) -> Iterator[DoctorFinding]:
-    """Whether runs can be written, and how much room there is."""
+    """Check that runs can be written, and report the free space."""
     place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     try:
         with tempfile.TemporaryFile(dir=place):
@@ -279,7 +277,7 @@ def check_disk(folder: Path, min_free_gib: float) -> Iterator[DoctorFinding]:
 
 
 def check_import_names() -> Iterator[DoctorFinding]:
-    """Whether our import names are ours: names such as `tasks` or `conf` are taken by other packages as well."""
+    """Check that names such as `tasks` and `conf` import this package, not another one."""
     home = Path(brokk_rl.__file__).parents[1]
     owned = 0
     for name in IMPORT_NAMES:
@@ -313,7 +311,7 @@ def check_import_names() -> Iterator[DoctorFinding]:
 
 
 def check_extensions() -> Iterator[DoctorFinding]:
-    """Installed packages that add options by entry point."""
+    """Report installed packages that add options by entry point."""
     try:
         others = [package for package in registry.find_packages() if package != registry.CORE]
         registry.list_options()

@@ -10,10 +10,15 @@ from typing import Any
 
 import pytest
 
-from brokk_rl.comparison import describe_differences
+from brokk_rl.comparison import (
+    describe_differences,
+    find_differences,
+    find_runs,
+    group_results,
+    load_run,
+)
 from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import compute_student_interval, compute_wilson_interval
-from brokk_rl.modes.compare import find_differences, find_runs, group_results, load_run
 
 
 def write_run(folder: Path, actuator: str, seed: int, strict: float, **more: Any) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import brokk_rl
+from brokk_rl import registry
 from brokk_rl.modes import doctor
 from brokk_rl.modes.doctor import Doctor, DoctorFinding, DoctorLimits
 from brokk_rl.registry import Option
@@ -18,12 +22,35 @@ def option(folder: Path, group: str, text: str) -> Option:
     return Option(group, "a", "conf", folder / "a.yaml")
 
 
-def test_an_option_is_described_by_its_spec(tmp_path: Path) -> None:
-    text = "# Not this.\n_target_: brokk_rl.modes.list.ListOptions\n"
-    assert (
-        option(tmp_path, "mode", text).summary()
-        == "Prints the options of every config group, those of installed extensions too."
-    )
+def test_an_option_without_a_comment_is_described_by_its_target(tmp_path: Path) -> None:
+    text = "_target_: brokk_rl.modes.list.ListOptions\n"
+    summary = "List the options of every config group, one line each."
+    assert option(tmp_path, "mode", text).summary() == summary
+    assert option(tmp_path, "mode", "# Another.\n" + text).summary() == "Another."
+
+
+def test_targets_of_earlier_versions_are_renamed_wherever_yaml_may_hold_them() -> None:
+    renamed = registry.load_renamed_targets()
+    assert renamed, "a file of an earlier version would not load"
+    old, new = next(iter(renamed.items()))
+    text = f"a: {{_target_: {old}, b: 1}}\n_target_: '{old}'\nnote: {old}\n"
+    expected = f"a: {{_target_: {new}, b: 1}}\n_target_: '{new}'\nnote: {old}\n"
+    assert registry.rename_targets(text) == expected
+
+
+def test_the_version_needs_no_configuration(brokk: Callable[..., Any]) -> None:
+    done = brokk("--version")
+    assert done.code == 0
+    assert done.out.strip() == f"brokk {brokk_rl.__version__}"
+
+
+def test_a_reader_that_stops_early_causes_no_traceback() -> None:
+    command = [sys.executable, "-m", "brokk_rl", "mode=list"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout and process.stderr
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait(timeout=60) != 0
 
 
 def test_an_override_is_described_by_the_first_sentence_of_its_comment(tmp_path: Path) -> None:
