@@ -1,7 +1,7 @@
-"""`diagnosis.json`: what a diagnosis says, as data. Effects, joints and numbers have the names of the effect registry.
+"""`diagnosis.json`: the answer of a diagnosis as data.
 
-Fields that a reader may rely on stand here; `more` holds whatever else the engine found worth
-telling, as plain JSON.
+Effects, joints and numbers have the names of the effect registry. Fields that a reader may rely on
+stand here; `more` holds everything else that the diagnosis reports, as plain JSON.
 """
 
 from __future__ import annotations
@@ -15,7 +15,65 @@ from typing import Any, Literal
 
 from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.session import write_json
-from diagnosis.closed import Estimate, Gap, JointClosed
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its 95 % interval."""
+
+    mean: float
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class JointClosed:
+    """Error of one joint over 5 s free runs before, after and at the floor, rad or m, and what of it is closed.
+
+    Attributes:
+        before: Of the simulator as it was.
+        after: With the selected effects.
+        floor: `None` without any.
+        share: `1 - after / before`.
+        closed: `(before - after) / (before - floor)`; `None` without a floor below `before`.
+    """
+
+    before: float
+    after: float
+    floor: float | None
+    share: float
+    closed: float | None
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Free-running error over 5 s on parts of the field recordings that were not fitted to, all joints together.
+
+    Attributes:
+        before: Of the simulator as it was.
+        after: With the selected effects.
+        floor: What it would be without any effect: the simulator's on left-out reference
+            recordings; without a reference that of a flexible model on field recordings that it was
+            not fitted to; `None` where neither is known.
+        closed: `(before - after) / (before - floor)`; `None` where there is no gap to close.
+        unit: `rad` or `m`; `travel` on a machine with joints of both kinds, whose errors are taken
+            over their travel.
+        floor_of: `reference`, `flexible model`, or empty.
+        joints: The same joint by joint.
+    """
+
+    before: float
+    after: float
+    floor: float | None
+    closed: Estimate | None
+    unit: str = "rad"
+    floor_of: str = "reference"
+    joints: Mapping[str, JointClosed] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """Name of the errors in `diagnosis.json`."""
+        return f"rmse_{self.unit}"
+
 
 SCHEMA = 1
 FILE = "diagnosis.json"

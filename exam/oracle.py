@@ -11,8 +11,8 @@ import numpy as np
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.machine import Machine
 from diagnosis import gap
-from diagnosis.repair import repair
-from diagnosis.sizes import fitted
+from diagnosis.refine import repair
+from diagnosis.responses import fitted
 from exam import ground
 from exam.ground import Errors
 

@@ -15,9 +15,9 @@ import numpy as np
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from diagnosis import sizes
+from diagnosis import responses
 from diagnosis.answer import FILE, Answer, Ranked, Selected, Where
-from diagnosis.noise import loss
+from diagnosis.residuals import robust_loss
 from exam import ground
 from exam.ground import Errors
 
@@ -74,15 +74,18 @@ def grown(errors: Errors, worth: Worth) -> dict[str, float]:
 def held_out(errors: Errors, names: frozenset[str]) -> float:
     """Returns the gain in log likelihood on the half that was not fitted to."""
     return float(
-        loss(errors.z) - loss(errors.z - sizes.crossed(errors.z, errors.rays(names), errors.fold))
+        robust_loss(errors.z)
+        - robust_loss(errors.z - responses.crossed(errors.z, errors.rays(names), errors.fold))
     )
 
 
 def bic(errors: Errors, names: frozenset[str]) -> float:
     """Returns the gain in log likelihood on all entries, less the price of the parameters."""
     rays = errors.rays(names)
-    left = errors.z - sizes.predicted(rays, sizes.fitted(errors.z, rays))
-    return float(loss(errors.z) - loss(left)) - 0.5 * len(rays) * float(np.log(len(errors.z)))
+    left = errors.z - responses.predicted(rays, responses.fitted(errors.z, rays))
+    return float(robust_loss(errors.z) - robust_loss(left)) - 0.5 * len(rays) * float(
+        np.log(len(errors.z))
+    )
 
 
 def _said(gains: dict[str, dict[str, float]]) -> Answer:

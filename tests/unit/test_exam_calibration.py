@@ -14,12 +14,12 @@ from composed import option
 
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
-from diagnosis import library, verdict, weighing
-from diagnosis.certainty import Certainty
-from diagnosis.engine import Findings, Prices
-from diagnosis.evidence import Evidence
+from diagnosis import decision, effect_library
+from diagnosis.calibration import Certainty
+from diagnosis.detection import Findings, Prices
+from diagnosis.residuals import Evidence
+from diagnosis.responses import Shape, plain
 from diagnosis.search import Table
-from diagnosis.sizes import Shape, plain
 from exam import seal
 from exam.calibration import Calibration, Item, items
 
@@ -38,7 +38,10 @@ def weights() -> Certainty:
 
 def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findings:
     """Returns findings on a machine whose first joint has a lag of some strength, in noise."""
-    random, kinds = np.random.default_rng(seed), library.load(machine, ["lag", "dead_band"])
+    random, kinds = (
+        np.random.default_rng(seed),
+        effect_library.load_effects(machine, ["lag", "dead_band"]),
+    )
     tables, block = [], np.arange(800) // 80
     for j in range(machine.num_joints):
         columns = random.standard_normal((2, 800))
@@ -54,7 +57,7 @@ def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findi
         return prices.joint * len(subset) + prices.reference * 1.5
 
     evidence = cast(Evidence, SimpleNamespace(z=np.zeros((len(tables), 800)), block=block))
-    chosen, still = weighing.chosen_of(tables, price, prices, kinds), np.zeros(len(tables))
+    chosen, still = decision.chosen_of(tables, price, prices, kinds), np.zeros(len(tables))
     return Findings(
         evidence,
         tables,
@@ -72,12 +75,14 @@ def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findi
 
 
 def test_what_was_weighed_is_chosen_from_again_as_it_was(machine: Machine, prices: Prices) -> None:
-    first, kinds = found(machine, prices, 0.5, 0), library.load(machine)
-    told = json.loads(json.dumps(weighing.weighed(first, prices)))
-    again = weighing.findings(told, prices, kinds)
+    first, kinds = found(machine, prices, 0.5, 0), effect_library.load_effects(machine)
+    told = json.loads(json.dumps(decision.record_weights(first, prices)))
+    again = decision.restore_result(told, prices, kinds)
     assert first.chosen.names == {"lag"} and again.chosen.subsets == first.chosen.subsets
     assert again.chosen.worth == pytest.approx(first.chosen.worth, abs=0.1)
-    assert not weighing.findings(told, dataclasses.replace(prices, joint=500.0), kinds).chosen.names
+    assert not decision.restore_result(
+        told, dataclasses.replace(prices, joint=500.0), kinds
+    ).chosen.names
 
 
 def label(kind: str, effects: list[dict[str, Any]]) -> dict[str, Any]:
@@ -97,15 +102,22 @@ def test_prices_are_found_that_name_what_is_there_and_nothing_else(
     lag = {"effect": "lag", "joints": ["q1"], "size": 1.0, "parameters": {}, "nothing": {}}
     cases = [
         *(
-            Item(label("none", []), weighing.weighed(found(machine, cheap, 0.14, seed), cheap))
+            Item(
+                label("none", []), decision.record_weights(found(machine, cheap, 0.14, seed), cheap)
+            )
             for seed in range(3)
         ),
         *(
-            Item(label("one", [lag]), weighing.weighed(found(machine, cheap, 0.4, seed), cheap))
+            Item(
+                label("one", [lag]),
+                decision.record_weights(found(machine, cheap, 0.4, seed), cheap),
+            )
             for seed in range(3)
         ),
     ]
-    fit = Calibration(machine, library.load(machine), [], [], trials=8, seed=0, workers=1)
+    fit = Calibration(
+        machine, effect_library.load_effects(machine), [], [], trials=8, seed=0, workers=1
+    )
     assert fit.value(cases, cheap, weights) < 0.8
     best = fit.fitted(cases, cheap, weights, lambda: None)
     assert fit.value(cases, *best) == pytest.approx(1.0)
@@ -122,11 +134,11 @@ def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothin
         weights, outside=outside, none={"constant": 2.0, "nearest": 0.0, "outside": 0.0}
     )
     named, silent = found(machine, prices, 0.5, 0), found(machine, prices, 0.0, 1)
-    assert verdict.is_unknown(named, prices, weights), (
+    assert decision.is_unknown(named, prices, weights), (
         "a fifth of causes lies outside, so few are missed only so"
     )
-    assert not verdict.is_unknown(silent, prices, weights)
-    rows = verdict.ranking(named, [], prices, weights, machine, 0.4)
+    assert not decision.is_unknown(silent, prices, weights)
+    rows = decision.ranking(named, [], prices, weights, machine, 0.4)
     assert max(rows, key=lambda row: row.probability).probability == pytest.approx(0.4)
     assert {row.effect for row in rows} >= {"lag", "unknown", "none"}
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
-from diagnosis.sizes import Shape
+from diagnosis.responses import Shape
 from exam import marking, rules, tally
 from exam.ground import Errors
 from exam.marking import Claim, Mark, mark
