@@ -27,7 +27,7 @@ from actuators.models.network import Coupled, JointNetworks, Mlp
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.rl.graph import capture
+from brokk_rl.rl.execution import capture_graph
 from brokk_rl.spec import spec
 from brokk_rl.split import COMMANDED
 
@@ -93,7 +93,7 @@ class FreeRunOptimizer:
         if self._device.type != "cuda":
             return update
         before = {name: value.clone() for name, value in self.state().items()}
-        graph = capture(update, self._device, gradients=True)
+        graph = capture_graph(update, self._device, gradients=True)
         for name, value in self.state().items():
             value.copy_(before[name])
         return graph.replay
