@@ -55,9 +55,8 @@ class SpeedData:
     ) -> None:
         self.recordings, self.machine, self._knots = list(recordings), machine, knots
         self._period_s = machine.period_s
-        self._skip = max(
-            1, round((machine.num_history + 1.0 / machine.period_s) / WIDTH)
-        )  # what came before is not known
+        # what came before the recording is not known
+        self._skip = max(1, round((machine.num_history + 1.0 / machine.period_s) / WIDTH))
         used = [r for r in recordings if r.num_samples > WIDTH * (self._skip + 4)]
         if not used:
             raise RecordingError(
