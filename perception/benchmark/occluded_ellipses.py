@@ -5,17 +5,19 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from perception.benchmark.patterns import SUPERSAMPLING, clouds, light
+from perception.benchmark.calibration_patterns import SUPERSAMPLING, draw_clouds, draw_light
 from perception.ellipse import conic
 
 STYLES = ("behind", "outlines", "halves", "covered")
 SHAPES = ("hearts of arcs", "hearts of curves", "spirals", "polygons", "salt")
-SEEN = 0.4
+MIN_VISIBLE = 0.4
 """Part of a rim that must be seen for its ellipse to count; what shows less of itself is left out
 of the truth."""
 
 
-def hidden(generator: np.random.Generator, style: str) -> tuple[np.ndarray, np.ndarray]:
+def draw_occluded_ellipses(
+    generator: np.random.Generator, style: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns a grey picture `(h, w)` uint8 and the ellipses `(C, 5)` of which at least `SEEN` of the rim is seen.
 
     Args:
@@ -46,7 +48,7 @@ def hidden(generator: np.random.Generator, style: str) -> tuple[np.ndarray, np.n
     if style != "behind":
         paper = float(canvas[0, 0])
         grain = cv2.resize(
-            clouds(generator, width, height, 1.3), size[::-1], interpolation=cv2.INTER_LINEAR
+            draw_clouds(generator, width, height, 1.3), size[::-1], interpolation=cv2.INTER_LINEAR
         )
         for number, ellipse in enumerate(ellipses, 1):
             there = _patch(generator, ellipse, size)
@@ -57,10 +59,10 @@ def hidden(generator: np.random.Generator, style: str) -> tuple[np.ndarray, np.n
             canvas[there] = np.clip(level + rough * np.asarray(grain)[there], 0, 255)
             owner[there] = 0
     picture = _taken(canvas, generator, width, height)
-    return picture, ellipses[_seen(owner, ellipses) >= SEEN]
+    return picture, ellipses[_seen(owner, ellipses) >= MIN_VISIBLE]
 
 
-def shapes(
+def draw_lookalikes(
     generator: np.random.Generator, kind: str, width: int = 800, height: int = 600
 ) -> np.ndarray:
     """Returns a picture without ellipses, `(height, width)` uint8; `kind` is one of `SHAPES`."""
@@ -191,9 +193,9 @@ def _fixed(places: np.ndarray) -> np.ndarray:
 def _taken(
     canvas: np.ndarray, generator: np.random.Generator, width: int, height: int
 ) -> np.ndarray:
-    picture = np.asarray(cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)) * light(
-        generator, width, height
-    )
+    picture = np.asarray(
+        cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
+    ) * draw_light(generator, width, height)
     picture = cv2.GaussianBlur(picture, (0, 0), generator.uniform(0.4, 1.0))
     return np.clip(
         np.rint(picture + generator.normal(0, generator.uniform(0.5, 3), picture.shape)), 0, 255

@@ -16,10 +16,10 @@ from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from perception.segment.network import find_weights
 from perception.segment.unet import UNet, compute_loss, read_checkpoint
-from perception.train import data as training_data
-from perception.train import export, report
-from perception.train.augment import Augmentation
-from perception.train.data import Crop, Samples, Views
+from perception.train import evaluation, export
+from perception.train import samples as training_data
+from perception.train.augmentation import Augmentation
+from perception.train.samples import Crop, Samples, TrainingViews
 
 STATE = "training.pt"
 """What an interrupted training goes on from."""
@@ -135,7 +135,7 @@ class _Training:
 
     def run(self) -> dict[str, Any]:
         settings = self._settings
-        pictures, known = report.looked_at(self._unseen, settings.size_px)
+        pictures, known = evaluation.crop_segmenter_views(self._unseen, settings.size_px)
         total = torch.zeros((), device=self._device)
         log.info(
             "%d frames to train on, %d to judge by, %s",
@@ -150,7 +150,7 @@ class _Training:
         )  # fmt: skip
         if settings.start is not None and self._update == 0:
             self._validate(pictures, known, None)  # a training may make a good network worse
-        with report.progress(self._update, settings.updates) as advance:
+        with evaluation.show_progress(self._update, settings.updates) as advance:
             while self._spent() < 1.0:
                 before = self._spent()
                 total += self._step(*samples.batch(self._update, settings.batch))
@@ -179,21 +179,21 @@ class _Training:
             network.load_state_dict(first.state_dict())
         return network
 
-    def _views(self) -> tuple[Views, Views]:
+    def _views(self) -> tuple[TrainingViews, TrainingViews]:
         settings, seed = self._settings, self._session.stream("views")
-        stems = training_data.frames(settings.frames)
+        stems = training_data.list_frames(settings.frames)
         if settings.validation is None:
             last = max(1, len(stems) // settings.hold_out)
             stems, unseen = stems[:-last], stems[-last:]
         else:
-            unseen = training_data.frames(settings.validation)
+            unseen = training_data.list_frames(settings.validation)
             if shared := {path.resolve() for path in stems} & {path.resolve() for path in unseen}:
                 raise ConfigError(
                     f"training.validation: {min(shared)} is also among training.frames; judge by other frames"
                 )
         if not stems:
             raise ConfigError("training.frames: one frame is too few to train on and to judge by")
-        both = training_data.read([*stems, *unseen], settings.size_px, settings.margin, seed)
+        both = training_data.read_views([*stems, *unseen], settings.size_px, settings.margin, seed)
         return both.part(slice(0, len(stems))), both.part(slice(len(stems), None))
 
     def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -235,8 +235,8 @@ class _Training:
     ) -> None:
         network = UNet(self._settings.widths).to(self._device)
         network.load_state_dict(self._mean)
-        probabilities = report.predicted(network, pictures, self._device)
-        figures = report.judged(probabilities, known, self._unseen.conditions)["all"]
+        probabilities = evaluation.predict(network, pictures, self._device)
+        figures = evaluation.compute_metrics(probabilities, known, self._unseen.conditions)["all"]
         block, mouth = figures["block"] or 0.0, figures["mouth"] or 0.0
         self._curve.append(
             {"update": self._update, "loss": mean_loss, "block": block, "mouth": mouth}
@@ -261,8 +261,8 @@ class _Training:
         network = UNet(self._settings.widths)
         network.load_state_dict(self._best_tensors)
         network.eval().requires_grad_(False)
-        probabilities = report.predicted(network.to(self._device), pictures, self._device)
-        conditions = report.judged(probabilities, known, self._unseen.conditions)
+        probabilities = evaluation.predict(network.to(self._device), pictures, self._device)
+        conditions = evaluation.compute_metrics(probabilities, known, self._unseen.conditions)
         network.cpu()
         facts = {
             "overlap": {name: conditions["all"][name] for name in ("block", "mouth")},
@@ -271,12 +271,12 @@ class _Training:
             "margin": self._settings.margin,
             "data": self._stamp["data"],
         }
-        header = export.header_of(network, self._settings.size_px, facts)
-        export.write(self._folder / export.TENSORS, network, header)
+        header = export.build_header(network, self._settings.size_px, facts)
+        export.write_checkpoint(self._folder / export.TENSORS, network, header)
         compared = pictures[: min(len(pictures), 8)].flatten(0, 1).float() / 255.0
         parity = export.write_onnx(self._folder / export.ONNX, network, header, compared)
-        report.draw_curve(self._folder / "curve.png", self._curve)
-        report.draw_samples(self._folder / "samples.png", pictures, probabilities, known)
+        evaluation.draw_curve(self._folder / "curve.png", self._curve)
+        evaluation.draw_samples(self._folder / "samples.png", pictures, probabilities, known)
         return {
             "schema": 1,
             "conditions": conditions,

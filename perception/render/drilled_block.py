@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from perception.render.solids import Box, Hits, Pose, Surface
-from perception.render.texture import Material
+from perception.render.materials import Material
+from perception.render.solids import Box, Hits, SolidPose, Surface
 
 FRONT = 5
 """Part of a box that faces along +z of its pose: the face that is drilled."""
@@ -23,7 +23,7 @@ _MARCH = 4
 
 
 @dataclass(frozen=True)
-class Hole:
+class DrilledHole:
     """A cylinder drilled at right angles into face `part` of a block.
 
     Attributes:
@@ -107,13 +107,13 @@ class Disc:
 
 
 @dataclass(frozen=True)
-class Block:
+class DrilledBlock:
     """A box with holes, chips and discs. Parts: six faces, wall and floor of each hole, fresh breaks, then the discs."""
 
-    pose: Pose
+    pose: SolidPose
     half_m: np.ndarray
     materials: tuple[Material, ...]
-    holes: tuple[Hole, ...]
+    holes: tuple[DrilledHole, ...]
     chips: tuple[Chip, ...] = ()
     discs: tuple[Disc, ...] = ()
     role: str = field(default="block")
@@ -214,7 +214,7 @@ class Block:
         return Surface(normal, uv, openness, sunlit)
 
 
-def _inside(hole: Hole, point: np.ndarray, floor: np.ndarray, sun: np.ndarray) -> Surface:
+def _inside(hole: DrilledHole, point: np.ndarray, floor: np.ndarray, sun: np.ndarray) -> Surface:
     """Describes the inside of a hole in the block's coordinates.
 
     The part of the sky that is seen through the mouth is, for a ring of the wall at depth h, with x

@@ -136,7 +136,7 @@ class TagGrid:
 
 
 @spec
-class Given:
+class GivenPoses:
     """Camera poses from a file, or from the frames themselves.
 
     Attributes:

@@ -78,7 +78,7 @@ class Light:
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """What a camera sees, without noise.
 
     Attributes:
@@ -132,7 +132,7 @@ class Tracer:
             if solid.corners_m is not None
         ]
 
-    def view(self, camera: Pinhole) -> View:
+    def view(self, camera: Pinhole) -> RenderedView:
         """Returns what `camera` sees."""
         size = (camera.height, camera.width)
         rows = max(1, CHUNK // camera.width)
@@ -161,7 +161,7 @@ class Tracer:
                 .mean(1)
             )
         depth = np.where(whole.solid == NOTHING, np.nan, whole.depth_m).astype(np.float32)
-        return View(
+        return RenderedView(
             radiance.reshape(*size, 3),
             depth.reshape(size),
             whole.solid.reshape(size),

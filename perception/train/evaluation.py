@@ -22,7 +22,7 @@ from rich.progress import (
 from perception.segment.network import THRESHOLD
 from perception.segment.unet import CHANNELS, UNet
 from perception.segment.window import center_window, cover_picture
-from perception.train.data import LOOKS, ROOM, Views
+from perception.train.samples import LOOKS, ROOM, TrainingViews
 
 BATCH = 32
 ALIKE = 0.5
@@ -32,7 +32,9 @@ SHOWN = 12
 COLOURS = {"block": (0, 114, 178), "mouth": (213, 94, 0)}
 
 
-def looked_at(views: Views, size_px: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+def crop_segmenter_views(
+    views: TrainingViews, size_px: tuple[int, int]
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns what the segmenter would see of each frame, `(F, 2, 3, h, w)` uint8, and what is there, `(F, 2, 2, h, w)` bool."""
     width, height = size_px
     full = tuple(views.layers.shape[3:])
@@ -57,7 +59,7 @@ def looked_at(views: Views, size_px: tuple[int, int]) -> tuple[torch.Tensor, tor
 
 
 @torch.no_grad()
-def predicted(network: UNet, pictures: torch.Tensor, device: torch.device) -> torch.Tensor:
+def predict(network: UNet, pictures: torch.Tensor, device: torch.device) -> torch.Tensor:
     """Returns the probabilities for pictures `(F, 2, 3, h, w)` uint8, `(F, 2, 2, h, w)`, on the CPU."""
     network.eval()
     flat, found = pictures.flatten(0, 1), []
@@ -70,7 +72,7 @@ def predicted(network: UNet, pictures: torch.Tensor, device: torch.device) -> to
     return torch.cat(found).unflatten(0, pictures.shape[:2])
 
 
-def judged(
+def compute_metrics(
     probabilities: torch.Tensor, known: torch.Tensor, conditions: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
     """Returns figures for each condition, and for all frames under `all`.
@@ -84,9 +86,9 @@ def judged(
     """
     said = probabilities > THRESHOLD
     block, mouth = (said[:, 0, 0], known[:, 0, 0]), (said[:, 1, 1], known[:, 1, 1])
-    counts = np.array([pieces(a.numpy(), b.numpy()) for a, b in zip(*mouth, strict=True)]).reshape(
-        -1, 3
-    )
+    counts = np.array(
+        [match_pieces(a.numpy(), b.numpy()) for a, b in zip(*mouth, strict=True)]
+    ).reshape(-1, 3)
     table = {}
     for name in ("all", *sorted(set(conditions))):
         chosen = np.array([name in ("all", condition) for condition in conditions])
@@ -106,7 +108,7 @@ def _iou(said: torch.Tensor, known: torch.Tensor) -> float | None:
     return float((said & known).sum() / (said | known).sum()) if known.any() else None
 
 
-def pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
+def match_pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
     """Returns how many mouths were found, how many there are, and how many pieces of `said` touch none."""
     num_said, said_labels = cv2.connectedComponents(said.astype(np.uint8))
     num_known, known_labels = cv2.connectedComponents(known.astype(np.uint8))
@@ -124,7 +126,7 @@ def pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
 
 
 @contextmanager
-def progress(done: int, total: int) -> Iterator[Callable[[], None]]:
+def show_progress(done: int, total: int) -> Iterator[Callable[[], None]]:
     """Shows how far a training is; yields what says that it is one update farther."""
     columns = (
         TextColumn("training"),

@@ -8,23 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from perception.calibrate import rigid
+from perception.calibrate import transforms
 
 log = logging.getLogger(__name__)
 
 STEP_S = 0.01
 OVER_S, LONGEST_S = 0.25, 0.7
 """Speeds are taken over the first; over a gap longer than the second one says nothing."""
-FEWEST = 15
+MIN_SPEEDS = 15
 """Pairs of frames that must have a speed."""
-STD_S = 0.02
+CLOCK_STD_S = 0.02
 """How well the correlation of speeds tells the offset; the poses tell the rest."""
-JITTER_S = 0.005
+FRAME_JITTER_S = 0.005
 """By which the time of a single frame may be off."""
 
 
 @dataclass(frozen=True)
-class ClockOffset:
+class ClockEstimate:
     """What is added to the time of a frame to have the time of the recording.
 
     Attributes:
@@ -38,14 +38,14 @@ class ClockOffset:
     is_trusted: bool
 
 
-def offset(
+def estimate_clock_offset(
     frame_s: np.ndarray,
     turns: np.ndarray,
     recording_s: np.ndarray,
     link_turns: np.ndarray,
     largest_s: float,
     least_correlation: float,
-) -> ClockOffset | None:
+) -> ClockEstimate | None:
     """Returns the offset at which the speeds of turning agree best, `None` where there is too little motion to compare.
 
     Args:
@@ -61,21 +61,21 @@ def offset(
     here = here[frame_s[later[here]] - frame_s[here] <= LONGEST_S]
     begin, end = frame_s[here], frame_s[later[here]]
     # how far it turned: not about which axis, that is what nobody knows yet
-    seen = _turned(turns[here], turns[later[here]]) / (end - begin)
+    seen = _compute_angles(turns[here], turns[later[here]]) / (end - begin)
     link = Slerp(recording_s, Rotation.from_matrix(link_turns))
-    fastest = float((_turned(link_turns[:-1], link_turns[1:]) / np.diff(recording_s)).max())
+    fastest = float((_compute_angles(link_turns[:-1], link_turns[1:]) / np.diff(recording_s)).max())
     believed = seen <= 1.3 * fastest + 1e-9  # a board that jumps was seen wrongly
     begin, end, seen = begin[believed], end[believed], seen[believed]
-    if len(seen) < FEWEST:
+    if len(seen) < MIN_SPEEDS:
         return None
     tried, scores = np.arange(-largest_s, largest_s + STEP_S / 2, STEP_S), []
     for shift in tried:
         inside = (begin + shift >= recording_s[0]) & (end + shift <= recording_s[-1])
-        if inside.sum() < FEWEST:
+        if inside.sum() < MIN_SPEEDS:
             scores.append(-1.0)
             continue
         ends = (link(times[inside] + shift).as_matrix() for times in (begin, end))
-        one, other = _turned(*ends) / (end - begin)[inside], seen[inside]
+        one, other = _compute_angles(*ends) / (end - begin)[inside], seen[inside]
         both = one.std() * other.std()
         scores.append(
             float(np.mean((one - one.mean()) * (other - other.mean())) / both)
@@ -90,7 +90,7 @@ def offset(
         before, here, after = scores[best - 1 : best + 2]
         bend = before - 2 * here + after
         top += 0.5 * STEP_S * (before - after) / bend if bend < 0 else 0.0
-    found = ClockOffset(float(top), scores[best], scores[best] >= least_correlation)
+    found = ClockEstimate(float(top), scores[best], scores[best] >= least_correlation)
     if not found.is_trusted:
         log.warning(
             "clocks: speeds of board and arm correlate by %.2f, %g is needed to tell an offset; it is taken for 0. Move the "
@@ -99,6 +99,8 @@ def offset(
     return found
 
 
-def _turned(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _compute_angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Returns by which angles rotations differ, rad."""
-    return np.linalg.norm(rigid.turn_of(np.swapaxes(one, 1, 2) @ other), axis=1)
+    return np.linalg.norm(
+        transforms.compute_rotation_vectors(np.swapaxes(one, 1, 2) @ other), axis=1
+    )

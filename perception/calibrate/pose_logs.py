@@ -12,18 +12,22 @@ from scipy.spatial.transform import Rotation, Slerp
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from perception.calibrate import arm, clock, judgement, rigid, spread
-from perception.calibrate.hand_eye import FEWEST, solve
-from perception.calibrate.result import stored
-from perception.calibrate.views import Views, expected
+from perception.calibrate import arm, clock_offset, evaluation, transforms
+from perception.calibrate.extrinsics import build_calibration
+from perception.calibrate.hand_eye import (
+    MIN_VIEWS,
+    HandEyeViews,
+    predict_board_poses,
+    solve_hand_eye,
+)
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 SPEED_OVER_S = 0.1
-APART_S = 1e-6
+MIN_TIME_STEP_S = 1e-6
 
 
 @dataclass(frozen=True)
-class Log:
+class PoseLog:
     """Poses over time: times `(T,)`, strictly increasing, and transforms `(T, 4, 4)`."""
 
     t_s: np.ndarray
@@ -33,13 +37,13 @@ class Log:
         """Returns poses in between, `(N, 4, 4)`: turns along the shortest way, shifts along lines."""
         inside = np.clip(t_s, self.t_s[0], self.t_s[-1])
         turns = Slerp(self.t_s, Rotation.from_matrix(self.poses[:, :3, :3]))(inside).as_matrix()
-        return rigid.pose(
+        return transforms.make_transform(
             turns, np.stack([np.interp(inside, self.t_s, self.poses[:, k, 3]) for k in range(3)], 1)
         )
 
 
 @spec
-class ByPoses:
+class PoseLogCalibration:
     """Two CSV files of poses, `t_s,x_m,y_m,z_m,qx,qy,qz,qw`: what the arm says and what the camera sees.
 
     Attributes:
@@ -90,31 +94,36 @@ class ByPoses:
             ConfigError: a file cannot be read as a log of poses.
             FrameError: the poses do not tell where the camera is.
         """
-        hand, eye = read(Path(self.arm)), read(Path(self.camera))
+        hand, eye = read_pose_log(Path(self.arm)), read_pose_log(Path(self.camera))
         if self.arm_tells == "link_from_base":
-            hand = Log(hand.t_s, rigid.inverse(hand.poses))
+            hand = PoseLog(hand.t_s, transforms.invert(hand.poses))
         if self.camera_tells == "board_from_camera":
-            eye = Log(eye.t_s, rigid.inverse(eye.poses))
+            eye = PoseLog(eye.t_s, transforms.invert(eye.poses))
         offset = None
         if self.clock_s:
             turns = (eye.t_s, eye.poses[:, :3, :3], hand.t_s, hand.poses[:, :3, :3])
-            offset = clock.offset(*turns, self.clock_s, self.least_correlation)
+            offset = clock_offset.estimate_clock_offset(
+                *turns, self.clock_s, self.least_correlation
+            )
         shift_s = offset.offset_s if offset is not None and offset.is_trusted else 0.0
         inside = np.flatnonzero(
             (eye.t_s + shift_s >= hand.t_s[0]) & (eye.t_s + shift_s <= hand.t_s[-1])
         )
         if len(inside) > self.max_poses:
             inside = inside[np.linspace(0, len(inside) - 1, self.max_poses).round().astype(int)]
-        if len(inside) < FEWEST:
+        if len(inside) < MIN_VIEWS:
             raise FrameError(
-                f"calibration: {len(inside)} poses of {self.camera} lie within the time of {self.arm}, {FEWEST} are needed at least"
+                f"calibration: {len(inside)} poses of {self.camera} lie within the time of {self.arm}, "
+                f"{MIN_VIEWS} are needed at least"
             )
         views = self._views(hand, eye.t_s[inside], eye.poses[inside], shift_s, offset is not None)
-        solution = solve(views)
+        solution = solve_hand_eye(views)
         assert solution is not None  # there are enough
-        turned, _ = spread.turns_rad(views.base_from_link[solution.used])
-        distance_m = np.linalg.norm(expected(views, solution.guess)[solution.used, :3, 3], axis=1)
-        missing = spread.unturned(
+        turned, _ = evaluation.measure_rotation_ranges(views.base_from_link[solution.used])
+        distance_m = np.linalg.norm(
+            predict_board_poses(views, solution.guess)[solution.used, :3, 3], axis=1
+        )
+        missing = evaluation.list_missing_motions(
             views.base_from_link[solution.used], distance_m, self.least_turn_rad
         )
         if turned[1] < 0.1 * self.least_turn_rad:
@@ -124,12 +133,12 @@ class ByPoses:
         other = "T_link_board" if self.camera_on == "base" else "T_base_board"
         more = {
             other: solution.guess.link_from_board.round(9).tolist(),
-            **judgement.told(views, solution, offset, shift_s),
+            **evaluation.summarise_solution(views, solution, offset, shift_s),
             "turns_rad": turned.round(4).tolist(),
             "missing": missing,
         }
-        cov, judged = solution.cov[:6, :6], judgement.of_views(views, solution)
-        told = stored(
+        cov, judged = solution.cov[:6, :6], evaluation.list_residuals(views, solution)
+        told = build_calibration(
             "poses", machine, solution.guess.base_from_camera, cov, judged, self.work_m, more
         )
         if self.camera_on == "base":
@@ -139,19 +148,19 @@ class ByPoses:
         }
 
     def _views(
-        self, hand: Log, eye_s: np.ndarray, seen: np.ndarray, shift_s: float, moving: bool
-    ) -> Views:
+        self, hand: PoseLog, eye_s: np.ndarray, seen: np.ndarray, shift_s: float, moving: bool
+    ) -> HandEyeViews:
         """Returns the views. A camera on the link is the same problem with link and base in each other's place."""
         t_s = eye_s + shift_s
 
         def at(times: np.ndarray) -> np.ndarray:
             poses = hand.at(times)
-            return poses if self.camera_on == "base" else rigid.inverse(poses)
+            return poses if self.camera_on == "base" else transforms.invert(poses)
 
         poses, count = at(t_s), len(t_s)
         about = poses if self.camera_on == "base" else np.broadcast_to(np.eye(4), poses.shape)
         slack, shared, std, names = (
-            [arm.wobble(about, *self.arm_std)],
+            [arm.build_wobble_motions(about, *self.arm_std)],
             np.zeros((count, 0, 6)),
             [],
             (),
@@ -159,7 +168,9 @@ class ByPoses:
         if moving:
             before, after = at(t_s - SPEED_OVER_S / 2), at(t_s + SPEED_OVER_S / 2)
             turn = (
-                rigid.turn_of(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2))
+                transforms.compute_rotation_vectors(
+                    after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2)
+                )
                 / SPEED_OVER_S
             )
             shift = (after[:, :3, 3] - before[:, :3, 3]) / SPEED_OVER_S - np.cross(
@@ -167,18 +178,18 @@ class ByPoses:
             )
             shared, std, names = (
                 np.concatenate([shift, turn], 1)[:, None],
-                [clock.STD_S],
-                (judgement.CLOCK,),
+                [clock_offset.CLOCK_STD_S],
+                (evaluation.CLOCK_NAME,),
             )
-            slack.append(clock.JITTER_S * shared)
+            slack.append(clock_offset.FRAME_JITTER_S * shared)
         cov = np.diag(np.repeat(self.camera_std, 3)) ** 2
-        return Views(
+        return HandEyeViews(
             poses, seen[:, None], np.broadcast_to(cov, (count, 1, 6, 6)), np.concatenate(slack, 1), shared, np.array(std),
             tuple(f"{one:.3f} s" for one in eye_s), names,
         )  # fmt: skip
 
 
-def read(path: Path) -> Log:
+def read_pose_log(path: Path) -> PoseLog:
     """Returns the poses of a CSV file; a line of names may come first.
 
     Raises:
@@ -206,10 +217,13 @@ def read(path: Path) -> Log:
         raise ConfigError(
             f"{path}: line {int(np.flatnonzero(wrong)[0]) + skipped + 1}: expected numbers and a unit quaternion qx qy qz qw"
         )
-    if len(table) < FEWEST:
-        raise ConfigError(f"{path}: {len(table)} poses, {FEWEST} are needed at least")
-    if (step := np.diff(table[:, 0])).min() <= APART_S:
+    if len(table) < MIN_VIEWS:
+        raise ConfigError(f"{path}: {len(table)} poses, {MIN_VIEWS} are needed at least")
+    if (step := np.diff(table[:, 0])).min() <= MIN_TIME_STEP_S:
         raise ConfigError(
             f"{path}: line {int(np.argmin(step)) + skipped + 2}: time does not increase"
         )
-    return Log(table[:, 0], rigid.pose(Rotation.from_quat(table[:, 4:]).as_matrix(), table[:, 1:4]))
+    return PoseLog(
+        table[:, 0],
+        transforms.make_transform(Rotation.from_quat(table[:, 4:]).as_matrix(), table[:, 1:4]),
+    )

@@ -9,17 +9,17 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
-from perception.render.drilled import Block
-from perception.render.sensor import Exposure
+from perception.render.drilled_block import DrilledBlock
+from perception.render.ray_tracer import Light
 from perception.render.solids import Solid
-from perception.render.tracer import Light
+from perception.render.stereo_camera import CameraExposure
 
 Range = tuple[float, float]
 Count = tuple[int, int]
 
 
 @spec
-class Sight:
+class ViewpointRanges:
     """From where the block is seen.
 
     Attributes:
@@ -37,7 +37,7 @@ class Sight:
 
 
 @spec
-class Concrete:
+class BlockRanges:
     """The block and what has been done to it.
 
     Attributes:
@@ -103,7 +103,7 @@ class Concrete:
 
 
 @spec
-class Surroundings:
+class SurroundingsRanges:
     """What else is there.
 
     Attributes:
@@ -128,7 +128,7 @@ class Surroundings:
 
 
 @spec
-class Daylight:
+class LightRanges:
     """How it is lit and how the camera takes it.
 
     Attributes:
@@ -189,9 +189,9 @@ class Scene:
     """
 
     solids: tuple[Solid, ...]
-    block: Block | None
+    block: DrilledBlock | None
     light: Light
-    exposure: Exposure
+    exposure: CameraExposure
     sky: tuple[float, float, float]
     hidden: tuple[float, ...]
     hidden_discs: tuple[float, ...]
@@ -199,8 +199,8 @@ class Scene:
 
 
 @spec
-class Scenes:
-    """A kind of scene; `perception.render.drawing.compose` draws one.
+class SceneRanges:
+    """A kind of scene; `perception.render.scene_sampler.compose_scene` draws one.
 
     Attributes:
         name: What it is called in truth files and tables.
@@ -211,10 +211,10 @@ class Scenes:
     """
 
     name: str
-    sight: Sight
-    block: Concrete
-    around: Surroundings
-    light: Daylight
+    sight: ViewpointRanges
+    block: BlockRanges
+    around: SurroundingsRanges
+    light: LightRanges
 
     def check(self) -> None:
         for part in (self.sight, self.block, self.around, self.light):
@@ -223,16 +223,16 @@ class Scenes:
                     raise ConfigError(f"scene: {field} {value} ends before it begins")
 
 
-def uniform(value: Range, generator: np.random.Generator) -> float:
+def draw_uniform(value: Range, generator: np.random.Generator) -> float:
     """Draws evenly from a range."""
     return float(generator.uniform(*value))
 
 
-def logarithmic(value: Range, generator: np.random.Generator) -> float:
+def draw_log_uniform(value: Range, generator: np.random.Generator) -> float:
     """Draws from a range, each factor as likely as any other."""
     return math.exp(generator.uniform(math.log(value[0]), math.log(value[1])))
 
 
-def integer(value: Count, generator: np.random.Generator) -> int:
+def draw_integer(value: Count, generator: np.random.Generator) -> int:
     """Draws a whole number, both ends included."""
     return int(generator.integers(value[0], value[1] + 1))

@@ -25,7 +25,7 @@ from brokk_rl.spec import spec
 from perception import dataset
 from perception.segment.network import SMALLEST_PIECE, THRESHOLD
 from perception.segment.window import Window, bound_block, center_window, cover_picture
-from perception.train.augment import Augmentation, augmented
+from perception.train.augmentation import Augmentation, apply_augmentations
 
 ROOM = 1.5
 """Size of a stored view over the network's picture: what a crop can take away without loss of
@@ -95,7 +95,7 @@ class Crop:
 
 
 @dataclass(frozen=True)
-class Views:
+class TrainingViews:
     """Views of all frames, in memory.
 
     Attributes:
@@ -112,9 +112,9 @@ class Views:
     def __len__(self) -> int:
         return len(self.names)
 
-    def part(self, chosen: slice) -> Views:
+    def part(self, chosen: slice) -> TrainingViews:
         """Returns the chosen frames."""
-        return Views(self.layers[chosen], self.conditions[chosen], self.names[chosen])
+        return TrainingViews(self.layers[chosen], self.conditions[chosen], self.names[chosen])
 
 
 class Samples:
@@ -133,7 +133,7 @@ class Samples:
 
     def __init__(
         self,
-        views: Views,
+        views: TrainingViews,
         crop: Crop,
         steps: Mapping[str, Augmentation],
         size_px: tuple[int, int],
@@ -163,11 +163,13 @@ class Samples:
         taken = self._layers[tuple(place)].to(self._device, non_blocking=True)
         seen = torch.tensor(SEEN)[look].to(self._device, non_blocking=True)
         windows = self._crop.windows(seen, (taken.shape[2], taken.shape[3]), generator)
-        layers = cut(taken, windows, self._size_px)
-        return augmented(layers[:, :3], self._steps, chance, generator), layers[:, 3:]
+        layers = cut_windows(taken, windows, self._size_px)
+        return apply_augmentations(layers[:, :3], self._steps, chance, generator), layers[:, 3:]
 
 
-def cut(layers: torch.Tensor, windows: torch.Tensor, size_px: tuple[int, int]) -> torch.Tensor:
+def cut_windows(
+    layers: torch.Tensor, windows: torch.Tensor, size_px: tuple[int, int]
+) -> torch.Tensor:
     """Returns parts of pictures `(B, C, H, W)` uint8 in the size of a sample, `(B, C, h, w)` float32 in [0, 1].
 
     Args:
@@ -182,7 +184,7 @@ def cut(layers: torch.Tensor, windows: torch.Tensor, size_px: tuple[int, int]) -
     return functional.avg_pool2d(seen, FINER)
 
 
-def frames(folders: str | Sequence[str]) -> list[Path]:
+def list_frames(folders: str | Sequence[str]) -> list[Path]:
     """Returns the frames with a mask in a folder, or in some, and those below them, as paths without endings, sorted.
 
     Raises:
@@ -205,7 +207,9 @@ def frames(folders: str | Sequence[str]) -> list[Path]:
     return stems
 
 
-def read(stems: Sequence[Path], size_px: tuple[int, int], margin: float, seed: int) -> Views:
+def read_views(
+    stems: Sequence[Path], size_px: tuple[int, int], margin: float, seed: int
+) -> TrainingViews:
     """Reads frames, some at a time, and keeps their two views.
 
     Args:
@@ -234,7 +238,9 @@ def read(stems: Sequence[Path], size_px: tuple[int, int], margin: float, seed: i
             conditions = list(track(work, "reading frames", total=len(stems), transient=True))
     finally:
         cv2.setNumThreads(threads)
-    return Views(torch.from_numpy(layers), tuple(conditions), tuple(str(stem) for stem in stems))
+    return TrainingViews(
+        torch.from_numpy(layers), tuple(conditions), tuple(str(stem) for stem in stems)
+    )
 
 
 def _frame(stem: Path) -> tuple[np.ndarray, np.ndarray, str]:

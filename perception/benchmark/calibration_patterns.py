@@ -19,7 +19,7 @@ NEGATIVES = ("hearts", "octagons", "spiral", "noise", "squares", "lines", "textu
 SUPERSAMPLING = 4
 
 
-def pattern(
+def draw_pattern(
     generator: np.random.Generator, condition: str, width: int = 1024, height: int = 768
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns a grey picture `(height, width)` uint8 of a calibration pattern and its ellipses `(C, 5)`.
@@ -47,7 +47,7 @@ def pattern(
             parts = (1.0, 0.62, 0.3) if rings and radius > 0.2 else (1.0,)
             for k, part in enumerate(parts):
                 circle = np.array([[i, j, radius * part, radius * part, 0.0]])
-                forms.append(moved(circle, homography))
+                forms.append(transform_circles(circle, homography))
                 levels.append(ink if k % 2 == 0 else paper)
     ellipses = np.concatenate(forms)
     table = _table(generator, width, height)
@@ -59,16 +59,16 @@ def pattern(
     for ellipse, level in zip(ellipses, levels, strict=True):
         _fill(canvas, ellipse, float(level))
     picture = cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
-    lit = picture * light(generator, width, height)
+    lit = picture * draw_light(generator, width, height)
     large = (
         (ellipses[:, 3] >= 2.5)
         & (ellipses[:, 0] - ellipses[:, 2] > 2)
         & (ellipses[:, 0] + ellipses[:, 2] < width - 2)
     )
-    return degraded(lit, condition, generator, ellipses), ellipses[large]
+    return degrade(lit, condition, generator, ellipses), ellipses[large]
 
 
-def degraded(
+def degrade(
     picture: np.ndarray, condition: str, generator: np.random.Generator, ellipses: np.ndarray
 ) -> np.ndarray:
     """Returns a float picture as a camera gives it under a condition, uint8."""
@@ -108,14 +108,16 @@ def degraded(
     )
 
 
-def negative(
+def draw_negative(
     kind: str, generator: np.random.Generator, width: int = 1024, height: int = 768
 ) -> np.ndarray:
     """Returns a picture without ellipses; `kind` is one of `NEGATIVES`."""
     if kind == "noise":
         return np.clip(generator.normal(128, 50, (height, width)), 0, 255).astype(np.uint8)
     if kind == "texture":
-        return np.clip(128 + 60 * clouds(generator, width, height, 1.2), 0, 255).astype(np.uint8)
+        return np.clip(128 + 60 * draw_clouds(generator, width, height, 1.2), 0, 255).astype(
+            np.uint8
+        )
     big = np.full((height * 2, width * 2), 230.0, np.float32)
     ink = 40.0
     if kind == "spiral":
@@ -153,7 +155,7 @@ def negative(
     )
 
 
-def overlap(first: np.ndarray, second: np.ndarray) -> float:
+def compute_ellipse_overlap(first: np.ndarray, second: np.ndarray) -> float:
     """Returns intersection over union of two ellipses `(5,)`."""
     if np.hypot(first[0] - second[0], first[1] - second[1]) > first[2] + second[2]:
         return 0.0
@@ -165,13 +167,13 @@ def overlap(first: np.ndarray, second: np.ndarray) -> float:
     return float(shared / (cv2.contourArea(one) + cv2.contourArea(two) - shared))
 
 
-def matches(found: Sequence[Ellipse], truth: np.ndarray, least: float = 0.8) -> int:
+def count_matches(found: Sequence[Ellipse], truth: np.ndarray, least: float = 0.8) -> int:
     """Returns how many ellipses are found, each at most once, with at least this intersection over union."""
     rows = [np.array([e.x, e.y, e.a, e.b, e.theta_rad]) for e in found]
     pairs = []
     for i, row in enumerate(rows):
         near = np.flatnonzero(np.hypot(truth[:, 0] - row[0], truth[:, 1] - row[1]) < row[2])
-        pairs += [(overlap(row, truth[j]), i, int(j)) for j in near]
+        pairs += [(compute_ellipse_overlap(row, truth[j]), i, int(j)) for j in near]
     used_rows, used_truth = set(), set()
     for value, i, j in sorted(pairs, reverse=True):
         if value > least and i not in used_rows and j not in used_truth:
@@ -180,7 +182,7 @@ def matches(found: Sequence[Ellipse], truth: np.ndarray, least: float = 0.8) -> 
     return len(used_rows)
 
 
-def moved(circle: np.ndarray, homography: np.ndarray) -> np.ndarray:
+def transform_circles(circle: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Returns the ellipses `(C, 5)` that circles, rows like theirs, are after a homography."""
     back = np.linalg.inv(homography)
     return conic.convert_forms_to_ellipses(back.T @ conic.build_quadratic_forms(circle) @ back)
@@ -204,7 +206,9 @@ def _fill(canvas: np.ndarray, ellipse: np.ndarray, level: float) -> None:
     )
 
 
-def clouds(generator: np.random.Generator, width: int, height: int, power: float) -> np.ndarray:
+def draw_clouds(
+    generator: np.random.Generator, width: int, height: int, power: float
+) -> np.ndarray:
     """Returns noise whose spectrum falls with frequency, of unit variance."""
     fy, fx = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)
     spectrum = (
@@ -216,14 +220,14 @@ def clouds(generator: np.random.Generator, width: int, height: int, power: float
 
 
 def _table(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
-    table = generator.uniform(60, 180) + 12 * clouds(generator, width, height, 1.5)
+    table = generator.uniform(60, 180) + 12 * draw_clouds(generator, width, height, 1.5)
     for _ in range(int(generator.integers(0, 12))):
         ends = (generator.uniform(0, 1, (2, 2)) * (width, height)).astype(int).tolist()
         cv2.rectangle(table, ends[0], ends[1], float(generator.uniform(0, 255)), -1)
     return table
 
 
-def light(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
+def draw_light(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
     """Returns how bright a lamp from one side makes each place of a picture, `(height, width)`."""
     slope = generator.uniform(-0.25, 0.25, 2)
     x, y = np.meshgrid(

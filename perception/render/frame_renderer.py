@@ -12,16 +12,15 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
-from perception.render.drawing import compose
-from perception.render.rig import Rig
-from perception.render.scenes import Scene, Scenes
-from perception.render.sensor import dust, photograph
-from perception.render.tracer import Tracer
+from perception.render.ray_tracer import Tracer
+from perception.render.scene_ranges import Scene, SceneRanges
+from perception.render.scene_sampler import compose_scene
+from perception.render.stereo_camera import StereoRig, draw_dust, take_picture
 from perception.stereo import Stereo
 
 
 @dataclass(frozen=True)
-class Shot:
+class RenderedFrame:
     """A rendered frame.
 
     Attributes:
@@ -42,7 +41,7 @@ class Shot:
 
 
 @spec
-class Studio:
+class FrameRenderer:
     """Renders frames of a kind of scene for a stereo camera, with their truth.
 
     Attributes:
@@ -55,8 +54,8 @@ class Studio:
             segmenter on.
     """
 
-    rig: Rig
-    scene: Scenes
+    rig: StereoRig
+    scene: SceneRanges
     stereo: Stereo
     depth: Literal["matched", "exact", "none"]
     pair: bool
@@ -83,28 +82,30 @@ class Studio:
         Raises:
             StorageError: a file could not be written.
         """
-        shot = self.shot(compose(self.scene, self.rig, generator), generator)
+        shot = self.shot(compose_scene(self.scene, self.rig, generator), generator)
         depth = {"matched": shot.depth_m, "exact": shot.exact_depth_m, "none": None}[self.depth]
         dataset.write_frame(stem, shot.color, depth, shot.right, shot.label, shot.truth)
 
-    def shot(self, scene: Scene, generator: np.random.Generator) -> Shot:
+    def shot(self, scene: Scene, generator: np.random.Generator) -> RenderedFrame:
         """Returns the frame of a scene."""
         tracer = Tracer(scene.solids, scene.light, scene.sky)
         left = tracer.view(self.rig.left)
-        density = dust(scene.exposure.patchiness, generator)
+        density = draw_dust(scene.exposure.patchiness, generator)
         color, partner = (
-            photograph(left.radiance, left.depth_m, scene.exposure, density, generator),
+            take_picture(left.radiance, left.depth_m, scene.exposure, density, generator),
             None,
         )
         if self.pair:
             right = tracer.view(self.rig.right)
-            partner = photograph(right.radiance, right.depth_m, scene.exposure, density, generator)
+            partner = take_picture(
+                right.radiance, right.depth_m, scene.exposure, density, generator
+            )
         depth = left.depth_m
         if partner is not None and self.depth == "matched":
             depth = self.stereo.depth_m(color, partner, self.rig.focal_px, self.rig.baseline_m)
         roles = np.array([solid.role for solid in scene.solids] + ["nothing"])[left.solid]
         label = FrameLabel(roles == "block", left.mouth, roles == "arm")
-        return Shot(color, partner, depth, left.depth_m, label, self._truth(scene))
+        return RenderedFrame(color, partner, depth, left.depth_m, label, self._truth(scene))
 
     def _truth(self, scene: Scene) -> SceneTruth:
         block = scene.block

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from perception.render.drilled import FRONT, Block, Chip, Disc, Hole
-from perception.render.solids import Cylinder, Pose, Solid
-from perception.render.texture import NUM_TEXTURES, SIDE, Material
+from perception.render.drilled_block import FRONT, Chip, Disc, DrilledBlock, DrilledHole
+from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
+from perception.render.solids import Cylinder, Solid, SolidPose
 
 if TYPE_CHECKING:
-    from perception.render.scenes import Concrete
+    from perception.render.scene_ranges import BlockRanges
 
 MARK_M = 0.002
 """Texel of painted marks: stains, wet patches, cracks."""
@@ -22,7 +22,7 @@ _SPACING = 1.3
 """Two discs or holes are farther apart than the sum of their radii by this factor."""
 
 
-def frame_of(normal: np.ndarray, turn_rad: float) -> np.ndarray:
+def build_frame(normal: np.ndarray, turn_rad: float) -> np.ndarray:
     """Returns a rotation whose third column is along `normal`, `(3,)`, turned about it."""
     normal = normal / np.linalg.norm(normal)
     first = np.cross(
@@ -34,13 +34,13 @@ def frame_of(normal: np.ndarray, turn_rad: float) -> np.ndarray:
     return np.stack([cos * first + sin * second, cos * second - sin * first, normal], 1)
 
 
-def block_at(
-    kind: Concrete,
+def draw_block(
+    kind: BlockRanges,
     target: np.ndarray,
     normal: np.ndarray,
     turn_rad: float,
     generator: np.random.Generator,
-) -> Block:
+) -> DrilledBlock:
     """Returns a block whose drilled face looks along `normal` and has its first hole, or its middle, at `target`."""
     half = (
         np.array(
@@ -71,11 +71,16 @@ def block_at(
         for place, size in zip(places[num_holes:], radii[num_holes:], strict=False)
     )
     chips = tuple(chip for hole in holes[:num_holes] for chip in _chips(kind, hole, generator))
-    rotation = frame_of(normal, turn_rad)
+    rotation = build_frame(normal, turn_rad)
     first = np.array([*places[0], half[2]]) if places else np.array([0.0, 0.0, half[2]])
-    pose = Pose(rotation, target - rotation @ first)
-    return Block(
-        pose, half, materials_of(kind, half, holes, discs, generator), tuple(holes), chips, discs
+    pose = SolidPose(rotation, target - rotation @ first)
+    return DrilledBlock(
+        pose,
+        half,
+        draw_block_materials(kind, half, holes, discs, generator),
+        tuple(holes),
+        chips,
+        discs,
     )
 
 
@@ -100,17 +105,17 @@ def _scattered(
 
 
 def _hole(
-    kind: Concrete, center: np.ndarray, radius: float, part: int, generator: np.random.Generator
-) -> Hole:
+    kind: BlockRanges, center: np.ndarray, radius: float, part: int, generator: np.random.Generator
+) -> DrilledHole:
     lamp = (
         float(generator.uniform(*kind.lamp)) if generator.random() < kind.lamp_probability else 0.0
     )
-    return Hole(center, radius, float(generator.uniform(*kind.depth_m)), part, lamp)
+    return DrilledHole(center, radius, float(generator.uniform(*kind.depth_m)), part, lamp)
 
 
 def _side_hole(
-    kind: Concrete, half: np.ndarray, radius: float, edge: float, generator: np.random.Generator
-) -> Hole:
+    kind: BlockRanges, half: np.ndarray, radius: float, edge: float, generator: np.random.Generator
+) -> DrilledHole:
     """Returns a hole in one of the four faces beside the drilled one; shallow, so that it meets no other."""
     part = int(generator.integers(4))
     axis = part // 2
@@ -119,10 +124,12 @@ def _side_hole(
     for other in {0, 1, 2} - {axis}:
         room = max(half[other] - radius - edge, 0.0)
         center[other] = generator.uniform(-room, room)
-    return Hole(center, radius, min(0.05, kind.depth_m[0]), part, 0.0)
+    return DrilledHole(center, radius, min(0.05, kind.depth_m[0]), part, 0.0)
 
 
-def bars_in(kind: Concrete, block: Block, generator: np.random.Generator) -> list[Solid]:
+def draw_bars(
+    kind: BlockRanges, block: DrilledBlock, generator: np.random.Generator
+) -> list[Solid]:
     """Returns reinforcing bars, cut bare by some of the holes: cylinders in the concrete, seen through a rim only."""
     bars: list[Solid] = []
     for hole in block.holes:
@@ -144,7 +151,7 @@ def bars_in(kind: Concrete, block: Block, generator: np.random.Generator) -> lis
         bars.append(
             Cylinder(
                 "block",
-                Pose(frame_of(along, 0.0), place),
+                SolidPose(build_frame(along, 0.0), place),
                 float(generator.uniform(0.005, 0.012)),
                 1.2 * hole.radius_m,
                 (rust,),
@@ -153,7 +160,7 @@ def bars_in(kind: Concrete, block: Block, generator: np.random.Generator) -> lis
     return bars
 
 
-def _chips(kind: Concrete, hole: Hole, generator: np.random.Generator) -> list[Chip]:
+def _chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
     """Returns pieces broken off a rim: balls whose bowls are centred near it and as wide along the face as `chip_m` says."""
     found = []
     for _ in range(int(generator.integers(kind.chips[0], kind.chips[1] + 1))):
@@ -164,10 +171,10 @@ def _chips(kind: Concrete, hole: Hole, generator: np.random.Generator) -> list[C
     return found
 
 
-def materials_of(
-    kind: Concrete,
+def draw_block_materials(
+    kind: BlockRanges,
     half: np.ndarray,
-    holes: Sequence[Hole],
+    holes: Sequence[DrilledHole],
     discs: tuple[Disc, ...],
     generator: np.random.Generator,
 ) -> tuple[Material, ...]:
@@ -181,7 +188,7 @@ def materials_of(
 
     def stone(brightness: float, contrast: float, with_marks: bool = False) -> Material:
         red, green, blue = np.clip(brightness * tint, 0.005, 0.95)
-        shift = generator.uniform(0, SIDE, 2)
+        shift = generator.uniform(0, TEXTURE_SIDE, 2)
         return Material(
             (float(red), float(green), float(blue)),
             contrast,
@@ -200,7 +207,7 @@ def materials_of(
     return tuple(parts)
 
 
-def _marks(kind: Concrete, half: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+def _marks(kind: BlockRanges, half: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Paints stains, wet patches, cracks and traces of formwork: relative brightness over the block's faces, `(h, w)` float32."""
     size = (2.4 * half[[1, 0]] / MARK_M).astype(int)
     marks = np.ones(tuple(size), np.float32)

@@ -22,7 +22,7 @@ ONE_SIGMA_2D = 1.515
 
 
 @dataclass
-class Tally:
+class FinderScore:
     """What was counted over the frames of one row.
 
     Attributes:
@@ -101,22 +101,22 @@ class Tally:
         """Every hole that could be found was, and nothing else."""
         return self.found == self.true and not (self.refused or self.false or self.fooled)
 
-    def __add__(self, other: Tally) -> Tally:
+    def __add__(self, other: FinderScore) -> FinderScore:
         """Returns what was counted by both."""
         both: dict[str, Any] = {
             name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "ms"
         }
         stages = dict.fromkeys((*self.ms, *other.ms))
-        return Tally(
+        return FinderScore(
             **both, ms={stage: self.ms.get(stage, []) + other.ms.get(stage, []) for stage in stages}
         )
 
 
-def judge(
+def score_frame(
     observer: Observer, frame: Frame, truth: dataset.SceneTruth
-) -> tuple[Tally, FrameDetections]:
+) -> tuple[FinderScore, FrameDetections]:
     """Returns what was counted on one frame, and what the finder saw in it: nothing where it refused the frame as a whole."""
-    tally = Tally(frames=1)
+    tally = FinderScore(frames=1)
     start = time.perf_counter()
     try:
         sighting = observer.look(frame)
@@ -125,12 +125,12 @@ def judge(
         sighting = FrameDetections([], [], [], None)
     for stage, value in {**sighting.ms, "total": 1000 * (time.perf_counter() - start)}.items():
         tally.ms[stage] = [value]
-    compare(sighting.holes, truth, frame, tally)
+    match_holes(sighting.holes, truth, frame, tally)
     return tally, sighting
 
 
-def compare(
-    holes: Sequence[HolePose], truth: dataset.SceneTruth, frame: Frame, tally: Tally
+def match_holes(
+    holes: Sequence[HolePose], truth: dataset.SceneTruth, frame: Frame, tally: FinderScore
 ) -> None:
     """Adds one frame: each true hole is found by the target nearest to its line of sight, each target finds one at most.
 
@@ -162,7 +162,7 @@ def compare(
 
 
 def _measure(
-    pose: HolePose, center: np.ndarray, axis: np.ndarray, eye: np.ndarray, tally: Tally
+    pose: HolePose, center: np.ndarray, axis: np.ndarray, eye: np.ndarray, tally: FinderScore
 ) -> None:
     ray = (center - eye) / np.linalg.norm(center - eye)
     error = pose.center_m - center

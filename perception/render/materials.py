@@ -8,7 +8,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-SIDE = 1024
+TEXTURE_SIDE = 1024
 """Texels of a texture along each side; it repeats beyond."""
 NUM_TEXTURES = 4
 _FINEST_OCTAVE, _COARSEST_OCTAVE = 10, 3
@@ -66,11 +66,11 @@ def _pyramid(number: int) -> tuple[np.ndarray, ...]:
     rise = (0.9, 1.0, 1.15, 1.3)[
         number
     ]  # strength of each octave relative to the one twice as coarse: from cloudy to speckled
-    total = np.zeros((SIDE, SIDE), np.float32)
+    total = np.zeros((TEXTURE_SIDE, TEXTURE_SIDE), np.float32)
     for octave in range(_COARSEST_OCTAVE, _FINEST_OCTAVE + 1):
         coarse = generator.standard_normal((1 << octave, 1 << octave)).astype(np.float32)
         pad = 2
-        scale = SIDE >> octave
+        scale = TEXTURE_SIDE >> octave
         wide = cv2.resize(
             np.pad(coarse, pad, mode="wrap"),
             None,
@@ -80,7 +80,9 @@ def _pyramid(number: int) -> tuple[np.ndarray, ...]:
         )
         total += (
             rise ** (octave - _COARSEST_OCTAVE)
-            * wide[pad * scale : pad * scale + SIDE, pad * scale : pad * scale + SIDE]
+            * wide[
+                pad * scale : pad * scale + TEXTURE_SIDE, pad * scale : pad * scale + TEXTURE_SIDE
+            ]
         )
     if number >= NUM_TEXTURES // 2:  # gravel: bright and dark stones
         total = np.tanh(2.0 * total / total.std())

@@ -1,4 +1,4 @@
-"""Calibration from points that the tip of the tool has touched and that somebody clicked in a frame."""
+"""The camera's place from points that the chisel has touched and the camera has seen; needs no board."""
 
 from __future__ import annotations
 
@@ -9,14 +9,151 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
+from scipy.stats import chi2
 
 from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception.calibrate import arm, touched
-from perception.calibrate.result import Judged, stored
+from perception.calibrate import arm, transforms
+from perception.calibrate.extrinsics import PoseResidual, build_calibration
+
+# --- from by_touch: Calibration from points that the tip of the tool has touched and that
+# somebody clicked in a frame.
+
+FREEDOM = 4.0
+"""Of Student's t, as in `hand_eye`."""
+TRIPLES = 300
+OUTSIDE = float(chi2.ppf(0.999, 3))
+MIN_POINTS = 4
+STEPS = 60
+
+
+@dataclass(frozen=True)
+class PointPairs:
+    """`N` points, each known twice.
+
+    Attributes:
+        in_camera_m: As seen, `(N, 3)`.
+        in_base_m: The tool's tip there, `(N, 3)`.
+        cov_m2: Covariance of each as seen, `(N, 3, 3)` in the camera's frame: mostly along the
+            sight.
+    """
+
+    in_camera_m: np.ndarray
+    in_base_m: np.ndarray
+    cov_m2: np.ndarray
+
+    def part(self, chosen: np.ndarray) -> PointPairs:
+        """Returns the chosen points."""
+        return PointPairs(self.in_camera_m[chosen], self.in_base_m[chosen], self.cov_m2[chosen])
+
+    def away_m(self, place: np.ndarray) -> np.ndarray:
+        """Returns how far the tip was from where a camera at `place`, `(4, 4)`, sees each point, `(N, 3)` in the base frame."""
+        return self.in_base_m - (self.in_camera_m @ place[:3, :3].T + place[:3, 3])
+
+    def kabsch(self) -> np.ndarray:
+        """Returns the camera's place, `(4, 4)`, that makes the sum of squared distances least (Kabsch, 1976)."""
+        middle, there = self.in_camera_m.mean(0), self.in_base_m.mean(0)
+        turn = transforms.find_nearest_rotation(
+            (self.in_base_m - there).T @ (self.in_camera_m - middle)
+        )
+        return transforms.make_transform(turn, there - turn @ middle)
+
+
+@dataclass(frozen=True)
+class PointFit:
+    """What came out.
+
+    Attributes:
+        base_from_camera: The camera, `(4, 4)`.
+        cov: Covariance of a small motion of it in its own frame, `(6, 6)`.
+        factor: The tip is this many times less exact than was assumed, 1 or more.
+        away_m: How far the tip was from where the camera sees each point, `(N, 3)` in the base
+            frame.
+        used: Which points were believed in the end, `(N,)` bool.
+    """
+
+    base_from_camera: np.ndarray
+    cov: np.ndarray
+    factor: float
+    away_m: np.ndarray
+    used: np.ndarray
+
+
+def fit_camera_to_points(points: PointPairs, tip_std_m: float) -> PointFit | None:
+    """Returns the camera's place; `None` where there are too few points to contradict each other.
+
+    Args:
+        points: What was touched.
+        tip_std_m: Standard deviation of the tip in each direction.
+    """
+    count = len(points.in_camera_m)
+    if count < MIN_POINTS:
+        return None
+    generator = np.random.default_rng(0)
+    groups = [
+        np.arange(count),
+        *(generator.choice(count, 3, replace=False) for _ in range(TRIPLES)),
+    ]
+    places = [points.part(group).kabsch() for group in groups]
+    place = places[
+        int(np.argmin([np.median(np.linalg.norm(points.away_m(one), axis=1)) for one in places]))
+    ]
+    # half of the points may be wrong: the median says how exact the others are
+    distance = _build_normal_equations(points, place, tip_std_m, None)[0]
+    std_m = tip_std_m * np.sqrt(max(1.0, np.median(distance) / chi2.ppf(0.5, 3)))
+    place = _refine_pose(points, place, std_m, None)
+    used = _build_normal_equations(points, place, std_m, None)[0] <= OUTSIDE
+    used = used if used.sum() >= MIN_POINTS else np.ones(count, bool)
+    good, full = points.part(used), np.ones(int(used.sum()))
+    place = _refine_pose(good, place, std_m, full)
+    distance, normal, _ = _build_normal_equations(good, place, std_m, full)
+    excess = max(1.0, float(distance.sum()) / max(3.0 * used.sum() - 6.0, 1.0))
+    cov = excess * np.linalg.pinv(normal, hermitian=True)
+    return PointFit(
+        place, cov, float(std_m / tip_std_m * np.sqrt(excess)), points.away_m(place), used
+    )
+
+
+def compute_width_m(in_base_m: np.ndarray) -> float:
+    """Returns how far points, `(N, 3)`, spread across the line that fits them best, standard deviation; 0 lets them turn."""
+    return float(
+        np.linalg.svd(in_base_m - in_base_m.mean(0), compute_uv=False)[1] / np.sqrt(len(in_base_m))
+    )
+
+
+def _build_normal_equations(
+    points: PointPairs, place: np.ndarray, tip_std_m: float, fixed: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns squared distances in standard deviations, and the normal equations of a small motion of the camera."""
+    away = points.away_m(place) @ place[:3, :3]  # in the camera's frame
+    information = np.linalg.inv(points.cov_m2 + tip_std_m**2 * np.eye(3))
+    distance = np.einsum("ni,nij,nj->n", away, information, away)
+    weight = (FREEDOM + 3) / (FREEDOM + distance) if fixed is None else fixed
+    slopes = np.concatenate(
+        [
+            np.broadcast_to(-np.eye(3), (len(away), 3, 3)),
+            transforms.build_cross_matrices(points.in_camera_m),
+        ],
+        2,
+    )
+    weighted = np.swapaxes(slopes, 1, 2) @ (weight[:, None, None] * information)
+    return distance, (weighted @ slopes).sum(0), (weighted @ away[..., None]).sum(0)[:, 0]
+
+
+def _refine_pose(
+    points: PointPairs, place: np.ndarray, tip_std_m: float, fixed: np.ndarray | None
+) -> np.ndarray:
+    for _ in range(STEPS):
+        _, normal, gradient = _build_normal_equations(points, place, tip_std_m, fixed)
+        step = -np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]
+        place = transforms.apply_motion(place, step)
+        if np.abs(step).max() < 1e-10:
+            break
+    return place
+
 
 EXAMPLE = """expected YAML such as
   points:
@@ -27,7 +164,7 @@ TRIMS = 4
 
 
 @dataclass(frozen=True)
-class Touch:
+class TouchedPoint:
     """A point as the file tells it; what is not given is `None`."""
 
     name: str
@@ -39,7 +176,7 @@ class Touch:
 
 
 @spec
-class ByTouch:
+class TouchCalibration:
     """Points touched with the tip of the tool; six or more, well apart, need neither a board nor a second person.
 
     Attributes:
@@ -83,25 +220,27 @@ class ByTouch:
             ConfigError: the file of points cannot be read.
             FrameError: the points do not tell where the camera is; says what is missing.
         """
-        touches = read(Path(self.points), machine.num_joints)
+        touches = read_touched_points(Path(self.points), machine.num_joints)
         frames = self._frames({one.frame for one in touches if one.frame is not None})
         names, here, there, covs, refused = [], [], [], [], []
         for one in touches:
             try:
                 at, cov = self._seen(one, frames)
             except FrameError as error:
-                refused.append(Judged(one.name, None, None, str(error)))
+                refused.append(PoseResidual(one.name, None, None, str(error)))
                 continue
             names.append(one.name)
             here.append(at)
             covs.append(cov)
             there.append(
-                one.base_m if one.q is None else arm.links(machine, one.q[None]).tip_in_base_m[0]
+                one.base_m
+                if one.q is None
+                else arm.compute_link_poses(machine, one.q[None]).tip_in_base_m[0]
             )
         found = None
         if names:
-            points = touched.Points(np.array(here), np.array(there), np.array(covs))
-            found = touched.fit(points, self.tip_std_m)
+            points = PointPairs(np.array(here), np.array(there), np.array(covs))
+            found = fit_camera_to_points(points, self.tip_std_m)
         if found is None:
             why = (
                 f" Left out: {'; '.join(str(one.left_out) for one in refused[:3])}"
@@ -109,16 +248,16 @@ class ByTouch:
                 else ""
             )
             raise FrameError(
-                f"calibration: {len(names)} points can be used, {touched.FEWEST} are needed at least, 8 are good.{why}"
+                f"calibration: {len(names)} points can be used, {MIN_POINTS} are needed at least, 8 are good.{why}"
             )
-        width_m = touched.width_m(np.array(there)[found.used])
+        width_m = compute_width_m(np.array(there)[found.used])
         if width_m < self.least_width_m:
             raise FrameError(
                 f"calibration: the points lie within {width_m:.3f} m of a line, {self.least_width_m:g} m are needed: "
                 "touch some beside it, and some higher or lower"
             )
         judged = [
-            Judged(
+            PoseResidual(
                 name, float(np.linalg.norm(away)), None,
                 None if good else f"{1000 * float(np.linalg.norm(away)):.0f} mm off while the others agree",
             )
@@ -130,7 +269,7 @@ class ByTouch:
             "width_m": round(width_m, 4),
             "missing": [],
         }
-        return stored(
+        return build_calibration(
             "touched",
             machine,
             found.base_from_camera,
@@ -155,7 +294,7 @@ class ByTouch:
                 if Path(frame.name).name in wanted:
                     found[Path(frame.name).name] = frame
 
-    def _seen(self, one: Touch, frames: dict[str, Frame]) -> tuple[np.ndarray, np.ndarray]:
+    def _seen(self, one: TouchedPoint, frames: dict[str, Frame]) -> tuple[np.ndarray, np.ndarray]:
         """Returns a point in camera coordinates, and its covariance."""
         if one.camera_m is not None:
             z, focal_px, sight = (
@@ -163,16 +302,18 @@ class ByTouch:
                 1000.0,
                 one.camera_m / np.linalg.norm(one.camera_m),
             )
-            return one.camera_m, _cov(sight, self.noise_per_m * z**2, self.click_px * z / focal_px)
+            return one.camera_m, _build_point_cov(
+                sight, self.noise_per_m * z**2, self.click_px * z / focal_px
+            )
         frame = frames.get(str(one.frame))
         if frame is None or one.pixel is None:
             raise FrameError(f"there is no frame '{one.frame}' that can be used")
-        point, along_m = depth_at(frame, one.pixel, self.window_px, self.noise_per_m)
+        point, along_m = fit_point_depth(frame, one.pixel, self.window_px, self.noise_per_m)
         across_m = self.click_px * point[2] / float(frame.camera_matrix[0, 0])
-        return point, _cov(point / np.linalg.norm(point), along_m, across_m)
+        return point, _build_point_cov(point / np.linalg.norm(point), along_m, across_m)
 
 
-def depth_at(
+def fit_point_depth(
     frame: Frame, pixel: np.ndarray, window_px: int, noise_per_m: float
 ) -> tuple[np.ndarray, float]:
     """Returns the point behind a pixel, `(3,)` m, by a plane through the depth around it, and its standard deviation along z.
@@ -215,7 +356,7 @@ def depth_at(
     )
 
 
-def read(path: Path, num_joints: int) -> list[Touch]:
+def read_touched_points(path: Path, num_joints: int) -> list[TouchedPoint]:
     """Returns the points of a file.
 
     Raises:
@@ -223,7 +364,7 @@ def read(path: Path, num_joints: int) -> list[Touch]:
     """
     try:
         told = yaml.safe_load(path.read_text())["points"]
-        found = [_touch(number, one, num_joints) for number, one in enumerate(told)]
+        found = [_parse_point(number, one, num_joints) for number, one in enumerate(told)]
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(
             f"calibration.points={path}: {type(error).__name__} {error}; {EXAMPLE}"
@@ -231,7 +372,7 @@ def read(path: Path, num_joints: int) -> list[Touch]:
     return found
 
 
-def _touch(number: int, one: dict[str, Any], num_joints: int) -> Touch:
+def _parse_point(number: int, one: dict[str, Any], num_joints: int) -> TouchedPoint:
     sizes = {"pixel": 2, "camera_m": 3, "q": num_joints, "base_m": 3}
     values = {name: np.asarray(one[name], float) if name in one else None for name in sizes}
     for name, size in sizes.items():
@@ -245,7 +386,7 @@ def _touch(number: int, one: dict[str, Any], num_joints: int) -> Touch:
     if values["pixel"] is not None and "frame" not in one:
         raise ValueError(f"point {number}: in which frame was it clicked?")
     frame = str(one["frame"]) if "frame" in one else None
-    return Touch(
+    return TouchedPoint(
         str(one.get("name", f"point {number}")),
         frame,
         values["pixel"],
@@ -255,6 +396,6 @@ def _touch(number: int, one: dict[str, Any], num_joints: int) -> Touch:
     )
 
 
-def _cov(sight: np.ndarray, along_m: float, across_m: float) -> np.ndarray:
+def _build_point_cov(sight: np.ndarray, along_m: float, across_m: float) -> np.ndarray:
     along = np.outer(sight, sight)
     return along_m**2 * along + across_m**2 * (np.eye(3) - along)
