@@ -11,18 +11,17 @@ import numpy as np
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.inspection import Thresholds
 from diagnosis import certainty, engine, separation, verdict, weighing
-from diagnosis.answer import Answer, Estimate, NextExperiment, Ranked, Selected, Where
+from diagnosis.answer import Answer, Estimate, NextExperiment, Outcome, Ranked, Selected, Where
 from diagnosis.case import Case
 from diagnosis.certainty import Certainty
 from diagnosis.engine import Findings, Prices, Tell
 from diagnosis.free_runs import FreeRuns
 from diagnosis.library import Kind
-from diagnosis.outcome import Outcome
 from diagnosis.reach import Reach, apart
 from diagnosis.remainder import CLUES
 from diagnosis.repair import Repair
 from diagnosis.simulator import Base
-from diagnosis.survey import survey
+from diagnosis.stages import survey_gap
 
 NEAR = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
@@ -92,7 +91,7 @@ class Diagnosis:
         told = "unknown" if unknown else "effects" if selected else "none"
         after = field.runs(paths) if selected else None
         machine = self.case.machine
-        seen = survey(
+        seen = survey_gap(
             before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
         )
         remainder = self._remainder(findings, reach) if selected else None

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from brokk_rl.spec import spec
-from diagnosis import around, frames, holding, library, remainder, sensors, tool
+from diagnosis import around, frames, geometry, holding, library, remainder, sensors
 from diagnosis.case import Case
 from diagnosis.evidence import Evidence, Ray
 from diagnosis.found import Found
@@ -123,11 +123,11 @@ class Search:
         """Returns what is found."""
         prices, nulls = self.prices, [one.evidence for one in self.base.nulls]
         self.tell("sensors", 0.32)
-        on_sensors = sensors.search(self.case, self.kinds, prices.joint, prices.name)
-        on_tool = tool.search(self.case, self.kinds, prices.joint, prices.name)
+        on_sensors = sensors.find_sensor_effects(self.case, self.kinds, prices.joint, prices.name)
+        on_tool = geometry.find_geometry_errors(self.case, self.kinds, prices.joint, prices.name)
         evidence = _adjusted(self.base.field.evidence, self.case, [*on_sensors, *on_tool.found])
         grown, shapes = self._simulated(
-            evidence, tool.is_tracked(self.case.field, self.case.machine)
+            evidence, geometry.is_tracked(self.case.field, self.case.machine)
         )
         small = {name: rays_of(ways[0].kind, SMALL) for name, ways in grown.items()}
         known = Nulls(self.base, small, grown, plain_joints(evidence), shapes, self.shared)
@@ -353,7 +353,9 @@ def _adjusted(evidence: Evidence, case: Case, found: Sequence[Found]) -> Evidenc
     if not rough:
         return evidence
     assert evidence.noise is not None, "noise is known by now"
-    reading = sensors.readings(case.field, case.reference, case.machine) * np.any(rough, 0)
+    reading = sensors.measure_excess_scatter(case.field, case.reference, case.machine) * np.any(
+        rough, 0
+    )
     noise = [
         replace(one, reading=float(more)) for one, more in zip(evidence.noise, reading, strict=True)
     ]

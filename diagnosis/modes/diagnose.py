@@ -18,7 +18,7 @@ from brokk_rl.inspection import Thresholds
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import already, answer, case, library, page, prescription, simulator
+from diagnosis import already, answer, case, library, prescription, report, simulator
 from diagnosis.answer import Answer
 from diagnosis.case import Case
 from diagnosis.certainty import Certainty
@@ -109,7 +109,7 @@ class Diagnose:
         folder = self.session.folder
         outcome.save(folder)
         prescription.write(outcome.answer, kinds, folder / prescription.FILE)
-        page.write(outcome, folder, self.machine)
+        report.write_report(outcome, folder, self.machine)
         _show(outcome.answer, folder)
 
     def _case(self) -> Case:
@@ -164,4 +164,7 @@ def _show(found: Answer, folder: Path) -> None:
     console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False)
     if found.selected:
         console.print(table)
-    console.print(f"report: {folder / page.PAGE}, answer: {folder / answer.FILE}", highlight=False)
+    console.print(
+        f"report: {folder / report.REPORT_FILE}, answer: {folder / answer.ANSWER_FILE}",
+        highlight=False,
+    )

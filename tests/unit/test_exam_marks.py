@@ -10,9 +10,9 @@ import pytest
 
 from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
 from diagnosis.sizes import Shape
-from exam import marking, rules, tally
-from exam.ground import Errors
-from exam.marking import Claim, Mark, mark
+from exam import baselines, metrics, score
+from exam.oracle import JointErrors
+from exam.score import CaseScore, Claim, score_answer
 
 CLASSES = (("dead_time", "clock_offset"), ("flow_gain", "encoder_scale"))
 
@@ -73,8 +73,8 @@ def answered(
     )
 
 
-def marked(truth: dict[str, Any], said: Answer | None, seconds: float | None = 10.0) -> Mark:
-    return mark(truth, said, CLASSES, ("frame_loss",), seconds)
+def marked(truth: dict[str, Any], said: Answer | None, seconds: float | None = 10.0) -> CaseScore:
+    return score_answer(truth, said, CLASSES, ("frame_loss",), seconds)
 
 
 def test_a_name_of_the_class_is_right_but_not_strictly() -> None:
@@ -129,7 +129,7 @@ def test_a_missing_answer_is_wrong_everywhere() -> None:
     )
 
 
-def table() -> list[Mark]:
+def table() -> list[CaseScore]:
     """Eight cases: 2 of 3 single effects right, 1 of 2 sets, 1 of 2 quiet ones, the one outside."""
     return [
         marked(label("one", ("lag", "q3", 1.0)), answered(chosen("lag"))),
@@ -152,7 +152,7 @@ def table() -> list[Mark]:
 
 
 def test_the_figures_of_a_table_are_those_worked_by_hand() -> None:
-    found = tally.tally(table())
+    found = metrics.compute_metrics(table())
     assert found["top1"]["value"] == pytest.approx(2 / 3) and found["top1"]["of"] == 3
     # lag: 2 right, none missed, none wrong among the single ones: 1; creep: 1 missed: 0
     assert found["macro_f1"]["value"] == pytest.approx(0.5)
@@ -174,8 +174,8 @@ def test_the_figures_of_a_table_are_those_worked_by_hand() -> None:
 def test_calibration_error_is_that_worked_by_hand() -> None:
     # at 0.95: 3 of 4 true, 0.2 off; at 0.65: 1 of 1 true, 0.35 off
     claims = [Claim(0.95, True)] * 3 + [Claim(0.95, False), Claim(0.65, True)]
-    assert tally.ece(claims) == pytest.approx(0.8 * 0.2 + 0.2 * 0.35)
-    assert tally.ece([Claim(1.0, True)]) == 0.0
+    assert metrics.compute_ece(claims) == pytest.approx(0.8 * 0.2 + 0.2 * 0.35)
+    assert metrics.compute_ece([Claim(1.0, True)]) == 0.0
 
 
 def test_auroc_counts_ties_half() -> None:
@@ -183,23 +183,27 @@ def test_auroc_counts_ties_half() -> None:
     marks = [marked(quiet, answered(unknown=p)) for p in (0.1, 0.4)] + [
         marked(outside, answered(unknown=p)) for p in (0.4, 0.9)
     ]
-    assert tally.auroc(marks) == pytest.approx(3.5 / 4)  # 0.4 > 0.1, 0.4 = 0.4, 0.9 > both
-    assert tally.auroc(marks[:2]) is None
+    assert metrics.compute_auroc(marks) == pytest.approx(
+        3.5 / 4
+    )  # 0.4 > 0.1, 0.4 = 0.4, 0.9 > both
+    assert metrics.compute_auroc(marks[:2]) is None
 
 
 def test_the_gap_closed_is_held_against_what_the_oracle_closes() -> None:
     truth = label("one", ("lag", "q3", 1.0))
     marks = [
-        mark(truth, answered(chosen("lag")), CLASSES, (), 1.0, oracle)
+        score_answer(truth, answered(chosen("lag")), CLASSES, (), 1.0, oracle)
         for oracle in (1.0, 0.8, 0.01)
     ]
     # each closes 0.9, so 0.9 and 1.125 of it; where nothing can be closed nobody is asked
-    assert tally.closed_of_oracle(marks) == pytest.approx((0.9 + 1.125) / 2)
-    assert tally.closed_of_oracle([mark(truth, None, CLASSES, (), None, 0.9)]) == 0.0
+    assert metrics.compute_closed_of_oracle(marks) == pytest.approx((0.9 + 1.125) / 2)
+    assert (
+        metrics.compute_closed_of_oracle([score_answer(truth, None, CLASSES, (), None, 0.9)]) == 0.0
+    )
 
 
 def test_intervals_hold_their_figure_and_shrink_with_the_number_of_cases() -> None:
-    few, many = tally.tally(table()), tally.tally(table() * 10)
+    few, many = metrics.compute_metrics(table()), metrics.compute_metrics(table() * 10)
     for key in ("macro_f1", "set_f1", "ece", "unknown_auroc"):
         low, high = few[key]["ci95"]
         assert low <= few[key]["value"] <= high
@@ -215,10 +219,15 @@ def test_forward_selection_takes_what_is_there_and_bic_leaves_what_does_not_pay(
         name: [Shape(sizes, np.outer(sizes, ray))]
         for name, ray in (("lag", form), ("creep", other))
     }
-    errors = Errors(1.2 * form + 0.5 * generator.standard_normal(600), shapes, fold)
-    assert set(rules.grown(errors, rules.bic)) == {"lag"}
-    assert next(iter(rules.grown(errors, rules.held_out))) == "lag"
-    assert rules.grown(Errors(generator.standard_normal(600), shapes, fold), rules.bic) == {}
+    errors = JointErrors(1.2 * form + 0.5 * generator.standard_normal(600), shapes, fold)
+    assert set(baselines.select_forward(errors, baselines.score_bic)) == {"lag"}
+    assert next(iter(baselines.select_forward(errors, baselines.score_held_out))) == "lag"
+    assert (
+        baselines.select_forward(
+            JointErrors(generator.standard_normal(600), shapes, fold), baselines.score_bic
+        )
+        == {}
+    )
 
 
 def test_a_number_that_all_joints_share_counts_once() -> None:
@@ -236,7 +245,7 @@ def test_a_number_that_all_joints_share_counts_once() -> None:
     }
     counts = [
         len(
-            marking._numbers(
+            score._score_parameters(
                 label,
                 Selected(
                     effect="frame_loss",
