@@ -29,7 +29,7 @@ from actuators.models import draw
 from actuators.models.transport import commands_in_force, opened
 from brokk_rl.errors import ConfigError
 from brokk_rl.follower import moved_levers
-from brokk_rl.machine import Machine, exclusive_mask
+from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.spec import spec
 
 Range = float | tuple[float, float]
@@ -185,7 +185,7 @@ class PersonModel:
         priority = asked.abs() + 1e-6 * self.state["hand"].abs()
         alone = torch.where(self._exclusive, priority, 0.0).amax(1)
         among = torch.where(self._exclusive, 0.0, priority).amax(1)
-        free = exclusive_mask(self._exclusive, alone > among)
+        free = mask_exclusive_joints(self._exclusive, alone > among)
         if self._levers[0] >= asked.shape[1]:
             return free
         taken, held_s = asked != 0, self.state["held_s"]

@@ -1,4 +1,4 @@
-"""`python -m brokk_rl` is `brokk`: for a process that starts another one, wherever the command was installed."""
+"""Run the command `brokk` as `python -m brokk_rl`, for processes that start other ones."""
 
 import sys
 

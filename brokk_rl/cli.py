@@ -1,4 +1,4 @@
-"""The command `brokk`: compose the configuration, instantiate the mode, run it, and say plainly what went wrong."""
+"""The command `brokk`: compose the configuration, run its mode, and explain errors."""
 
 from __future__ import annotations
 
@@ -32,82 +32,97 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 from rich.logging import RichHandler
 
+import brokk_rl
 from brokk_rl import distributed, extensions, gpu_pool, registry
-from brokk_rl.errors import BrokkError, ConfigError, choices
-from brokk_rl.session import earlier, remove_empty
+from brokk_rl.errors import BrokkError, ConfigError, list_choices
+from brokk_rl.session import read_earlier_job, remove_empty_folders
 from brokk_rl.sweep import SweepFolder
 
 log = logging.getLogger(__name__)
 
 
-class Stopped(BaseException):
-    """A failed job on its way to `main`; no `Exception`, so that Hydra passes it on without a line of its own."""
+class FailedJob(BaseException):
+    """A failed job on its way to `main`.
+
+    It is no `Exception`, so that Hydra raises it again without a message of its own.
+    """
 
 
 def main() -> int:
-    """Runs the command and returns its exit code: 0 done, 1 our own fault, 2 something the user can mend, 130 interrupted."""
+    """Run the command and return its exit code.
+
+    0: finished; 1: a defect of this package; 2: an error that the user can correct; 130:
+    interrupted; 141: the reader of the output closed it, as `| head` does.
+    """
+    if "--version" in sys.argv[1:]:
+        sys.stdout.write(f"brokk {brokk_rl.__version__}\n")
+        return 0
     trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
     set_up_logging()
-    # our options of submitit's launchers bear its own names, as everyone knows them; Hydra warns of
-    # it three times
+    # The launcher options keep the names that submitit gave them; Hydra warns of that three times.
     warnings.filterwarnings(
         "ignore", message=r"\s*'hydra/launcher/\w+' is validated against ConfigStore schema"
     )
-    # before torch is loaded: beside other work its threads, if they wait spinning, make an update
-    # thirty times slower
+    # This must precede the import of torch. Threads that wait actively make an update thirty times
+    # slower where other programs run on the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    signal.signal(
-        signal.SIGTERM, signal.default_int_handler
-    )  # a run that a scheduler stops ends like one stopped by hand
+    # A run that a scheduler stops ends like one that is stopped by hand.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with _hydra_raises():
-            extensions.register(sys.argv[1:])
-            hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")(job)()
+        with _make_hydra_raise():
+            extensions.register_options(sys.argv[1:])
+            command = hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")
+            command(run_job)()
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # Python flushes stdout once more when it ends; that must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except KeyboardInterrupt:
-        if _speaks():
+        if _is_first_process():
             sys.stderr.write("interrupted\n")
         return 130
-    except (Stopped, Exception) as error:
+    except (FailedJob, Exception) as error:
         SweepFolder.drop_if_unused()
-        cause = error.args[0] if isinstance(error, Stopped) else error
+        cause = error.args[0] if isinstance(error, FailedJob) else error
         message = explain(cause)
         if trace or message is None:
             traceback.print_exception(cause)
-        if message is not None and (
-            _speaks() or not isinstance(cause, ConfigError)
-        ):  # the first has said what is wrong for all
+        # Of several processes the first one reports an error of the configuration for all.
+        if message is not None and (_is_first_process() or not isinstance(cause, ConfigError)):
             sys.stderr.write(f"error: {message}\n")
         return 1 if message is None else 2
     return 0
 
 
-def job(cfg: DictConfig) -> float | None:
-    """Runs one composed configuration: all of `brokk`, or one job of a sweep."""
-    set_up_logging()  # a launcher may run the job in a process of its own
+def run_job(cfg: DictConfig) -> float | None:
+    """Run one composed configuration: the whole command, or one job of a sweep."""
+    set_up_logging()  # A launcher may run the job in a process of its own.
     try:
-        with gpu_pool.taken():
+        with gpu_pool.take_place():
             return _run(cfg)
     except Exception as error:
         if HydraConfig.get().mode is not RunMode.MULTIRUN:
-            raise Stopped(error) from error
+            raise FailedJob(error) from error
         message = explain(error)
         if message is None:
             raise
-        # the other jobs go on; Hydra repeats only the first error, at the end, and from another
-        # process it comes without its cause
+        # The other jobs go on. Hydra repeats only the first error, at the end, and an error of
+        # another process comes without its cause.
         log.error("job %s failed: %s", HydraConfig.get().job.num, message)
         raise BrokkError(message) from error
 
 
 def _run(cfg: DictConfig) -> float | None:
-    """Instantiates the mode and runs it within its session, where it has one."""
-    cfg, sweep = _taken_in(cfg), HydraConfig.get().mode is RunMode.MULTIRUN
+    """Instantiate the mode and run it, within its session where it has one."""
+    sweep = HydraConfig.get().mode is RunMode.MULTIRUN
+    cfg = _drop_consumed_groups(_rename_targets(cfg))
     if "session" not in cfg:
         distributed.check_together(get_class(str(cfg._target_)), sweep)
         return instantiate(cfg, _convert_="all").run()
-    folder, resolved = run_folder(cfg), _resolved(cfg)
+    folder, resolved = choose_run_folder(cfg), _format_resolved(cfg)
     try:
-        before = earlier(folder, resolved) if sweep else None
+        before = read_earlier_job(folder, resolved) if sweep else None
         if before and before.get("outcome") == "finished":
             log.info("job %s is done already: %s", HydraConfig.get().job.num, folder)
             return before.get("objective")
@@ -115,7 +130,7 @@ def _run(cfg: DictConfig) -> float | None:
         mode = instantiate(cfg, session={"out": str(folder)}, **again, _convert_="all")
         distributed.check_together(type(mode), sweep)
         resume = bool(before or getattr(mode, "resume", None))
-        with mode.session.start(resolved, _facts(cfg, mode), resume) as record:
+        with mode.session.start(resolved, _collect_facts(cfg, mode), resume) as record:
             objective = mode.run()
             record.fields["objective"] = (
                 objective if objective is not None and math.isfinite(objective) else None
@@ -123,25 +138,32 @@ def _run(cfg: DictConfig) -> float | None:
             return objective
     except Exception:
         if sweep:
-            # made by Hydra, in several levels where an override holds a path; what the job or the
-            # sweep has written into stays
-            remove_empty([folder, *folder.parents])
+            # Hydra made these folders, in several levels where an override holds a path. A folder
+            # into which a job has written stays.
+            remove_empty_folders([folder, *folder.parents])
         raise
 
 
-def _speaks() -> bool:
-    """Whether this process shows a person how things go; of several only the first."""
+def _is_first_process() -> bool:
+    """Return true for the process that reports to the user: the first one."""
     try:
-        return distributed.own().first
+        return distributed.read_rank().first
     except ConfigError:
         return True
 
 
-def _taken_in(cfg: DictConfig) -> DictConfig:
-    """Returns the configuration without groups that are only taken in by another node (`actuator: ${actuator}`), not by the mode.
+def _rename_targets(cfg: DictConfig) -> DictConfig:
+    """Return the configuration with current targets, as `resolved.yaml` of an older run needs it."""
+    text = OmegaConf.to_yaml(cfg)
+    current = registry.rename_targets(text)
+    return cfg if current == text else OmegaConf.create(current)
 
-    So an option can bring groups of its own, such as `link=simulated` the actuator that it
-    simulates, to be chosen like any other.
+
+def _drop_consumed_groups(cfg: DictConfig) -> DictConfig:
+    """Return the configuration without groups that only another node uses (`actuator: ${actuator}`).
+
+    An option can thus bring groups of its own: `link=simulated` brings the actuator that it
+    simulates, which is chosen like any other.
     """
     taken = {name for name in re.findall(r"\$\{(\w+)\}", OmegaConf.to_yaml(cfg)) if name in cfg}
     if not taken:
@@ -152,8 +174,8 @@ def _taken_in(cfg: DictConfig) -> DictConfig:
     return OmegaConf.create({key: value for key, value in whole.items() if key not in taken})
 
 
-def _facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
-    """Returns what `session.json` says about how the run was put together."""
+def _collect_facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
+    """Return the fields of `session.json` about mode, options, overrides and machine."""
     settings = HydraConfig.get()
     made = OmegaConf.to_container(settings.runtime.choices)
     assert isinstance(made, dict)
@@ -165,16 +187,20 @@ def _facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
     overrides = list(settings.overrides.task)
     for override in overrides:
         key, _, value = override.partition("=")
-        if value.startswith("["):  # Hydra keeps no record of options that were chosen as a list
+        if value.startswith("["):  # Hydra does not record options that were chosen as a list.
             chosen.setdefault(key, value)
-    facts: dict[str, Any] = {"mode": _mode_name(cfg), "choices": chosen, "overrides": overrides}
+    facts: dict[str, Any] = {
+        "mode": _read_mode_name(cfg),
+        "choices": chosen,
+        "overrides": overrides,
+    }
     if machine := getattr(mode, "machine", None):
         facts |= {"machine": machine.name, "fingerprint": machine.fingerprint()}
     return facts
 
 
-def run_folder(cfg: DictConfig) -> Path:
-    """Returns where a run writes: the job's folder in a sweep, else `session.out`, else a new folder under `runs`."""
+def choose_run_folder(cfg: DictConfig) -> Path:
+    """Return the run folder: that of a sweep's job, else `session.out`, else a new one in `runs`."""
     settings = HydraConfig.get()
     if settings.mode is RunMode.MULTIRUN:
         return Path(settings.runtime.output_dir)
@@ -182,13 +208,15 @@ def run_folder(cfg: DictConfig) -> Path:
     if out:
         return Path(out)
     name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
-    name = Path(name).stem if name else None  # an option may be a file, experiment=@<path>
-    stem = "_".join(filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", _mode_name(cfg), name)))
+    name = Path(name).stem if name else None  # An option may be a file: experiment=@<path>.
+    stem = "_".join(
+        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", _read_mode_name(cfg), name))
+    )
     return Path("runs") / stem
 
 
 def set_up_logging() -> None:
-    """Shows log records to a person, on stderr; does nothing where someone has set up logging already."""
+    """Send log records to stderr, unless logging is set up already."""
     handler = RichHandler(
         console=Console(stderr=True),
         show_path=False,
@@ -196,35 +224,38 @@ def set_up_logging() -> None:
         omit_repeated_times=False,
     )
     logging.basicConfig(
-        level=logging.INFO if _speaks() else logging.ERROR, format="%(message)s", handlers=[handler]
+        level=logging.INFO if _is_first_process() else logging.ERROR,
+        format="%(message)s",
+        handlers=[handler],
     )
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # tells of its font cache otherwise
+    logging.getLogger("matplotlib").setLevel(
+        logging.WARNING
+    )  # It reports its font cache otherwise.
 
 
 def explain(error: BaseException) -> str | None:
-    """Returns what to tell a person about `error`, `None` when it is our own fault and deserves its traceback."""
-    chain = list(_causes(error))
+    """Return the message for the user, `None` for a defect that needs its traceback."""
+    chain = list(_iterate_causes(error))
     ours = next((e for e in chain if isinstance(e, BrokkError)), None)
     full = next((e for e in chain if isinstance(e, OSError) and e.errno == errno.ENOSPC), None)
     missing = next((e for e in chain if isinstance(e, MissingMandatoryValue)), None)
     if full:
         where = f" ({full.filename})" if full.filename else ""
         return f"the disk is full{where}. Free some space, or choose another disk with session.out=<folder>."
-    if any(
-        type(e).__name__ == "OutOfMemoryError" for e in chain
-    ):  # torch's, without importing torch for it
+    # The class is torch's; its name is compared so that torch need not be imported.
+    if any(type(e).__name__ == "OutOfMemoryError" for e in chain):
         return f"the memory of the GPU is full: use fewer environments, or session.device=cpu ({error})"
     if ours:
-        return f"{ours}{_node(error)}"
+        return f"{ours}{_locate_node(error)}"
     if missing:
         key = str(missing.full_key or missing)
         return f"{key} has no default and must be given: {key}=<value>"
     if isinstance(error, MissingConfigException):
-        return _no_such_option(error)
+        return _explain_missing_option(error)
     if isinstance(error, InstantiationException):
-        return _bad_node(error)
+        return _explain_bad_node(error)
     if isinstance(error, ConfigCompositionException):
-        return _bad_override(error)
+        return _explain_bad_override(error)
     if isinstance(error, (HydraException, OmegaConfBaseException)) or str(error).startswith(
         "Config group override must"
     ):
@@ -232,42 +263,42 @@ def explain(error: BaseException) -> str | None:
     return None
 
 
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
+def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__
 
 
-def _no_such_option(error: MissingConfigException) -> str:
+def _explain_missing_option(error: MissingConfigException) -> str:
     group, _, name = str(error.missing_cfg_file).rpartition("/")
     if not group:
         return str(error).split("\nConfig search path")[0]
     if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
         return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
     offered = error.options or [
-        option.name for option in registry.options() if option.group == group
-    ]  # Hydra: none for a list
+        option.name for option in registry.list_options() if option.group == group
+    ]  # Hydra lists none where a list of options was given.
     if not offered:
         return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
-    return f"there is no {group}={name}; {choices(name, offered)}"
+    return f"there is no {group}={name}; {list_choices(name, offered)}"
 
 
-def _bad_node(error: InstantiationException) -> str:
-    """Explains a node that cannot be built: a field that its spec does not have, one that it lacks, a target that is not there."""
+def _explain_bad_node(error: InstantiationException) -> str:
+    """Explain a node that cannot be built: an unknown field, a missing field, a missing target."""
     cause = error.__cause__
     called = re.search(r"call to target '([\w.]+)'", str(error))
     if called and isinstance(cause, TypeError):
         known = list(getattr(get_class(called[1]), "__dataclass_fields__", ()))
         name = called[1].rpartition(".")[2]
         if unknown := re.search(r"unexpected keyword argument '(\w+)'", str(cause)):
-            return f"{name} has no field '{unknown[1]}'; {choices(unknown[1], known)}{_node(error)}"
+            return f"{name} has no field '{unknown[1]}'; {list_choices(unknown[1], known)}{_locate_node(error)}"
         if lacking := re.search(r"missing \d+ required keyword-only arguments?: (.+)", str(cause)):
-            return f"{name} lacks {lacking[1]}{_node(error)}"
+            return f"{name} lacks {lacking[1]}{_locate_node(error)}"
     return str(error)
 
 
-def _node(error: BaseException) -> str:
-    """Returns where in the configuration an object could not be built, as the tail of a message."""
+def _locate_node(error: BaseException) -> str:
+    """Return the end of a message: the place in the configuration that could not be built."""
     found = (
         re.search(r"full_key: (\S+)", str(error))
         if isinstance(error, InstantiationException)
@@ -276,8 +307,8 @@ def _node(error: BaseException) -> str:
     return f" (in '{found[1]}': change {found[1]}.<field>=… or its file)" if found else ""
 
 
-def _bad_override(error: ConfigCompositionException) -> str:
-    """Explains an override of something that the configuration does not hold."""
+def _explain_bad_override(error: ConfigCompositionException) -> str:
+    """Explain an override of a key that the configuration does not have."""
     text = str(error)
     found = re.search(r"(?:In '([^']+)': )?Could not override '([^']+)'", text)
     if not found:
@@ -294,15 +325,14 @@ def _bad_override(error: ConfigCompositionException) -> str:
         return text
     where, key = found[1], found[2].split("@")[0]
     source = f"{where} changes" if where and where != "config" else "you gave"
-    with contextlib.suppress(
-        Exception
-    ):  # the mode itself may not compose; then the short answer must do
-        cfg = _mode_alone()
+    # The mode itself may not compose; the message is then shorter.
+    with contextlib.suppress(Exception):
+        cfg = _compose_mode()
         if "No match in the defaults list" in text or key in {
-            option.group for option in registry.options()
+            option.group for option in registry.list_options()
         }:
             groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra")]
-            return f"{source} '{key}', but mode={_mode_name(cfg)} does not use such a group; {choices(key, groups)}"
+            return f"{source} '{key}', but mode={_read_mode_name(cfg)} does not use such a group; {list_choices(key, groups)}"
         parent, _, leaf = key.rpartition(".")
         while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:
             parent, _, leaf = parent.rpartition(".")
@@ -311,23 +341,23 @@ def _bad_override(error: ConfigCompositionException) -> str:
             if isinstance(node, DictConfig)
             else []
         )
-        return f"{source} '{key}', but '{parent or f'mode={_mode_name(cfg)}'}' has no '{leaf}'; {choices(leaf, names)}"
+        return f"{source} '{key}', but '{parent or f'mode={_read_mode_name(cfg)}'}' has no '{leaf}'; {list_choices(leaf, names)}"
     return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --cfg job` shows what it has"
 
 
-def _mode_alone() -> DictConfig:
-    """Composes the mode of the command line without any other override, to see what it offers."""
+def _compose_mode() -> DictConfig:
+    """Compose the mode of the command line without other overrides, to list its groups and fields."""
     modes = [arg for arg in sys.argv[1:] if arg.startswith("mode=")]
     with hydra.initialize_config_module("conf", version_base="1.3"):
         return hydra.compose("config", overrides=modes[-1:], return_hydra_config=True)
 
 
-def _mode_name(cfg: DictConfig) -> str:
+def _read_mode_name(cfg: DictConfig) -> str:
     return str(cfg._target_).split(".")[-2]
 
 
-def _resolved(cfg: DictConfig) -> str:
-    """Returns the text of `resolved.yaml`, which runs again in a new folder."""
+def _format_resolved(cfg: DictConfig) -> str:
+    """Return the text of `resolved.yaml`, which runs again in a new folder."""
     values = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
     values.session.out = "???"
     settings = {"defaults": [{"hydra": "brokk"}, "_self_"]}
@@ -338,8 +368,8 @@ def _resolved(cfg: DictConfig) -> str:
 
 
 @contextlib.contextmanager
-def _hydra_raises() -> Iterator[None]:
-    """Makes Hydra raise its errors instead of printing them and leaving."""
+def _make_hydra_raise() -> Iterator[None]:
+    """Make Hydra raise its errors instead of printing them and leaving."""
     name = "HYDRA_FULL_ERROR"
     before = os.environ.get(name)
     os.environ[name] = "1"

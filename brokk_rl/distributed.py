@@ -1,7 +1,7 @@
-"""Which of several processes this one is.
+"""Rank of this process among those that `torchrun` started.
 
-`torchrun` starts one process a GPU and tells each by the environment; started by hand, a process is
-alone.
+`torchrun` starts one process for each GPU and sets environment variables. A process started by
+hand is alone.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from brokk_rl.errors import ConfigError
 
 @dataclass(frozen=True)
 class Rank:
-    """This process among those that work together.
+    """Rank of this process.
 
     Attributes:
-        index: Number over all computers; 0 is the one that writes, shows and evaluates.
-        local: Number on this computer, that of its GPU.
+        index: Rank over all computers; rank 0 writes, prints and evaluates.
+        local: Rank on this computer, equal to the index of its GPU.
         count: Number of processes.
     """
 
@@ -28,15 +28,15 @@ class Rank:
 
     @property
     def first(self) -> bool:
-        """Whether this process is the one that writes and shows."""
+        """True for the process that writes and prints."""
         return self.index == 0
 
 
-def own() -> Rank:
-    """Returns what `torchrun` has said about this process (`RANK`, `LOCAL_RANK`, `WORLD_SIZE`).
+def read_rank() -> Rank:
+    """Return the rank from the environment (`RANK`, `LOCAL_RANK`, `WORLD_SIZE`).
 
     Raises:
-        ConfigError: The three do not fit each other.
+        ConfigError: The three variables contradict each other.
     """
     told = {name: os.environ.get(name) for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE")}
     count = int(told["WORLD_SIZE"] or 1)
@@ -52,16 +52,16 @@ def own() -> Rank:
 
 
 def check_together(mode: type, sweep: bool) -> None:
-    """Refuses several processes where each would do the whole work of one.
+    """Refuse several processes where each would do the whole work.
 
     Args:
-        mode: Class of the mode; `together` says that it shares its work.
-        sweep: Whether it is a job of a sweep.
+        mode: Class of the mode; its attribute `together` is true if processes share its work.
+        sweep: True for a job of a sweep.
 
     Raises:
-        ConfigError: There are several for a mode that is the work of one, or for a sweep.
+        ConfigError: Several processes were started for such a mode or for a sweep.
     """
-    if own().count == 1:
+    if read_rank().count == 1:
         return
     if not getattr(mode, "together", False):
         raise ConfigError(f"{mode.__name__} is the work of one process: start it without torchrun")

@@ -1,7 +1,7 @@
-"""The errors that a person can act on.
+"""Errors that the user can act on.
 
-Every message says what was expected, what came, and where to change it. Anything that is not a
-`BrokkError` is our own bug and keeps its traceback.
+Each message names the expected value, the given value, and the place to change it. Any other
+exception is a defect of this package and keeps its traceback.
 """
 
 from collections.abc import Iterable
@@ -9,23 +9,23 @@ from difflib import get_close_matches
 
 
 class BrokkError(Exception):
-    """Something the user can mend; the command prints the message without a traceback."""
+    """Base of errors that the user can correct; the command prints them without a traceback."""
 
 
 class ConfigError(BrokkError):
-    """A value in the configuration does not make sense."""
+    """A value of the configuration is invalid."""
 
 
 class DeviceError(BrokkError):
-    """A device was asked for that is not there or cannot do the work."""
+    """The requested device is missing or cannot run the job."""
 
 
 class RecordingError(BrokkError):
-    """A recording cannot be used; names file, row and column."""
+    """A recording is invalid; the message names file, row and column."""
 
 
 class FrameError(BrokkError):
-    """A camera frame cannot be used; names the file or the camera, and what is wrong with it."""
+    """A camera frame is invalid; the message names the file or camera and the defect."""
 
 
 class CheckpointError(BrokkError):
@@ -37,19 +37,19 @@ class SimulationError(BrokkError):
 
 
 class DistributedError(BrokkError):
-    """Processes that train together lost each other, or no longer hold the same policy."""
+    """Processes of one training lost contact, or their policies differ."""
 
 
 class LinkError(BrokkError):
-    """The link to a machine fell silent or said something that makes no sense."""
+    """The link to a machine is silent, or sent an invalid message."""
 
 
 class StorageError(BrokkError):
-    """A file could not be written; nothing half-written is left behind."""
+    """A file could not be written; no partial file remains."""
 
 
-def choices(name: str, known: Iterable[str]) -> str:
-    """Returns the tail of a message about an unknown name: the nearest choices first, then all of them."""
+def list_choices(name: str, known: Iterable[str]) -> str:
+    """Return the end of a message about an unknown name: the nearest choice, then all choices."""
     names = sorted(known)
     near = get_close_matches(name, names, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""

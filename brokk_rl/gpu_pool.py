@@ -1,10 +1,9 @@
-"""Places for the jobs of a sweep that run at the same time on one computer.
+"""GPU pool for the jobs of a sweep that run at the same time on one computer.
 
-submitit starts all jobs of a local sweep at once and shows each of them no GPU or the same ones. So
-the launching process says what
-places there are, a GPU each, and a job waits for a free one before it touches a GPU. A place is a
-locked file: the system frees it when its process ends, however it ends, and two sweeps on one
-computer share the GPUs without knowing of each other.
+submitit starts all jobs of a local sweep at once and gives them no GPU, or all the same ones. The
+launching process therefore lists places, one for each GPU, and a job waits for a free place. A
+place is a locked file: the system unlocks it when its process ends, however it ends. Two sweeps on
+one computer thus share the GPUs.
 """
 
 from __future__ import annotations
@@ -20,16 +19,19 @@ from pathlib import Path
 from typing import IO
 
 OFFERED = "BROKK_PLACES"
-"""Environment variable with the places, one job at a time in each: `0,1,2,3` are GPUs, `0,0` two
-jobs on one, `cpu,cpu` none."""
+"""Environment variable with the places, one job at a time in each.
+
+`0,1,2,3` are four GPUs, `0,0` allows two jobs on one GPU, and `cpu,cpu` two jobs without a GPU.
+"""
 NO_GPU = "cpu"
 POLL_S = 0.5
+"""Seconds between looks for a free place; short against a job of minutes."""
 
 log = logging.getLogger(__name__)
 
 
-def offer() -> None:
-    """Says to the jobs of this sweep which places there are: those that a person has named, else each visible GPU, else one."""
+def offer_places() -> None:
+    """List the places in the environment: those the user has set, else each visible GPU, else one."""
     if OFFERED in os.environ:
         return
     import torch
@@ -41,14 +43,14 @@ def offer() -> None:
 
 
 @contextmanager
-def taken() -> Iterator[str | None]:
-    """Waits for a free place in a job that submitit started locally, and shows it that GPU alone; elsewhere does nothing."""
+def take_place() -> Iterator[str | None]:
+    """Wait for a free place and show its GPU alone; does nothing outside a local submitit job."""
     offered = os.environ.get(OFFERED)
     if not offered or os.environ.get("SUBMITIT_EXECUTOR") != "local":
         yield None
         return
     names = [name.strip() for name in offered.split(",")]
-    file, gpu = _wait(names)
+    file, gpu = _wait_for_place(names)
     try:
         os.environ["CUDA_VISIBLE_DEVICES"] = "" if gpu == NO_GPU else gpu
         yield gpu
@@ -56,8 +58,8 @@ def taken() -> Iterator[str | None]:
         file.close()
 
 
-def _wait(names: list[str]) -> tuple[IO[str], str]:
-    """Returns the open, locked file of the first place that is free, and its GPU."""
+def _wait_for_place(names: list[str]) -> tuple[IO[str], str]:
+    """Return the open, locked file of the first free place, and its GPU."""
     folder = Path(tempfile.gettempdir()) / f"brokk_places_{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     said = False

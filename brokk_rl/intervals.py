@@ -1,4 +1,4 @@
-"""95 % intervals of what was counted or measured."""
+"""95 % confidence intervals of rates and means."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from scipy import stats
 CONFIDENCE = 0.95
 
 
-def wilson(successes: float, trials: int) -> tuple[float, float]:
-    """Returns the Wilson score interval of a rate; right also at 0 and 1, where the usual formula gives an interval of width 0.
+def compute_wilson_interval(successes: float, trials: int) -> tuple[float, float]:
+    """Return the Wilson score interval of a rate.
+
+    It stays valid at rates of 0 and 1, where the normal approximation has width 0.
 
     Source: Wilson 1927, equation (10), without continuity correction.
     """
@@ -25,8 +27,8 @@ def wilson(successes: float, trials: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def student(values: Sequence[float]) -> tuple[float, float] | None:
-    """Returns Student's interval of the mean of independent values, such as one per seed; `None` for fewer than two."""
+def compute_student_interval(values: Sequence[float]) -> tuple[float, float] | None:
+    """Return Student's interval of the mean of independent values; `None` for fewer than two."""
     count = len(values)
     if count < 2:
         return None

@@ -1,8 +1,8 @@
 """The machine: joints, limits, geometry, control rate and levers, read from one YAML file.
 
-Everything that must agree between training, recordings and the machine's own computer comes from
-here, and `fingerprint` stamps it onto every file, so that a policy of one machine cannot be loaded
-on another unnoticed. This module needs neither torch nor MuJoCo.
+Training, recordings and the machine's own computer must agree on these numbers. `fingerprint`
+stamps them onto every file, so a policy of another machine is refused when it is loaded. This
+module needs neither torch nor MuJoCo.
 """
 
 import hashlib
@@ -18,13 +18,12 @@ from brokk_rl.spec import spec
 
 @spec
 class Dimension:
-    """A number about the machine together with where it comes from.
+    """A number of the machine with its source.
 
     Attributes:
         value: The number, in the unit that its key names.
         source: Data sheet, measurement, paper, or how it was estimated.
-        confidence: How far to trust it; the randomisation of a low-confidence dimension should be
-            wide.
+        confidence: Trust in the number; randomise a number of low confidence widely.
     """
 
     value: float
@@ -34,7 +33,7 @@ class Dimension:
 
 @spec
 class Body:
-    """The link behind a joint: where it is, what it weighs, and how its cylinder holds it.
+    """The link behind a joint: geometry, mass, and the force of its cylinder.
 
     Attributes:
         axis: Unit axis of the joint in the frame of the parent link, right-handed.
@@ -191,7 +190,7 @@ class Machine:
 
     @property
     def has_bodies(self) -> bool:
-        """True where geometry and masses are known, so that the machine can be simulated and its weight computed."""
+        """True if geometry and masses are known, as simulation and weight need."""
         return self.tool_m is not None and all(joint.body is not None for joint in self.joints)
 
     @property
@@ -199,7 +198,7 @@ class Machine:
         """The links in machine order.
 
         Raises:
-            ConfigError: they are not known.
+            ConfigError: The bodies are not known.
         """
         bodies = tuple(joint.body for joint in self.joints if joint.body is not None)
         if len(bodies) < self.num_joints:
@@ -214,7 +213,7 @@ class Machine:
         """Tool point in the frame of the last link, `(3,)`.
 
         Raises:
-            ConfigError: it is not known.
+            ConfigError: The tool point is not known.
         """
         if self.tool_m is None:
             raise ConfigError(
@@ -223,10 +222,10 @@ class Machine:
         return np.array([d.value for d in self.tool_m])
 
     def fingerprint(self) -> dict[str, str]:
-        """Returns what another file must agree with to be used on this machine: a short hash of each group of fields.
+        """Return a short hash of each group of fields that files of this machine must share.
 
-        Sources, confidences, titles and home positions do not matter; names, order, limits,
-        geometry, rate and masks do.
+        Names, order, limits, geometry, rate and masks count. Sources, confidences, titles and home
+        positions do not.
         """
         bodies = [joint.body for joint in self.joints]
         geometry = [
@@ -247,7 +246,11 @@ class Machine:
         }
 
     def check_fingerprint(self, other: dict[str, str], what: str) -> None:
-        """Raises a `CheckpointError` that names the groups of fields in which `other`, the stamp on `what`, differs."""
+        """Refuse a fingerprint `other` of the file `what` that differs.
+
+        Raises:
+            CheckpointError: Groups of fields differ; the message names them.
+        """
         mine = self.fingerprint()
         differing = [key for key in mine if other.get(key) != mine[key]]
         if differing:
@@ -257,11 +260,11 @@ class Machine:
             )
 
 
-def exclusive_mask(is_exclusive: Any, positioning: Any) -> Any:
-    """Returns which joints may be commanded: the exclusive ones while positioning, else all the others.
+def mask_exclusive_joints(is_exclusive: Any, positioning: Any) -> Any:
+    """Return the joints that may be commanded: exclusive ones while positioning, else the others.
 
-    These are the paper's masks [0, 1, 0, 0, 0] and [1, 0, 1, 1, 1]; tasks, excitations, guard and
-    levers all use this function.
+    These are the paper's masks [0, 1, 0, 0, 0] and [1, 0, 1, 1, 1]. Tasks, excitations, guard and
+    levers all call this function.
 
     Args:
         is_exclusive: `Machine.is_exclusive`, `(J,)` bool, numpy or torch.

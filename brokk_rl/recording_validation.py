@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brokk_rl.errors import choices
+from brokk_rl.errors import list_choices
 
 SCHEMA = "1"
 RATE_TOLERANCE = 0.2
@@ -70,7 +70,7 @@ def of_names(required: Sequence[str], present: Sequence[str]) -> Iterator[Breach
     """Yields the columns that are missing."""
     for name in required:
         if name not in present:
-            yield Breach(f"column '{name}' is missing; {choices(name, present)}", name)
+            yield Breach(f"column '{name}' is missing; {list_choices(name, present)}", name)
 
 
 def of_columns(

@@ -1,15 +1,17 @@
-"""The registries: which options each config group has, ours and those of installed extensions.
+"""Registries: the options of each config group, of this package and of installed extensions.
 
-A registry is a folder of YAML files. Nothing here imports what an option stands for: the line that
-describes an option is read from the source of its spec, so that listing costs nothing and a broken
-option can be listed too.
+A registry is a folder of YAML files. Nothing here imports the target of an option. Its summary is
+the first comment of its file, else the first docstring line in the source of its target. Listing
+is therefore cheap, and a broken option can be listed too.
 """
 
 from __future__ import annotations
 
 import ast
+import json
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import metadata, util
 from pathlib import Path
 
@@ -20,10 +22,7 @@ from brokk_rl.errors import ConfigError
 ENTRY_POINTS = "brokk_rl.conf"
 CORE = "conf"
 SETTINGS = ("hydra",)
-"""Groups of Hydra's own settings: no registry of ours."""
-SAME_SPEC = ("machine", "rig", "scene", "session")
-"""Groups whose options differ in their numbers only, so that the spec says nothing about one of
-them."""
+"""Groups that hold settings of Hydra and are no registries."""
 
 
 @dataclass(frozen=True)
@@ -43,33 +42,34 @@ class Option:
     path: Path
 
     def summary(self) -> str:
-        """Returns one line about the option: of its spec, or the comment on top where the spec says nothing about it."""
+        """Return the first sentence of the file's comment, else the first line of its target."""
         text = self.path.read_text()
         target = (yaml.safe_load(text) or {}).get("_target_")
-        shared = self.group in SAME_SPEC
-        return (_docstring_line(target) if target and not shared else "") or _comment(text)
+        return _read_comment(text) or (_read_docstring_line(target) if target else "")
 
 
-def packages() -> dict[str, Path]:
-    """Returns the folder of each config package: ours first, then those of installed extensions by entry point.
+def find_packages() -> dict[str, Path]:
+    """Return the folder of each config package: this one first, then installed extensions.
 
     Raises:
         ConfigError: An extension names a package that cannot be found.
     """
-    found = {CORE: _folder(CORE, "brokk_rl")}
+    found = {CORE: _find_folder(CORE, "brokk_rl")}
     for point in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
-        found[point.value] = _folder(point.value, f"entry point '{point.name}' of {ENTRY_POINTS}")
+        found[point.value] = _find_folder(
+            point.value, f"entry point '{point.name}' of {ENTRY_POINTS}"
+        )
     return found
 
 
-def options() -> list[Option]:
-    """Returns every option of every group, sorted by group and name.
+def list_options() -> list[Option]:
+    """Return every option of every group, sorted by group and name.
 
     Raises:
         ConfigError: Two packages offer the same option.
     """
     found: dict[tuple[str, str], Option] = {}
-    for package, folder in packages().items():
+    for package, folder in find_packages().items():
         for path in sorted(folder.rglob("*.yaml")):
             group, name = path.parent.relative_to(folder).as_posix(), path.stem
             if group == "." or group.split("/")[0] in SETTINGS:
@@ -82,7 +82,23 @@ def options() -> list[Option]:
     return [found[key] for key in sorted(found)]
 
 
-def _folder(package: str, who: str) -> Path:
+@lru_cache
+def load_renamed_targets() -> dict[str, str]:
+    """Return the current target of each target that an earlier version had."""
+    return json.loads((Path(__file__).parent / "renamed_targets.json").read_text())
+
+
+def rename_targets(text: str) -> str:
+    """Return YAML text with current targets, so that files of earlier versions still load."""
+    renamed = load_renamed_targets()
+
+    def rename(found: re.Match[str]) -> str:
+        return found[1] + renamed.get(found[2], found[2])
+
+    return re.sub(r"(_target_['\"]?:\s*['\"]?)([\w.]+)", rename, text)
+
+
+def _find_folder(package: str, who: str) -> Path:
     try:
         place = util.find_spec(package)
     except ModuleNotFoundError:
@@ -94,8 +110,8 @@ def _folder(package: str, who: str) -> Path:
     return Path(next(iter(place.submodule_search_locations)))
 
 
-def _docstring_line(target: str) -> str:
-    """Returns the first line of the docstring of the class or function `target`, '' where it cannot be found."""
+def _read_docstring_line(target: str) -> str:
+    """Return the first docstring line of the class or function `target`, or an empty string."""
     module, _, name = str(target).rpartition(".")
     try:
         place = util.find_spec(module)
@@ -109,8 +125,8 @@ def _docstring_line(target: str) -> str:
     return ""
 
 
-def _comment(text: str) -> str:
-    """Returns the first sentence of the comment on top of a file, '' where there is none."""
+def _read_comment(text: str) -> str:
+    """Return the first sentence of the comment at the top of a file, or an empty string."""
     lines = []
     for line in text.splitlines():
         if not line.startswith("#"):

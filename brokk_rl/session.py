@@ -1,4 +1,4 @@
-"""A session: one run's folder, seed and device, and the record of how it went."""
+"""Session of one run: folder, seed, device, and the record in `session.json`."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ STAMPED = (
 
 @spec
 class Session:
-    """One run: where it writes, its seed and its device.
+    """Folder, seed and device of one run.
 
     Attributes:
         out: Run folder.
-        seed: The one seed from which every stream of random numbers is derived.
+        seed: Seed from which every stream of random numbers is derived.
         device: `auto` (a GPU if there is one), `cpu`, `cuda` or `cuda:<index>`.
     """
 
@@ -68,20 +68,20 @@ class Session:
 
     @property
     def folder(self) -> Path:
-        """The run folder; exists from `start` on."""
+        """Run folder; `start` makes it."""
         return Path(self.out)
 
     def torch_device(self) -> torch.device:
-        """Returns the device to compute on; of several processes each has the GPU of its local rank.
+        """Return the device to compute on; each of several processes has the GPU of its local rank.
 
         Raises:
-            DeviceError: A GPU was asked for and is not there. `auto` never raises in a process that
-                is alone.
+            DeviceError: A GPU was asked for and is missing. `auto` never raises in a single
+                process.
         """
         import torch
 
         kind, _, index = self.device.partition(":")
-        rank = distributed.own()
+        rank = distributed.read_rank()
         if rank.count > 1:
             if index:
                 raise DeviceError(
@@ -108,52 +108,53 @@ class Session:
         return torch.device("cuda", number)
 
     def stream(self, name: str) -> int:
-        """Returns the seed of the stream `name`, below 2**32: the same for the same session seed and name, unrelated otherwise.
+        """Return the seed of the stream `name`, below 2**32.
 
-        Of several processes the first has the streams of a process that is alone, each other one
-        streams of its own.
+        It depends on the session seed and the name only. The first of several processes has the
+        streams of a single process, each other process has streams of its own.
         """
-        rank = distributed.own().index
+        rank = distributed.read_rank().index
         key = f"{self.seed}/{name}" + (f"/rank{rank}" if rank else "")
         return int.from_bytes(hashlib.sha256(key.encode()).digest()[:4], "little")
 
     def generator(self, name: str) -> np.random.Generator:
-        """Returns a numpy generator for the stream `name`, independent of how often any other stream is used."""
+        """Return a numpy generator for the stream `name`, independent of all other streams."""
         return np.random.default_rng(self.stream(name))
 
     def torch_generator(self, name: str, device: torch.device | str = "cpu") -> torch.Generator:
-        """Returns a torch generator on `device` for the stream `name`."""
+        """Return a torch generator on `device` for the stream `name`."""
         import torch
 
         return torch.Generator(device=device).manual_seed(self.stream(name))
 
     def seed_all(self) -> None:
-        """Seeds the global generators of Python, numpy and torch (all devices)."""
+        """Seed the global generators of Python, numpy and torch (all devices)."""
         random.seed(self.stream("python"))
         np.random.seed(self.stream("numpy"))
         try:
             import torch
-        except ImportError:  # the machine's own computer has no torch
+        except ImportError:  # The machine's own computer has no torch.
             return
         torch.manual_seed(self.stream("torch"))
 
     @contextmanager
-    def start(self, resolved: str, facts: dict[str, Any], resume: bool = False) -> Iterator[Record]:
-        """Makes the run folder, writes `resolved.yaml` and keeps `session.json` up to date until the block ends.
+    def start(
+        self, resolved: str, facts: dict[str, Any], resume: bool = False
+    ) -> Iterator[SessionRecord]:
+        """Make the run folder, write `resolved.yaml`, and keep `session.json` current in the block.
+
+        Only the first of several processes writes; the others keep their record in memory.
 
         Args:
             resolved: Text of `resolved.yaml`.
             facts: Further fields of `session.json`: mode, choices, overrides, machine, fingerprint.
-            resume: The folder may already hold a run, which goes on.
-
-        Of several processes only the first writes; the record of the others stays in memory.
+            resume: True if the folder may hold a run, which then goes on.
 
         Raises:
-            StorageError: The folder holds a run already and `resume` is false, or cannot be
-                written.
+            StorageError: The folder holds a run and `resume` is false, or it cannot be written.
         """
-        if not distributed.own().first:
-            yield Record(self.folder)
+        if not distributed.read_rank().first:
+            yield SessionRecord(self.folder)
             return
         before = read_record(self.folder) if self.folder.is_dir() else None
         if before and not resume:
@@ -162,15 +163,15 @@ class Session:
                 "Give another folder with session.out=<folder>, or delete this one."
             )
         fields = {
-            "schema": 1, "outcome": "running", "objective": None, "started": _now(), "ended": None,
+            "schema": 1, "outcome": "running", "objective": None, "started": _format_now(), "ended": None,
             "command": ["brokk", *sys.argv[1:]], **facts,
-            "seed": self.seed, "device": self.device, "commit": commit(), "versions": versions(), "pid": os.getpid(),
+            "seed": self.seed, "device": self.device, "commit": describe_commit(), "versions": read_versions(), "pid": os.getpid(),
         }  # fmt: skip
         if before:
             fields["started"] = before.get("started", fields["started"])
-            fields["resumed"] = [*before.get("resumed", []), _now()]
-        record = Record(self.folder, fields)
-        new_folders = missing_folders(self.folder)
+            fields["resumed"] = [*before.get("resumed", []), _format_now()]
+        record = SessionRecord(self.folder, fields)
+        new_folders = list_missing_folders(self.folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_text(self.folder / RESOLVED, resolved)
@@ -188,43 +189,43 @@ class Session:
             raise
         except BaseException as error:
             record.fields["error"] = f"{type(error).__name__}: {error}"
-            if isinstance(error, BrokkError) and not before and self._take_back(new_folders):
-                record = None  # refused before anything was done: nothing stays behind
+            if isinstance(error, BrokkError) and not before and self._remove_start(new_folders):
+                record = None  # Refused before any work: nothing stays.
             raise
         finally:
             if record:
-                record.fields |= {"outcome": outcome, "ended": _now()}
+                record.fields |= {"outcome": outcome, "ended": _format_now()}
                 record.write()
 
-    def _take_back(self, new_folders: Sequence[Path]) -> bool:
-        """Removes the files of `start` and the folders made for them, unless the run has written something; says whether it did."""
+    def _remove_start(self, new_folders: Sequence[Path]) -> bool:
+        """Remove what `start` made and return true, unless the run has written something."""
         if {path.name for path in self.folder.iterdir()} - {RECORD, RESOLVED}:
             return False
         for name in (RECORD, RESOLVED):
             (self.folder / name).unlink()
-        remove_empty(new_folders)
+        remove_empty_folders(new_folders)
         return True
 
 
 @dataclass
-class Record:
-    """`session.json` of a running session.
+class SessionRecord:
+    """Content of `session.json` during a run.
 
     Attributes:
         folder: Run folder.
-        fields: What stands in the file.
+        fields: Fields of the file.
     """
 
     folder: Path
     fields: dict[str, Any] = field(default_factory=dict)
 
     def write(self) -> None:
-        """Writes the file in one step."""
+        """Write the file in one step."""
         write_json(self.folder / RECORD, self.fields)
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """Returns what `session.json` of a run folder says, `None` where there is none."""
+    """Return the content of `session.json` in a run folder, `None` where there is none."""
     try:
         return json.loads((folder / RECORD).read_text())
     except FileNotFoundError:
@@ -233,15 +234,14 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         raise StorageError(f"{folder / RECORD} is not readable as JSON: {error}") from error
 
 
-def earlier(folder: Path, resolved: str) -> dict[str, Any] | None:
-    """Returns what `session.json` says of the same job of the same sweep, run earlier; `None` where there is none.
+def read_earlier_job(folder: Path, resolved: str) -> dict[str, Any] | None:
+    """Return the record of the same job in an earlier run of the same sweep, or `None`.
 
-    So a sweep that is run again, into the same `session.out`, skips what is finished and goes on
-    with the rest.
+    A sweep that is run again into the same `session.out` thus skips finished jobs.
 
     Args:
         folder: The job's folder.
-        resolved: What its `resolved.yaml` should hold.
+        resolved: Expected text of its `resolved.yaml`.
 
     Raises:
         StorageError: The folder holds another job.
@@ -256,12 +256,12 @@ def earlier(folder: Path, resolved: str) -> dict[str, Any] | None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes `value` as JSON in one step: readers see the old file or the whole new one, never a part."""
+    """Write `value` as JSON in one step: a reader sees the old or the new file, never a part."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text file in one step; a full disk leaves the old file as it was."""
+    """Write a text file in one step; on a full disk the old file stays."""
     part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         part.write_text(text)
@@ -270,20 +270,20 @@ def write_text(path: Path, text: str) -> None:
         part.unlink(missing_ok=True)
 
 
-def missing_folders(folder: Path) -> list[Path]:
-    """Returns `folder` and those above it that do not exist yet, the innermost first."""
+def list_missing_folders(folder: Path) -> list[Path]:
+    """Return `folder` and its parents that do not exist yet, the innermost first."""
     return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
-def remove_empty(folders: Sequence[Path]) -> None:
-    """Removes folders, innermost first, until one holds something."""
+def remove_empty_folders(folders: Sequence[Path]) -> None:
+    """Remove folders, the innermost first, up to the first one that is not empty."""
     with suppress(OSError):
         for folder in folders:
             folder.rmdir()
 
 
-def versions() -> dict[str, str]:
-    """Returns the installed versions of Python and of the packages that decide the result."""
+def read_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that influence results."""
     found = {"python": ".".join(map(str, sys.version_info[:3]))}
     for name in STAMPED:
         try:
@@ -293,10 +293,10 @@ def versions() -> dict[str, str]:
     return found
 
 
-def commit() -> str | None:
-    """Returns the commit of the checkout that this code runs from, `-dirty` after it when files differ; `None` outside one."""
+def describe_commit() -> str | None:
+    """Return the commit of this checkout, with `-dirty` if files differ; `None` outside a checkout."""
     root = Path(__file__).parents[1]
-    if not (root / ".git").exists():  # an installed wheel may lie inside someone else's checkout
+    if not (root / ".git").exists():  # A wheel may be installed inside another checkout.
         return None
     try:
         git = [
@@ -316,5 +316,5 @@ def commit() -> str | None:
         return None
 
 
-def _now() -> str:
+def _format_now() -> str:
     return datetime.now().astimezone().isoformat(timespec="seconds")

@@ -12,12 +12,13 @@ T = TypeVar("T")
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def spec(cls: type[T]) -> type[T]:
-    """Makes `cls` a spec: a frozen, keyword-only dataclass whose fields are checked against their annotations.
+    """Turn `cls` into a spec: a frozen, keyword-only dataclass that checks its field types.
 
-    A YAML list becomes a tuple, an integer given for a float becomes a float, and a whole number
-    such as 48e6 given for an integer an integer; any other mismatch is a `ConfigError` that names
-    the field, what was expected and what came. A spec may define `check(self)` for rules between
-    fields. Specs are pure data: a number lives in one YAML file, so fields have no defaults here.
+    A YAML list becomes a tuple. An integer given for a float becomes a float, and a whole number
+    such as 48e6 given for an integer becomes an integer. Any other mismatch raises a `ConfigError`
+    that names the field, the expected type and the value. A spec may define `check(self)` for
+    rules between fields. Specs are pure data: a number lives in one YAML file, so fields have no
+    defaults here.
     """
     cls.__post_init__ = _post_init  # type: ignore[attr-defined]
     return dataclass(frozen=True, kw_only=True)(cls)
@@ -28,19 +29,19 @@ def _post_init(self: Any) -> None:
     for field in fields(self):
         where = f"{type(self).__name__}.{field.name}"
         object.__setattr__(
-            self, field.name, _fitted(getattr(self, field.name), hints[field.name], where)
+            self, field.name, _convert(getattr(self, field.name), hints[field.name], where)
         )
     if check := getattr(self, "check", None):
         check()
 
 
-def _fitted(value: Any, hint: Any, where: str) -> Any:
-    """Returns `value` as `hint` wants it, or raises a `ConfigError`."""
+def _convert(value: Any, hint: Any, where: str) -> Any:
+    """Return `value` converted to the annotated type, or raise a `ConfigError`."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return value
     if origin in (Union, types.UnionType):
-        return _first_fit(value, args, where, hint)
+        return _convert_union(value, args, where, hint)
     if origin is typing.Literal:
         if value not in args:
             raise ConfigError(
@@ -54,12 +55,12 @@ def _fitted(value: Any, hint: Any, where: str) -> Any:
                 f"{where}: expected {len(inner)} values, got {len(value)}: {list(value)}"
             )
         return tuple(
-            _fitted(v, h, f"{where}[{i}]")
+            _convert(v, h, f"{where}[{i}]")
             for i, (v, h) in enumerate(zip(value, inner, strict=True))
         )
     if origin is dict and isinstance(value, dict):
         return {
-            _fitted(k, args[0], where): _fitted(v, args[1], f"{where}.{k}")
+            _convert(k, args[0], where): _convert(v, args[1], f"{where}.{k}")
             for k, v in value.items()
         }
     plain = origin or hint
@@ -75,14 +76,14 @@ def _fitted(value: Any, hint: Any, where: str) -> Any:
     return value
 
 
-def _first_fit(value: Any, hints: tuple[Any, ...], where: str, whole: Any) -> Any:
+def _convert_union(value: Any, hints: tuple[Any, ...], where: str, whole: Any) -> Any:
     for hint in hints:
         if hint is type(None):
             if value is None:
                 return None
             continue
         try:
-            return _fitted(value, hint, where)
+            return _convert(value, hint, where)
         except ConfigError:
             continue
     raise ConfigError(f"{where}: expected {whole}, got {type(value).__name__} {value!r}")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Lever, Machine
 from brokk_rl.spec import spec
 
@@ -22,7 +22,7 @@ AXES = (("left", "theta"), ("left", "psi"), ("right", "theta"), ("right", "psi")
 
 
 @dataclass(frozen=True)
-class Levers:
+class LeverPositions:
     """Positions of both levers, of full, in [-1, 1]: theta fore and aft, psi sideways; and whether the right button is held."""
 
     left_theta: float
@@ -42,10 +42,10 @@ class LeverAngles:
     right_psi_rad: float
     button_right: bool
 
-    def parts(self, full_rad: tuple[float, ...]) -> Levers:
+    def parts(self, full_rad: tuple[float, ...]) -> LeverPositions:
         """Returns them as parts of `full_rad`, the angle at full deflection of each of the four `AXES`."""
         parts = (angle / full for angle, full in zip(self.angles_rad, full_rad, strict=True))
-        return Levers(*parts, button_right=self.button_right)
+        return LeverPositions(*parts, button_right=self.button_right)
 
     @property
     def angles_rad(self) -> tuple[float, ...]:
@@ -54,7 +54,7 @@ class LeverAngles:
 
 
 @spec
-class Guidance:
+class LeverGuidance:
     """How commands are shown as lever positions.
 
     Attributes:
@@ -74,7 +74,7 @@ class Guidance:
             )
 
 
-def full_angles_rad(levers: Sequence[Lever]) -> tuple[float, ...]:
+def find_full_angles_rad(levers: Sequence[Lever]) -> tuple[float, ...]:
     """Returns the angle at full deflection of each of the four `AXES`; 1 where no joint hangs on it."""
     return tuple(
         max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0)
@@ -98,7 +98,7 @@ class LeverMap:
         for lever in levers:
             if lever.joint not in names:
                 raise ConfigError(
-                    f"guidance: machine '{machine.name}' has no joint '{lever.joint}'; {choices(lever.joint, names)}"
+                    f"guidance: machine '{machine.name}' has no joint '{lever.joint}'; {list_choices(lever.joint, names)}"
                 )
         by_joint = {lever.joint: lever for lever in levers}
         if missing := [name for name in names if name not in by_joint]:
@@ -129,7 +129,7 @@ class LeverMap:
 
 
 @dataclass(frozen=True)
-class Shown:
+class DisplayedLevers:
     """Lever positions to show: angles of the four `AXES` in rad, and whether the right button is to be held."""
 
     angles_rad: np.ndarray
@@ -144,12 +144,12 @@ class LeverDisplay:
         machine: The machine.
     """
 
-    def __init__(self, guidance: Guidance, machine: Machine) -> None:
+    def __init__(self, guidance: LeverGuidance, machine: Machine) -> None:
         self._guidance = guidance
         self.map = LeverMap(guidance.levers or machine.levers, machine)
         self._angles_rad, self._button = np.zeros(len(AXES)), False
 
-    def show(self, u: np.ndarray, period_s: float) -> Shown:
+    def show(self, u: np.ndarray, period_s: float) -> DisplayedLevers:
         """Returns what to show for commands `(J,)`, one period after what was shown last."""
         wanted = np.where(np.abs(u) < self._guidance.dead_zone, 0.0, u)
         angles_rad, button = self.map.levers(wanted)
@@ -161,4 +161,4 @@ class LeverDisplay:
             self._button = button
         step = self._guidance.max_rate_rad_s * period_s
         self._angles_rad = self._angles_rad + np.clip(angles_rad - self._angles_rad, -step, step)
-        return Shown(self._angles_rad.copy(), self._button)
+        return DisplayedLevers(self._angles_rad.copy(), self._button)

@@ -18,14 +18,14 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.spec import spec
-from deploy.bus.wire import Wire
-from deploy.guard.guard import State
-from deploy.guard.limits import Limits
-from deploy.runtime.bus_process import Setting
-from deploy.runtime.operator_state import view
-from deploy.runtime.process import Child, ask_for_priority, back_to_ordinary
+from deploy.bus.can_bus import CanBus
+from deploy.guard.guard import GuardState
+from deploy.guard.limits import GuardLimits
+from deploy.runtime.bus_process import BusProcessConfig
+from deploy.runtime.operator_state import read_snapshot
+from deploy.runtime.process import ChildProcess, ask_for_priority, give_up_priority
 from deploy.runtime.process_group import BUS_PRIORITY, PATIENCE_S
-from deploy.runtime.shm_layout import Exchange
+from deploy.runtime.shm_layout import LoopMemory
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ ANSWER_S = 0.2
 
 
 @spec
-class Can:
+class CanConnection:
     """A machine on a bus, through the guard.
 
     Attributes:
@@ -47,9 +47,9 @@ class Can:
         realtime: Whether to ask for real-time priority.
     """
 
-    wire: Wire
+    wire: CanBus
     dbc: str
-    limits: Limits
+    limits: GuardLimits
     patience_s: float
     realtime: bool
 
@@ -72,10 +72,10 @@ class Can:
 class CanLink:
     """The link at work; see `brokk_rl.contracts.link.Link`."""
 
-    def __init__(self, can: Can, machine: Machine) -> None:
+    def __init__(self, can: CanConnection, machine: Machine) -> None:
         self._can, self._machine = can, machine
-        self._exchange: Exchange | None = None
-        self._child: Child | None = None
+        self._memory: LoopMemory | None = None
+        self._child: ChildProcess | None = None
         self._reached = np.zeros(machine.num_joints)
         self._was_active = False
 
@@ -90,7 +90,7 @@ class CanLink:
         Raises:
             LinkError: the guard objects, and not only because the dead-man was released.
         """
-        exchange, u = self._opened(), np.asarray(command.u, dtype=float)
+        memory, u = self._opened(), np.asarray(command.u, dtype=float)
         if not np.isfinite(u).all():
             raise LinkError(f"link: a command that is no number cannot be sent: {u}")
         if not u.any():
@@ -104,12 +104,12 @@ class CanLink:
             if time.monotonic() > until_s:
                 raise LinkError("link: the bus process does not answer")
             time.sleep(0.002)
-        if int(state["guard"]) == State.LATCHED.value:
-            safety = view(exchange).safety
+        if int(state["guard"]) == GuardState.LATCHED.value:
+            safety = read_snapshot(memory).safety
             raise LinkError(
                 f"link: the guard has stopped the machine: {safety.cause if safety else 'unknown'}"
             )
-        if int(state["guard"]) != State.ACTIVE.value:
+        if int(state["guard"]) != GuardState.ACTIVE.value:
             self._reached = np.zeros_like(u)
             return Command(np.zeros_like(u))
         passed = np.where(
@@ -126,19 +126,19 @@ class CanLink:
 
     def __enter__(self) -> Self:
         can, machine = self._can, self._machine
-        self._exchange = Exchange.new(machine.num_joints, commands=True)
-        setting = Setting(can.wire, can.dbc, machine, can.limits)
+        self._memory = LoopMemory.new(machine.num_joints, commands=True)
+        setting = BusProcessConfig(can.wire, can.dbc, machine, can.limits)
         priority = BUS_PRIORITY if can.realtime else None
-        self._child = Child(
+        self._child = ChildProcess(
             "bus",
             "deploy.runtime.bus_process:run",
-            (setting, self._exchange),
-            self._exchange.files,
+            (setting, self._memory),
+            self._memory.files,
             priority,
         )
         until_s = time.monotonic() + can.patience_s
         try:
-            while (state := self._exchange.state.read()) is None or float(state["q_t_s"]) == 0.0:
+            while (state := self._memory.state.read()) is None or float(state["q_t_s"]) == 0.0:
                 if self._child.code is not None:
                     raise LinkError(
                         f"link: the bus process has died (exit code {self._child.code})"
@@ -158,19 +158,19 @@ class CanLink:
 
     def __exit__(self, *exc: Any) -> None:
         if self._can.realtime:
-            back_to_ordinary()
+            give_up_priority()
         if self._child is not None:
             self._child.end(PATIENCE_S)  # sends zero before it goes
-        if self._exchange is not None:
-            self._exchange.close()
-        self._child = self._exchange = None
+        if self._memory is not None:
+            self._memory.close()
+        self._child = self._memory = None
 
     def _ask(self, u: np.ndarray) -> float:
-        exchange = self._opened()
-        assert exchange.request is not None
-        request, now_s = exchange.request.new(), time.monotonic()
+        memory = self._opened()
+        assert memory.request is not None
+        request, now_s = memory.request.new(), time.monotonic()
         request["t_s"], request["u"] = now_s, u
-        exchange.request.write(request)
+        memory.request.write(request)
         return now_s
 
     def _wait_for_operator(self) -> None:
@@ -179,9 +179,9 @@ class CanLink:
             return
         until_s = time.monotonic() + self._can.patience_s
         log.warning("release the dead-man, then press and hold it: the machine will move")
-        while int(self._state()["guard"]) != State.ACTIVE.value:
+        while int(self._state()["guard"]) != GuardState.ACTIVE.value:
             if time.monotonic() > until_s:
-                safety = view(self._opened()).safety
+                safety = read_snapshot(self._opened()).safety
                 raise LinkError(
                     f"link: the machine was not released for motion: {safety.trip if safety else 'no state'}"
                 )
@@ -211,7 +211,7 @@ class CanLink:
             raise LinkError("link: nothing has come from the bus yet")
         return state
 
-    def _opened(self) -> Exchange:
-        if self._exchange is None:
+    def _opened(self) -> LoopMemory:
+        if self._memory is None:
             raise LinkError("link: it is not open; use it in a `with` block")
-        return self._exchange
+        return self._memory

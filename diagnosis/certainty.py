@@ -14,7 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.spec import spec
 from diagnosis.engine import Findings
 from diagnosis.remainder import CLUES, CURVE, FORMS, LATER, STARTS, TIME
@@ -63,7 +63,7 @@ class Certainty:
             for sign in getattr(self, name):
                 if sign not in signs:
                     raise ConfigError(
-                        f"certainty.{name}: '{sign}' is no sign; {choices(sign, signs)}"
+                        f"certainty.{name}: '{sign}' is no sign; {list_choices(sign, signs)}"
                     )
             if missing := [sign for sign in signs if sign not in getattr(self, name)]:
                 raise ConfigError(

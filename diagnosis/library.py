@@ -15,7 +15,7 @@ import yaml
 
 from brokk_rl import registry
 from brokk_rl.contracts.actuator import ActuatorModel
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
@@ -110,7 +110,7 @@ def load(machine: Machine, names: Sequence[str] | None = None) -> list[Kind]:
         ConfigError: a name is unknown, or an effect cannot be imported.
     """
     found = {}
-    for option in registry.options():
+    for option in registry.list_options():
         if option.group != "effect":
             continue
         path = (yaml.safe_load(option.path.read_text()) or {}).get("_target_", "")
@@ -125,7 +125,9 @@ def load(machine: Machine, names: Sequence[str] | None = None) -> list[Kind]:
             found[option.name] = Kind(option.name, target, machine.num_joints)
     for name in names or ():
         if name not in found:
-            raise ConfigError(f"diagnosis.effects: '{name}' is no effect; {choices(name, found)}")
+            raise ConfigError(
+                f"diagnosis.effects: '{name}' is no effect; {list_choices(name, found)}"
+            )
     usable = []
     for kind in (found[name] for name in names or found):
         try:

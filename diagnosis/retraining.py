@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from brokk_rl.intervals import wilson
+from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.plot import BLUE, GREY, RED, remove_frame
 from brokk_rl.report import Cell, Report, Tone
 
@@ -68,7 +68,7 @@ def _compute_rate(row: Mapping[str, Any]) -> SuccessRate:
     """Returns a rate with its Wilson interval."""
     episodes = int(row["episodes"])
     rate = float(row["success_strict"]["mean"])
-    low, high = wilson(round(rate * episodes), episodes)
+    low, high = compute_wilson_interval(round(rate * episodes), episodes)
     return {"mean": rate, "ci95": [low, high]}
 
 

@@ -20,7 +20,7 @@ from actuators.excite.plan.runner import Runner
 from actuators.excite.plan.schedule import Approach, Plan, schedule
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
@@ -226,7 +226,7 @@ class CaseRecorder:
         for name in names:
             if name not in self._excitations:
                 raise ConfigError(
-                    f"exam: programs: no excitation '{name}'; {choices(name, self._excitations)}"
+                    f"exam: programs: no excitation '{name}'; {list_choices(name, self._excitations)}"
                 )
         chosen = {name: self._excitations[name] for name in names}
         stream = job.stream("plan")

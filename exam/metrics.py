@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from brokk_rl.intervals import CONFIDENCE, wilson
+from brokk_rl.intervals import CONFIDENCE, compute_wilson_interval
 from exam.score import QUIET_KINDS, CaseScore, Claim
 
 NUM_DRAWS = 1000
@@ -27,7 +27,7 @@ Figure = dict[str, Any]
 
 def compute_rate(right: Sequence[bool]) -> Figure:
     """Returns share, number and Wilson interval."""
-    low, high = wilson(sum(right), len(right))
+    low, high = compute_wilson_interval(sum(right), len(right))
     return {
         "value": float(np.mean(right)) if right else None,
         "of": len(right),

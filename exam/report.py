@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from brokk_rl.errors import StorageError
 from brokk_rl.report import DPI, MISSING, Cell, Report
-from brokk_rl.session import commit, write_text
+from brokk_rl.session import describe_commit, write_text
 
 HEADLINES = (
     "top1", "top1_strictly", "macro_f1", "joints", "exact_set", "set_f1", "false_alarms", "unknown_recall", "unknown_auroc",
@@ -42,7 +42,7 @@ def append_to_ledger(
     }
     line = {
         "when": when,
-        "commit": commit(),
+        "commit": describe_commit(),
         "candidate": name,
         **exam,
         **{key: _round_float(value) for key, value in figures.items()},

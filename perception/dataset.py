@@ -27,14 +27,14 @@ import yaml
 
 from brokk_rl.errors import FrameError, StorageError
 
-BLOCK, MOUTH, ARM = 1, 2, 4
+BLOCK, HOLE_MASK, ARM = 1, 2, 4
 CAMERA, COLOR, RIGHT, DEPTH, DEPTH_MM, TRUTH, MASK = (
     "camera.yaml", ".color.png", ".right.png", ".depth.npy", ".depth.png", ".truth.json", ".mask.png",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Circle:
+class TrueCircle:
     """A rim, or a disc that is none, as it truly is.
 
     Attributes:
@@ -59,7 +59,7 @@ class Circle:
 
 
 @dataclass(frozen=True)
-class Truth:
+class SceneTruth:
     """What a rendered frame shows.
 
     Attributes:
@@ -72,21 +72,21 @@ class Truth:
 
     scene: str
     conditions: dict[str, float]
-    holes: tuple[Circle, ...]
-    decoys: tuple[Circle, ...]
+    holes: tuple[TrueCircle, ...]
+    decoys: tuple[TrueCircle, ...]
     block: dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Label:
+class FrameLabel:
     """Masks of a frame, `(h, w)` bool: the block with its mouths, what is seen through rims, and the arm."""
 
     block: np.ndarray
-    mouth: np.ndarray
+    hole_mask: np.ndarray
     arm: np.ndarray
 
 
-def stems(folder: Path) -> list[Path]:
+def list_stems(folder: Path) -> list[Path]:
     """Returns the frames of a folder, sorted: each path without its endings.
 
     Raises:
@@ -106,19 +106,19 @@ def stems(folder: Path) -> list[Path]:
     return found
 
 
-def read_truth(stem: Path) -> Truth:
+def read_truth(stem: Path) -> SceneTruth:
     """Returns the truth of the rendered frame at `stem`.
 
     Raises:
         FrameError: it has none, or one that cannot be read.
     """
-    path = _beside(stem, TRUTH)
+    path = _build_path(stem, TRUTH)
     try:
         told = json.loads(path.read_text())
         circles = {
-            name: tuple(Circle(**entry) for entry in told[name]) for name in ("holes", "decoys")
+            name: tuple(TrueCircle(**entry) for entry in told[name]) for name in ("holes", "decoys")
         }
-        return Truth(
+        return SceneTruth(
             told["scene"], told["conditions"], circles["holes"], circles["decoys"], told["block"]
         )
     except FileNotFoundError as error:
@@ -127,25 +127,25 @@ def read_truth(stem: Path) -> Truth:
         raise FrameError(f"{path}: not a truth file of this version ({error})") from error
 
 
-def read_label(stem: Path) -> Label:
+def read_label(stem: Path) -> FrameLabel:
     """Returns the masks of the rendered frame at `stem`.
 
     Raises:
         FrameError: it has none, or one that cannot be read.
     """
-    path = _beside(stem, MASK)
+    path = _build_path(stem, MASK)
     bits = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if bits is None or bits.ndim != 2:
         raise FrameError(
             f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames have one"
         )
     bits = np.asarray(bits, np.uint8)
-    return Label((bits & BLOCK) > 0, (bits & MOUTH) > 0, (bits & ARM) > 0)
+    return FrameLabel((bits & BLOCK) > 0, (bits & HOLE_MASK) > 0, (bits & ARM) > 0)
 
 
-def mask_bits(label: Label) -> np.ndarray:
+def encode_mask(label: FrameLabel) -> np.ndarray:
     """Returns masks as they stand in the file, `(h, w)` uint8."""
-    return (BLOCK * label.block + MOUTH * label.mouth + ARM * label.arm).astype(np.uint8)
+    return (BLOCK * label.block + HOLE_MASK * label.hole_mask + ARM * label.arm).astype(np.uint8)
 
 
 def write_camera(
@@ -176,8 +176,8 @@ def write_frame(
     color: np.ndarray,
     depth_m: np.ndarray | None,
     right: np.ndarray | None = None,
-    label: Label | None = None,
-    truth: Truth | None = None,
+    label: FrameLabel | None = None,
+    truth: SceneTruth | None = None,
 ) -> None:
     """Writes a frame, the truth last: where that stands, all of it does.
 
@@ -189,14 +189,14 @@ def write_frame(
         (RIGHT, None if right is None else right[..., ::-1]),
     ):
         if picture is not None:
-            write_picture(_beside(stem, ending), picture)
+            write_picture(_build_path(stem, ending), picture)
     if depth_m is not None:
-        _write(_beside(stem, DEPTH), depth_m.astype(np.float32))
+        _write(_build_path(stem, DEPTH), depth_m.astype(np.float32))
     if label is not None:
-        write_picture(_beside(stem, MASK), mask_bits(label))
+        write_picture(_build_path(stem, MASK), encode_mask(label))
     if truth is not None:
         _write(
-            _beside(stem, TRUTH),
+            _build_path(stem, TRUTH),
             (json.dumps(asdict(truth), indent=1, allow_nan=False) + "\n").encode(),
         )
 
@@ -215,10 +215,10 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
 
 def is_whole(stem: Path) -> bool:
     """Says whether a rendered frame has been written to its end."""
-    return _beside(stem, TRUTH).is_file()
+    return _build_path(stem, TRUTH).is_file()
 
 
-def _beside(stem: Path, ending: str) -> Path:
+def _build_path(stem: Path, ending: str) -> Path:
     return stem.with_name(stem.name + ending)
 
 

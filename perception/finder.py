@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,29 +11,29 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from brokk_rl.contracts.vision import (  # fmt: skip
+from brokk_rl.contracts.vision import (
     Ellipse,
-    EllipseSpec,
-    FilterSpec,
+    EllipseDetectorSpec,
+    FrameDetections,
     HolePose,
-    PoseSpec,
+    PoseEstimatorSpec,
     Rejection,
     SegmenterSpec,
-    Sighting,
     Target,
+    TrackerSpec,
 )
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Borehole, Frame
 from brokk_rl.spec import spec
-from perception import explain, search
-from perception.pose.estimator import gray_of
+from perception import search
+from perception.pose.plane_conic import convert_to_gray
 
 ALIKE = 0.15
 """Part of its size by which an ellipse differs from another that is the same rim."""
 
 
 @spec
-class Perception:
+class StagedPerception:
     """Looks for boreholes in frames: a segmenter, an ellipse detector, a pose estimator and a filter, each to be swapped.
 
     Attributes:
@@ -50,9 +51,9 @@ class Perception:
     """
 
     segmenter: SegmenterSpec
-    ellipse: EllipseSpec
-    pose: PoseSpec
-    filter: FilterSpec
+    ellipse: EllipseDetectorSpec
+    pose: PoseEstimatorSpec
+    filter: TrackerSpec
     radius_m: float
     size_slack: float
     comfortable_px: float
@@ -69,15 +70,15 @@ class Perception:
                 f"perception: expected radius_m > 0 and size_slack >= 0, got {self.radius_m} and {self.size_slack}"
             )
 
-    def build(self) -> Finder:
+    def build(self) -> StagedFinder:
         """Returns a finder."""
-        return Finder(self)
+        return StagedFinder(self)
 
 
-class Finder:
+class StagedFinder:
     """See `Perception`. `find` and `look` answer for one frame; `follow` remembers."""
 
-    def __init__(self, settings: Perception) -> None:
+    def __init__(self, settings: StagedPerception) -> None:
         self.settings = settings
         self._segmenter, self._detector = settings.segmenter.build(), settings.ellipse.build()
         self._pose = settings.pose.build()
@@ -95,11 +96,11 @@ class Finder:
             return None
         return sighting.holes[0].borehole() if sighting.holes else None
 
-    def follow(self, sighting: Sighting, t_s: float) -> Target | None:
+    def follow(self, sighting: FrameDetections, t_s: float) -> Target | None:
         """Returns what the filter holds to be true after this sighting as well."""
         return self._filter.update(sighting.holes, t_s)
 
-    def look(self, frame: Frame) -> Sighting:
+    def look(self, frame: Frame) -> FrameDetections:
         """Returns everything that one frame says; in the base frame where the camera's pose is known, else in the camera's.
 
         Raises:
@@ -107,14 +108,14 @@ class Finder:
         """
         s = self.settings
         ms: dict[str, float] = {}
-        with _timed(ms, "frame"):
-            frame = rectified(frame)
-        with _timed(ms, "segment"):
+        with _time_stage(ms, "frame"):
+            frame = rectify(frame)
+        with _time_stage(ms, "segment"):
             masks = self._segmenter.segment(frame)
         roi = masks.block > s.block_probability
         share = cv2.countNonZero(roi.view(np.uint8)) / roi.size
         if share < s.smallest_block:
-            return Sighting(
+            return FrameDetections(
                 [],
                 [
                     Rejection(
@@ -125,14 +126,16 @@ class Finder:
                 masks,
                 ms,
             )
-        with _timed(ms, "ellipse"):
-            gray = gray_of(frame)
-            levels = search.levels(frame, roi, s.radius_m, s.size_slack, s.comfortable_px)
-            levels = search.box(roi, levels) if s.roi == "box" else levels
-            ellipses = _distinct(
+        with _time_stage(ms, "ellipse"):
+            gray = convert_to_gray(frame)
+            levels = search.plan_search_levels(
+                frame, roi, s.radius_m, s.size_slack, s.comfortable_px
+            )
+            levels = search.merge_levels_to_box(roi, levels) if s.roi == "box" else levels
+            ellipses = _remove_duplicates(
                 [one for level in levels for one in level.detect(self._detector, gray)]
             )
-        with _timed(ms, "pose"):
+        with _time_stage(ms, "pose"):
             judged = [(ellipse, self._pose.estimate(frame, masks, ellipse)) for ellipse in ellipses]
             found = [(e, pose) for e, pose in judged if isinstance(pose, HolePose)]
             refused = [pose for _, pose in judged if isinstance(pose, Rejection)]
@@ -147,15 +150,15 @@ class Finder:
         rejected = [*refused, *doubles]
         shown = [e for e, _ in holes] + [r.ellipse for r in rejected if r.ellipse is not None]
         ms["total"] = sum(ms.values())
-        return Sighting([pose for _, pose in holes], rejected, shown, masks, ms)
+        return FrameDetections([pose for _, pose in holes], rejected, shown, masks, ms)
 
     def ellipses(self, frame: Frame) -> list[Ellipse]:
         """Returns the ellipses of the whole picture, the best first, of any size; needs no depth."""
-        return self._detector.detect(gray_of(rectified(frame)), None, None)
+        return self._detector.detect(convert_to_gray(rectify(frame)), None, None)
 
     def explain(self, rejection: Rejection) -> str:
         """Returns in words what was refused, why, and what could be done."""
-        return explain.words(rejection)
+        return explain_rejection(rejection)
 
     def _single(
         self, found: Sequence[tuple[Ellipse, HolePose]]
@@ -181,7 +184,7 @@ class Finder:
         return sorted(kept, key=lambda one: -one[1].score), doubles
 
 
-def rectified(frame: Frame) -> Frame:
+def rectify(frame: Frame) -> Frame:
     """Returns the frame without lens distortion; depth is moved, never mixed between pixels."""
     if frame.distortion is None or not np.any(frame.distortion):
         return frame
@@ -211,7 +214,7 @@ def rectified(frame: Frame) -> Frame:
     )
 
 
-def _distinct(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
+def _remove_duplicates(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
     """Returns the ellipses, the best first, without those that are nearly the same as a better one."""
     kept: list[Ellipse] = []
     for one in sorted(ellipses, key=lambda one: -one.score):
@@ -226,7 +229,84 @@ def _distinct(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
 
 
 @contextmanager
-def _timed(ms: dict[str, float], stage: str) -> Iterator[None]:
+def _time_stage(ms: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     ms[stage] = 1000.0 * (time.perf_counter() - start)
+
+
+WORDS = {
+    "part of the picture that is block": (
+        "too little of the picture is block",
+        "Is the block in sight, the segmenter the right one?",
+    ),
+    "ellipses of a possible size on the block": (
+        "nothing on the block looks like a rim of the right size",
+        "",
+    ),
+    "pixels of the face with depth": (
+        "the face around it has hardly any depth",
+        "Too dark, too near, or no texture to match.",
+    ),
+    "depth noise on the face, 1/m": (
+        "the face around it is no plane",
+        "Is it on the block's edge, or is the depth that noisy?",
+    ),
+    "tilt of the face, rad": (
+        "the camera sees the face at too flat an angle",
+        "Another place for the camera would see it better.",
+    ),
+    "axis ratio on the face": ("on the face it is no circle", "A shadow, a stain, or an edge."),
+    "part of a circle on the face with a rim": (
+        "too little of a rim is seen",
+        "What hides it? Another place would see it better.",
+    ),
+    "radius, m": (
+        "on the face it does not have the size of a hole",
+        "Look at perception.pose.radius_m if the holes are of another size.",
+    ),
+    "brightness inside over outside": (
+        "it is not dark inside",
+        "A ring, a filled hole, or a lamp in it.",
+    ),
+    "contrast to the grain of the face": (
+        "it is hardly darker than the spots of the face",
+        "A stain or a shadow.",
+    ),
+    "mouth probability inside": (
+        "the network does not take it for the mouth of a hole",
+        "A flat dark disc looks like this.",
+    ),
+    "evidence of depth inside": (
+        "it is evenly dark, and as deep as the face",
+        "A flat dark disc looks like this.",
+    ),
+    "distance to a larger rim, m": (
+        "it lies within a larger rim",
+        "The far rim or the floor of a hole.",
+    ),
+    "known depth at the centre": (
+        "the depth at its centre is unknown",
+        "The interior of a hole is; perception=plane_conic needs none.",
+    ),
+    "local normals around the rim": ("there is too little depth around it for normals", ""),
+    "angle between local normals, rad": ("the normals around it do not agree", ""),
+    "known pose of the camera": ("nobody knows where the camera is", "Run mode=calibrate."),
+    "angle to the expected normal, rad": (
+        "seen as a circle, its face looks elsewhere than expected",
+        "",
+    ),
+}
+
+
+def explain_rejection(rejection: Rejection) -> str:
+    """Returns a sentence with what was refused, the figure and its limit, and what could be done."""
+    place = rejection.ellipse
+    where = (
+        "the frame"
+        if place is None
+        else f"the ellipse at ({place.x:.0f}, {place.y:.0f}), {place.a:.0f} x {place.b:.0f} px"
+    )
+    reason, advice = WORDS.get(rejection.reason, ("it was refused", ""))
+    figure = "unknown" if math.isnan(rejection.value) else f"{rejection.value:.4g}"
+    return f"{where}: {reason} ({rejection.reason}: {figure}, limit {rejection.limit:.4g}). {advice}".rstrip()

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from brokk_rl.contracts.vision import Ellipse, HolePose, Sighting
+from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose
 from brokk_rl.errors import ConfigError, StorageError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
@@ -24,7 +24,7 @@ BLOCK, FOUND, REFUSED, AXIS, DOUBT = (
 
 
 @spec
-class Drawing:
+class OverlayDrawing:
     """Draws what was seen into the picture.
 
     Attributes:
@@ -43,7 +43,7 @@ class Drawing:
                 f"overlay: expected width_px >= 64 and axis_m > 0, got {self.width_px} and {self.axis_m}"
             )
 
-    def write(self, path: Path, frame: Frame, sighting: Sighting) -> None:
+    def write(self, path: Path, frame: Frame, sighting: FrameDetections) -> None:
         """Writes the picture in one step; see `brokk_rl.contracts.vision.Overlay`."""
         done, data = cv2.imencode(".png", self.draw(frame, sighting))
         part = path.with_name(f".{path.name}.{os.getpid()}")
@@ -57,7 +57,7 @@ class Drawing:
         finally:
             part.unlink(missing_ok=True)
 
-    def draw(self, frame: Frame, sighting: Sighting) -> np.ndarray:
+    def draw(self, frame: Frame, sighting: FrameDetections) -> np.ndarray:
         """Returns the picture, `(h, w, 3)` uint8, blue first."""
         height, width = frame.color.shape[:2]
         scale = min(1.0, self.width_px / width)
@@ -79,13 +79,13 @@ class Drawing:
             )
         refused = [one.ellipse for one in sighting.rejected if one.ellipse is not None]
         for ellipse in sighting.ellipses:
-            _ellipse(picture, ellipse, scale, REFUSED if ellipse in refused else FOUND)
+            _draw_ellipse(picture, ellipse, scale, REFUSED if ellipse in refused else FOUND)
         for one in sighting.rejected:
             if one.ellipse is not None:
                 below = (
                     np.array([one.ellipse.x - one.ellipse.a, one.ellipse.y + one.ellipse.a]) * scale
                 )
-                _words(picture, one.reason.split(",")[0], below + np.array([0, 14]), REFUSED)
+                _write_text(picture, one.reason.split(",")[0], below + np.array([0, 14]), REFUSED)
         for hole in sighting.holes:
             self._hole(picture, hole, frame, scale)
         return picture
@@ -99,10 +99,12 @@ class Drawing:
         center, axis = turn @ hole.center_m + shift, turn @ hole.axis
         cov = turn @ hole.cov_m2 @ turn.T
         start, end = (
-            _pixel(frame.camera_matrix, point) * scale
+            _project_point(frame.camera_matrix, point) * scale
             for point in (center, center + self.axis_m * axis)
         )
-        cv2.arrowedLine(picture, _whole(start), _whole(end), AXIS, 2, cv2.LINE_AA, tipLength=0.2)
+        cv2.arrowedLine(
+            picture, _round_point(start), _round_point(end), AXIS, 2, cv2.LINE_AA, tipLength=0.2
+        )
         x, y, z = center
         slope = frame.camera_matrix[:2, :2] @ np.array(
             [[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]]
@@ -111,36 +113,53 @@ class Drawing:
         axes = np.maximum(self.num_sigma * np.sqrt(np.maximum(values, 0.0)) * scale, 1.0)
         angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
         cv2.ellipse(
-            picture, _whole(start), _whole(axes[::-1]), angle, 0, 360, DOUBT, 1, cv2.LINE_AA
+            picture,
+            _round_point(start),
+            _round_point(axes[::-1]),
+            angle,
+            0,
+            360,
+            DOUBT,
+            1,
+            cv2.LINE_AA,
         )
         std = 1000 * np.sqrt(np.trace(hole.cov_m2))
         text = f"{np.linalg.norm(center):.2f} m, +-{std:.1f} mm, r {1000 * hole.radius_m:.1f} mm"
-        _words(picture, text, np.minimum(start, end) + np.array([8, -12]), FOUND)
+        _write_text(picture, text, np.minimum(start, end) + np.array([8, -12]), FOUND)
 
 
-def _ellipse(
+def _draw_ellipse(
     picture: np.ndarray, ellipse: Ellipse, scale: float, color: tuple[int, int, int]
 ) -> None:
-    place = _whole(np.array([ellipse.x, ellipse.y]) * scale * 16)
-    axes = _whole(np.array([ellipse.a, ellipse.b]) * scale * 16)
+    place = _round_point(np.array([ellipse.x, ellipse.y]) * scale * 16)
+    axes = _round_point(np.array([ellipse.a, ellipse.b]) * scale * 16)
     cv2.ellipse(
         picture, place, axes, float(np.degrees(ellipse.theta_rad)), 0, 360, color, 1, cv2.LINE_AA, 4
     )
 
 
-def _words(picture: np.ndarray, text: str, place: np.ndarray, color: tuple[int, int, int]) -> None:
+def _write_text(
+    picture: np.ndarray, text: str, place: np.ndarray, color: tuple[int, int, int]
+) -> None:
     """Writes words that can be read on any ground."""
     for ink, width in (((0, 0, 0), 3), (color, 1)):
         cv2.putText(
-            picture, text, _whole(place), cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, width, cv2.LINE_AA
+            picture,
+            text,
+            _round_point(place),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.45,
+            ink,
+            width,
+            cv2.LINE_AA,
         )
 
 
-def _pixel(camera_matrix: np.ndarray, point: np.ndarray) -> np.ndarray:
+def _project_point(camera_matrix: np.ndarray, point: np.ndarray) -> np.ndarray:
     seen = camera_matrix @ point
     return seen[:2] / seen[2]
 
 
-def _whole(values: np.ndarray) -> tuple[int, int]:
+def _round_point(values: np.ndarray) -> tuple[int, int]:
     limited = np.clip(np.rint(values), -30000, 30000).astype(int)
     return int(limited[0]), int(limited[1])

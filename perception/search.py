@@ -40,7 +40,7 @@ other side one camera sees."""
 
 
 @dataclass(frozen=True)
-class Level:
+class SearchLevel:
     """A part of the picture in which holes look alike large.
 
     Attributes:
@@ -110,22 +110,22 @@ class Level:
                 left + middle : left + width * step : step,
             ]
             before = cv2.morphologyEx(
-                (depth < nearest).view(np.uint8), cv2.MORPH_OPEN, _square(1)
+                (depth < nearest).view(np.uint8), cv2.MORPH_OPEN, _make_square(1)
             )  # not where it is unknown
-            inner = cv2.erode(before, _square(-(-SPREAD_PX // step)))
-            roi = roi & ((cv2.dilate(before, _square(DRAWN_PX)) == 0) | (inner > 0))
+            inner = cv2.erode(before, _make_square(-(-SPREAD_PX // step)))
+            roi = roi & ((cv2.dilate(before, _make_square(DRAWN_PX)) == 0) | (inner > 0))
         prior = self.prior and SizePrior(
             self.prior.lowest_px / self.shrink, self.prior.highest_px / self.shrink
         )
         return [
-            _enlarged(one, self.shrink, left, top)
+            _enlarge(one, self.shrink, left, top)
             for one in detector.detect(small, np.ascontiguousarray(roi).astype(bool), prior)
         ]
 
 
-def levels(
+def plan_search_levels(
     frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfortable_px: float
-) -> list[Level]:
+) -> list[SearchLevel]:
     """Returns where to look: each part of the block in the coarsest resolution in which a hole there has a good size.
 
     A circle's major semi-axis is focal length times radius over depth, however it is tilted. What
@@ -146,24 +146,26 @@ def levels(
     inside = mask[STEP // 2 :: STEP, STEP // 2 :: STEP]
     known = inside & np.isfinite(depth)
     if np.count_nonzero(known) < LEAST:
-        return [Level(1, _dilated(inside, 0.03 * inside.shape[1]), None)]
+        return [SearchLevel(1, _dilate(inside, 0.03 * inside.shape[1]), None)]
     size_px = np.divide(
         focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=known
     )
     everywhere_px, unknown = np.where(known, size_px, np.nan), ~np.isfinite(depth)
-    before_px = _before(
+    before_px = _measure_occluders(
         np.divide(
             focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=~unknown
         ),
         known,
     )
     behind = size_px < cv2.dilate(
-        np.where(before_px < NOWHERE, before_px, np.float32(0.0)), _square(1)
+        np.where(before_px < NOWHERE, before_px, np.float32(0.0)), _make_square(1)
     )
     nearest_m = np.where(before_px < NOWHERE, focal_px * radius_m / before_px, np.float32(0.0))
     found, rest = [], known.copy()
     shown_px = np.where(behind, size_px / HALF, size_px)
-    suited = [_suited(shown_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)]
+    suited = [
+        _select_sizes(shown_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)
+    ]
     for _ in range(
         OCTAVES
     ):  # the resolution next that suits most of what is left, the coarser one of two alike
@@ -175,8 +177,8 @@ def levels(
             break
         rest &= ~here
         reach = float(np.percentile(size_px[here], 98.0)) * (1.0 + slack) / STEP
-        hidden = (_dilated(here, UNSEEN * reach) > 0) & unknown
-        count, pieces = cv2.connectedComponents(_dilated(here | hidden, reach))
+        hidden = (_dilate(here, UNSEEN * reach) > 0) & unknown
+        count, pieces = cv2.connectedComponents(_dilate(here | hidden, reach))
         for piece in range(1, count):
             part = pieces == piece
             some_px = size_px[part & here]
@@ -184,7 +186,7 @@ def levels(
                 low, high = np.percentile(some_px, (2.0, 98.0))
                 prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
                 found.append(
-                    Level(
+                    SearchLevel(
                         2**number,
                         part.astype(np.uint8),
                         prior,
@@ -197,7 +199,7 @@ def levels(
     return found
 
 
-def box(mask: np.ndarray, whole: Sequence[Level]) -> list[Level]:
+def merge_levels_to_box(mask: np.ndarray, whole: Sequence[SearchLevel]) -> list[SearchLevel]:
     """Returns one level instead, in full resolution: the bounding box of the mask, as large as a hole may be anywhere."""
     x, y, wide, high = cv2.boundingRect(mask.view(np.uint8))
     region = np.zeros([-(-size // STEP) for size in mask.shape], np.uint8)
@@ -208,17 +210,17 @@ def box(mask: np.ndarray, whole: Sequence[Level]) -> list[Level]:
         if priors
         else None
     )
-    return [Level(1, region, prior)]
+    return [SearchLevel(1, region, prior)]
 
 
-def _before(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
+def _measure_occluders(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
     """Returns how large a hole looks at least on what stands before a face, `(h, w)`, `NOWHERE` where nothing does.
 
     Args:
         seen_px: How large it would look at each place, 0 where nobody knows.
         face: Where the faces are, bool.
     """
-    reach = _square(round(float(np.percentile(seen_px[face], 98.0)) / STEP))
+    reach = _make_square(round(float(np.percentile(seen_px[face], 98.0)) / STEP))
     rough_px, seen_px = seen_px, cv2.medianBlur(seen_px, 5)
     noise = 1.4826 * float(np.median(np.abs(rough_px[face] / np.maximum(seen_px[face], 1.0) - 1.0)))
     around = cv2.dilate(
@@ -228,29 +230,29 @@ def _before(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
     # mouth's depth may be in reach
     around = cv2.erode(np.where(face & (around > 0), around, np.float32(NOWHERE)), reach)
     least = np.float32(BEFORE + NOISES * noise) * cv2.erode(
-        np.where(face | (seen_px == 0), around, np.float32(NOWHERE)), _square(NEAR)
+        np.where(face | (seen_px == 0), around, np.float32(NOWHERE)), _make_square(NEAR)
     )
-    there = cv2.dilate((seen_px > least).view(np.uint8), _square(1))
+    there = cv2.dilate((seen_px > least).view(np.uint8), _make_square(1))
     return np.where(there > 0, least, np.float32(NOWHERE))
 
 
-def _square(reach: int) -> np.ndarray:
+def _make_square(reach: int) -> np.ndarray:
     return np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
 
 
-def _suited(size_px: np.ndarray, comfortable_px: float, octave: int) -> np.ndarray:
+def _select_sizes(size_px: np.ndarray, comfortable_px: float, octave: int) -> np.ndarray:
     """Says which sizes suit a resolution: from the least comfortable one to three times it, and what suits none beyond."""
     low = comfortable_px if octave else 0.0
     return (size_px >= low) & ((size_px < 3.0 * comfortable_px) | (octave == OCTAVES - 1))
 
 
-def _dilated(small: np.ndarray, reach: float) -> np.ndarray:
+def _dilate(small: np.ndarray, reach: float) -> np.ndarray:
     size = 2 * max(1, round(reach)) + 1
     return cv2.dilate(
         small.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     )
 
 
-def _enlarged(one: Ellipse, factor: int, left: int, top: int) -> Ellipse:
+def _enlarge(one: Ellipse, factor: int, left: int, top: int) -> Ellipse:
     x, y = ((place + 0.5) * factor - 0.5 + start for place, start in ((one.x, left), (one.y, top)))
     return replace(one, x=x, y=y, a=one.a * factor, b=one.b * factor, rms_px=one.rms_px * factor)

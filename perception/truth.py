@@ -10,7 +10,7 @@ from brokk_rl.spec import spec
 
 
 @spec
-class Truth:
+class TruthPerception:
     """Returns a configured borehole for every frame; stands in for a camera in the simulator and in rehearsals.
 
     Attributes:

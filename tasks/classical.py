@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import torch
 
-from brokk_rl.kinematics import Kinematics, ToolPose, product
+from brokk_rl.kinematics import Kinematics, ToolPose, multiply_small_matrices
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -230,8 +230,8 @@ class ClassicalController:
         jacobian = torch.cat((tip_jacobian, pitch_jacobian[:, None]), 1) * (
             self.speed * (1.0 - self._exclusive)
         )
-        square = product(jacobian, jacobian.transpose(1, 2)) + self._damping
-        share = product(
+        square = multiply_small_matrices(jacobian, jacobian.transpose(1, 2)) + self._damping
+        share = multiply_small_matrices(
             jacobian.transpose(1, 2),
             _solve_4(square, torch.cat((wanted, turn[:, None]), 1)[..., None]),
         )[..., 0]
@@ -262,9 +262,14 @@ def _solve_4(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """
     p, q, s = a[:, :2, :2], a[:, :2, 2:], a[:, 2:, 2:]
     p_inverse = _inverse_2(p)
-    down = product(q.transpose(1, 2), p_inverse)
-    low = product(_inverse_2(s - product(down, q)), b[:, 2:] - product(down, b[:, :2]))
-    return torch.cat((product(p_inverse, b[:, :2] - product(q, low)), low), 1)
+    down = multiply_small_matrices(q.transpose(1, 2), p_inverse)
+    low = multiply_small_matrices(
+        _inverse_2(s - multiply_small_matrices(down, q)),
+        b[:, 2:] - multiply_small_matrices(down, b[:, :2]),
+    )
+    return torch.cat(
+        (multiply_small_matrices(p_inverse, b[:, :2] - multiply_small_matrices(q, low)), low), 1
+    )
 
 
 def _inverse_2(m: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,7 @@ from typing import Literal
 
 import torch
 
-from brokk_rl.machine import exclusive_mask
+from brokk_rl.machine import mask_exclusive_joints
 from brokk_rl.spec import spec
 from tasks.classical import Guidance
 
@@ -120,5 +120,5 @@ class Action:
         if self.limits:
             u = torch.maximum(torch.minimum(u, highest), lowest)
         if self.mask:
-            u = torch.where(exclusive_mask(exclusive, positioning), u, 0.0)
+            u = torch.where(mask_exclusive_joints(exclusive, positioning), u, 0.0)
         return u.clamp(-1.0, 1.0)

@@ -16,19 +16,19 @@ from composed import option
 
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
+from deploy.guidance import LeverPositions
 from deploy.page.protocol import (
-    Advice,
-    Drawn,
-    Levers,
-    Recording,
+    BoreholeChoice,
+    DrawReport,
+    OperatorRequest,
+    PageState,
+    RecordingStatus,
     Safety,
-    Shown,
-    Stream,
-    Target,
-    Wish,
+    ShownAdvice,
+    SourceAge,
 )
-from deploy.page.server import Server
-from deploy.page.settings import OperatorPage
+from deploy.page.server import PageServer
+from deploy.page.settings import PageSettings
 
 TOKEN = "correct horse battery staple"
 CHROMIUM = (
@@ -46,14 +46,15 @@ FLAGS = [
     "--enable-unsafe-swiftshader",
 ]
 
-LEVERS = Levers(0.0, 0.0, 0.0, 0.0, False)
-SHOWN = Shown(
-    t_s=0.0, alive=True, guiding=True, advice=Advice(True, "valid", 1, LEVERS, None), own=LEVERS, q=(0.0, -0.95, 0.55, 1.15, 0.6),
-    streams=tuple(Stream(name, 0.0, 1e6) for name in ("positions", "levers", "advice", "borehole")),
-    safety=Safety(False, "SILENT", "nothing", True, False, True), recording=Recording(False, 0.0, 0),
+LEVERS = LeverPositions(0.0, 0.0, 0.0, 0.0, False)
+SHOWN = PageState(
+    t_s=0.0, alive=True, guiding=True, advice=ShownAdvice(True, "valid", 1, LEVERS, None), own=LEVERS,
+    q=(0.0, -0.95, 0.55, 1.15, 0.6),
+    streams=tuple(SourceAge(name, 0.0, 1e6) for name in ("positions", "levers", "advice", "borehole")),
+    safety=Safety(False, "SILENT", "nothing", True, False, True), recording=RecordingStatus(False, 0.0, 0),
     targets=(
-        Target("A", (2.6, 0.0, 0.75), (0.0, 0.0, 1.0), 0.05, 0.002, 0.97, True),
-        Target("B", (2.2, 0.4, 0.75), (0.0, 0.0, 1.0), 0.05, None, None, False),
+        BoreholeChoice("A", (2.6, 0.0, 0.75), (0.0, 0.0, 1.0), 0.05, 0.002, 0.97, True),
+        BoreholeChoice("B", (2.2, 0.4, 0.75), (0.0, 0.0, 1.0), 0.05, None, None, False),
     ),
     path_in_base_m=((2.6, 0.3, 1.2), (2.6, 0.0, 1.05), (2.6, 0.0, 0.65)), block_in_base_m=None,
 )  # fmt: skip
@@ -63,31 +64,31 @@ SHOWN = Shown(
 class Scripted:
     """Shows `now` and remembers what came back."""
 
-    def __init__(self, now: Shown = SHOWN) -> None:
+    def __init__(self, now: PageState = SHOWN) -> None:
         self.now, self.picture = now, None
-        self.wishes: list[Wish] = []
-        self.seen: list[Drawn] = []
+        self.wishes: list[OperatorRequest] = []
+        self.seen: list[DrawReport] = []
 
     def news(self) -> int | None:
         return self.now.advice.number if self.now.advice else None
 
-    def shown(self) -> Shown:
+    def shown(self) -> PageState:
         return self.now
 
     def frame(self, after_s: float) -> Frame | None:
         return self.picture if self.picture is not None and self.picture.t_s > after_s else None
 
-    def wish(self, wish: Wish) -> bool:
+    def wish(self, wish: OperatorRequest) -> bool:
         self.wishes.append(wish)
         return True
 
-    def drawn(self, drawn: Drawn) -> None:
+    def drawn(self, drawn: DrawReport) -> None:
         self.seen.append(drawn)
 
     def advise(self, number: int, due_s: float | None = None, **axes: Any) -> None:
         """Advises these lever positions, of full."""
         self.now = replace(
-            self.now, advice=Advice(True, "valid", number, replace(LEVERS, **axes), due_s)
+            self.now, advice=ShownAdvice(True, "valid", number, replace(LEVERS, **axes), due_s)
         )
 
 
@@ -96,8 +97,8 @@ def served(
     feed: Any, port: int = 0, machine: Machine | None = None, annex: Any = None, **changes: Any
 ) -> Iterator[int]:
     """Serves the page of `conf/page/local.yaml` with `changes`, and what `annex` has; yields the port."""
-    page: OperatorPage = replace(option("page", "local"), port=port, token=TOKEN, **changes)
-    server = Server(page, machine or option("machine", "brokk170"), feed, TOKEN, annex)
+    page: PageSettings = replace(option("page", "local"), port=port, token=TOKEN, **changes)
+    server = PageServer(page, machine or option("machine", "brokk170"), feed, TOKEN, annex)
     ready, ending, found, failed = (
         threading.Event(),
         threading.Event(),

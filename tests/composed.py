@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 
 from brokk_rl import extensions, registry
 
-extensions.register([])  # the exam's options are those of an extension
+extensions.register_options([])  # the exam's options are those of an extension
 
 
 def option(group: str, name: str) -> Any:
@@ -22,7 +22,7 @@ def option(group: str, name: str) -> Any:
 
 def names(group: str) -> list[str]:
     """Returns the names of the options of a group; empty where there are none."""
-    return [entry.name for entry in registry.options() if entry.group == group]
+    return [entry.name for entry in registry.list_options() if entry.group == group]
 
 
 def every(group: str) -> pytest.MarkDecorator:

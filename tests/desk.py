@@ -16,15 +16,15 @@ import numpy as np
 from actuators.excite.plan.drive import NominalMachine
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from deploy.bus.description import Description
-from deploy.bus.protection import Fault
-from deploy.bus.wire import Wire
-from deploy.guard.limits import Limits
-from deploy.runtime.bus_process import Setting
-from deploy.runtime.operator_state import view
-from deploy.runtime.process import Child
-from deploy.runtime.shm_layout import Exchange
-from deploy.twin.faults import ask
+from deploy.bus.can_bus import CanBus
+from deploy.bus.description import BusDescription
+from deploy.bus.protection import MessageFault
+from deploy.guard.limits import GuardLimits
+from deploy.runtime.bus_process import BusProcessConfig
+from deploy.runtime.operator_state import read_snapshot
+from deploy.runtime.process import ChildProcess
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.twin.faults import request_fault
 from deploy.twin.twin import Twin
 
 DBC = "deploy:dbc/example_gateway.dbc"
@@ -33,17 +33,17 @@ COMMAND = (0.3, 0.0, -0.3, 0.0, 0.2)
 REACH_RAD = 0.2
 
 
-def command(stop: Callable[[], bool], home: np.ndarray, exchange: Exchange) -> None:
+def command(stop: Callable[[], bool], home: np.ndarray, memory: LoopMemory) -> None:
     """Asks for motion twenty times a second, as a policy would: to and fro, so that no joint ever comes to its end."""
-    assert exchange.request is not None
+    assert memory.request is not None
     u = np.array(COMMAND)
     while not stop():
-        request, state = exchange.request.new(), exchange.state.read()
+        request, state = memory.request.new(), memory.state.read()
         if state is not None and state["q_t_s"] > 0:
             away = state["q"] - home
             u = np.where(np.abs(away) > REACH_RAD, -np.sign(away) * np.abs(u), u)
         request["t_s"], request["u"] = time.monotonic(), u
-        exchange.request.write(request)
+        memory.request.write(request)
         time.sleep(0.05)
 
 
@@ -54,9 +54,11 @@ def free_port() -> int:
         return one.getsockname()[1]
 
 
-def wire() -> Wire:
+def wire() -> CanBus:
     """Returns a bus that nobody else uses."""
-    return Wire(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=free_port())
+    return CanBus(
+        interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=free_port()
+    )
 
 
 class Stop(NamedTuple):
@@ -82,12 +84,12 @@ class Desk:
     """
 
     def __init__(
-        self, machine: Machine, limits: Limits, folder: Path, commands: bool = True
+        self, machine: Machine, limits: GuardLimits, folder: Path, commands: bool = True
     ) -> None:
         self.machine, self.wire, self.port = machine, wire(), free_port()
-        self.exchange = Exchange.new(machine.num_joints, commands)
-        self._description = Description(DBC, machine)
-        self._setting = Setting(self.wire, DBC, machine, limits)
+        self.memory = LoopMemory.new(machine.num_joints, commands)
+        self._description = BusDescription(DBC, machine)
+        self._setting = BusProcessConfig(self.wire, DBC, machine, limits)
         twin = Twin(
             wire=self.wire,
             dbc=DBC,
@@ -100,22 +102,22 @@ class Desk:
         )
         session = Session(out=str(folder), seed=0, device="cpu")
         self._twin_arguments = (twin, machine, NominalMachine(), session, None)
-        self.children: dict[str, Child] = {}
+        self.children: dict[str, ChildProcess] = {}
         self.bus = self.wire.open()
 
     def start(self, name: str) -> None:
         """Starts `twin`, `bus` or `commander`."""
         what: dict[str, tuple[str, tuple[Any, ...], int | None]] = {
             "twin": ("deploy.twin.twin:run", self._twin_arguments, 60),
-            "bus": ("deploy.runtime.bus_process:run", (self._setting, self.exchange), 55),
-            "commander": ("desk:command", (self.machine.home, self.exchange), 50),
+            "bus": ("deploy.runtime.bus_process:run", (self._setting, self.memory), 55),
+            "commander": ("desk:command", (self.machine.home, self.memory), 50),
         }
         target, arguments, priority = what[name]
-        self.children[name] = Child(name, target, arguments, self.exchange.files, priority)
+        self.children[name] = ChildProcess(name, target, arguments, self.memory.files, priority)
 
     def fault(self, fault: str, message: str = "", seconds: float = 1e9) -> float:
         """Switches a fault on; returns when (monotonic)."""
-        answer = ask(
+        answer = request_fault(
             self.port, {"fault": fault, "message": message, "seconds": seconds}, timeout_s=5.0
         )
         assert answer.startswith("ok "), answer
@@ -123,9 +125,9 @@ class Desk:
 
     def arm(self, armed: bool = True) -> None:
         """Arms or disarms."""
-        controls = self.exchange.controls.new()
+        controls = self.memory.controls.new()
         controls["t_s"], controls["armed"] = time.monotonic(), armed
-        self.exchange.controls.write(controls)
+        self.memory.controls.write(controls)
 
     def heard(self, message: str, seconds: float) -> list[tuple[float, dict[str, float]]]:
         """Returns what was said on the bus from now on, with when."""
@@ -135,7 +137,7 @@ class Desk:
             frame = self.bus.recv(left_s)
             if frame is not None and frame.frame_id == layout.frame_id:
                 values = self._description.decode(layout, frame.data)
-                if not isinstance(values, Fault):
+                if not isinstance(values, MessageFault):
                     found.append((time.monotonic(), values))
         return found
 
@@ -156,7 +158,7 @@ class Desk:
                 for _, values in self.heard("ValveFeedback", 0.05)
             ):
                 return
-        raise AssertionError(f"the machine does not move: {view(self.exchange).plain()}")
+        raise AssertionError(f"the machine does not move: {read_snapshot(self.memory).plain()}")
 
     def still_after(self, since_s: float, seconds: float = 1.0) -> Stop:
         """Returns how long after `since_s` the valves got nothing any more, and zero was commanded, to the end of `seconds`.
@@ -174,7 +176,7 @@ class Desk:
             if frame is None or (name := kinds.get(frame.frame_id)) is None:
                 continue
             values = self._description.decode(self._description.layouts[name], frame.data)
-            if isinstance(values, Fault):
+            if isinstance(values, MessageFault):
                 continue
             if any(
                 value
@@ -198,7 +200,7 @@ class Desk:
         """Waits until positions come."""
         end_s = time.monotonic() + patience_s
         while time.monotonic() < end_s:
-            state = self.exchange.state.read()
+            state = self.memory.state.read()
             if state is not None and float(state["q_t_s"]) > 0 and np.isfinite(state["q"]).all():
                 return
             time.sleep(0.02)
@@ -217,4 +219,4 @@ class Desk:
                 os.kill(child.pid, signal.SIGCONT)
             child.end(2.0)
         self.bus.close()
-        self.exchange.close()
+        self.memory.close()

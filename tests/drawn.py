@@ -47,7 +47,7 @@ def drawn(
         np.cos(angle) * np.array([1.0, 0, 0]) + np.sin(angle) * np.cross(AXIS, [1.0, 0, 0])
     )
     seen = points @ K.T
-    row = conic.fit((seen[:, :2] / seen[:, 2:])[None], np.ones((1, 90)))[0]
+    row = conic.fit_ellipses((seen[:, :2] / seen[:, 2:])[None], np.ones((1, 90)))[0]
     return (
         frame,
         Masks(np.ones(inverse.shape, np.float32), None),

@@ -9,8 +9,8 @@ import numpy as np
 from browser import SHOWN, Scripted
 from composed import option
 
-from brokk_rl.chain import tool
 from brokk_rl.errors import RecordingError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
@@ -27,7 +27,7 @@ def plan(
     place: Path, machine: Machine, count: int = 2, practice: int = 0, trials: int = 2
 ) -> list[design.Trial]:
     """Plans a study in which the hole lies where the arm is at home, and trials begin with the first joint turned away."""
-    tip = tool(machine, machine.home).tip_in_base_m
+    tip = compute_tool_kinematics(machine, machine.home).tip_in_base_m
     hole = design.Hole(
         center_in_base_m=(float(tip[0]), float(tip[1]), float(tip[2]) + 0.12), radius_m=0.05
     )

@@ -22,17 +22,17 @@ from actuators.excite.plan.drive import NominalMachine
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from deploy.bus.wire import Wire, Wired
-from deploy.policy.adviser import Adviser, Counsel
-from deploy.policy.bundle import Bundle
-from deploy.runtime.bus_process import Setting, Station
-from deploy.runtime.operator_state import View, view
-from deploy.runtime.shm_layout import Exchange
+from deploy.bus.can_bus import CanBus, CanFrame
+from deploy.policy.bundle import PolicyBundle
+from deploy.policy.policy_process import PolicyAdviser, PolicyProcessConfig
+from deploy.runtime.bus_process import BusProcess, BusProcessConfig
+from deploy.runtime.operator_state import LoopSnapshot, read_snapshot
+from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import FaultPort
-from deploy.twin.twin import Running, Twin
+from deploy.twin.twin import RunningTwin, Twin
 
 DBC = "deploy:dbc/example_gateway.dbc"
-NO_WIRE = Wire(interface="virtual", channel="air", bitrate=None, port=None)
+NO_WIRE = CanBus(interface="virtual", channel="air", bitrate=None, port=None)
 BEGIN_S = 65.536 * 20 - 1.0
 """The gateway's clock wraps a second after the beginning."""
 WANTED = (0.3, 0.0, -0.3, 0.0, 0.2)
@@ -46,8 +46,8 @@ class Air:
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
-        self.inbox: deque[Wired] = deque()
-        self.sent: list[Wired] = []
+        self.inbox: deque[CanFrame] = deque()
+        self.sent: list[CanFrame] = []
         self.broken = self.echo = False
         self.interface, self.channel = "air", "1"
 
@@ -57,7 +57,7 @@ class Air:
         self.inbox.clear()
         return self
 
-    def recv(self, timeout_s: float) -> Wired | None:
+    def recv(self, timeout_s: float) -> CanFrame | None:
         end_ms = self._stage.ms + max(1, round(1e3 * timeout_s))
         while True:
             if self.broken:
@@ -68,7 +68,7 @@ class Air:
                 return None
             self._stage.tick()
 
-    def send(self, frame: Wired) -> None:
+    def send(self, frame: CanFrame) -> None:
         if self.broken:
             raise LinkError("bus: cannot send")
         self.sent.append(frame)
@@ -87,7 +87,7 @@ class Gateway:
 
     def recv(self, timeout_s: float) -> None: ...
 
-    def send(self, frame: Wired) -> None:
+    def send(self, frame: CanFrame) -> None:
         self._stage.air.inbox.append(frame)
 
 
@@ -105,7 +105,7 @@ class Stage:
         self, machine: Machine, mode: Mode, folder: Path, again_s: float | None = None
     ) -> None:
         self.machine, self.mode, self.ms = machine, mode, 0
-        self.exchange = Exchange.new(machine.num_joints, commands=mode != "listen")
+        self.memory = LoopMemory.new(machine.num_joints, commands=mode != "listen")
         self.air, self.request_s, self.wanted = Air(self), 0.05, WANTED
         self.stopped_ms: int | None = None
         self._times = 0
@@ -123,14 +123,14 @@ class Stage:
             link = NominalMachine().build(
                 machine, 1, Session(out=str(folder), seed=0, device="cpu")
             )
-            self.twin = Running(twin, machine, link, Gateway(self), FaultPort(None))
+            self.twin = RunningTwin(twin, machine, link, Gateway(self), FaultPort(None))
             limits, wire = option("guard", "default"), self.air
-            self.station = Station(Setting(wire, DBC, machine, limits), self.exchange)  # type: ignore[arg-type]
+            self.station = BusProcess(BusProcessConfig(wire, DBC, machine, limits), self.memory)  # type: ignore[arg-type]
             policy = "tasks:policies/borehole_insertion"
-            counsel = Counsel(
+            counsel = PolicyProcessConfig(
                 machine, policy, option("guidance", "machine"), limits.joints_s, 600.0, None
             )
-            self.adviser = Adviser(counsel, Bundle(policy, machine), self.exchange)
+            self.adviser = PolicyAdviser(counsel, PolicyBundle(policy, machine), self.memory)
             if mode == "collect":
                 self.adviser = None
             self._write("target", t_s=self.now_s, center_in_base_m=(2.6, 0.0, 0.75))
@@ -191,7 +191,7 @@ class Stage:
         self._write("target", t_s=self.now_s, center_in_base_m=(2.5, 0.7 * side, 0.75))
         self.go(0.4)
         self.go(
-            1.2, lambda: bool(self.exchange.state.peek("alone"))
+            1.2, lambda: bool(self.memory.state.peek("alone"))
         )  # a second sender is remembered for a second
         if self.mode != "collect":
             self.go(2.0, lambda: self.advised)
@@ -213,9 +213,9 @@ class Stage:
         return max(0, self.stopped_ms - begun_ms) / 1e3
 
     @property
-    def view(self) -> View:
+    def view(self) -> LoopSnapshot:
         with self._time():
-            return view(self.exchange)
+            return read_snapshot(self.memory)
 
     @property
     def advised(self) -> bool:
@@ -224,10 +224,10 @@ class Stage:
         return advice is not None and advice.valid
 
     def close(self) -> None:
-        self.exchange.close()
+        self.memory.close()
 
     def _write(self, name: str, **values: Any) -> None:
-        slot = getattr(self.exchange, name)
+        slot = getattr(self.memory, name)
         record = slot.new()
         for key, value in values.items():
             record[key] = np.asarray(value)

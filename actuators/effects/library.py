@@ -10,7 +10,7 @@ from actuators.effects.timing import DelayJitter
 from actuators.effects.wrapped import EffectSpec, Memory, Moment, Plant, per_row
 from actuators.models.parameters import OTHER, PerJoint
 from brokk_rl.contracts.actuator import ActuatorModel
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
@@ -46,7 +46,7 @@ class Library:
         for name in self.share if isinstance(self.share, dict) else ():
             if name not in (*self.effects, OTHER):
                 raise ConfigError(
-                    f"effect.library.share: '{name}' is no effect of it; {choices(name, (*self.effects, OTHER))}"
+                    f"effect.library.share: '{name}' is no effect of it; {list_choices(name, (*self.effects, OTHER))}"
                 )
         on_commands = [name for name, effect in self.effects.items() if effect.side == "command"]
         for name, effect in self.effects.items():

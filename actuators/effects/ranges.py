@@ -10,7 +10,7 @@ import torch
 
 from actuators.models import draw
 from actuators.models.parameters import per_joint
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 
 Value = float | tuple[float, float] | dict[str, float | tuple[float, float]]
@@ -181,7 +181,7 @@ def _chosen(joints: Joints, machine: Machine, where: str) -> np.ndarray:
     for name in joints:
         if name not in machine.joint_names:
             raise ConfigError(
-                f"{where}: '{name}' is no joint of machine '{machine.name}'; {choices(name, machine.joint_names)}"
+                f"{where}: '{name}' is no joint of machine '{machine.name}'; {list_choices(name, machine.joint_names)}"
             )
     return np.array([name in joints for name in machine.joint_names])
 

@@ -7,7 +7,7 @@ import numpy as np
 from actuators.excite.poses import poses
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine, exclusive_mask
+from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.spec import spec
 
 
@@ -96,7 +96,7 @@ class Levels:
             np.diff(np.floor(self.exclusive_share * np.arange(num_turns + 1) + generator.random()))
             > 0
         )
-        return u * exclusive_mask(exclusive, np.repeat(alone, turn)[:steps])
+        return u * mask_exclusive_joints(exclusive, np.repeat(alone, turn)[:steps])
 
     def _joint(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
         """Returns the levels of one joint, `(T,)`."""

@@ -16,7 +16,7 @@ from scipy import stats
 
 from brokk_rl import open_loop
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.intervals import CONFIDENCE
 from brokk_rl.machine import Machine
 
@@ -72,7 +72,7 @@ def parameters_of(model: ActuatorModel, names: tuple[str, ...]) -> dict[str, tor
     for name in names:
         if name not in parameters:
             raise ConfigError(
-                f"fit.free: '{name}' is no number of {type(model).__name__}; {choices(name, parameters)}"
+                f"fit.free: '{name}' is no number of {type(model).__name__}; {list_choices(name, parameters)}"
             )
     return parameters
 

@@ -142,7 +142,7 @@ def use(actuator: Actuator, folder: Path, name: str) -> str:
     checkpoint = getattr(actuator, "checkpoint", None)
     if checkpoint is None:
         return ""
-    for option in registry.options():
+    for option in registry.list_options():
         if (
             option.group == "actuator"
             and (yaml.safe_load(option.path.read_text()) or {}).get("_target_") == target

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from actuators.models.draw import hashed
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 
 OTHER = "other"
@@ -33,7 +33,7 @@ def per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarray:
         for name in value:
             if name not in known:
                 raise ConfigError(
-                    f"{where}: '{name}' is no joint of machine '{machine.name}'; {choices(name, (*known, OTHER))}"
+                    f"{where}: '{name}' is no joint of machine '{machine.name}'; {list_choices(name, (*known, OTHER))}"
                 )
     missing = [name for name in known if name not in value and OTHER not in value]
     if missing:
@@ -72,7 +72,9 @@ class Parameters:
     ) -> None:
         for name, width in spread.items():
             if name not in nominal:
-                raise ConfigError(f"{where}: '{name}' is no parameter; {choices(name, nominal)}")
+                raise ConfigError(
+                    f"{where}: '{name}' is no parameter; {list_choices(name, nominal)}"
+                )
             if not 0 <= width < 1:
                 raise ConfigError(
                     f"{where}.{name}: expected a relative half width in [0, 1), got {width}"

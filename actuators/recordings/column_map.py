@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from brokk_rl import record
-from brokk_rl.errors import ConfigError, RecordingError, choices
+from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.spec import spec
@@ -213,7 +213,7 @@ class _Table:
         header = self._cells.header
         if column.column not in header:
             raise RecordingError(
-                f"{self._path}: column '{column.column}' is missing; {choices(column.column, header)}"
+                f"{self._path}: column '{column.column}' is missing; {list_choices(column.column, header)}"
             )
         if header.count(column.column) > 1:
             raise RecordingError(

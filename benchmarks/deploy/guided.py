@@ -22,7 +22,7 @@ import torch
 from hydra.utils import instantiate
 
 from brokk_rl.kinematics import Kinematics
-from deploy.recorder import reading
+from deploy.recorder import capture_reader
 
 SECONDS = {"guided": 55, "alone": 45}
 """Twice what the slowest one in twenty takes in training, and half a minute until everything has
@@ -82,7 +82,7 @@ def summary(results: list[dict[str, object]]) -> dict[str, object]:
 
 
 def judged(out: Path, machine: object, task: object, hole: np.ndarray) -> dict[str, object]:
-    contents = reading.read(out / "capture.mcap")
+    contents = capture_reader.read_capture(out / "capture.mcap")
     positions = {}
     for messages in contents.messages.values():
         for name in machine.joint_names:

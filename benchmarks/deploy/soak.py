@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from deploy.recorder import reading
+from deploy.recorder import capture_reader
 
 LOOK_S, ELSEWHERE_S, EVERY_S = 5.0, 20.0, 300.0
 HOLES_M = ((2.3, 2.8), (-0.6, 0.6), (0.6, 0.9))
@@ -85,7 +85,7 @@ def main(folder: Path, seconds: float) -> None:
     run = subprocess.Popen(command)
     memory = watched(run, folder)
     timing = json.loads((folder / "timing.json").read_text())
-    contents = reading.read(folder / "capture.mcap")
+    contents = capture_reader.read_capture(folder / "capture.mcap")
     gaps = {}
     for name, modulus in (("JointPos1", 16), ("ValveFeedback", 16)):
         steps = np.diff(contents.messages[name].series("Counter")) % modulus

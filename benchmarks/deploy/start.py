@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from deploy.recorder import reading
+from deploy.recorder import capture_reader
 
 PATIENCE_S = 60.0
 OPEN = " is open"
@@ -54,7 +54,9 @@ def trial(folder: Path) -> dict[str, Any]:
     run.send_signal(signal.SIGINT)
     run.stderr.read()
     run.wait(PATIENCE_S)
-    cycle_s = reading.read(folder / "capture.mcap").messages["advice"][0][0] - begun_s
+    cycle_s = (
+        capture_reader.read_capture(folder / "capture.mcap").messages["advice"][0][0] - begun_s
+    )
     return {
         "bus_open_s": round(open_s, 3),
         "policy_cycle_s": round(cycle_s, 3),

@@ -28,10 +28,10 @@ from composed import option
 
 from brokk_rl.machine import Machine
 from deploy.page import server
-from deploy.page.clock import PageClock, Said
-from deploy.page.cloud import encode
-from deploy.page.demo import Demo, DemoFeed
-from deploy.page.protocol import Drawn
+from deploy.page.clock import DrawAcknowledgement, PageClock
+from deploy.page.demo import DemoFeed, DemoMachine
+from deploy.page.frame_codec import encode_frame
+from deploy.page.protocol import DrawReport
 
 SECONDS, WARM_S = 10.0, 6.0
 QUANTILES = {"p50": 0.5, "p95": 0.95, "max": 1.0}
@@ -41,13 +41,13 @@ SIZE = {"width": 1366, "height": 900}
 class Timed(DemoFeed):
     """The demo, which remembers when it said what first and when that was seen."""
 
-    def __init__(self, demo: Demo, machine: Machine) -> None:
+    def __init__(self, demo: DemoMachine, machine: Machine) -> None:
         super().__init__(demo, machine, time.monotonic)
         self.period_s = machine.period_s
         self.latency_s: list[tuple[float, float]] = []
         self.round_trip_s = np.inf
 
-    def drawn(self, drawn: Drawn) -> None:
+    def drawn(self, drawn: DrawReport) -> None:
         made_s = self._began_s + drawn.number * self.period_s
         self.latency_s.append((time.monotonic(), drawn.t_s - made_s))
         self.round_trip_s = min(self.round_trip_s, drawn.round_trip_s)
@@ -59,7 +59,7 @@ class Parted(PageClock):
     in_browser_ms: ClassVar[list[float]] = []
     on_the_way_ms: ClassVar[list[float]] = []
 
-    def heard(self, text: str | bytes, now_s: float) -> Said | None:
+    def heard(self, text: str | bytes, now_s: float) -> DrawAcknowledgement | None:
         number, came_ms, drawn_ms, _ = json.loads(text)
         sent_s = self._sent.get(number, (np.nan, None))[0]
         said = super().heard(text, now_s)
@@ -98,7 +98,7 @@ def measure(browser: Any, rate_hz: float, scene: bool) -> dict[str, Any]:
         if scene:
             frame = feed.frame(-1.0)
             assert frame is not None
-            bytes_a_frame = len(encode(frame, 640, 80))
+            bytes_a_frame = len(encode_frame(frame, 640, 80))
         context.close()
     latency_s = np.array([value for at_s, value in feed.latency_s if at_s > begun_s])
     frames_hz = (after["frames"] - before["frames"]) / took_s

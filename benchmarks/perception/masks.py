@@ -83,14 +83,18 @@ def judged(segmenter: Segmenter, source: FrameSource, name: str) -> dict[str, fl
             masks = segmenter.segment(frame)
             ms.append(1000 * (time.perf_counter() - start))
             label = dataset.read_label(Path(frame.name))
-            mouth = np.zeros_like(label.mouth) if masks.mouth is None else masks.mouth > THRESHOLD
+            mouth = (
+                np.zeros_like(label.hole_mask)
+                if masks.hole_mask is None
+                else masks.hole_mask > THRESHOLD
+            )
             for channel, (said, known) in enumerate(
-                ((masks.block > THRESHOLD, label.block), (mouth, label.mouth))
+                ((masks.block > THRESHOLD, label.block), (mouth, label.hole_mask))
             ):
                 shared[channel] += (said & known).sum()
                 either[channel] += (said | known).sum()
                 real[channel] += known.sum()
-            counts += pieces(mouth, label.mouth)
+            counts += pieces(mouth, label.hole_mask)
     block, mouth = (
         float(a / b) if any_real else None
         for a, b, any_real in zip(shared, either, real, strict=True)

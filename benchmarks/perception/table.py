@@ -32,7 +32,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from brokk_rl.contracts.vision import Observer, Overlay, Sighting
+from brokk_rl.contracts.vision import FrameDetections, Observer, Overlay
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from perception.benchmark.cells import Tally, judge
@@ -172,7 +172,9 @@ def look(task: Task) -> list[dict[str, Any]]:
     return lines
 
 
-def show_failure(task: Task, name: str, frame: Frame, sighting: Sighting, seer: Observer) -> None:
+def show_failure(
+    task: Task, name: str, frame: Frame, sighting: FrameDetections, seer: Observer
+) -> None:
     """Writes the picture of what went wrong and why, unless there are enough of its kind."""
     task.failures.mkdir(parents=True, exist_ok=True)
     if len(list(task.failures.glob(f"{name}_*.png"))) < task.pictures:

@@ -16,7 +16,7 @@ from brokk_rl.checks.exercise import (
     same,
 )
 from brokk_rl.contracts.actuator import Follower, FollowerModel
-from brokk_rl.machine import Machine, exclusive_mask
+from brokk_rl.machine import Machine, mask_exclusive_joints
 
 NUM_STEPS = 60
 
@@ -77,7 +77,7 @@ def _follow(
             u = torch.rand(u.shape, generator=generator) * 2 - 1
             u = (u.sign(), u, torch.zeros_like(u))[step % 3]
             positioning = torch.rand(NUM_ENVS, generator=generator) < 0.5
-            u = torch.where(exclusive_mask(exclusive, positioning), u, 0.0)
+            u = torch.where(mask_exclusive_joints(exclusive, positioning), u, 0.0)
         proposed = u.clone()
         if alter_first:
             proposed[0] = -proposed[0].roll(1)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.checks.exercise import require
-from brokk_rl.contracts.vision import PerceptionBackend
+from brokk_rl.contracts.vision import FinderSpec
 from brokk_rl.signals import Frame
 
 
-def check_finder(backend: PerceptionBackend) -> None:
+def check_finder(backend: FinderSpec) -> None:
     """Checks what `PerceptionBackend.build` returns against `BoreholeFinder`, on a frame of noise and on one without depth."""
     finder = backend.build()
     generator = np.random.default_rng(0)

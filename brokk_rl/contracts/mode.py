@@ -1,4 +1,4 @@
-"""Modes: what the command runs.
+"""Modes: the verbs of the command.
 
 `brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
 extensions.

@@ -28,12 +28,12 @@ class Masks:
 
     Attributes:
         block: Probability that a pixel shows the block, `(h, w)` float32 in [0, 1].
-        mouth: Probability that a pixel shows the inside of a hole, `(h, w)` float32 in [0, 1];
+        hole_mask: Probability that a pixel shows the inside of a hole, `(h, w)` float32 in [0, 1];
             `None` where nobody has looked.
     """
 
     block: np.ndarray
-    mouth: np.ndarray | None
+    hole_mask: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -106,22 +106,29 @@ class HolePose:
             camera_cov: How uncertain that is, see `Frame`; it adds to the covariances.
         """
         rotation, shift = base_from_camera[:3, :3], base_from_camera[:3, 3]
-        shared = [None, None] if camera_cov is None else [
-            rotation @ lever @ camera_cov @ lever.T @ rotation.T
-            for lever in (np.hstack([np.eye(3), -_crossing(self.center_m)]), np.hstack([np.zeros((3, 3)), -_crossing(self.axis)]))
-        ]  # fmt: skip
+        shared_m2 = shared_rad2 = None
+        cov_m2 = rotation @ self.cov_m2 @ rotation.T
+        axis_cov_rad2 = rotation @ self.axis_cov_rad2 @ rotation.T
+        if camera_cov is not None:
+            # First order: a small motion (shift, turn) of the camera moves the centre by
+            # shift - center x turn, and the axis by -axis x turn.
+            center_lever = np.hstack([np.eye(3), -_build_cross_matrix(self.center_m)])
+            axis_lever = np.hstack([np.zeros((3, 3)), -_build_cross_matrix(self.axis)])
+            shared_m2 = rotation @ center_lever @ camera_cov @ center_lever.T @ rotation.T
+            shared_rad2 = rotation @ axis_lever @ camera_cov @ axis_lever.T @ rotation.T
+            cov_m2 = cov_m2 + shared_m2
+            axis_cov_rad2 = axis_cov_rad2 + shared_rad2
         return HolePose(
             center_m=rotation @ self.center_m + shift,
             axis=rotation @ self.axis,
             radius_m=self.radius_m,
-            cov_m2=rotation @ self.cov_m2 @ rotation.T + (0.0 if shared[0] is None else shared[0]),
-            axis_cov_rad2=rotation @ self.axis_cov_rad2 @ rotation.T
-            + (0.0 if shared[1] is None else shared[1]),
+            cov_m2=cov_m2,
+            axis_cov_rad2=axis_cov_rad2,
             frame="base",
             score=self.score,
             t_s=self.t_s,
-            shared_m2=shared[0],
-            shared_rad2=shared[1],
+            shared_m2=shared_m2,
+            shared_rad2=shared_rad2,
         )
 
     def borehole(self) -> Borehole:
@@ -129,7 +136,7 @@ class HolePose:
         return Borehole(self.center_m, self.axis, self.radius_m, self.cov_m2)
 
 
-def _crossing(vector: np.ndarray) -> np.ndarray:
+def _build_cross_matrix(vector: np.ndarray) -> np.ndarray:
     """Returns the matrix that takes the cross product with a vector from the left, `(3, 3)`."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -172,7 +179,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class FrameDetections:
     """Everything that came out of one frame.
 
     Attributes:
@@ -245,7 +252,7 @@ class PoseEstimator(Protocol):
         ...
 
 
-class TargetFilter(Protocol):
+class HoleTracker(Protocol):
     """Makes one target of what is seen frame after frame."""
 
     def update(self, poses: Sequence[HolePose], t_s: float) -> Target | None:
@@ -264,7 +271,7 @@ class Observer(Protocol):
         """Returns the borehole in the base frame, or `None` when there is none to be sure of."""
         ...
 
-    def look(self, frame: Frame) -> Sighting:
+    def look(self, frame: Frame) -> FrameDetections:
         """Returns everything that one frame says.
 
         Raises:
@@ -272,7 +279,7 @@ class Observer(Protocol):
         """
         ...
 
-    def follow(self, sighting: Sighting, t_s: float) -> Target | None:
+    def follow(self, sighting: FrameDetections, t_s: float) -> Target | None:
         """Returns what the filter holds to be true after this sighting as well."""
         ...
 
@@ -288,7 +295,7 @@ class Observer(Protocol):
 class Overlay(Protocol):
     """Draws what was seen into the picture in which it was seen."""
 
-    def write(self, path: Path, frame: Frame, sighting: Sighting) -> None:
+    def write(self, path: Path, frame: Frame, sighting: FrameDetections) -> None:
         """Writes a picture file.
 
         Raises:
@@ -297,7 +304,7 @@ class Overlay(Protocol):
         ...
 
 
-class SourceSpec(Protocol):
+class FrameSourceSpec(Protocol):
     """A spec in `conf/perception/source`."""
 
     def build(self) -> FrameSource:
@@ -313,7 +320,7 @@ class SegmenterSpec(Protocol):
         ...
 
 
-class EllipseSpec(Protocol):
+class EllipseDetectorSpec(Protocol):
     """A spec in `conf/perception/ellipse`."""
 
     def build(self) -> EllipseDetector:
@@ -321,7 +328,7 @@ class EllipseSpec(Protocol):
         ...
 
 
-class PoseSpec(Protocol):
+class PoseEstimatorSpec(Protocol):
     """A spec in `conf/perception/pose`."""
 
     def build(self) -> PoseEstimator:
@@ -329,10 +336,10 @@ class PoseSpec(Protocol):
         ...
 
 
-class FilterSpec(Protocol):
+class TrackerSpec(Protocol):
     """A spec in `conf/perception/filter`."""
 
-    def build(self) -> TargetFilter:
+    def build(self) -> HoleTracker:
         """Returns a filter without memory yet."""
         ...
 
@@ -345,7 +352,7 @@ class BoreholeFinder(Protocol):
         ...
 
 
-class PerceptionBackend(Protocol):
+class FinderSpec(Protocol):
     """A spec in `conf/perception`: builds a finder."""
 
     def build(self) -> BoreholeFinder:

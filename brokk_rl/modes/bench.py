@@ -25,7 +25,7 @@ from brokk_rl.rl.logger import Logbook
 from brokk_rl.rl.runner import Runner, Training
 from brokk_rl.rl.tracking import Off
 from brokk_rl.rl.vec_env import ControlLoop, Plant
-from brokk_rl.session import Session, versions, write_json
+from brokk_rl.session import Session, read_versions, write_json
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -123,7 +123,7 @@ class Bench:
                 "device": name,
                 "ranks": group.rank.count,
                 **rows[-1],
-                "versions": versions(),
+                "versions": read_versions(),
                 "rows": rows,
             }
             write_json(self.session.folder / "benchmark.json", results)

@@ -1,4 +1,4 @@
-"""`brokk mode=doctor`: what works on this computer, and what to do about the rest."""
+"""`brokk mode=doctor`: report which parts work on this computer, with advice for the others."""
 
 from __future__ import annotations
 
@@ -25,19 +25,27 @@ from brokk_rl.sim import probe
 from brokk_rl.spec import spec
 
 DISTRIBUTION = "brokk-rl"
-IMPORT_NAMES = ("brokk_rl", "conf", "tasks", "actuators", "perception", "deploy")
+IMPORT_NAMES = (
+    "brokk_rl",
+    "conf",
+    "tasks",
+    "actuators",
+    "perception",
+    "deploy",
+    "diagnosis",
+    "exam",
+)
 COLORS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
 
 @dataclass(frozen=True)
-class Finding:
+class DoctorFinding:
     """One line of the report.
 
     Attributes:
-        level: `fail` where something essential does not work, `warn` where something optional does
-            not.
-        text: What was found.
-        advice: What to do about it.
+        level: `fail` if an essential part does not work, `warn` if an optional part does not.
+        text: The finding.
+        advice: How to correct it.
     """
 
     level: Literal["ok", "warn", "fail"]
@@ -46,8 +54,8 @@ class Finding:
 
 
 @spec
-class Limits:
-    """Where the doctor looks and what it finds too little.
+class DoctorLimits:
+    """Folder and limits of the checks.
 
     Attributes:
         folder: Folder in which runs will be written.
@@ -60,15 +68,15 @@ class Limits:
 
 @spec
 class Doctor:
-    """Says what works here: versions, GPU, CUDA graphs, kernel cache, rendering, disk, owners of the import names."""
+    """Report which parts work on this computer: GPU, CUDA graphs, rendering, disk, packages."""
 
-    doctor: Limits
+    doctor: DoctorLimits
 
     def run(self) -> None:
-        """Prints the report.
+        """Print the report.
 
         Raises:
-            SystemExit: With code 1, when something essential does not work.
+            SystemExit: With code 1 if an essential part does not work.
         """
         table = Table(box=None, show_header=False, padding=(0, 1, 0, 0))
         failed = False
@@ -82,50 +90,49 @@ class Doctor:
         if failed:
             raise SystemExit(1)
 
-    def findings(self) -> Iterator[tuple[str, Finding]]:
-        """Yields topic and finding, the most basic first; a probe that breaks becomes a warning."""
-        probes: tuple[tuple[str, Callable[[], Iterator[Finding]]], ...] = (
-            ("Python", python),
-            ("packages", packages),
-            ("processor", processor),
-            ("torch", torch_devices),
-            ("CUDA graphs", cuda_graphs),
-            ("Warp", warp),
-            ("rendering", rendering),
-            ("disk", lambda: disk(Path(self.doctor.folder), self.doctor.min_free_gib)),
-            ("import names", import_names),
-            ("extensions", extensions),
+    def findings(self) -> Iterator[tuple[str, DoctorFinding]]:
+        """Yield topic and finding, the most basic first; a failing probe becomes a warning."""
+        probes: tuple[tuple[str, Callable[[], Iterator[DoctorFinding]]], ...] = (
+            ("Python", check_python),
+            ("packages", check_packages),
+            ("processor", check_processor),
+            ("torch", check_torch_devices),
+            ("CUDA graphs", check_cuda_graphs),
+            ("Warp", check_warp),
+            ("rendering", check_rendering),
+            ("disk", lambda: check_disk(Path(self.doctor.folder), self.doctor.min_free_gib)),
+            ("import names", check_import_names),
+            ("extensions", check_extensions),
         )
         for topic, examine in probes:
             try:
                 for finding in examine():
                     yield topic, finding
-            except (
-                Exception
-            ) as error:  # whatever breaks in a foreign package must not hide the rest of the report
-                yield topic, Finding("warn", f"cannot tell: {type(error).__name__}: {error}")
+            # A failure inside another package must not hide the rest of the report.
+            except Exception as error:
+                yield topic, DoctorFinding("warn", f"cannot tell: {type(error).__name__}: {error}")
 
 
-def python() -> Iterator[Finding]:
-    """The interpreter against what the project asks for."""
+def check_python() -> Iterator[DoctorFinding]:
+    """Compare the Python version with the required one."""
     text = f"{platform.python_version()} on {platform.platform(terse=True)}"
-    about = _metadata()
+    about = _read_metadata()
     wanted = SpecifierSet(about["Requires-Python"] if about else "")
     if wanted.contains(platform.python_version()):
-        yield Finding("ok", text)
+        yield DoctorFinding("ok", text)
     else:
-        yield Finding(
+        yield DoctorFinding(
             "fail",
             f"{text}, but the project wants {wanted}",
-            "make again the environment with such a Python: make clean setup",
+            "make the environment again with such a Python: make clean setup",
         )
 
 
-def packages() -> Iterator[Finding]:
-    """Installed packages against what the project asks for."""
-    about = _metadata()
+def check_packages() -> Iterator[DoctorFinding]:
+    """Compare installed packages with the required versions."""
+    about = _read_metadata()
     if about is None:
-        yield Finding(
+        yield DoctorFinding(
             "warn",
             f"{DISTRIBUTION} runs from its sources and is not installed; versions are not checked",
             "make setup",
@@ -142,21 +149,23 @@ def packages() -> Iterator[Finding]:
         try:
             version = metadata.version(requirement.name)
         except metadata.PackageNotFoundError:
-            yield Finding("fail", f"{requirement.name} is missing", "make setup")
+            yield DoctorFinding("fail", f"{requirement.name} is missing", "make setup")
             continue
         if requirement.specifier.contains(version, prereleases=True):
             fit += 1
         else:
-            yield Finding(
+            yield DoctorFinding(
                 "warn",
                 f"{requirement.name} {version} is installed, the project wants {requirement.specifier}",
                 "make setup",
             )
-    yield Finding("ok", f"{fit} of {len(wanted)} as wanted; {DISTRIBUTION} {about['Version']}")
+    yield DoctorFinding(
+        "ok", f"{fit} of {len(wanted)} as wanted; {DISTRIBUTION} {about['Version']}"
+    )
 
 
-def processor() -> Iterator[Finding]:
-    """Cores that this process may use, and threads that torch does use."""
+def check_processor() -> Iterator[DoctorFinding]:
+    """Report the cores of this process and the threads of torch."""
     import torch
 
     cores = (
@@ -164,33 +173,35 @@ def processor() -> Iterator[Finding]:
     )
     text = f"{cores} cores ({os.cpu_count()} in all), torch uses {torch.get_num_threads()} threads"
     if torch.get_num_threads() > cores:
-        yield Finding(
+        yield DoctorFinding(
             "warn", text, f"more threads than cores slow each other down: OMP_NUM_THREADS={cores}"
         )
     else:
-        yield Finding("ok", text)
+        yield DoctorFinding("ok", text)
 
 
-def torch_devices() -> Iterator[Finding]:
+def check_torch_devices() -> Iterator[DoctorFinding]:
     """GPUs that torch can use, and the driver behind them."""
     import torch
 
     built = f"{torch.__version__}, built for CUDA {torch.version.cuda or 'none'}"
-    driver = driver_version()
+    driver = read_driver_version()
     if torch.cuda.is_available():
         names = ", ".join(
             torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())
         )
-        yield Finding("ok", f"{built}, driver {driver or 'unknown'}: {names}")
+        yield DoctorFinding("ok", f"{built}, driver {driver or 'unknown'}: {names}")
     elif driver:
         advice = "the driver may be too old for this CUDA, or CUDA_VISIBLE_DEVICES hides the GPU"
-        yield Finding("warn", f"{built}: there is a driver {driver}, but torch sees no GPU", advice)
+        yield DoctorFinding(
+            "warn", f"{built}: there is a driver {driver}, but torch sees no GPU", advice
+        )
     else:
-        yield Finding("ok", f"{built}; no NVIDIA GPU here, everything runs on the CPU")
+        yield DoctorFinding("ok", f"{built}; no NVIDIA GPU here, everything runs on the CPU")
 
 
-def driver_version() -> str | None:
-    """Returns the version of the NVIDIA driver, `None` when there is none."""
+def read_driver_version() -> str | None:
+    """Return the version of the NVIDIA driver, `None` without one."""
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
         lines = subprocess.run(
@@ -201,54 +212,56 @@ def driver_version() -> str | None:
     return lines[0] if lines else None
 
 
-def cuda_graphs() -> Iterator[Finding]:
-    """Whether a control step can be captured in a CUDA graph; without that a GPU is several times slower."""
+def check_cuda_graphs() -> Iterator[DoctorFinding]:
+    """Check that a control step can be captured; without CUDA graphs a GPU is several times slower."""
     import torch
 
     if not torch.cuda.is_available():
-        yield Finding("ok", "not needed without a GPU")
+        yield DoctorFinding("ok", "not needed without a GPU")
         return
     try:
-        yield Finding("ok", f"captured and replayed one on {probe.capture_graph()}")
+        yield DoctorFinding("ok", f"captured and replayed one on {probe.capture_graph()}")
     except Exception as error:
         advice = "training works, several times slower; a newer driver usually mends it"
-        yield Finding("warn", f"cannot capture: {error}", advice)
+        yield DoctorFinding("warn", f"cannot capture: {error}", advice)
 
 
-def warp() -> Iterator[Finding]:
-    """Version of Warp, and its kernel cache, which saves a minute or two of compiling at each start."""
+def check_warp() -> Iterator[DoctorFinding]:
+    """Report the version of Warp and its kernel cache, which saves minutes of compilation."""
     cache = probe.kernel_cache()
     size = (
         sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
         if cache.exists()
         else 0
     )
-    yield Finding("ok", f"{probe.warp_version()}, kernel cache {cache} ({size / 2**20:.1f} MiB)")
+    yield DoctorFinding(
+        "ok", f"{probe.warp_version()}, kernel cache {cache} ({size / 2**20:.1f} MiB)"
+    )
 
 
-def rendering() -> Iterator[Finding]:
-    """Whether MuJoCo can draw pictures, which only videos need."""
+def check_rendering() -> Iterator[DoctorFinding]:
+    """Check that MuJoCo can render, which only videos need."""
     name = probe.working_renderer()
     if name:
-        yield Finding("ok", f"MuJoCo draws with MUJOCO_GL={name}")
+        yield DoctorFinding("ok", f"MuJoCo draws with MUJOCO_GL={name}")
     else:
         asked = os.environ.get("MUJOCO_GL")
         tried = f"MUJOCO_GL={asked}" if asked else f"any of {', '.join(probe.RENDERERS)}"
-        yield Finding(
+        yield DoctorFinding(
             "warn",
             f"MuJoCo cannot draw with {tried}: no videos",
             "install libegl1 and libgl1, or libosmesa6",
         )
 
 
-def disk(folder: Path, min_free_gib: float) -> Iterator[Finding]:
-    """Whether runs can be written, and how much room there is."""
+def check_disk(folder: Path, min_free_gib: float) -> Iterator[DoctorFinding]:
+    """Check that runs can be written, and report the free space."""
     place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     try:
         with tempfile.TemporaryFile(dir=place):
             pass
     except OSError as error:
-        yield Finding(
+        yield DoctorFinding(
             "fail",
             f"cannot write into {place}: {error.strerror}",
             "work in a folder of your own, or give session.out=<folder>",
@@ -257,14 +270,14 @@ def disk(folder: Path, min_free_gib: float) -> Iterator[Finding]:
     free_gib = shutil.disk_usage(place).free / 2**30
     text = f"{free_gib:.1f} GiB free for {folder}"
     yield (
-        Finding("ok", text)
+        DoctorFinding("ok", text)
         if free_gib >= min_free_gib
-        else Finding("warn", text, "checkpoints and recordings need more; free some space")
+        else DoctorFinding("warn", text, "checkpoints and recordings need more; free some space")
     )
 
 
-def import_names() -> Iterator[Finding]:
-    """Whether our import names are ours: names such as `tasks` or `conf` are taken by other packages as well."""
+def check_import_names() -> Iterator[DoctorFinding]:
+    """Check that names such as `tasks` and `conf` import this package, not another one."""
     home = Path(brokk_rl.__file__).parents[1]
     owned = 0
     for name in IMPORT_NAMES:
@@ -276,7 +289,7 @@ def import_names() -> Iterator[Finding]:
         )
         if folder != home / name:
             place = folder or (found.origin if found else None)
-            yield Finding(
+            yield DoctorFinding(
                 "fail",
                 f"'{name}' is {place or 'missing'}, not {home / name}",
                 "install the project in an environment of its own",
@@ -289,26 +302,26 @@ def import_names() -> Iterator[Finding]:
             path.parts[0].removesuffix(".py") for path in distribution.files or () if path.parts
         }
         if name != DISTRIBUTION and (clash := sorted(tops.intersection(IMPORT_NAMES))):
-            yield Finding(
+            yield DoctorFinding(
                 "warn",
                 f"the package {name} also installs {', '.join(clash)}",
                 f"pip uninstall {name}, or use separate environments",
             )
-    yield Finding("ok", f"{owned} of {len(IMPORT_NAMES)} come from {home}")
+    yield DoctorFinding("ok", f"{owned} of {len(IMPORT_NAMES)} come from {home}")
 
 
-def extensions() -> Iterator[Finding]:
-    """Installed packages that add options by entry point."""
+def check_extensions() -> Iterator[DoctorFinding]:
+    """Report installed packages that add options by entry point."""
     try:
-        others = [package for package in registry.packages() if package != registry.CORE]
-        registry.options()
+        others = [package for package in registry.find_packages() if package != registry.CORE]
+        registry.list_options()
     except BrokkError as error:
-        yield Finding("fail", str(error))
+        yield DoctorFinding("fail", str(error))
         return
-    yield Finding("ok", ", ".join(others) or "none installed")
+    yield DoctorFinding("ok", ", ".join(others) or "none installed")
 
 
-def _metadata() -> metadata.PackageMetadata | None:
+def _read_metadata() -> metadata.PackageMetadata | None:
     try:
         return metadata.metadata(DISTRIBUTION)
     except metadata.PackageNotFoundError:

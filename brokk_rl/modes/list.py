@@ -1,16 +1,16 @@
-"""`brokk mode=list`: every registry, one line per entry."""
+"""`brokk mode=list`: every registry, one line per option."""
 
 from rich.console import Console
-from rich.table import Table
+from rich.markup import escape
 
 from brokk_rl import registry
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.spec import spec
 
 
 @spec
-class Selection:
-    """What to list.
+class ListSelection:
+    """Selection of groups.
 
     Attributes:
         group: Only this group; `None` lists all of them.
@@ -20,28 +20,32 @@ class Selection:
 
 
 @spec
-class List:
-    """Prints the options of every config group, those of installed extensions too."""
+class ListOptions:
+    """List the options of every config group, one line each."""
 
-    list: Selection
+    list: ListSelection
 
     def run(self) -> None:
-        """Prints the list."""
-        entries = registry.options()
-        groups = sorted({option.group for option in entries})
-        if self.list.group and self.list.group not in groups:
+        """Print the list; lines are cut at the width of the terminal.
+
+        Raises:
+            ConfigError: There is no such group.
+        """
+        options = registry.list_options()
+        groups = sorted({option.group for option in options})
+        wanted = self.list.group
+        if wanted and wanted not in groups:
             raise ConfigError(
-                f"list.group: there is no group '{self.list.group}'; {choices(self.list.group, groups)}"
+                f"list.group: there is no group '{wanted}'; {list_choices(wanted, groups)}"
             )
-        table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-        table.add_column(no_wrap=True)
-        table.add_column()
-        for group in [self.list.group] if self.list.group else groups:
-            table.add_row(f"[bold]{group}[/bold]", "")
-            for option in entries:
-                if option.group == group:
-                    origin = (
-                        "" if option.package == registry.CORE else f" [dim]({option.package})[/dim]"
-                    )
-                    table.add_row(f"  {option.name}", option.summary() + origin)
-        Console().print(table)
+        console = Console(highlight=False)
+        width = max(len(option.name) for option in options)
+        for group in [wanted] if wanted else groups:
+            console.print(f"[bold]{escape(group)}[/bold]")
+            for option in options:
+                if option.group != group:
+                    continue
+                own = option.package == registry.CORE
+                origin = "" if own else f" [dim]({escape(option.package)})[/dim]"
+                line = f"  {option.name:<{width}}  {escape(option.summary())}{origin}"
+                console.print(line, no_wrap=True, overflow="ellipsis")

@@ -155,7 +155,7 @@ class Train:
             return None
         folder = self.session.folder
         if Path(self.resume).resolve() == folder.resolve() and not checkpoints(folder):
-            if distributed.own().first:
+            if distributed.read_rank().first:
                 (folder / PROGRESS).unlink(missing_ok=True)
             return None
         return find_checkpoint(Path(self.resume))

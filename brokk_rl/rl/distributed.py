@@ -27,7 +27,7 @@ class Group:
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.device, self.rank = device, distributed.own()
+        self.device, self.rank = device, distributed.read_rank()
 
     @property
     def together(self) -> bool:

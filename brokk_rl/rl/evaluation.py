@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from brokk_rl.contracts.task import Policy
-from brokk_rl.intervals import wilson
+from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.rl.vec_env import ControlLoop, Starts
 
 
@@ -107,7 +107,7 @@ def _summary(
 
 
 def _share(happened: np.ndarray) -> dict[str, Any]:
-    low, high = wilson(int(happened.sum()), len(happened))
+    low, high = compute_wilson_interval(int(happened.sum()), len(happened))
     return {"mean": float(happened.mean()), "ci95": [low, high]}
 
 

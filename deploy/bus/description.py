@@ -11,6 +11,7 @@ attribute `E2EDataId`. Cycle times are the DBC's (`GenMsgCycleTime`): no rate is
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -20,9 +21,9 @@ import cantools
 from cantools.database import Database
 from cantools.database.can import Message
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
-from deploy.bus.protection import Fault, crc8
+from deploy.bus.protection import FINAL, MAX_STEP, START, TABLE, MessageFault, compute_crc8
 
 COUNTER, CRC = "Counter", "Crc"
 PC, GATEWAY, REMOTE = "PC", "GATEWAY", "REMOTE"
@@ -30,7 +31,7 @@ LEVER_AXES = ("left_theta", "left_psi", "right_theta", "right_psi")
 
 
 @dataclass(frozen=True)
-class Layout:
+class MessageLayout:
     """One message of the bus.
 
     Attributes:
@@ -56,7 +57,7 @@ class Layout:
     modulus: int
 
 
-class Description:
+class BusDescription:
     """A DBC, checked against a machine.
 
     Args:
@@ -73,11 +74,13 @@ class Description:
 
     def __init__(self, name: str, machine: Machine) -> None:
         self.name = name
-        self._database = _load(name)
+        self._database = _load_database(name)
         self._messages: dict[str, Message] = {
             message.name: message for message in self._database.messages
         }
-        self.layouts = {message.name: _layout(message, name) for message in self._database.messages}
+        self.layouts = {
+            message.name: _build_layout(message, name) for message in self._database.messages
+        }
         self.by_id = {layout.frame_id: layout for layout in self.layouts.values()}
         self._home = {
             signal.name: message.name
@@ -115,7 +118,7 @@ class Description:
         """
         if signal not in self._home:
             raise ConfigError(
-                f"bus: {self.name} has no signal '{signal}'; {choices(signal, self._home)}"
+                f"bus: {self.name} has no signal '{signal}'; {list_choices(signal, self._home)}"
             )
         return self._home[signal]
 
@@ -131,7 +134,7 @@ class Description:
         """Returns the unit of a signal, '' for none."""
         return self._messages[message].get_signal_by_name(signal).unit or ""
 
-    def sent_by(self, node: str) -> list[Layout]:
+    def sent_by(self, node: str) -> list[MessageLayout]:
         """Returns what `node` sends."""
         return [layout for layout in self.layouts.values() if layout.sender == node]
 
@@ -142,24 +145,24 @@ class Description:
         if layout.data_id is None:
             return message.encode(data)
         encoded = bytearray(message.encode(data | {COUNTER: counter % layout.modulus, CRC: 0}))
-        encoded[layout.crc_byte] = crc8(encoded, layout.data_id)
+        encoded[layout.crc_byte] = compute_crc8(encoded, layout.data_id)
         return bytes(encoded)
 
-    def decode(self, layout: Layout, data: bytes) -> dict[str, float] | Fault:
+    def decode(self, layout: MessageLayout, data: bytes) -> dict[str, float] | MessageFault:
         """Returns the signals of a message, its counter among them, or what is wrong with it."""
         if len(data) != layout.length:
-            return Fault.LENGTH
+            return MessageFault.LENGTH
         if layout.data_id is not None:
             plain = bytearray(data)
             plain[layout.crc_byte] = 0
-            if crc8(plain, layout.data_id) != data[layout.crc_byte]:
-                return Fault.CRC
+            if compute_crc8(plain, layout.data_id) != data[layout.crc_byte]:
+                return MessageFault.CRC
         decoded = self._messages[layout.name].decode(data, decode_choices=False)
         assert isinstance(decoded, dict)
         return {name: float(value) for name, value in decoded.items()}  # type: ignore[arg-type]
 
 
-def located(name: str) -> Path:
+def resolve_package_path(name: str) -> Path:
     """Returns the path of a file: a path, or `package:path` within an installed package."""
     package, colon, inside = name.partition(":")
     if not colon or Path(name).exists():
@@ -172,8 +175,8 @@ def located(name: str) -> Path:
         ) from error
 
 
-def _load(name: str) -> Database:
-    path = located(name)
+def _load_database(name: str) -> Database:
+    path = resolve_package_path(name)
     try:
         database = cantools.database.load_file(path)
     except OSError as error:
@@ -185,7 +188,7 @@ def _load(name: str) -> Database:
     return database
 
 
-def _layout(message: Message, dbc: str) -> Layout:
+def _build_layout(message: Message, dbc: str) -> MessageLayout:
     signals = {signal.name: signal for signal in message.signals}
     attribute = message.dbc.attributes.get("E2EDataId") if message.dbc else None
     data_id, crc_byte, modulus = None, 0, 1
@@ -202,7 +205,7 @@ def _layout(message: Message, dbc: str) -> Layout:
                 f"bus: message {message.name} of {dbc} has E2EDataId; it needs {COUNTER}, and {CRC} of one whole byte"
             )
         data_id, crc_byte, modulus = int(attribute.value), crc.start // 8, 1 << counter.length
-    return Layout(
+    return MessageLayout(
         name=message.name,
         frame_id=message.frame_id,
         extended=message.is_extended_frame,
@@ -213,3 +216,56 @@ def _layout(message: Message, dbc: str) -> Layout:
         crc_byte=crc_byte,
         modulus=modulus,
     )
+
+
+PREFIX = "BROKK"
+
+
+def generate_c_header(description: BusDescription) -> str:
+    """Returns the text of the header."""
+    lines = [
+        f"/* Made from {description.name}: do not edit. Packing and unpacking: cantools generate_c_source. */",
+        f"#ifndef {PREFIX}_BUS_H",
+        f"#define {PREFIX}_BUS_H",
+        "#include <stdint.h>",
+        "",
+        f"#define {PREFIX}_COUNTER_MAX_STEP {MAX_STEP}u",
+    ]
+    for layout in description.layouts.values():
+        name = f"{PREFIX}_{_convert_to_upper_snake(layout.name)}"
+        lines += [
+            "",
+            f"#define {name}_ID 0x{layout.frame_id:X}u",
+            f"#define {name}_EXTENDED {int(layout.extended)}",
+            f"#define {name}_LENGTH {layout.length}u",
+            f"#define {name}_PERIOD_MS {round(1e3 * layout.period_s)}u",
+        ]
+        if layout.data_id is not None:
+            lines += [
+                f"#define {name}_DATA_ID 0x{layout.data_id:X}u",
+                f"#define {name}_CRC_BYTE {layout.crc_byte}u",
+                f"#define {name}_COUNTER_MODULUS {layout.modulus}u",
+            ]
+    values = ", ".join(f"0x{value:02X}" for value in TABLE)
+    rows = re.findall(r"(?:0x..(?:, )?){1,16}", values)
+    lines += [
+        "",
+        "/* CRC-8 SAE J1850 over the data, its CRC byte taken as zero, then the data id, low byte first. */",
+        "static const uint8_t brokk_crc8_table[256] = {",
+        *(f"  {row.rstrip(' ')}" for row in rows),
+        "};",
+        "static inline uint8_t brokk_crc8(const uint8_t *data, uint8_t length, uint8_t crc_byte, uint16_t data_id) {",
+        f"  uint8_t crc = 0x{START:02X}u, i;",
+        "  for (i = 0; i < length; i++) crc = brokk_crc8_table[crc ^ (i == crc_byte ? 0u : data[i])];",
+        "  crc = brokk_crc8_table[crc ^ (data_id & 0xFFu)];",
+        f"  return (uint8_t)(brokk_crc8_table[crc ^ (data_id >> 8)] ^ 0x{FINAL:02X}u);",
+        "}",
+        "#endif",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _convert_to_upper_snake(name: str) -> str:
+    """Returns `ValveCmd` as `VALVE_CMD`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).upper()

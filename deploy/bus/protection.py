@@ -22,7 +22,7 @@ is too long."""
 IN_A_ROW, SCORE, RECOVERY = 2, 5, 10
 
 
-def _table() -> bytes:
+def _build_table() -> bytes:
     values = []
     for value in range(256):
         for _ in range(8):
@@ -31,10 +31,10 @@ def _table() -> bytes:
     return bytes(values)
 
 
-TABLE = _table()
+TABLE = _build_table()
 
 
-def crc8(data: bytes | bytearray, data_id: int) -> int:
+def compute_crc8(data: bytes | bytearray, data_id: int) -> int:
     """Returns the CRC of `data` followed by the two bytes of `data_id`, low byte first."""
     crc = START
     for byte in data:
@@ -43,7 +43,7 @@ def crc8(data: bytes | bytearray, data_id: int) -> int:
     return TABLE[crc ^ (data_id >> 8)] ^ FINAL
 
 
-class Trust(Enum):
+class ChannelTrust(Enum):
     """How far a channel is to be believed."""
 
     INIT = 0
@@ -51,7 +51,7 @@ class Trust(Enum):
     INVALID = 2
 
 
-class Fault(Enum):
+class MessageFault(Enum):
     """What was wrong with a message."""
 
     CRC = "wrong CRC"
@@ -60,7 +60,7 @@ class Fault(Enum):
     LENGTH = "wrong length"
 
 
-class Channel:
+class ProtectedChannel:
     """The receiver's side of one message.
 
     Args:
@@ -76,38 +76,38 @@ class Channel:
         self._modulus = modulus
         self._last: int | None = None
         self._bad, self._good, self._score = 0, 0, 0
-        self.trust = Trust.INIT
-        self.errors = dict.fromkeys(Fault, 0)
+        self.trust = ChannelTrust.INIT
+        self.errors = dict.fromkeys(MessageFault, 0)
         self.lost = 0
 
-    def take(self, counter: int) -> Fault | None:
+    def take(self, counter: int) -> MessageFault | None:
         """Judges a message whose CRC is right by its counter; returns what is wrong with it."""
         before, self._last = self._last, counter
         if before is None:
             return self._count(None)
         step = (counter - before) % self._modulus
         if step == 0:
-            return self._count(Fault.REPEATED)
+            return self._count(MessageFault.REPEATED)
         if step > MAX_STEP:
-            return self._count(Fault.SEQUENCE)
+            return self._count(MessageFault.SEQUENCE)
         self.lost += step - 1
         return self._count(None)
 
-    def refuse(self, fault: Fault) -> Fault:
+    def refuse(self, fault: MessageFault) -> MessageFault:
         """Counts a message that could not even be read; returns `fault`."""
         self._count(fault)
         return fault
 
-    def _count(self, fault: Fault | None) -> Fault | None:
+    def _count(self, fault: MessageFault | None) -> MessageFault | None:
         if fault is None:
             self._good, self._bad, self._score = self._good + 1, 0, max(0, self._score - 1)
-            needed = IN_A_ROW if self.trust is Trust.INIT else RECOVERY
-            if self.trust is not Trust.VALID and self._good >= needed:
-                self.trust = Trust.VALID
+            needed = IN_A_ROW if self.trust is ChannelTrust.INIT else RECOVERY
+            if self.trust is not ChannelTrust.VALID and self._good >= needed:
+                self.trust = ChannelTrust.VALID
         else:
             self.errors[fault] += 1
             self._good, self._bad, self._score = 0, self._bad + 1, min(SCORE, self._score + 1)
-            if self.trust is Trust.VALID and (self._bad >= IN_A_ROW or self._score >= SCORE):
-                self.trust = Trust.INVALID
+            if self.trust is ChannelTrust.VALID and (self._bad >= IN_A_ROW or self._score >= SCORE):
+                self.trust = ChannelTrust.INVALID
                 self._score = 0
         return fault

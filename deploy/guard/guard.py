@@ -21,10 +21,10 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from deploy.guard.limits import Body, Limits, Numbers
+from deploy.guard.limits import GuardLimits, JointBounds, Numbers
 
 
-class State(Enum):
+class GuardState(Enum):
     """What the guard lets pass; the number travels on the bus."""
 
     SILENT = 0
@@ -33,7 +33,7 @@ class State(Enum):
     ACTIVE = 3
 
 
-class Trip(Enum):
+class GuardTrip(Enum):
     """Why the guard does not let pass what is asked for."""
 
     NONE = "nothing"
@@ -56,7 +56,7 @@ class Trip(Enum):
 
 
 @dataclass(frozen=True)
-class Seen:
+class GuardInput:
     """What is known in one cycle. Ages in s, infinite where nothing has come yet.
 
     Attributes:
@@ -89,7 +89,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Request:
+class CommandRequest:
     """A command that somebody wants sent.
 
     Attributes:
@@ -102,7 +102,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Decision:
+class GuardDecision:
     """What the guard makes of it.
 
     Attributes:
@@ -112,15 +112,15 @@ class Decision:
         cause: What latched it last.
     """
 
-    state: State
+    state: GuardState
     u: Numbers
-    trip: Trip
-    cause: Trip
+    trip: GuardTrip
+    cause: GuardTrip
 
     @property
     def sends(self) -> bool:
         """Whether anything is sent at all."""
-        return self.state is not State.SILENT
+        return self.state is not GuardState.SILENT
 
 
 class Guard:
@@ -131,17 +131,19 @@ class Guard:
         body: The machine.
     """
 
-    def __init__(self, limits: Limits, body: Body) -> None:
+    def __init__(self, limits: GuardLimits, body: JointBounds) -> None:
         self._limits, self._body = limits, body
         self._still = (0.0,) * len(body.lower)
-        self._state, self._cause = State.SILENT, Trip.NONE
+        self._state, self._cause = GuardState.SILENT, GuardTrip.NONE
         self._sent, self._before_s, self._followed_s = (
             self._still,
             math.nan,
             math.nan,
         )  # never: no comparison with nan holds
 
-    def decide(self, now_s: float, armed: bool, seen: Seen, request: Request | None) -> Decision:
+    def decide(
+        self, now_s: float, armed: bool, seen: GuardInput, request: CommandRequest | None
+    ) -> GuardDecision:
         """Returns what to send in this cycle.
 
         Args:
@@ -152,64 +154,66 @@ class Guard:
         """
         elapsed_s, self._before_s = now_s - self._before_s, now_s
         wrong = self._health(seen, elapsed_s)
-        if seen.followed or self._state is not State.ACTIVE:
+        if seen.followed or self._state is not GuardState.ACTIVE:
             self._followed_s = now_s
-        elif now_s - self._followed_s > self._limits.ignored_s and wrong is Trip.NONE:
-            wrong = Trip.IGNORED
+        elif now_s - self._followed_s > self._limits.ignored_s and wrong is GuardTrip.NONE:
+            wrong = GuardTrip.IGNORED
         if not armed:
-            self._state, self._cause = State.SILENT, Trip.NONE
-            return self._say(self._still, wrong if wrong is not Trip.NONE else Trip.NOT_ARMED)
-        if self._state is State.SILENT:
-            self._state, self._cause = State.LATCHED, Trip.NOT_ARMED
-        if wrong is Trip.NONE and self._state is State.ACTIVE and seen.deadman:
+            self._state, self._cause = GuardState.SILENT, GuardTrip.NONE
+            return self._say(
+                self._still, wrong if wrong is not GuardTrip.NONE else GuardTrip.NOT_ARMED
+            )
+        if self._state is GuardState.SILENT:
+            self._state, self._cause = GuardState.LATCHED, GuardTrip.NOT_ARMED
+        if wrong is GuardTrip.NONE and self._state is GuardState.ACTIVE and seen.deadman:
             wrong = self._objection(request)
-        if wrong is not Trip.NONE:
-            if self._state is not State.LATCHED:
-                self._state, self._cause = State.LATCHED, wrong
+        if wrong is not GuardTrip.NONE:
+            if self._state is not GuardState.LATCHED:
+                self._state, self._cause = GuardState.LATCHED, wrong
             return self._say(self._still, wrong)
         if not seen.deadman:
-            self._state = State.READY  # released, in neutral, nothing wrong: may be pressed
-            return self._say(self._still, Trip.DEADMAN)
-        if self._state is State.LATCHED:
+            self._state = GuardState.READY  # released, in neutral, nothing wrong: may be pressed
+            return self._say(self._still, GuardTrip.DEADMAN)
+        if self._state is GuardState.LATCHED:
             return self._say(self._still, self._cause)
-        if self._state is State.READY:
-            self._state, self._cause = State.ACTIVE, Trip.NONE
-            return self._say(self._still, Trip.NONE)
+        if self._state is GuardState.READY:
+            self._state, self._cause = GuardState.ACTIVE, GuardTrip.NONE
+            return self._say(self._still, GuardTrip.NONE)
         assert request is not None
-        return self._say(self._limited(request.u, seen.q, elapsed_s), Trip.NONE)
+        return self._say(self._limited(request.u, seen.q, elapsed_s), GuardTrip.NONE)
 
-    def stops(self, seen: Seen) -> bool:
+    def stops(self, seen: GuardInput) -> bool:
         """Says whether what is seen now ends a motion: then the caller decides at once, not in its next cycle."""
-        return self._state is State.ACTIVE and (
-            not seen.deadman or self._health(seen, 0.0) is not Trip.NONE
+        return self._state is GuardState.ACTIVE and (
+            not seen.deadman or self._health(seen, 0.0) is not GuardTrip.NONE
         )
 
-    def _health(self, seen: Seen, elapsed_s: float) -> Trip:
+    def _health(self, seen: GuardInput, elapsed_s: float) -> GuardTrip:
         """Returns the first thing that is wrong, whatever is asked for."""
         limits = self._limits
         checks = (
-            (seen.bus_up, Trip.BUS_DOWN),
-            (0.0 <= elapsed_s <= limits.gap_s, Trip.TIME_GAP),
-            (not seen.estop, Trip.ESTOP),
-            (seen.trusted, Trip.CHANNEL_INVALID),
-            (seen.status_age_s <= limits.status_s, Trip.STATUS_STALE),
-            (seen.levers_age_s <= limits.levers_s, Trip.LEVERS_STALE),
-            (seen.joints_age_s <= limits.joints_s, Trip.JOINTS_STALE),
-            (seen.joints_plausible and all(map(math.isfinite, seen.q)), Trip.JOINTS_INVALID),
-            (seen.alone, Trip.SECOND_SENDER),
-            (seen.lever <= limits.neutral, Trip.LEVER),
+            (seen.bus_up, GuardTrip.BUS_DOWN),
+            (0.0 <= elapsed_s <= limits.gap_s, GuardTrip.TIME_GAP),
+            (not seen.estop, GuardTrip.ESTOP),
+            (seen.trusted, GuardTrip.CHANNEL_INVALID),
+            (seen.status_age_s <= limits.status_s, GuardTrip.STATUS_STALE),
+            (seen.levers_age_s <= limits.levers_s, GuardTrip.LEVERS_STALE),
+            (seen.joints_age_s <= limits.joints_s, GuardTrip.JOINTS_STALE),
+            (seen.joints_plausible and all(map(math.isfinite, seen.q)), GuardTrip.JOINTS_INVALID),
+            (seen.alone, GuardTrip.SECOND_SENDER),
+            (seen.lever <= limits.neutral, GuardTrip.LEVER),
         )
-        return next((trip for fine, trip in checks if not fine), Trip.NONE)
+        return next((trip for fine, trip in checks if not fine), GuardTrip.NONE)
 
-    def _objection(self, request: Request | None) -> Trip:
+    def _objection(self, request: CommandRequest | None) -> GuardTrip:
         """Returns what is wrong with a request."""
         if request is None or not request.age_s <= self._limits.request_s:
-            return Trip.REQUEST_STALE
+            return GuardTrip.REQUEST_STALE
         full = 1.0 + self._limits.overrun
         if len(request.u) != len(self._still) or not all(
             -full <= value <= full for value in request.u
         ):
-            return Trip.REQUEST_INVALID
+            return GuardTrip.REQUEST_INVALID
         moved = {
             exclusive
             for exclusive, value in zip(self._body.exclusive, request.u, strict=True)
@@ -217,8 +221,8 @@ class Guard:
         }
         alone = sum(value != 0 for value in request.u) == 1
         if True in moved and not alone:
-            return Trip.REQUEST_EXCLUSIVE
-        return Trip.NONE
+            return GuardTrip.REQUEST_EXCLUSIVE
+        return GuardTrip.NONE
 
     def _limited(self, u: Numbers, q: Numbers, elapsed_s: float) -> Numbers:
         """Returns the command within magnitude, growth and joint limits."""
@@ -237,6 +241,6 @@ class Guard:
             values.append(0.0 if outward else value)
         return tuple(values)
 
-    def _say(self, u: Numbers, trip: Trip) -> Decision:
+    def _say(self, u: Numbers, trip: GuardTrip) -> GuardDecision:
         self._sent = u
-        return Decision(self._state, u, trip, self._cause)
+        return GuardDecision(self._state, u, trip, self._cause)

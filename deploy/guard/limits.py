@@ -13,7 +13,7 @@ Numbers = tuple[float, ...]
 
 
 @spec
-class Limits:
+class GuardLimits:
     """What the guard allows.
 
     Attributes:
@@ -85,7 +85,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Body:
+class JointBounds:
     """What the guard knows of the machine, each of length `J`.
 
     Attributes:
@@ -101,14 +101,14 @@ class Body:
     exclusive: tuple[bool, ...]
 
 
-def body_of(
+def build_joint_bounds(
     lower: Sequence[float],
     upper: Sequence[float],
     max_speed: Sequence[float],
     exclusive: Sequence[bool],
-) -> Body:
+) -> JointBounds:
     """Returns the machine as the guard knows it, from arrays of length `J`."""
-    return Body(
+    return JointBounds(
         tuple(map(float, lower)),
         tuple(map(float, upper)),
         tuple(map(float, max_speed)),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from deploy.guard.limits import Body, Limits
+from deploy.guard.limits import GuardLimits, JointBounds
 
 
-class Plausibility:
+class PlausibilityFilter:
     """Rejects joint positions that no machine could have reached; a few in a row make all of them implausible.
 
     Args:
@@ -13,7 +13,7 @@ class Plausibility:
         body: Gives the speeds and limits.
     """
 
-    def __init__(self, limits: Limits, body: Body) -> None:
+    def __init__(self, limits: GuardLimits, body: JointBounds) -> None:
         self._limits, self._body = limits, body
         self._last: list[tuple[float, float] | None] = [None] * len(body.lower)
         self._jumps = [0] * len(body.lower)

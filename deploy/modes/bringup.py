@@ -30,7 +30,7 @@ class Checklist(Protocol):
 
 
 @spec
-class Bringup:
+class BringupMode:
     """Checks bus, signs, limits, latency, dead-man and emergency stop with the operator, and lets the policy run in the shadow."""
 
     session: Session

@@ -26,7 +26,7 @@ class Bench(Protocol):
 
 
 @spec
-class Deploy:
+class DeployMode:
     """Listens to a machine and shows the operator where to move the levers; `deploy=auto` sends the policy's commands itself."""
 
     session: Session

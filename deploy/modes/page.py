@@ -38,7 +38,7 @@ class Served(Protocol):
 
 
 @spec
-class Page:
+class PageMode:
     """Serves the operator's page with a made-up machine; `brokk preset=bench` shows the loop's own."""
 
     session: Session

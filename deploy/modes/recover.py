@@ -18,7 +18,7 @@ class RecoverySpec(Protocol):
 
 
 @spec
-class Recover:
+class RecoverMode:
     """Recovers captures that a crash or a power failure cut off."""
 
     session: Session

@@ -26,7 +26,7 @@ class Steps(Protocol):
 
 
 @spec
-class Study:
+class StudyMode:
     """Studies whether guidance helps people: `study.do=plan`, `run`, `simulate` (operators are simulated), `report` or `erase`.
 
     Attributes:

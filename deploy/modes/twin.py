@@ -22,7 +22,7 @@ class TwinSpec(Protocol):
 
 
 @spec
-class Twin:
+class TwinMode:
     """A simulated machine behind the bus: gateway, remote and plant in real time, with faults on request."""
 
     session: Session

@@ -14,9 +14,9 @@ import json
 import re
 from typing import Literal
 
-from deploy.page.protocol import KINDS, Shown, Wish
+from deploy.page.protocol import REQUEST_KINDS, OperatorRequest, PageState
 
-Refusal = Literal["token", "malformed", "deadman", "target", "nowhere", "busy"]
+RefusalReason = Literal["token", "malformed", "deadman", "target", "nowhere", "busy"]
 """Why a wish was refused: wrong token; no such wish; the dead-man is not held; no such target;
 nothing is measured where the person points; the loop does not take it."""
 LOCAL = ("localhost", "127.0.0.1", "[::1]")
@@ -26,23 +26,23 @@ LONGEST = 256
 """Bytes of a wish."""
 
 
-def names(host: str, port: int, others: tuple[str, ...]) -> frozenset[str]:
+def list_own_hosts(host: str, port: int, others: tuple[str, ...]) -> frozenset[str]:
     """Returns the values of the `Host` header that are this server's."""
     every = {host, *others, *(LOCAL if host in (*LOCAL, "0.0.0.0", "::") else ())}
     return frozenset(f"{name}:{port}" for name in every)
 
 
-def same_origin(origin: str | None, host: str | None, mine: frozenset[str]) -> bool:
+def is_same_origin(origin: str | None, host: str | None, mine: frozenset[str]) -> bool:
     """Says whether a connection comes from a page of this server; programs that send no `Origin` are no browser, and may watch."""
     return host in mine and (origin is None or origin == f"http://{host}")
 
 
-def token_fits(given: object, token: str) -> bool:
+def matches_token(given: object, token: str) -> bool:
     """Compares in a time that says nothing about where they differ."""
     return isinstance(given, str) and hmac.compare_digest(given.encode(), token.encode())
 
 
-def read_wish(text: str | bytes) -> Wish | None:
+def parse_request(text: str | bytes) -> OperatorRequest | None:
     """Returns the wish that a message holds, `None` where it holds none."""
     try:
         found = json.loads(text) if len(text) <= LONGEST else None
@@ -51,17 +51,17 @@ def read_wish(text: str | bytes) -> Wish | None:
     if not isinstance(found, dict) or set(found) != {"kind", "value"}:
         return None
     kind, value = found["kind"], found["value"]
-    if kind not in KINDS or not isinstance(value, str):
+    if kind not in REQUEST_KINDS or not isinstance(value, str):
         return None
     fits = {
         "record": value in ("on", "off"),
         "target": bool(value),
         "point": bool(POINT.fullmatch(value)),
     }.get(kind, value == "")
-    return Wish(kind, value) if fits else None
+    return OperatorRequest(kind, value) if fits else None
 
 
-def refusal(wish: Wish, shown: Shown) -> Refusal | None:
+def find_refusal(wish: OperatorRequest, shown: PageState) -> RefusalReason | None:
     """Returns why a wish must not be handed on now, `None` where it may."""
     if wish.kind == "stop":
         return None

@@ -12,7 +12,7 @@ answered."""
 
 
 @dataclass(frozen=True)
-class Said:
+class DrawAcknowledgement:
     """What a page said of a message.
 
     Attributes:
@@ -49,7 +49,7 @@ class PageClock:
         if len(self._sent) > KEPT:
             del self._sent[next(iter(self._sent))]
 
-    def heard(self, text: str | bytes, now_s: float) -> Said | None:
+    def heard(self, text: str | bytes, now_s: float) -> DrawAcknowledgement | None:
         """Returns what the page says in `text`: `[number, came_ms, drawn_ms, said_ms]` by its own clock; `None` for nonsense."""
         try:
             number, came_ms, drawn_ms, said_ms = json.loads(text)
@@ -67,4 +67,4 @@ class PageClock:
             self._ahead_s = ((came_s - sent_s) + (said_s - now_s)) / 2.0
         new = advice is not None and advice != self._advice
         self._advice = advice
-        return Said(number, advice if new else None, drawn_s - self._ahead_s)
+        return DrawAcknowledgement(number, advice if new else None, drawn_s - self._ahead_s)

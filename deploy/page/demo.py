@@ -8,30 +8,29 @@ claims nothing about a machine or a policy.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from brokk_rl.chain import tool
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from deploy.page.demo_camera import Camera
-from deploy.page.pointing import borehole_at
+from deploy.guidance import LeverPositions
 from deploy.page.protocol import (
-    Advice,
-    Drawn,
-    Levers,
-    Recording,
+    BoreholeChoice,
+    DrawReport,
+    OperatorRequest,
+    PageState,
+    RecordingStatus,
     Safety,
-    Shown,
-    Stream,
-    Target,
-    Wish,
+    ShownAdvice,
+    SourceAge,
+    Vector,
 )
-from deploy.page.scene import approach
+from deploy.page.scene import locate_borehole, plan_approach
 from deploy.runtime.target import NEAR_M
 
 EXCLUSIVE_S, OTHERS_S = 5.0, 9.0
@@ -41,14 +40,14 @@ LIMITS_S = {"positions": 0.15, "levers": 0.15, "advice": 0.15, "camera": 1.0, "b
 BLOCK_M = ((1.9, -0.8, 0.0), (3.3, 0.8, 0.75))
 UP = (0.0, 0.0, 1.0)
 TARGETS = (
-    Target("1", (2.6, 0.0, 0.75), UP, 0.06, 0.002, 0.97, False),
-    Target("2", (2.25, 0.4, 0.75), UP, 0.06, 0.004, 0.86, False),
-    Target("3", (2.95, -0.4, 0.75), UP, 0.06, 0.011, 0.41, False),
+    BoreholeChoice("1", (2.6, 0.0, 0.75), UP, 0.06, 0.002, 0.97, False),
+    BoreholeChoice("2", (2.25, 0.4, 0.75), UP, 0.06, 0.004, 0.86, False),
+    BoreholeChoice("3", (2.95, -0.4, 0.75), UP, 0.06, 0.011, 0.41, False),
 )
 
 
 @spec
-class Demo:
+class DemoMachine:
     """A made-up machine at work: levers, joints, boreholes, camera and point cloud from the clock alone.
 
     Attributes:
@@ -84,7 +83,7 @@ class Demo:
 
 
 class DemoFeed:
-    """See `deploy.page.protocol.Feed`.
+    """See `deploy.page.protocol.PageFeed`.
 
     Args:
         demo: What is shown.
@@ -92,13 +91,13 @@ class DemoFeed:
         clock: Monotonic time in s.
     """
 
-    def __init__(self, demo: Demo, machine: Machine, clock: Callable[[], float]) -> None:
+    def __init__(self, demo: DemoMachine, machine: Machine, clock: Callable[[], float]) -> None:
         self._demo, self._machine, self._clock = demo, machine, clock
         self._began_s = clock()
         self._guiding, self._recorded_s = True, self._began_s
         self._recording, self._chosen = False, TARGETS[0].name
         self._camera = (
-            Camera(demo.width_px, demo.height_px, BLOCK_M, TARGETS) if demo.frames else None
+            DemoCamera(demo.width_px, demo.height_px, BLOCK_M, TARGETS) if demo.frames else None
         )
         self._exclusive = machine.is_exclusive
 
@@ -106,7 +105,7 @@ class DemoFeed:
         """See `Feed`."""
         return int((self._clock() - self._began_s) / self._machine.period_s)
 
-    def shown(self) -> Shown:
+    def shown(self) -> PageState:
         """See `Feed`."""
         now_s, machine = self._clock(), self._machine
         t_s = now_s - self._began_s
@@ -118,8 +117,8 @@ class DemoFeed:
         chosen = next(target for target in targets if target.chosen)
         path = ()
         if machine.has_bodies and self._guiding:
-            path = approach(
-                tool(machine, q).tip_in_base_m,
+            path = plan_approach(
+                compute_tool_kinematics(machine, q).tip_in_base_m,
                 np.array(chosen.center_in_base_m),
                 np.array(chosen.axis_in_base),
             )
@@ -130,11 +129,11 @@ class DemoFeed:
             "borehole": t_s,
         }
         age_s["camera"] = t_s % (1.0 / self._demo.rate_hz) if self._camera else None
-        return Shown(
-            t_s=now_s, alive=True, guiding=self._guiding, advice=Advice(True, "valid", number, levers, due_s), own=own,
-            q=tuple(q.tolist()), streams=tuple(Stream(name, age_s[name], limit_s) for name, limit_s in LIMITS_S.items()),
+        return PageState(
+            t_s=now_s, alive=True, guiding=self._guiding, advice=ShownAdvice(True, "valid", number, levers, due_s), own=own,
+            q=tuple(q.tolist()), streams=tuple(SourceAge(name, age_s[name], limit_s) for name, limit_s in LIMITS_S.items()),
             safety=Safety(False, "SILENT", "nothing", True, False, True),
-            recording=Recording(self._recording, now_s - self._recorded_s if self._recording else 0.0, 0),
+            recording=RecordingStatus(self._recording, now_s - self._recorded_s if self._recording else 0.0, 0),
             targets=targets, path_in_base_m=path, block_in_base_m=BLOCK_M,
         )  # fmt: skip
 
@@ -144,7 +143,7 @@ class DemoFeed:
         t_s = self._began_s + number / self._demo.rate_hz
         return self._camera.frame(number, t_s) if self._camera and t_s > after_s else None
 
-    def wish(self, wish: Wish) -> bool:
+    def wish(self, wish: OperatorRequest) -> bool:
         """See `Feed`."""
         if wish.kind == "target":
             self._chosen = wish.value
@@ -159,7 +158,7 @@ class DemoFeed:
     def _point(self, x: float, y: float) -> bool:
         """Chooses the borehole that a person points at, if there is one."""
         frame = self.frame(-1.0)
-        found = frame and borehole_at(frame, x, y, TARGETS[0].radius_m)
+        found = frame and locate_borehole(frame, x, y, TARGETS[0].radius_m)
         if not found:
             return False
         apart_m = {
@@ -170,10 +169,10 @@ class DemoFeed:
         self._chosen = nearest if apart_m[nearest] <= NEAR_M else self._chosen
         return apart_m[nearest] <= NEAR_M
 
-    def drawn(self, drawn: Drawn) -> None:
+    def drawn(self, drawn: DrawReport) -> None:
         """See `Feed`; nobody is interested."""
 
-    def _programme(self, t_s: float) -> tuple[Levers, float | None]:
+    def _programme(self, t_s: float) -> tuple[LeverPositions, float | None]:
         """Returns lever positions at `t_s`, and the time until the button is due."""
         u, cycle = np.zeros(self._machine.num_joints), EXCLUSIVE_S + OTHERS_S
         at_s, number = t_s % cycle, int(t_s // cycle)
@@ -196,7 +195,7 @@ class DemoFeed:
             )
         left_s = cycle - at_s
         due_s = 0.0 if alone else left_s if left_s <= LEAD_IN_S and self._exclusive.any() else None
-        return levers_of(self._machine, u, alone), due_s
+        return compute_lever_positions(self._machine, u, alone), due_s
 
     def _positions(self, t_s: float) -> np.ndarray:
         """Returns what these commands make of the joints, kept within their limits."""
@@ -222,7 +221,7 @@ class DemoFeed:
         )
 
 
-def levers_of(machine: Machine, u: np.ndarray, button: bool) -> Levers:
+def compute_lever_positions(machine: Machine, u: np.ndarray, button: bool) -> LeverPositions:
     """Returns the lever positions, of full, that stand for commands `(J,)` on the machine's own levers."""
     axes = {(lever.side, lever.axis): 0.0 for lever in machine.levers}
     for lever in machine.levers:
@@ -231,4 +230,97 @@ def levers_of(machine: Machine, u: np.ndarray, button: bool) -> Levers:
             axes[lever.side, lever.axis] = float(u[j])
     sides = [(side, axis) for side in ("left", "right") for axis in ("theta", "psi")]
     left_theta, left_psi, right_theta, right_psi = (axes.get(one, 0.0) for one in sides)
-    return Levers(left_theta, left_psi, right_theta, right_psi, button)
+    return LeverPositions(left_theta, left_psi, right_theta, right_psi, button)
+
+
+EYE_M, LOOK_AT_M = np.array([0.1, 0.33, 1.6]), np.array([2.7, 0.0, 0.5])
+FOV_RAD = 1.0
+"""Across the width."""
+NOISE = 0.002
+"""Standard deviation of depth over depth, as a stereo camera's at 2 m."""
+SEED = 7
+
+
+class DemoCamera:
+    """Makes frames; the scene stands still, the noise does not.
+
+    Args:
+        width: Of the picture, px.
+        height: Of the picture, px.
+        block: Two opposite corners of the block in the base frame, m.
+        holes: Boreholes in its upper face.
+    """
+
+    def __init__(
+        self, width: int, height: int, block: tuple[Vector, Vector], holes: Sequence[BoreholeChoice]
+    ) -> None:
+        ahead = (LOOK_AT_M - EYE_M) / np.linalg.norm(LOOK_AT_M - EYE_M)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        self._pose = np.eye(4)
+        self._pose[:3, :3], self._pose[:3, 3] = (
+            np.stack([right, np.cross(ahead, right), ahead], 1),
+            EYE_M,
+        )
+        focal = width / 2 / np.tan(FOV_RAD / 2)
+        self._matrix = np.array(
+            [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
+        )
+        v, u = np.mgrid[:height, :width]
+        rays = np.stack(
+            [
+                (u - self._matrix[0, 2]) / focal,
+                (v - self._matrix[1, 2]) / focal,
+                np.ones_like(u, float),
+            ],
+            -1,
+        )
+        way = rays @ self._pose[:3, :3].T  # one m of depth along each
+        chance = np.random.default_rng(SEED)
+        self._depth_m, shade = _render_scene(way, block, holes)
+        grain = (
+            chance.normal(0.0, 9.0, (height, width, 1))
+            + chance.normal(0.0, 5.0, (height // 8 + 1, width // 8 + 1))
+            .repeat(8, 0)
+            .repeat(8, 1)[:height, :width, None]
+        )
+        self._color = (shade + grain).clip(0, 255).astype(np.uint8)
+        self._noise = chance.normal(0.0, NOISE, (height, 2 * width)).astype(np.float32)
+
+    def frame(self, number: int, t_s: float) -> Frame:
+        """Returns the `number`-th frame, taken at `t_s`."""
+        width = self._color.shape[1]
+        start = number * 37 % width
+        depth_m = self._depth_m * (1.0 + self._noise[:, start : start + width])
+        return Frame(self._color, depth_m, self._matrix, self._pose, t_s)
+
+
+def _render_scene(
+    way: np.ndarray, block: tuple[Vector, Vector], holes: Sequence[BoreholeChoice]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns depth `(h, w)` float32 in m, NaN where nothing is met, and colour `(h, w, 3)`, for rays `way` from `EYE_M`."""
+    low, high = np.array(block[0]), np.array(block[1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        enter, leave = np.sort(np.stack([(low - EYE_M) / way, (high - EYE_M) / way]), 0)
+        near, face = enter.max(-1), enter.argmax(-1)
+        hit = (near < leave.min(-1)) & (near > 0)
+        ground = np.where(way[..., 2] < 0, -EYE_M[2] / way[..., 2], np.nan)
+    ground[ground > 12.0] = np.nan
+    depth_m = np.where(hit, near, ground)
+    shade = np.where(hit[..., None], np.array([[150.0], [128.0], [186.0]])[face], 96.0) * np.array(
+        [1.0, 0.98, 0.93]
+    )
+    point_m = EYE_M + np.nan_to_num(depth_m)[..., None] * way
+    for hole in holes:
+        inside = (
+            hit
+            & (face == 2)
+            & (
+                np.linalg.norm(point_m[..., :2] - hole.center_in_base_m[:2], axis=-1)
+                < hole.radius_m
+            )
+        )
+        depth_m = np.where(inside, np.nan, depth_m)  # stereo sees nothing in a dark hole
+        shade[inside] = 22.0
+    shade[np.isnan(depth_m) & ~hit] = [170.0, 200.0, 225.0]
+    return depth_m.astype(np.float32), shade

@@ -11,21 +11,21 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, Protocol, get_args
 
 from brokk_rl.signals import Frame
-from deploy.guidance import Levers
+from deploy.guidance import LeverPositions
 
 Vector = tuple[float, float, float]
-Kind = Literal["start", "stop", "record", "target", "point"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+RequestKind = Literal["start", "stop", "record", "target", "point"]
+REQUEST_KINDS: tuple[RequestKind, ...] = get_args(RequestKind)
 """What can be wished for."""
 
 
 @dataclass(frozen=True)
-class Advice:
+class ShownAdvice:
     """Where the levers should go; drawn green.
 
     Attributes:
         valid: Whether there is an advice; if not, `reason` says why.
-        reason: Why there is none, as `deploy.policy.adviser.Advised` has it.
+        reason: Why there is none, as `deploy.policy.policy_process.AdviceStatus` has it.
         number: Counts up; draw times refer to it.
         levers: Where to.
         button_due_s: Time until the right button is to be held, 0 where that is now; `None` where
@@ -35,12 +35,12 @@ class Advice:
     valid: bool
     reason: str
     number: int
-    levers: Levers
+    levers: LeverPositions
     button_due_s: float | None
 
 
 @dataclass(frozen=True)
-class Stream:
+class SourceAge:
     """How fresh one source is.
 
     Attributes:
@@ -82,7 +82,7 @@ class Safety:
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordingStatus:
     """Whether this is written down.
 
     Attributes:
@@ -97,7 +97,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Target:
+class BoreholeChoice:
     """A borehole that can be chosen.
 
     Attributes:
@@ -120,7 +120,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Shown:
+class PageState:
     """All that the page shows at one moment.
 
     Attributes:
@@ -142,13 +142,13 @@ class Shown:
     t_s: float
     alive: bool
     guiding: bool
-    advice: Advice | None
-    own: Levers | None
+    advice: ShownAdvice | None
+    own: LeverPositions | None
     q: tuple[float, ...] | None
-    streams: tuple[Stream, ...]
+    streams: tuple[SourceAge, ...]
     safety: Safety | None
-    recording: Recording
-    targets: tuple[Target, ...]
+    recording: RecordingStatus
+    targets: tuple[BoreholeChoice, ...]
     path_in_base_m: tuple[Vector, ...]
     block_in_base_m: tuple[Vector, Vector] | None
 
@@ -166,11 +166,11 @@ class Shown:
 
     def plain(self) -> dict[str, Any]:
         """Returns it as plain JSON data; what is not finite is null."""
-        return _plain(asdict(self))
+        return _to_plain(asdict(self))
 
 
 @dataclass(frozen=True)
-class Wish:
+class OperatorRequest:
     """What a person wants done, checked already: token, origin, dead-man.
 
     Attributes:
@@ -180,19 +180,19 @@ class Wish:
             the picture from its upper left corner, else empty.
     """
 
-    kind: Kind
+    kind: RequestKind
     value: str
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawReport:
     """When an advice became visible on a page; reaction times count from then.
 
     Attributes:
         number: Of the advice.
         t_s: Monotonic time of this computer at which its frame was drawn, by the browser's clock
             and half the round trip.
-        round_trip_s: Of the shortest exchange with that page so far; half of it is how wrong `t_s`
+        round_trip_s: Of the shortest memory with that page so far; half of it is how wrong `t_s`
             may be.
         page: Counts the pages that were opened.
     """
@@ -203,14 +203,14 @@ class Drawn:
     page: int
 
 
-class Feed(Protocol):
+class PageFeed(Protocol):
     """Where the page gets its state from, and where wishes go. No method waits: the loop must never feel the page."""
 
     def news(self) -> int | None:
         """Returns the number of the newest advice, `None` where there is none: whether `shown` has a new one, at little cost."""
         ...
 
-    def shown(self) -> Shown:
+    def shown(self) -> PageState:
         """Returns the newest state."""
         ...
 
@@ -218,18 +218,18 @@ class Feed(Protocol):
         """Returns the newest frame if it is later than `after_s`, else `None`."""
         ...
 
-    def wish(self, wish: Wish) -> bool:
+    def wish(self, wish: OperatorRequest) -> bool:
         """Hands a wish on; says whether it was taken."""
         ...
 
-    def drawn(self, drawn: Drawn) -> None:
+    def drawn(self, drawn: DrawReport) -> None:
         """Hands on when something became visible."""
         ...
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _to_plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
+        return [_to_plain(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -15,7 +15,8 @@ import time
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Protocol
+from importlib.resources import files
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -24,17 +25,15 @@ from websockets.http11 import Request, Response
 
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
-from deploy.page import access, cloud
+from deploy.page import access, frame_codec
 from deploy.page.clock import PageClock
-from deploy.page.files import FILES, SECURITY, load
-from deploy.page.latest_value import Newest, Room
-from deploy.page.protocol import Drawn, Feed, Shown
+from deploy.page.protocol import DrawReport, PageFeed, PageState
 
 if TYPE_CHECKING:
-    from deploy.page.settings import OperatorPage
+    from deploy.page.settings import PageSettings
 
 
-class Annex(Protocol):
+class PageExtension(Protocol):
     """What else a server serves: the pages of a study."""
 
     files: Mapping[str, tuple[str, bytes]]
@@ -66,7 +65,7 @@ BUFFER_BYTES = 1 << 16
 STATE, FRAMES, CONTROL = "/state", "/frames", "/control"
 
 
-class Server:
+class PageServer:
     """See the module.
 
     Args:
@@ -79,21 +78,21 @@ class Server:
 
     def __init__(
         self,
-        page: OperatorPage,
+        page: PageSettings,
         machine: Machine,
-        feed: Feed,
+        feed: PageFeed,
         token: str,
-        annex: Annex | None = None,
+        annex: PageExtension | None = None,
     ) -> None:
         self._page, self._feed, self._token, self._annex = page, feed, token, annex
-        self._files = load(json.dumps(page.setup(machine)).encode())
+        self._files = load_files(json.dumps(page.setup(machine)).encode())
         self._talks = {STATE: self._states, FRAMES: self._frames, CONTROL: self._control}
         if annex is not None:
             self._files |= annex.files
             self._talks[annex.path] = self._visit
         self._names: frozenset[str] = frozenset()
-        self._state: Newest[tuple[Shown | None, str]] = Newest((None, ""))
-        self._frame = Newest(b"")
+        self._state: LatestValue[tuple[PageState | None, str]] = LatestValue((None, ""))
+        self._frame = LatestValue(b"")
         self._open, self._pages = 0, 0
         self._guess = asyncio.Lock()
 
@@ -115,7 +114,7 @@ class Server:
                 f"page: cannot listen on {page.host}:{page.port} ({error.strerror}); choose page.port=…"
             ) from error
         port = next(iter(server.sockets)).getsockname()[1]
-        self._names = access.names(page.host, port, page.names)
+        self._names = access.list_own_hosts(page.host, port, page.names)
         logging.getLogger("deploy.page.websockets").setLevel(logging.WARNING)
         async with server, asyncio.TaskGroup() as group:
             tasks = [group.create_task(self._watch()), group.create_task(self._watch_frames())]
@@ -172,7 +171,10 @@ class Server:
                 )  # a camera's period is not exact
                 await self._frame.put(
                     await asyncio.to_thread(
-                        cloud.encode, frame, self._page.picture_px, self._page.jpeg_quality
+                        frame_codec.encode_frame,
+                        frame,
+                        self._page.picture_px,
+                        self._page.jpeg_quality,
                     )
                 )
 
@@ -180,22 +182,26 @@ class Server:
         """Answers requests for files; `None` lets a WebSocket in."""
         path, host = request.path.partition("?")[0], request.headers.get("Host")
         if host not in self._names:
-            return _refused(HTTPStatus.MISDIRECTED_REQUEST, "unknown host name; see page.names")
+            return _build_refusal(
+                HTTPStatus.MISDIRECTED_REQUEST, "unknown host name; see page.names"
+            )
         if path not in self._talks:
             found = self._files.get(path)
             return (
-                _refused(HTTPStatus.NOT_FOUND, "no such page")
+                _build_refusal(HTTPStatus.NOT_FOUND, "no such page")
                 if found is None
-                else _response(HTTPStatus.OK, *found)
+                else _build_response(HTTPStatus.OK, *found)
             )
         origin = request.headers.get("Origin")
-        if not access.same_origin(origin, host, self._names) or (
+        if not access.is_same_origin(origin, host, self._names) or (
             path not in (STATE, FRAMES) and origin is None
         ):
             log.warning("refused a connection from another origin")
-            return _refused(HTTPStatus.FORBIDDEN, "another origin")
+            return _build_refusal(HTTPStatus.FORBIDDEN, "another origin")
         if self._open >= 3 * self._page.clients:
-            return _refused(HTTPStatus.SERVICE_UNAVAILABLE, "too many pages; see page.clients")
+            return _build_refusal(
+                HTTPStatus.SERVICE_UNAVAILABLE, "too many pages; see page.clients"
+            )
         return None
 
     async def _connection(self, connection: ServerConnection) -> None:
@@ -211,7 +217,7 @@ class Server:
     async def _states(self, connection: ServerConnection) -> None:
         self._pages += 1
         clock, page = PageClock(), self._pages
-        room = Room(UNDRAWN_STATES)
+        room = SendWindow(UNDRAWN_STATES)
 
         async def listen() -> None:
             async for text in connection:
@@ -220,7 +226,9 @@ class Server:
                     return
                 room.drawn(said.number)
                 if said.advice is not None:
-                    self._feed.drawn(Drawn(said.advice, said.drawn_s, clock.round_trip_s, page))
+                    self._feed.drawn(
+                        DrawReport(said.advice, said.drawn_s, clock.round_trip_s, page)
+                    )
 
         async def speak() -> None:
             number = 0
@@ -232,10 +240,10 @@ class Server:
                 room.sent(number)
                 await connection.send(text)
 
-        await _both(listen(), speak())
+        await _run_both(listen(), speak())
 
     async def _frames(self, connection: ServerConnection) -> None:
-        room = Room(UNDRAWN_FRAMES)
+        room = SendWindow(UNDRAWN_FRAMES)
 
         async def listen() -> None:
             async for text in connection:
@@ -253,7 +261,7 @@ class Server:
                 room.sent(sent)
                 await connection.send(message)
 
-        await _both(listen(), speak())
+        await _run_both(listen(), speak())
 
     async def _visit(self, connection: ServerConnection) -> None:
         if self._annex and await self._let_in(connection):
@@ -270,7 +278,7 @@ class Server:
             given = json.loads(await asyncio.wait_for(connection.recv(), 5.0))
         except (ValueError, TimeoutError):
             given = None
-        if not access.token_fits(
+        if not access.matches_token(
             given.get("token") if isinstance(given, dict) else None, self._token
         ):
             async with self._guess:  # one guess at a time, whoever guesses
@@ -283,10 +291,10 @@ class Server:
 
     def _hand_on(self, text: str | bytes) -> dict[str, str]:
         """Checks a wish against what holds now, not against what the page showed; returns the answer."""
-        wish = access.read_wish(text)
+        wish = access.parse_request(text)
         if wish is None:
             return {"refused": "malformed", "kind": ""}
-        reason = access.refusal(wish, self._feed.shown())
+        reason = access.find_refusal(wish, self._feed.shown())
         if reason is None and not self._feed.wish(wish):
             reason = "nowhere" if wish.kind == "point" else "busy"
         log.info("%s %s: %s", wish.kind, wish.value, reason or "done")
@@ -297,7 +305,9 @@ class Server:
         )
 
 
-async def _both(listen: Coroutine[None, None, None], speak: Coroutine[None, None, None]) -> None:
+async def _run_both(
+    listen: Coroutine[None, None, None], speak: Coroutine[None, None, None]
+) -> None:
     """Runs both ways of a connection until one ends."""
     tasks = [asyncio.create_task(listen), asyncio.create_task(speak)]
     try:
@@ -310,12 +320,98 @@ async def _both(listen: Coroutine[None, None, None], speak: Coroutine[None, None
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
+def _build_response(status: HTTPStatus, kind: str, body: bytes) -> Response:
     headers = Headers(
         {**SECURITY, "Content-Type": kind, "Content-Length": str(len(body)), "Connection": "close"}
     )
     return Response(status.value, status.phrase, headers, body)
 
 
-def _refused(status: HTTPStatus, why: str) -> Response:
-    return _response(status, FILES[".txt"], f"{why}\n".encode())
+def _build_refusal(status: HTTPStatus, why: str) -> Response:
+    return _build_response(status, FILES[".txt"], f"{why}\n".encode())
+
+
+T = TypeVar("T")
+
+
+class LatestValue(Generic[T]):
+    """One value that is replaced and never queued.
+
+    Args:
+        value: The first.
+    """
+
+    def __init__(self, value: T) -> None:
+        self.value, self.number = value, 0
+        self._news = asyncio.Condition()
+
+    async def put(self, value: T) -> None:
+        """Replaces it."""
+        self.value, self.number = value, self.number + 1
+        async with self._news:
+            self._news.notify_all()
+
+    async def after(self, number: int) -> tuple[int, T]:
+        """Waits for one that is newer than the `number`-th; returns its number and it."""
+        async with self._news:
+            await self._news.wait_for(lambda: self.number > number)
+        return self.number, self.value
+
+
+class SendWindow:
+    """Keeps a page from having more than `limit` messages that it has not drawn."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit, self._undrawn, self._free = limit, list[int](), asyncio.Event()
+        self._free.set()
+
+    def sent(self, number: int) -> None:
+        """Notes that message `number` went out."""
+        self._undrawn.append(number)
+        if len(self._undrawn) >= self._limit:
+            self._free.clear()
+
+    def drawn(self, number: int) -> None:
+        """Notes that it was drawn: whoever has drawn one has no use for those before."""
+        self._undrawn = [one for one in self._undrawn if one > number]
+        if len(self._undrawn) < self._limit:
+            self._free.set()
+
+    async def wait(self) -> None:
+        """Waits until there is room."""
+        await self._free.wait()
+
+
+FILES = {
+    ".html": "text/html; charset=utf-8", ".css": "text/css; charset=utf-8", ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json; charset=utf-8", ".txt": "text/plain; charset=utf-8", ".svg": "image/svg+xml",
+}  # fmt: skip
+SECURITY = {
+    # nothing but this server's own files, no code or style in the page itself, no frame around it
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; worker-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+def load_files(setup: bytes) -> dict[str, tuple[str, bytes]]:
+    """Returns type and content of each file by its path; `/setup.json` is `setup`."""
+    found = {"/setup.json": (FILES[".json"], setup)} | read_static_files("deploy.page")
+    found["/"] = found["/index.html"]
+    return found
+
+
+def read_static_files(package: str) -> dict[str, tuple[str, bytes]]:
+    """Returns type and content of each file in the folder `static` of a package, by its path."""
+    found = {}
+    for entry in files(package).joinpath("static").iterdir():
+        kind = FILES.get("." + entry.name.rpartition(".")[2])
+        if kind and entry.is_file():
+            found[f"/{entry.name}"] = (kind, entry.read_bytes())
+    return found

@@ -14,16 +14,16 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.page.protocol import Feed
-from deploy.page.scene import geometry
-from deploy.page.server import Annex, Server
+from deploy.page.protocol import PageFeed
+from deploy.page.scene import describe_geometry
+from deploy.page.server import PageExtension, PageServer
 
 LINK = "page.url"
 """File in the run folder with the address that carries the token; only its owner may read it."""
 
 
 @spec
-class OperatorPage:
+class PageSettings:
     """The operator's page.
 
     Attributes:
@@ -80,10 +80,10 @@ class OperatorPage:
         self,
         stop: Callable[[], bool],
         machine: Machine,
-        feed: Feed,
+        feed: PageFeed,
         session: Session,
         tell: Callable[[str], None],
-        annex: Annex | None = None,
+        annex: PageExtension | None = None,
     ) -> None:
         """Serves the page, and what `annex` has, until `stop` says so or a person stops it.
 
@@ -95,18 +95,18 @@ class OperatorPage:
         token = self.token or secrets.token_urlsafe(24)
 
         def ready(port: int) -> None:
-            address = link(self, port, token)
-            keep_link(session, address)
+            address = build_link(self, port, token)
+            write_link(session, address)
             tell(address)
 
         with contextlib.suppress(KeyboardInterrupt):
-            asyncio.run(Server(self, machine, feed, token, annex).run(stop, ready))
+            asyncio.run(PageServer(self, machine, feed, token, annex).run(stop, ready))
 
     def setup(self, machine: Machine) -> dict[str, Any]:
         """Returns what a page needs to know once, as plain data; nothing secret."""
         return {
             "machine": machine.name, "title": machine.title, "joints": list(machine.joint_names),
-            "exclusive": list(machine.exclusive), "geometry": geometry(machine), "language": self.language,
+            "exclusive": list(machine.exclusive), "geometry": describe_geometry(machine), "language": self.language,
             "tolerance": self.tolerance, "stale_s": self.stale_s, "points": self.points,
             "axes": {f"{lever.side}_{lever.axis}": lever.max_angle_rad for lever in machine.levers},
             "shared": {
@@ -116,7 +116,7 @@ class OperatorPage:
         }  # fmt: skip
 
 
-def link(page: OperatorPage, port: int, token: str) -> str:
+def build_link(page: PageSettings, port: int, token: str) -> str:
     """Returns the address to open; the token stands behind `#`, which browsers keep to themselves."""
     host = (
         "localhost"
@@ -126,7 +126,7 @@ def link(page: OperatorPage, port: int, token: str) -> str:
     return f"http://{host}:{port}/#token={token}"
 
 
-def keep_link(session: Session, address: str) -> Path:
+def write_link(session: Session, address: str) -> Path:
     """Writes the link into the run folder for its owner alone; returns the file."""
     path = session.folder / LINK
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:

@@ -17,7 +17,7 @@ import onnxruntime
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import Encoder, Scaling
-from deploy.bus.description import located
+from deploy.bus.description import resolve_package_path
 
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
 SCHEMA = 1
@@ -25,7 +25,7 @@ TOLERANCE = 1e-3
 """Largest difference of a command (of full) to the golden answers; that of the export."""
 
 
-class Bundle:
+class PolicyBundle:
     """A policy ready to act.
 
     Args:
@@ -41,7 +41,7 @@ class Bundle:
     """
 
     def __init__(self, folder: str, machine: Machine) -> None:
-        place = located(folder)
+        place = resolve_package_path(folder)
         self.contract = _read(place / CONTRACT, folder)
         _check_contract(self.contract, machine, folder)
         observation = self.contract["observation"]
@@ -58,12 +58,12 @@ class Bundle:
         )
         expected = self.encoder.describe()
         for key, value in expected.items():
-            if key != "size" and _differs(value, observation.get(key)):
+            if key != "size" and _is_different(value, observation.get(key)):
                 raise CheckpointError(
                     f"{folder}: the policy was told its observations otherwise ('{key}': {observation.get(key)}, here {value}); "
                     "train or export it again for this machine and version"
                 )
-        self._session = _session(place / ONNX, folder, self.contract)
+        self._session = _open_session(place / ONNX, folder, self.contract)
         wanted = self._session.get_inputs()[0].shape[-1]
         if not expected["size"] == observation["size"] == wanted:
             raise CheckpointError(
@@ -103,7 +103,7 @@ def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> 
         "dead_time_s": machine.dead_time_s,
     }  # fmt: skip
     for name, here in facts.items():
-        if _differs(here, contract.get(name)):
+        if _is_different(here, contract.get(name)):
             raise CheckpointError(
                 f"{folder}: the policy's {name} is {contract.get(name)}, that of machine '{machine.name}' {here}"
             )
@@ -115,19 +115,19 @@ def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> 
         )
 
 
-def _differs(mine: Any, other: Any) -> bool:
+def _is_different(mine: Any, other: Any) -> bool:
     """Says whether two pieces of plain data differ by more than rounding."""
     if isinstance(mine, dict):
         return (
             not isinstance(other, dict)
             or mine.keys() != other.keys()
-            or any(_differs(mine[k], other[k]) for k in mine)
+            or any(_is_different(mine[k], other[k]) for k in mine)
         )
     if isinstance(mine, (list, tuple)):
         return (
             not isinstance(other, list)
             or len(mine) != len(other)
-            or any(map(_differs, mine, other))
+            or any(map(_is_different, mine, other))
         )
     if isinstance(mine, (int, float)) and isinstance(other, (int, float)):
         return abs(mine - other) > 1e-6
@@ -150,7 +150,9 @@ def _read(path: Path, folder: str) -> dict[str, Any]:
         ) from error
 
 
-def _session(path: Path, folder: str, contract: dict[str, Any]) -> onnxruntime.InferenceSession:
+def _open_session(
+    path: Path, folder: str, contract: dict[str, Any]
+) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = (
         1  # a pool of threads would only wake up late

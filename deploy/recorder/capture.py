@@ -25,14 +25,14 @@ from mcap.writer import CompressionType, Writer
 
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
-from deploy.bus.description import Description, Layout, located
-from deploy.bus.protection import Fault
-from deploy.picture import jpeg
+from deploy.bus.description import BusDescription, MessageLayout, resolve_package_path
+from deploy.bus.protection import MessageFault
+from deploy.picture import encode_jpeg
 from deploy.runtime.bus_process import FRAME, FRAMES
-from deploy.runtime.perception_process import frame_of
+from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
-from deploy.runtime.shm_layout import Exchange, wall_offset_ns
+from deploy.runtime.shm_layout import LoopMemory, measure_wall_offset_ns
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ FACTS = "brokk"
 
 
 @dataclass(frozen=True)
-class Capture:
+class CaptureConfig:
     """What a log process is to do.
 
     Attributes:
@@ -71,7 +71,7 @@ class Capture:
     pictures_hz: float
 
 
-def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
+def run(stop: Stop, capture: CaptureConfig, memory: LoopMemory) -> None:
     """Runs until it is asked to stop, then takes what is there: those who write may go on without being recorded.
 
     Raises:
@@ -79,12 +79,12 @@ def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
             readable.
     """
     try:
-        with Log(capture) as target:
-            asked, pictures = False, Pictures(exchange.frame, capture.pictures_hz)
+        with CaptureWriter(capture) as target:
+            asked, pictures = False, PictureSampler(memory.frame, capture.pictures_hz)
             while not asked:
                 time.sleep(POLL_S)
                 asked = stop()
-                for pipe in exchange.logs:
+                for pipe in memory.logs:
                     for data in pipe.take():
                         target.add(data)
                 if (picture := pictures.due()) is not None:
@@ -96,7 +96,7 @@ def run(stop: Stop, capture: Capture, exchange: Exchange) -> None:
         ) from error
 
 
-class DurableBlf(BLFWriter):
+class DurableBlfWriter(BLFWriter):
     """A BLF whose header is true at any time, not only after it was closed."""
 
     def flush(self) -> None:
@@ -109,12 +109,12 @@ class DurableBlf(BLFWriter):
         self.file.flush()
 
 
-class Log:
+class CaptureWriter:
     """Both files; a context manager."""
 
-    def __init__(self, capture: Capture) -> None:
-        self._description = Description(capture.dbc, capture.machine)
-        self._offset_ns = wall_offset_ns()
+    def __init__(self, capture: CaptureConfig) -> None:
+        self._description = BusDescription(capture.dbc, capture.machine)
+        self._offset_ns = measure_wall_offset_ns()
         capture.folder.mkdir(parents=True, exist_ok=True)
         self._mcap_file = (capture.folder / MCAP).open("wb")
         self._mcap = Writer(self._mcap_file, compression=CompressionType.ZSTD)
@@ -127,9 +127,13 @@ class Log:
         self._mcap.add_metadata(FACTS, facts | capture.facts)
         now_ns = time.time_ns()
         self._mcap.add_attachment(
-            now_ns, now_ns, Path(capture.dbc).name, "text/plain", located(capture.dbc).read_bytes()
+            now_ns,
+            now_ns,
+            Path(capture.dbc).name,
+            "text/plain",
+            resolve_package_path(capture.dbc).read_bytes(),
         )
-        self._blf = DurableBlf(capture.folder / BLF)
+        self._blf = DurableBlfWriter(capture.folder / BLF)
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
         self._flushed_s = time.monotonic()
@@ -137,7 +141,7 @@ class Log:
     def add(self, data: bytes) -> None:
         """Takes one record of a pipe."""
         if data[:1] == FRAMES:
-            for t_s, frame_id, sent, payload in _frames(data[1:]):
+            for t_s, frame_id, sent, payload in _iterate_frames(data[1:]):
                 self._add_frame(t_s, frame_id, sent, payload)
         else:
             values = json.loads(data[1:])
@@ -169,7 +173,7 @@ class Log:
         os.fsync(self._mcap_file.fileno())
         os.fsync(self._blf.file.fileno())
 
-    def __enter__(self) -> Log:
+    def __enter__(self) -> CaptureWriter:
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -196,7 +200,7 @@ class Log:
         if layout is None:
             return
         values = self._description.decode(layout, payload)
-        if isinstance(values, Fault):
+        if isinstance(values, MessageFault):
             self._write(
                 "refused",
                 t_s,
@@ -206,7 +210,7 @@ class Log:
             self._write(layout.name, t_s, values | {"sent": sent}, layout)
 
     def _write(
-        self, topic: str, t_s: float, values: dict[str, Any], layout: Layout | None = None
+        self, topic: str, t_s: float, values: dict[str, Any], layout: MessageLayout | None = None
     ) -> None:
         if topic not in self._channels:
             self._channels[topic] = self._mcap.register_channel(
@@ -218,7 +222,7 @@ class Log:
         text = json.dumps({"t_s": t_s, **values}).encode()
         self._mcap.add_message(self._channels[topic], wall_ns, text, wall_ns, self._sequence[topic])
 
-    def _schema(self, topic: str, layout: Layout | None) -> int:
+    def _schema(self, topic: str, layout: MessageLayout | None) -> int:
         properties: dict[str, Any] = {
             "t_s": {"type": "number", "description": "monotonic time in s"}
         }
@@ -237,7 +241,7 @@ class Log:
         return self._mcap.register_schema(title, "jsonschema", json.dumps(schema).encode())
 
 
-class Pictures:
+class PictureSampler:
     """Takes pictures for the record, no more often than asked for.
 
     Args:
@@ -261,11 +265,11 @@ class Pictures:
         record = self._slot.read()
         if record is None:
             return None
-        frame = frame_of(record)
-        return frame.t_s, jpeg(frame.color, JPEG_QUALITY)
+        frame = read_frame(record)
+        return frame.t_s, encode_jpeg(frame.color, JPEG_QUALITY)
 
 
-def _frames(data: bytes) -> Iterator[tuple[float, int, bool, bytes]]:
+def _iterate_frames(data: bytes) -> Iterator[tuple[float, int, bool, bytes]]:
     at = 0
     while at < len(data):
         t_s, frame_id, sent, length = FRAME.unpack_from(data, at)

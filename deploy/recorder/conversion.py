@@ -19,15 +19,15 @@ from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.spec import spec
-from deploy.recorder import reading
-from deploy.recorder.reading import Contents
+from deploy.recorder import capture_reader
+from deploy.recorder.capture_reader import CaptureContents
 
 Series = tuple[np.ndarray, np.ndarray]
 """Times, s, and values."""
 
 
 @spec
-class CaptureLog:
+class CaptureLogReader:
     """Reads captures of the loop, whole or cut off.
 
     Attributes:
@@ -46,7 +46,7 @@ class CaptureLog:
                 is long enough.
         """
         (contents, q, flow), found = self._series(path, machine), []
-        for begin_s, end_s in _pieces([*q.values(), *flow.values()], self.longest_gap_s):
+        for begin_s, end_s in _split_at_gaps([*q.values(), *flow.values()], self.longest_gap_s):
             if end_s - begin_s >= max(self.shortest_s, 2 * machine.period_s):
                 found.append(self._piece(contents, q, flow, begin_s, end_s, path, machine))
         if not found:
@@ -63,7 +63,7 @@ class CaptureLog:
             RecordingError: it cannot be read, was made on another machine, or has a gap there.
         """
         contents, q, flow = self._series(path, machine)
-        for first_s, last_s in _pieces([*q.values(), *flow.values()], self.longest_gap_s):
+        for first_s, last_s in _split_at_gaps([*q.values(), *flow.values()], self.longest_gap_s):
             if first_s <= begin_s + self.longest_gap_s and last_s >= end_s - self.longest_gap_s:
                 return self._piece(
                     contents, q, flow, max(first_s, begin_s), min(last_s, end_s), path, machine
@@ -74,20 +74,20 @@ class CaptureLog:
 
     def _series(
         self, path: Path, machine: Machine
-    ) -> tuple[Contents, dict[str, Series], dict[str, Series]]:
+    ) -> tuple[CaptureContents, dict[str, Series], dict[str, Series]]:
         """Returns the capture, positions, and what the valves got, by joint."""
-        contents = reading.read(path)
+        contents = capture_reader.read_capture(path)
         try:
             machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
         except (CheckpointError, KeyError, ValueError) as error:
             raise RecordingError(f"{path}: {error}") from error
         names = machine.joint_names
-        q = {name: _series(contents, f"Position_{name}", path) for name in names}
-        return contents, q, {name: _series(contents, f"Flow_{name}", path) for name in names}
+        q = {name: _find_series(contents, f"Position_{name}", path) for name in names}
+        return contents, q, {name: _find_series(contents, f"Flow_{name}", path) for name in names}
 
     def _piece(
         self,
-        contents: Contents,
+        contents: CaptureContents,
         q: dict[str, Series],
         flow: dict[str, Series],
         begin_s: float,
@@ -100,15 +100,19 @@ class CaptureLog:
         )
         first_s = next(iter(contents.messages.values()))[0][0]
         created = datetime.fromtimestamp((contents.wall_ns / 1e9) + (begin_s - first_s), UTC)
+        columns_u, columns_q = [], []
+        for name in machine.joint_names:
+            columns_u.append(_average_over_periods(flow[name], grid_s, machine.period_s))
+            columns_q.append(np.interp(grid_s, *q[name]))
         return Recording(
             machine=machine.name,
             joints=machine.joint_names,
             units=tuple(joint.unit for joint in machine.joints),
             rate_hz=1.0 / machine.period_s,
             t_s=grid_s - begin_s,
-            u=np.stack([_means(flow[name], grid_s, machine.period_s) for name in machine.joint_names], 1).astype(np.float32),
-            q=np.stack([np.interp(grid_s, q[name][0], q[name][1]) for name in machine.joint_names], 1).astype(np.float32),
-            extra=_extra(contents, grid_s, machine),
+            u=np.stack(columns_u, 1).astype(np.float32),
+            q=np.stack(columns_q, 1).astype(np.float32),
+            extra=_build_extra_columns(contents, grid_s, machine),
             metadata={
                 "source": f"capture: {contents.facts.get('source', path.name)}", "fingerprint": record.stamp(machine),
                 "run": f"{path.resolve().parent.name}/{path.stem}", "created": created.isoformat(timespec="milliseconds"),
@@ -117,7 +121,7 @@ class CaptureLog:
         )  # fmt: skip
 
 
-def _series(contents: Contents, signal: str, path: Path) -> Series:
+def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:
     """Returns times and values of a signal, whatever message it came in; of what was called invalid nothing."""
     joint, positions = signal.partition("_")[2], signal.startswith("Position_")
     for messages in contents.messages.values():
@@ -134,7 +138,7 @@ def _series(contents: Contents, signal: str, path: Path) -> Series:
     )
 
 
-def _pieces(series: Sequence[Series], longest_gap_s: float) -> list[tuple[float, float]]:
+def _split_at_gaps(series: Sequence[Series], longest_gap_s: float) -> list[tuple[float, float]]:
     """Returns the times, begin and end, in which none of the series has a gap."""
     begin_s, end_s = max(t_s[0] for t_s, _ in series), min(t_s[-1] for t_s, _ in series)
     gaps = sorted(
@@ -152,7 +156,7 @@ def _pieces(series: Sequence[Series], longest_gap_s: float) -> list[tuple[float,
     return pieces
 
 
-def _means(series: Series, grid_s: np.ndarray, period_s: float) -> np.ndarray:
+def _average_over_periods(series: Series, grid_s: np.ndarray, period_s: float) -> np.ndarray:
     """Returns the means over the period after each grid time of a value that holds until its next message."""
     t_s, values = series
     # integral of the staircase up to any time, linear in between
@@ -160,7 +164,9 @@ def _means(series: Series, grid_s: np.ndarray, period_s: float) -> np.ndarray:
     return np.diff(np.interp(np.append(grid_s, grid_s[-1] + period_s), t_s, integral)) / period_s
 
 
-def _extra(contents: Contents, grid_s: np.ndarray, machine: Machine) -> dict[str, np.ndarray]:
+def _build_extra_columns(
+    contents: CaptureContents, grid_s: np.ndarray, machine: Machine
+) -> dict[str, np.ndarray]:
     """Returns the oil's temperature and the advice shown, where there was any; NaN where not."""
     extra: dict[str, np.ndarray] = {}
     for messages in contents.messages.values():

@@ -18,20 +18,20 @@ from dataclasses import dataclass
 
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
-from deploy.bus.description import Description
-from deploy.bus.wire import OpenReplay, OpenWire, Replay, Wire, Wired
-from deploy.guard.guard import Decision, Guard, Request, State, Trip
-from deploy.guard.limits import Limits
-from deploy.runtime.process import Pace, Stop
-from deploy.runtime.receiver import Receiver
-from deploy.runtime.shm_layout import Exchange
+from deploy.bus.can_bus import BusReplay, CanBus, CanFrame, OpenBusReplay, OpenCanBus
+from deploy.bus.description import BusDescription
+from deploy.guard.guard import CommandRequest, Guard, GuardDecision, GuardState, GuardTrip
+from deploy.guard.limits import GuardLimits
+from deploy.runtime.process import CycleTimer, Stop
+from deploy.runtime.receiver import BusReceiver
+from deploy.runtime.shm_layout import LoopMemory
 
 log = logging.getLogger(__name__)
 
 CYCLE_S = 0.01
 REOPEN_S = 0.2
 """Between attempts to open a bus that went down."""
-TRIPS = tuple(Trip)
+TRIPS = tuple(GuardTrip)
 FRAME = struct.Struct("<dIBB")
 """Of a frame in the log's pipe: time, identifier, 1 where it was sent from here, and number of data
 bytes that follow."""
@@ -42,7 +42,7 @@ IDLE, COMMAND = 0, 1
 
 
 @dataclass(frozen=True)
-class Setting:
+class BusProcessConfig:
     """What a bus process is to do.
 
     Attributes:
@@ -52,33 +52,33 @@ class Setting:
         limits: Of the guard.
     """
 
-    wire: Wire | Replay
+    wire: CanBus | BusReplay
     dbc: str
     machine: Machine
-    limits: Limits
+    limits: GuardLimits
 
 
-def run(stop: Stop, setting: Setting, exchange: Exchange) -> None:
+def run(stop: Stop, setting: BusProcessConfig, memory: LoopMemory) -> None:
     """Runs until it is asked to stop; then sends zero, where anything is sent, and closes the bus."""
-    Station(setting, exchange).run(stop)
+    BusProcess(setting, memory).run(stop)
 
 
-class Station:
+class BusProcess:
     """See the module."""
 
-    def __init__(self, setting: Setting, exchange: Exchange) -> None:
-        self._wire, self._exchange, self._machine = setting.wire, exchange, setting.machine
-        self._description = Description(setting.dbc, setting.machine)
-        self._receiver = Receiver(self._description, setting.machine, setting.limits)
+    def __init__(self, setting: BusProcessConfig, memory: LoopMemory) -> None:
+        self._wire, self._memory, self._machine = setting.wire, memory, setting.machine
+        self._description = BusDescription(setting.dbc, setting.machine)
+        self._receiver = BusReceiver(self._description, setting.machine, setting.limits)
         self._guard = Guard(setting.limits, self._receiver.body)
         self._gap_s = setting.limits.gap_s
-        self._bus: OpenWire | OpenReplay | None = None
+        self._bus: OpenCanBus | OpenBusReplay | None = None
         self._was_down, self._reopen_s = False, 0.0
         self._log: list[bytes] = []
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
-        self._decision: Decision | None = None
-        self._pace = Pace(CYCLE_S)
+        self._decision: GuardDecision | None = None
+        self._pace = CycleTimer(CYCLE_S)
 
     def run(self, stop: Stop) -> None:
         """Runs cycles until asked to stop."""
@@ -110,7 +110,7 @@ class Station:
         except LinkError as error:
             self._down(error)
 
-    def _take(self, frame: Wired, now_s: float) -> None:
+    def _take(self, frame: CanFrame, now_s: float) -> None:
         """Takes in a frame; one that ends a motion is acted on at once."""
         fault = self._receiver.take(frame, now_s)
         self._note(frame, now_s, sent=False)
@@ -118,7 +118,7 @@ class Station:
             self._say("fault", now_s, {"frame_id": frame.frame_id, "fault": fault.value})
         if (
             self._decision is not None
-            and self._decision.state is State.ACTIVE
+            and self._decision.state is GuardState.ACTIVE
             and self._guard.stops(self._receiver.seen(now_s, True))
         ):
             self._cycle()
@@ -143,35 +143,33 @@ class Station:
                     "cause": decision.cause.value,
                 },
             )
-        if decision.sends and self._exchange.request is not None:
+        if decision.sends and self._memory.request is not None:
             stops = before is not None and any(before.u) and not any(decision.u)
             self._command(decision, now_s, at_once=stops)
         self._publish(now_s, decision)
         if self._log:
-            self._exchange.bus_log.put(FRAMES + b"".join(self._log))
+            self._memory.bus_log.put(FRAMES + b"".join(self._log))
             self._log.clear()
 
     def _armed(self) -> bool:
-        controls = self._exchange.controls.read()
-        return (
-            self._exchange.request is not None and controls is not None and bool(controls["armed"])
-        )
+        controls = self._memory.controls.read()
+        return self._memory.request is not None and controls is not None and bool(controls["armed"])
 
-    def _request(self, now_s: float) -> Request | None:
-        record = self._exchange.request.read() if self._exchange.request else None
+    def _request(self, now_s: float) -> CommandRequest | None:
+        record = self._memory.request.read() if self._memory.request else None
         return (
             None
             if record is None
-            else Request(tuple(record["u"].tolist()), now_s - float(record["t_s"]))
+            else CommandRequest(tuple(record["u"].tolist()), now_s - float(record["t_s"]))
         )
 
-    def _command(self, decision: Decision, now_s: float, at_once: bool) -> None:
+    def _command(self, decision: GuardDecision, now_s: float, at_once: bool) -> None:
         """Sends the guard's decision, and the heartbeat when it is due; the one place from which valves are commanded."""
         values: dict[str, float] = {
             f"Command_{joint}": u
             for joint, u in zip(self._machine.joint_names, decision.u, strict=True)
         }
-        values["CommandMode"] = COMMAND if decision.state is State.ACTIVE else IDLE
+        values["CommandMode"] = COMMAND if decision.state is GuardState.ACTIVE else IDLE
         self._send(self._description.command.name, values, now_s, at_once)
         if "PcHeartbeat" in self._description.layouts:
             state = {"PcState": decision.state.value, "Overruns": min(4095, self._pace.missed)}
@@ -184,7 +182,7 @@ class Station:
         self._due_s[name] = max(due_s, now_s - period_s) + period_s
         counter = self._counters[name] = self._counters.get(name, -1) + 1
         layout = self._description.layouts[name]
-        frame = Wired(
+        frame = CanFrame(
             layout.frame_id, self._description.encode(name, values, counter), layout.extended
         )
         if name == self._description.command.name:
@@ -195,8 +193,8 @@ class Station:
             self._down(error)
         self._note(frame, now_s, sent=True)
 
-    def _publish(self, now_s: float, decision: Decision) -> None:
-        receiver, record = self._receiver, self._exchange.state.new()
+    def _publish(self, now_s: float, decision: GuardDecision) -> None:
+        receiver, record = self._receiver, self._memory.state.new()
         seen = receiver.seen(now_s, self._bus is not None)
         record["t_s"], record["q"], record["q_t_s"] = (
             now_s,
@@ -241,7 +239,7 @@ class Station:
             receiver.lost,
         )
         record["missed"] = self._pace.missed
-        self._exchange.state.write(record)
+        self._memory.state.write(record)
 
     def _open(self) -> None:
         try:
@@ -266,16 +264,16 @@ class Station:
                 now_s, True, self._receiver.seen(now_s, False), None
             )  # a bus that is going down: zero
             self._command(last, now_s, at_once=True)
-        self._exchange.reports.put(json.dumps({"process": "bus"} | self._pace.report()).encode())
+        self._memory.reports.put(json.dumps({"process": "bus"} | self._pace.report()).encode())
         if self._log:
-            self._exchange.bus_log.put(FRAMES + b"".join(self._log))
+            self._memory.bus_log.put(FRAMES + b"".join(self._log))
         if self._bus is not None:
             self._bus.close()
 
-    def _note(self, frame: Wired, now_s: float, sent: bool) -> None:
+    def _note(self, frame: CanFrame, now_s: float, sent: bool) -> None:
         self._log.append(FRAME.pack(now_s, frame.frame_id, sent, len(frame.data)) + frame.data)
 
     def _say(self, topic: str, now_s: float, values: dict[str, object]) -> None:
-        self._exchange.bus_log.put(
+        self._memory.bus_log.put(
             TEXT + json.dumps({"topic": topic, "t_s": now_s, **values}).encode()
         )

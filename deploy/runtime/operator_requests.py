@@ -11,28 +11,30 @@ from pathlib import Path
 import numpy as np
 
 from brokk_rl.errors import ConfigError
-from deploy.runtime.process import Child
-from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import Aim, Place
+from deploy.runtime.process import ChildProcess
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.target import TargetPosition, TargetSelector
 
 log = logging.getLogger(__name__)
 
 
-class Recorder:
+class RecordingControl:
     """The log process, there or not as it is wanted; one at a time, each recording in a folder of its own.
 
     While there is none the pipes are emptied, so that nothing old is written later and nothing
     counts as lost.
 
     Args:
-        exchange: With the pipes.
+        memory: With the pipes.
         folder: Of the first recording; the next ones go into `recording_2`, … in it.
         start: Starts a log process that writes into a folder.
     """
 
-    def __init__(self, exchange: Exchange, folder: Path, start: Callable[[Path], Child]) -> None:
-        self._exchange, self._folder, self._start = exchange, folder, start
-        self._child: Child | None = None
+    def __init__(
+        self, memory: LoopMemory, folder: Path, start: Callable[[Path], ChildProcess]
+    ) -> None:
+        self._memory, self._folder, self._start = memory, folder, start
+        self._child: ChildProcess | None = None
         self._asked, self._number = False, 0
         self.wanted = False
         self.into: Path | None = None
@@ -72,7 +74,7 @@ class Recorder:
             child.ask_to_stop()
             self._asked = True
         elif child is None:
-            for pipe in self._exchange.logs:
+            for pipe in self._memory.logs:
                 for _ in pipe.take():
                     pass
 
@@ -82,11 +84,11 @@ class Recorder:
             self._child.end(patience_s)
 
 
-class Wanted:
+class RequestHandler:
     """Takes wishes and writes the controls that follow from them.
 
     Args:
-        exchange: Where to read and write.
+        memory: Where to read and write.
         recorder: Of this run.
         aim: Which borehole the advice is for.
         armed: Whether sending is armed from the beginning.
@@ -94,21 +96,26 @@ class Wanted:
     """
 
     def __init__(
-        self, exchange: Exchange, recorder: Recorder, aim: Aim, armed: bool, commands: bool
+        self,
+        memory: LoopMemory,
+        recorder: RecordingControl,
+        aim: TargetSelector,
+        armed: bool,
+        commands: bool,
     ) -> None:
-        self._exchange, self._recorder, self._aim = exchange, recorder, aim
+        self._memory, self._recorder, self._aim = memory, recorder, aim
         self._armed, self._commands = armed, commands
 
     def refresh(self) -> None:
         """Takes what has come, and says how things stand."""
-        for data in self._exchange.wishes.take():
+        for data in self._memory.wishes.take():
             wish = json.loads(data)
             if wish["kind"] == "record":
                 self._recorder.wanted = wish["value"] == "on"
                 self._recorder.into = Path(wish["into"]) if "into" in wish else self._recorder.into
             elif "center_in_base_m" in wish:
                 self._aim.choose(
-                    Place(np.array(wish["center_in_base_m"]), wish["std_m"], wish["t_s"])
+                    TargetPosition(np.array(wish["center_in_base_m"]), wish["std_m"], wish["t_s"])
                 )
             else:
                 self._armed = self._commands and wish["kind"] == "start"
@@ -118,10 +125,10 @@ class Wanted:
         except ConfigError as error:  # a file that makes no sense costs an alarm, not the run
             log.error("%s", error)
         self._recorder.refresh()
-        controls = self._exchange.controls.new()
+        controls = self._memory.controls.new()
         controls["t_s"], controls["armed"] = time.monotonic(), self._armed
         controls["recording"], controls["recording_t_s"] = (
             self._recorder.recording,
             self._recorder.since_s,
         )
-        self._exchange.controls.write(controls)
+        self._memory.controls.write(controls)

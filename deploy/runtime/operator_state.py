@@ -11,11 +11,11 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from deploy.guard.guard import State
-from deploy.guidance import LeverAngles, Levers
-from deploy.policy.adviser import REASONS, Advised
+from deploy.guard.guard import GuardState
+from deploy.guidance import LeverAngles, LeverPositions
+from deploy.policy.policy_process import REASONS, AdviceStatus
 from deploy.runtime.bus_process import TRIPS
-from deploy.runtime.shm_layout import Exchange
+from deploy.runtime.shm_layout import LoopMemory
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Machine:
     q: tuple[float, ...]
     q_age_s: float
     flow: tuple[float, ...]
-    levers: Levers
+    levers: LeverPositions
     levers_age_s: float
     exclusive_selected: bool
     oil_c: float | None
@@ -101,7 +101,7 @@ class Safety:
 
 
 @dataclass(frozen=True)
-class View:
+class LoopSnapshot:
     """Everything at one moment; `None` where nothing has come yet.
 
     Attributes:
@@ -120,20 +120,20 @@ class View:
 
     def plain(self) -> dict[str, Any]:
         """Returns it as plain JSON data; what is not finite is null."""
-        return _plain(asdict(self))
+        return _to_plain(asdict(self))
 
 
 ALIVE_S = 0.2
 """Age of the newest state up to which the bus process is said to be at work."""
 
 
-def view(exchange: Exchange) -> View:
+def read_snapshot(memory: LoopMemory) -> LoopSnapshot:
     """Returns what is to be shown now."""
-    state, advice, now_s = exchange.state.read(), exchange.advice.read(), time.monotonic()
+    state, advice, now_s = memory.state.read(), memory.advice.read(), time.monotonic()
     proposed = None
     if advice is not None:
         proposed = Advice(
-            valid=REASONS[int(advice["reason"])] is Advised.VALID,
+            valid=REASONS[int(advice["reason"])] is AdviceStatus.VALID,
             reason=REASONS[int(advice["reason"])].value,
             age_s=now_s - float(advice["t_s"]),
             number=int(advice["number"]),
@@ -144,20 +144,20 @@ def view(exchange: Exchange) -> View:
             target_in_base_m=tuple(advice["target_in_base_m"].tolist()),
         )
     if state is None:
-        return View(now_s, False, proposed, None, None)
+        return LoopSnapshot(now_s, False, proposed, None, None)
     oil_c = float(state["oil_c"])
     machine = Machine(
         q=tuple(state["q"].tolist()),
         q_age_s=now_s - float(state["q_t_s"]),
         flow=tuple(state["flow"].tolist()),
-        levers=Levers(*state["lever"].tolist(), button_right=bool(state["button_right"])),
+        levers=LeverPositions(*state["lever"].tolist(), button_right=bool(state["button_right"])),
         levers_age_s=now_s - float(state["levers_t_s"]),
         exclusive_selected=bool(state["exclusive_selected"]),
         oil_c=oil_c if math.isfinite(oil_c) else None,
     )
     safety = Safety(
-        commands=exchange.request is not None,
-        state=State(int(state["guard"])).name,
+        commands=memory.request is not None,
+        state=GuardState(int(state["guard"])).name,
         trip=TRIPS[int(state["trip"])].value,
         cause=TRIPS[int(state["cause"])].value,
         deadman=bool(state["deadman"]),
@@ -168,14 +168,14 @@ def view(exchange: Exchange) -> View:
         sent=tuple(state["sent"].tolist()),
         refused=int(state["refused"]),
         lost=int(state["lost"]),
-        log_dropped=sum(pipe.dropped for pipe in exchange.logs),
+        log_dropped=sum(pipe.dropped for pipe in memory.logs),
     )
-    return View(now_s, now_s - float(state["t_s"]) < ALIVE_S, proposed, machine, safety)
+    return LoopSnapshot(now_s, now_s - float(state["t_s"]) < ALIVE_S, proposed, machine, safety)
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _to_plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
+        return [_to_plain(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

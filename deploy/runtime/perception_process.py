@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.contracts.vision import FrameSource, HolePose, Observer, PerceptionBackend, SourceSpec
+from brokk_rl.contracts.vision import FinderSpec, FrameSource, FrameSourceSpec, HolePose, Observer
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from deploy.picture import shrunk
+from deploy.picture import shrink_picture
 from deploy.runtime.bus_process import TEXT
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
-from deploy.runtime.shm_layout import MOST_HOLES, Exchange
+from deploy.runtime.shm_layout import MOST_HOLES, LoopMemory
 from deploy.runtime.target import NEAR_M
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ QUIET_S = 10.0
 
 
 @spec
-class Camera:
+class CameraConfig:
     """A camera beside the loop, and what is looked for in its frames.
 
     Attributes:
@@ -51,8 +51,8 @@ class Camera:
         record_hz: Pictures a second that are recorded; 0: none.
     """
 
-    source: SourceSpec
-    finder: PerceptionBackend | None
+    source: FrameSourceSpec
+    finder: FinderSpec | None
     rate_hz: float
     num_px: int
     forget_s: float
@@ -70,7 +70,7 @@ class Camera:
             )
 
 
-def run(stop: Stop, camera: Camera, exchange: Exchange) -> None:
+def run(stop: Stop, camera: CameraConfig, exchange: LoopMemory) -> None:
     """Runs until it is asked to stop, or the source is at its end.
 
     Raises:
@@ -127,7 +127,7 @@ def _publish(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:
     color, depth_m = (
         (frame.color, frame.depth_m)
         if part == 1.0
-        else (shrunk(frame.color, *size), shrunk(frame.depth_m, *size))
+        else (shrink_picture(frame.color, *size), shrink_picture(frame.depth_m, *size))
     )
     count = size[0] * size[1]
     record = slot.new()
@@ -143,7 +143,7 @@ def _publish(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:
     slot.write(record)
 
 
-def frame_of(record: Any) -> Frame:
+def read_frame(record: Any) -> Frame:
     """Returns the frame that a record of `frame_fields` holds."""
     width, height = int(record["width"]), int(record["height"])
     pose = np.array(record["base_from_camera"])

@@ -35,7 +35,7 @@ Stop = Callable[[], bool]
 """Says whether the process is asked to end."""
 
 
-class Child:
+class ChildProcess:
     """A running child process.
 
     Args:
@@ -93,10 +93,10 @@ class Child:
             return self._process.wait()
 
 
-def enter() -> None:
+def enter_child() -> None:
     """Where a child process begins."""
     name, target, realtime, parent = pickle.load(sys.stdin.buffer)
-    _libc().prctl(_DIE_WITH_PARENT, signal.SIGTERM)
+    _load_libc().prctl(_DIE_WITH_PARENT, signal.SIGTERM)
     if os.getppid() != parent:
         raise SystemExit(1)  # it died meanwhile
     signal.signal(
@@ -125,7 +125,7 @@ def keep_in_memory() -> None:
     gc.freeze()
     gc.disable()
     mapped_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    if _libc().mlockall(_LOCK_ALL | (_ON_USE if mapped_bytes > _LARGE_BYTES else 0)) != 0:
+    if _load_libc().mlockall(_LOCK_ALL | (_ON_USE if mapped_bytes > _LARGE_BYTES else 0)) != 0:
         log.debug("memory is not locked: %s", os.strerror(ctypes.get_errno()))
 
 
@@ -143,12 +143,12 @@ def ask_for_priority(priority: int) -> Literal["fifo", "ordinary"]:
     return "fifo"
 
 
-def back_to_ordinary() -> None:
+def give_up_priority() -> None:
     """Gives the priority of `ask_for_priority` back."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-class Pace:
+class CycleTimer:
     """Absolute deadlines on the monotonic clock; a missed one is skipped, not made up for.
 
     Args:
@@ -198,5 +198,5 @@ class Pace:
         }  # fmt: skip
 
 
-def _libc() -> ctypes.CDLL:
+def _load_libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)

@@ -9,16 +9,16 @@ from typing import Any
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from deploy.bus.description import Description
-from deploy.bus.wire import Replay, Wire
-from deploy.guard.limits import Limits
-from deploy.guidance import Guidance, LeverMap
-from deploy.policy.adviser import Counsel
-from deploy.policy.bundle import Bundle
-from deploy.runtime.bus_process import Setting
-from deploy.runtime.process import Child
-from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import TargetSource
+from deploy.bus.can_bus import BusReplay, CanBus
+from deploy.bus.description import BusDescription
+from deploy.guard.limits import GuardLimits
+from deploy.guidance import LeverGuidance, LeverMap
+from deploy.policy.bundle import PolicyBundle
+from deploy.policy.policy_process import PolicyProcessConfig
+from deploy.runtime.bus_process import BusProcessConfig
+from deploy.runtime.process import ChildProcess
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.target import TargetSpec
 
 log = logging.getLogger(__name__)
 
@@ -32,17 +32,17 @@ log when all has been said."""
 
 
 @dataclass
-class Children:
+class ProcessGroup:
     """The processes of a run.
 
     Attributes:
-        exchange: What they share.
+        memory: What they share.
         realtime: Whether those that ask for real-time priority get it.
     """
 
-    exchange: Exchange
+    memory: LoopMemory
     realtime: bool
-    _running: list[Child] = field(default_factory=list)
+    _running: list[ChildProcess] = field(default_factory=list)
 
     @property
     def pids(self) -> dict[str, int]:
@@ -52,10 +52,10 @@ class Children:
     def start(
         self, name: str, target: str, arguments: tuple[Any, ...], priority: int | None = None
     ) -> None:
-        """Starts `target` (`module:function`), called as `function(stop, *arguments, exchange)`."""
+        """Starts `target` (`module:function`), called as `function(stop, *arguments, memory)`."""
         realtime = priority if self.realtime else None
         self._running.append(
-            Child(name, target, (*arguments, self.exchange), self.exchange.files, realtime)
+            ChildProcess(name, target, (*arguments, self.memory), self.memory.files, realtime)
         )
 
     def check(self) -> None:
@@ -87,7 +87,7 @@ class Children:
 
 
 @spec
-class Listener:
+class BusAndPolicySettings:
     """Whatever listens to a machine and lets a policy run along.
 
     Attributes:
@@ -100,12 +100,12 @@ class Listener:
         realtime: Whether to ask for real-time priority.
     """
 
-    wire: Wire | Replay
+    wire: CanBus | BusReplay
     dbc: str
-    limits: Limits
-    guidance: Guidance
+    limits: GuardLimits
+    guidance: LeverGuidance
     policy: str
-    target: TargetSource
+    target: TargetSpec
     realtime: bool
 
     def refuse(self, machine: Machine) -> None:
@@ -115,12 +115,12 @@ class Listener:
             CheckpointError: the policy cannot be used on this machine.
             ConfigError: bus description or levers do not fit the machine.
         """
-        Description(self.dbc, machine)
+        BusDescription(self.dbc, machine)
         LeverMap(self.guidance.levers or machine.levers, machine)
-        Bundle(self.policy, machine)
+        PolicyBundle(self.policy, machine)
 
     def listen(
-        self, children: Children, machine: Machine, target_s: float, pitch_rad: float | None
+        self, children: ProcessGroup, machine: Machine, target_s: float, pitch_rad: float | None
     ) -> None:
         """Starts bus and policy.
 
@@ -130,9 +130,9 @@ class Listener:
             target_s: Age of the borehole from which there is no advice.
             pitch_rad: Wanted pitch of the tool, for policies that ask for one.
         """
-        setting = Setting(self.wire, self.dbc, machine, self.limits)
-        counsel = Counsel(
+        setting = BusProcessConfig(self.wire, self.dbc, machine, self.limits)
+        counsel = PolicyProcessConfig(
             machine, self.policy, self.guidance, self.limits.joints_s, target_s, pitch_rad
         )
         children.start("bus", "deploy.runtime.bus_process:run", (setting,), BUS_PRIORITY)
-        children.start("policy", "deploy.policy.adviser:run", (counsel,), POLICY_PRIORITY)
+        children.start("policy", "deploy.policy.policy_process:run", (counsel,), POLICY_PRIORITY)

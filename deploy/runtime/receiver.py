@@ -9,12 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from brokk_rl.machine import Machine
-from deploy.bus.description import COUNTER, GATEWAY, LEVER_AXES, REMOTE, Description, Layout
-from deploy.bus.protection import Channel, Fault, Trust
-from deploy.bus.wire import Wired
-from deploy.guard.guard import Seen
-from deploy.guard.limits import Limits, body_of
-from deploy.guard.plausibility import Plausibility
+from deploy.bus.can_bus import CanFrame
+from deploy.bus.description import (
+    COUNTER,
+    GATEWAY,
+    LEVER_AXES,
+    REMOTE,
+    BusDescription,
+    MessageLayout,
+)
+from deploy.bus.protection import ChannelTrust, MessageFault, ProtectedChannel
+from deploy.guard.guard import GuardInput
+from deploy.guard.limits import GuardLimits, build_joint_bounds
+from deploy.guard.plausibility import PlausibilityFilter
 
 OWN = 8
 """Commands last sent that are known again: on some buses a node hears itself."""
@@ -27,7 +34,7 @@ FORGET_S = 60.0
 
 
 @dataclass
-class Receiver:
+class BusReceiver:
     """What is known of the machine, message by message.
 
     Attributes:
@@ -36,15 +43,17 @@ class Receiver:
         limits: For plausibility.
     """
 
-    description: Description
+    description: BusDescription
     machine: Machine
-    limits: Limits
+    limits: GuardLimits
 
     def __post_init__(self) -> None:
         machine, described = self.machine, self.description
         heard = [layout for node in (GATEWAY, REMOTE) for layout in described.sent_by(node)]
         self.channels = {
-            layout.name: Channel(layout.modulus) for layout in heard if layout.data_id is not None
+            layout.name: ProtectedChannel(layout.modulus)
+            for layout in heard
+            if layout.data_id is not None
         }
         self._wanted = {layout.frame_id: layout for layout in heard}
         needed = {
@@ -53,13 +62,13 @@ class Receiver:
         }
         needed |= {described.message_of(f"Position_{joint}") for joint in machine.joint_names}
         self._needed = needed & set(self.channels)
-        self.body = body_of(
+        self.body = build_joint_bounds(
             machine.lower.tolist(),
             machine.upper.tolist(),
             machine.max_speed.tolist(),
             machine.is_exclusive.tolist(),
         )
-        self.plausibility = Plausibility(self.limits, self.body)
+        self.plausibility = PlausibilityFilter(self.limits, self.body)
         count = machine.num_joints
         self.q, self.q_t_s, self.q_valid = (
             np.zeros(count),
@@ -82,7 +91,7 @@ class Receiver:
             -math.inf,
         )
         self.frames = self.refused = 0
-        self.held_up_s, self._transit = 0.0, _Transit()
+        self.held_up_s, self._transit = 0.0, _TransitTime()
         self._own: deque[bytes] = deque(maxlen=OWN)
         self._stranger_s = -math.inf
 
@@ -95,7 +104,7 @@ class Receiver:
         """Is told the data of a command that this process sends itself, before it does."""
         self._own.append(data)
 
-    def take(self, frame: Wired, now_s: float) -> Fault | None:
+    def take(self, frame: CanFrame, now_s: float) -> MessageFault | None:
         """Takes in a frame; returns what is wrong with it."""
         layout = self._wanted.get(frame.frame_id)
         if layout is None:
@@ -105,19 +114,19 @@ class Receiver:
         self.frames += 1
         channel = self.channels.get(layout.name)
         values = self.description.decode(layout, frame.data)
-        if isinstance(values, Fault):
+        if isinstance(values, MessageFault):
             fault = channel.refuse(values) if channel else values
         else:
             fault = channel.take(int(values[COUNTER])) if channel else None
-        if fault is not None or isinstance(values, Fault):
+        if fault is not None or isinstance(values, MessageFault):
             self.refused += 1
             return fault
         self._use(layout, values, now_s)
         return None
 
-    def seen(self, now_s: float, bus_up: bool) -> Seen:
+    def seen(self, now_s: float, bus_up: bool) -> GuardInput:
         """Returns what the guard is to know."""
-        return Seen(
+        return GuardInput(
             q=tuple(self.q.tolist()),
             joints_age_s=now_s - float(self.q_t_s.min()) + self.held_up_s,
             joints_plausible=bool(self.q_valid.all()) and self.plausibility.plausible,
@@ -135,14 +144,14 @@ class Receiver:
     @property
     def trusted(self) -> bool:
         """Whether none of the channels that matter has become invalid."""
-        return all(self.channels[name].trust is not Trust.INVALID for name in self._needed)
+        return all(self.channels[name].trust is not ChannelTrust.INVALID for name in self._needed)
 
     @property
     def lost(self) -> int:
         """Messages that the counters have skipped."""
         return sum(channel.lost for channel in self.channels.values())
 
-    def _use(self, layout: Layout, values: dict[str, float], now_s: float) -> None:
+    def _use(self, layout: MessageLayout, values: dict[str, float], now_s: float) -> None:
         machine, stamp = self.machine, values.get("Stamp")
         if stamp is not None:
             self.held_up_s = self._transit.held_up(stamp, now_s)
@@ -172,7 +181,7 @@ class Receiver:
             self.oil_c, self.status_t_s = values.get("OilTemperature", math.nan), now_s
 
 
-class _Transit:
+class _TransitTime:
     """How much longer than at best a stamped message was on its way, whatever the two clocks say."""
 
     def __init__(self) -> None:

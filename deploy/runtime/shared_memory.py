@@ -19,7 +19,7 @@ import numpy as np
 HEAD = struct.Struct("<Q")
 
 
-class Memory:
+class AnonymousMemory:
     """Anonymous memory that child processes inherit; pickling passes on the number of its file.
 
     Args:
@@ -31,14 +31,14 @@ class Memory:
         self.name, self.size = name, size
         self.fd = os.memfd_create(f"brokk_{name}")
         os.ftruncate(self.fd, size)
-        self.bytes = _mapped(self.fd, size)
+        self.bytes = _map_memory(self.fd, size)
 
     def __getstate__(self) -> tuple[str, int, int]:
         return self.name, self.size, self.fd
 
     def __setstate__(self, state: tuple[str, int, int]) -> None:
         self.name, self.size, self.fd = state
-        self.bytes = _mapped(self.fd, self.size)
+        self.bytes = _map_memory(self.fd, self.size)
 
     def close(self) -> None:
         """Lets go of it."""
@@ -46,7 +46,7 @@ class Memory:
         os.close(self.fd)
 
 
-def _mapped(fd: int, size: int) -> mmap.mmap:
+def _map_memory(fd: int, size: int) -> mmap.mmap:
     # with all of its pages: what is there from the beginning costs no cycle later, and does not
     # look like growth
     return mmap.mmap(fd, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
@@ -67,7 +67,7 @@ class Slot:
     def __init__(self, name: str, fields: np.dtype) -> None:
         self.fields = fields
         self._stride = -(-(fields.itemsize + 4) // 8) * 8
-        self.memory = Memory(name, HEAD.size + 2 * self._stride)
+        self.memory = AnonymousMemory(name, HEAD.size + 2 * self._stride)
         self._number = 0
 
     def write(self, record: np.ndarray) -> None:
@@ -127,7 +127,7 @@ class Pipe:
 
     def __init__(self, name: str, size: int) -> None:
         self._size = size
-        self.memory = Memory(name, self._HEADER.size + size)
+        self.memory = AnonymousMemory(name, self._HEADER.size + size)
 
     def put(self, data: bytes) -> bool:
         """Appends `data`; says whether there was room."""

@@ -20,7 +20,7 @@ PIPE_BYTES = 8 << 20
 """About two minutes of a full bus."""
 
 
-def state_fields(num_joints: int) -> np.dtype:
+def build_state_fields(num_joints: int) -> np.dtype:
     """Returns the fields of the machine's state as the bus has it."""
     each = (float, (num_joints,))
     return np.dtype(
@@ -53,8 +53,8 @@ def state_fields(num_joints: int) -> np.dtype:
             ("bus_up", bool),
             ("trusted", bool),
             ("alone", bool),
-            ("guard", np.int8),  # deploy.guard.guard.State
-            ("trip", np.int8),  # index into deploy.guard.guard.Trip
+            ("guard", np.int8),  # deploy.guard.guard.GuardState
+            ("trip", np.int8),  # index into deploy.guard.guard.GuardTrip
             ("cause", np.int8),
             ("sent", *each),
             ("frames", np.uint64),
@@ -65,7 +65,7 @@ def state_fields(num_joints: int) -> np.dtype:
     )
 
 
-def advice_fields(num_joints: int) -> np.dtype:
+def build_advice_fields(num_joints: int) -> np.dtype:
     """Returns the fields of what the policy proposes."""
     return np.dtype(
         [
@@ -81,12 +81,12 @@ def advice_fields(num_joints: int) -> np.dtype:
     )
 
 
-def request_fields(num_joints: int) -> np.dtype:
+def build_request_fields(num_joints: int) -> np.dtype:
     """Returns the fields of a command that somebody wants sent."""
     return np.dtype([("t_s", float), ("u", float, (num_joints,))])
 
 
-def frame_fields(num_px: int) -> np.dtype:
+def build_frame_fields(num_px: int) -> np.dtype:
     """Returns the fields of a camera's frame of `num_px` pixels at most; see `brokk_rl.signals.Frame`."""
     return np.dtype(
         [
@@ -129,7 +129,7 @@ since when."""
 
 
 @dataclass
-class Exchange:
+class LoopMemory:
     """Everything that the processes share; goes to each of them as it is.
 
     Attributes:
@@ -163,7 +163,7 @@ class Exchange:
     reports: Pipe
 
     @classmethod
-    def new(cls, num_joints: int, commands: bool, frame_px: int = 0) -> Exchange:
+    def new(cls, num_joints: int, commands: bool, frame_px: int = 0) -> LoopMemory:
         """Returns a fresh one.
 
         Args:
@@ -172,12 +172,12 @@ class Exchange:
             frame_px: Pixels of a camera's frame; 0: no camera.
         """
         return cls(
-            state=Slot("state", state_fields(num_joints)),
-            advice=Slot("advice", advice_fields(num_joints)),
-            request=Slot("request", request_fields(num_joints)) if commands else None,
+            state=Slot("state", build_state_fields(num_joints)),
+            advice=Slot("advice", build_advice_fields(num_joints)),
+            request=Slot("request", build_request_fields(num_joints)) if commands else None,
             target=Slot("target", TARGET),
             controls=Slot("controls", CONTROLS),
-            frame=Slot("frame", frame_fields(frame_px)) if frame_px else None,
+            frame=Slot("frame", build_frame_fields(frame_px)) if frame_px else None,
             holes=Slot("holes", HOLES),
             bus_log=Pipe("bus_log", PIPE_BYTES),
             policy_log=Pipe("policy_log", PIPE_BYTES),
@@ -204,6 +204,6 @@ class Exchange:
                 part.memory.close()
 
 
-def wall_offset_ns() -> int:
+def measure_wall_offset_ns() -> int:
     """Returns what makes a wall-clock time of a monotonic one, taken once: later steps of the wall clock change nothing."""
     return time.time_ns() - time.monotonic_ns()

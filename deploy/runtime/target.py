@@ -19,7 +19,7 @@ NEAR_M = 0.1
 
 
 @dataclass(frozen=True)
-class Place:
+class TargetPosition:
     """Where a borehole is said to be.
 
     Attributes:
@@ -40,10 +40,10 @@ class Place:
         slot.write(record)
 
 
-class Target(Protocol):
+class TargetProvider(Protocol):
     """Knows the borehole."""
 
-    def news(self, holes: list[Any]) -> Place | None:
+    def news(self, holes: list[Any]) -> TargetPosition | None:
         """Returns the borehole where there is news of it, else `None`; called several times a second.
 
         Args:
@@ -55,16 +55,16 @@ class Target(Protocol):
         ...
 
 
-class TargetSource(Protocol):
+class TargetSpec(Protocol):
     """A spec in `conf/target`."""
 
-    def build(self) -> Target:
+    def build(self) -> TargetProvider:
         """Returns it at work."""
         ...
 
 
 @spec
-class Given:
+class GivenTarget:
     """A borehole that does not move, given by its centre.
 
     Attributes:
@@ -73,13 +73,13 @@ class Given:
 
     center_in_base_m: tuple[float, float, float]
 
-    def build(self) -> Target:
+    def build(self) -> TargetProvider:
         """Returns it at work; see `TargetSource`."""
-        return _Once(Place(np.array(self.center_in_base_m), 0.0, None))
+        return _FixedTarget(TargetPosition(np.array(self.center_in_base_m), 0.0, None))
 
 
 @spec
-class File:
+class FileTarget:
     """A JSON file with `center_in_base_m`, read again whenever it changes; its age counts from then on.
 
     Attributes:
@@ -88,13 +88,13 @@ class File:
 
     path: str
 
-    def build(self) -> Target:
+    def build(self) -> TargetProvider:
         """Returns it at work; see `TargetSource`."""
-        return _Watched(Path(self.path))
+        return _WatchedFile(Path(self.path))
 
 
 @spec
-class Seen:
+class DetectedTarget:
     """The surest borehole that the camera shows (`camera=…`), until a person chooses another at the page.
 
     Attributes:
@@ -103,12 +103,12 @@ class Seen:
 
     score: float
 
-    def build(self) -> Target:
+    def build(self) -> TargetProvider:
         """Returns it at work; see `TargetSource`."""
-        return _Surest(self.score)
+        return _SurestHole(self.score)
 
 
-class Aim:
+class TargetSelector:
     """The borehole that the advice is for: that of whoever spoke last, configuration, file, perception or a person.
 
     What the camera then sees of it keeps it fresh.
@@ -119,9 +119,9 @@ class Aim:
         holes: What perception knows.
     """
 
-    def __init__(self, target: Target, slot: Slot, holes: Slot) -> None:
+    def __init__(self, target: TargetProvider, slot: Slot, holes: Slot) -> None:
         self._target, self._slot, self._holes = target, slot, holes
-        self._place: Place | None = None
+        self._place: TargetPosition | None = None
 
     def refresh(self) -> None:
         """Takes over news.
@@ -129,35 +129,35 @@ class Aim:
         Raises:
             ConfigError: the configured source makes no sense now.
         """
-        before, known = self._place, holes_of(self._holes)
+        before, known = self._place, read_holes(self._holes)
         news = self._target.news(known)
         self._place = news or self._seen(known) or before
         if self._place is not None and (self._place is not before or self._place.t_s is None):
             self._place.write(self._slot)
 
-    def choose(self, place: Place) -> None:
+    def choose(self, place: TargetPosition) -> None:
         """Takes what a person has chosen."""
         self._place = place
         place.write(self._slot)
 
-    def _seen(self, known: list[Any]) -> Place | None:
+    def _seen(self, known: list[Any]) -> TargetPosition | None:
         """Returns what the camera says of the borehole since the last time."""
         place = self._place
         if place is None:
             return None
-        one = nearest(known, place.center_in_base_m)
+        one = find_nearest(known, place.center_in_base_m)
         if one is None or (place.t_s is not None and float(one["t_s"]) <= place.t_s):
             return None
-        return place_of(one)
+        return locate_hole(one)
 
 
-def holes_of(slot: Slot) -> list[Any]:
+def read_holes(slot: Slot) -> list[Any]:
     """Returns the boreholes that perception knows, records of `HOLE`."""
     record = slot.read()
     return [] if record is None else list(record["holes"][: int(record["count"])])
 
 
-def nearest(holes: list[Any], center_m: np.ndarray) -> Any | None:
+def find_nearest(holes: list[Any], center_m: np.ndarray) -> Any | None:
     """Returns that of `holes` which is the borehole at `center_m`, if any."""
     one = min(
         holes,
@@ -171,40 +171,42 @@ def nearest(holes: list[Any], center_m: np.ndarray) -> Any | None:
     )
 
 
-def place_of(hole: Any) -> Place:
+def locate_hole(hole: Any) -> TargetPosition:
     """Returns where a borehole is that perception knows."""
-    return Place(np.array(hole["center_in_base_m"]), float(hole["std_m"]), float(hole["t_s"]))
+    return TargetPosition(
+        np.array(hole["center_in_base_m"]), float(hole["std_m"]), float(hole["t_s"])
+    )
 
 
-class _Once:
-    def __init__(self, place: Place) -> None:
-        self._place: Place | None = place
+class _FixedTarget:
+    def __init__(self, place: TargetPosition) -> None:
+        self._place: TargetPosition | None = place
 
-    def news(self, holes: list[Any]) -> Place | None:
+    def news(self, holes: list[Any]) -> TargetPosition | None:
         place, self._place = self._place, None
         return place
 
 
-class _Surest:
+class _SurestHole:
     def __init__(self, score: float) -> None:
         self._score, self._said = score, False
 
-    def news(self, holes: list[Any]) -> Place | None:
+    def news(self, holes: list[Any]) -> TargetPosition | None:
         sure = max(holes, key=lambda hole: float(hole["score"]), default=None)
         if self._said or sure is None or float(sure["score"]) < self._score:
             return None
         self._said = (
             True  # from now on it is followed; a surer one next to it is the operator's choice
         )
-        return place_of(sure)
+        return locate_hole(sure)
 
 
-class _Watched:
+class _WatchedFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._changed: int | None = None
 
-    def news(self, holes: list[Any]) -> Place | None:
+    def news(self, holes: list[Any]) -> TargetPosition | None:
         try:
             changed = self._path.stat().st_mtime_ns
             if changed == self._changed:
@@ -225,4 +227,4 @@ class _Watched:
             )
         # only a file that lay there before goes by the wall clock, which may be set at any time
         age_s = max(0.0, time.time() - changed / 1e9) if before is None else 0.0
-        return Place(center_m, std_m, time.monotonic() - age_s)
+        return TargetPosition(center_m, std_m, time.monotonic() - age_s)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from brokk_rl import record
-from brokk_rl.chain import tool
 from brokk_rl.errors import RecordingError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from deploy.study import exact, tlx
@@ -185,7 +185,9 @@ def _measured(
             )
         )
     num = int(np.searchsorted(recording.t_s - recording.t_s[0], values["time_s"], side="right"))
-    return MeasuredTrial(trial, values, tool(machine, recording.q[:num]).tip_in_base_m, counts)
+    return MeasuredTrial(
+        trial, values, compute_tool_kinematics(machine, recording.q[:num]).tip_in_base_m, counts
+    )
 
 
 def _outcome_only(trial: MeasuredTrial) -> MeasuredTrial:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.errors import BrokkError, ConfigError, choices
+from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.machine import Machine
 from deploy.study import folder as folders
 from deploy.study.folder import StudyData
@@ -114,7 +114,7 @@ class Conductor:
         plan = self._data.plan
         if who is not None and (who not in plan["participants"] or who in plan.get("erased", {})):
             raise ConfigError(
-                f"study.participant={who}: no participant of the plan; {choices(who, plan['participants'])}"
+                f"study.participant={who}: no participant of the plan; {list_choices(who, plan['participants'])}"
             )
         if self._attempt is not None:
             self._attempt.abort("the sitting was left")

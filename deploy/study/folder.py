@@ -22,7 +22,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from brokk_rl.errors import ConfigError, StorageError, choices
+from brokk_rl.errors import ConfigError, StorageError, list_choices
 from brokk_rl.session import write_json
 from deploy.study.design import CONDITIONS, PERIODS
 
@@ -175,7 +175,7 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     plan = read_plan(folder)
     if participant not in plan["participants"]:
         raise ConfigError(
-            f"study.participant={participant}: the study has no such participant; {choices(participant, plan['participants'])}"
+            f"study.participant={participant}: the study has no such participant; {list_choices(participant, plan['participants'])}"
         )
     gone = []
     for part in (TRIALS, RECORDINGS, CAPTURES, QUESTIONNAIRES, PARTICIPANTS):

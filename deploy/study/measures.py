@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brokk_rl.chain import tool
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from deploy.study.design import Hole, Success
@@ -82,7 +82,7 @@ def measure(
         success: When the tool is in.
         limit_s: Time limit of the trial.
     """
-    tip = tool(machine, recording.q).tip_in_base_m
+    tip = compute_tool_kinematics(machine, recording.q).tip_in_base_m
     t_s = recording.t_s - recording.t_s[0]
     last = insertion(tip, hole, success)
     within = t_s <= limit_s

@@ -26,16 +26,16 @@ from brokk_rl.contracts.operator import Operator, OperatorModel, OperatorView
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.bus.description import Description
-from deploy.bus.wire import Wire
-from deploy.guidance import AXES, Guidance, LeverMap
+from deploy.bus.can_bus import CanBus
+from deploy.bus.description import BusDescription
+from deploy.guidance import AXES, LeverGuidance, LeverMap
 from deploy.page.settings import LINK
-from deploy.runtime.process import Pace, Stop
-from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.supervisor import Companion
+from deploy.runtime.process import CycleTimer, Stop
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.supervisor import CompanionProcess
 from deploy.study.simulation import answered
-from deploy.twin.gateway import axis_full_rad
-from deploy.twin.remote import Remote
+from deploy.twin.gateway import find_axis_full_rad
+from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class Participant:
 
     twin: Twin
     plant: Connection
-    guidance: Guidance
+    guidance: LeverGuidance
     guided: Operator
     unguided: Operator
     sittings: int | None
@@ -75,19 +75,19 @@ class Participant:
             "unguided": type(self.unguided).__name__.lower(),
         }
 
-    def companions(self, machine: Machine, session: Session) -> list[Companion]:
+    def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
         """Returns the processes to run beside the loop."""
         person = Person(
             self, machine, session.folder.resolve() / LINK, session.stream("study operators")
         )
         return [
-            Companion(
+            CompanionProcess(
                 "twin",
                 "deploy.twin.twin:run",
                 (self.twin, machine, self.plant, session),
                 TWIN_PRIORITY,
             ),
-            Companion(
+            CompanionProcess(
                 "participant", "deploy.study.participant:take_part", (person,), TWIN_PRIORITY
             ),
         ]
@@ -110,7 +110,7 @@ class Person:
     seed: int
 
 
-def take_part(stop: Stop, person: Person, exchange: Exchange) -> None:
+def take_part(stop: Stop, person: Person, memory: LoopMemory) -> None:
     """Takes part until it is asked to stop; asks its parent to stop once all sittings are done."""
     asyncio.run(_Taking(person).run(stop))
 
@@ -240,15 +240,15 @@ class _Taking:
         """Number of the participant whose sitting it is."""
         return int("".join(filter(str.isdigit, self._study.get("who") or "0")))
 
-    async def _hold(self, stop: Stop, wire: Wire, tasks: list[asyncio.Task[None]]) -> None:
+    async def _hold(self, stop: Stop, wire: CanBus, tasks: list[asyncio.Task[None]]) -> None:
         """Holds the remote, dead-man pressed."""
-        remote = Remote(Description(self._bench.twin.dbc, self._machine))
+        remote = RadioRemote(BusDescription(self._bench.twin.dbc, self._machine))
         remote.deadman = True
         every, pace, cycle, full_rad = (
             round(self._machine.period_s / remote.period_s),
-            Pace(remote.period_s),
+            CycleTimer(remote.period_s),
             0,
-            axis_full_rad(self._machine),
+            find_axis_full_rad(self._machine),
         )
         with wire.open([]) as bus:
             while not stop() and not any(task.done() for task in tasks):

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from brokk_rl.intervals import student
+from brokk_rl.intervals import compute_student_interval
 from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, add_legend, remove_frame
 from deploy.study import tlx
 from deploy.study.analysis import Analysis, MeasuredTrial
@@ -176,5 +176,5 @@ def _hole(trial: MeasuredTrial) -> str:
 def _half(values: np.ndarray) -> float:
     """Returns half of Student's 95 % interval, 0 for a single value."""
     known = values[~np.isnan(values)]
-    interval = student(known.tolist())
+    interval = compute_student_interval(known.tolist())
     return (interval[1] - interval[0]) / 2 if interval else 0.0

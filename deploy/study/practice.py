@@ -14,7 +14,7 @@ import numpy as np
 from scipy import optimize
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.intervals import wilson
+from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.spec import spec
 from deploy.study import exact
 
@@ -154,4 +154,8 @@ def share_significant(
     else:
         p = exact.sequence_p(np.where(first, guided - unguided, unguided - guided), first)
     hits = int((p <= alpha).sum())
-    return {"share": hits / studies, "ci95": list(wilson(hits, studies)), "studies": studies}
+    return {
+        "share": hits / studies,
+        "ci95": list(compute_wilson_interval(hits, studies)),
+        "studies": studies,
+    }

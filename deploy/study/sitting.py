@@ -8,23 +8,23 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.page.from_loop import Beside
-from deploy.page.settings import OperatorPage
-from deploy.runtime.supervisor import Companion, Loop
-from deploy.runtime.target import File
+from deploy.page.loop_feed import PageProcessConfig
+from deploy.page.settings import PageSettings
+from deploy.runtime.supervisor import CompanionProcess, DeploymentLoop
+from deploy.runtime.target import FileTarget
 from deploy.study import folder as folders
 from deploy.study.conductor import Words
 from deploy.study.participant import Participant
 from deploy.study.study_server import Sitters
 from deploy.study.trial import Times
-from deploy.twin.bench import Bench
+from deploy.twin.bench import TwinBench
 
 LOCK, TARGET = ".sitting", "target.json"
-"""File in the study's folder that one program at a time holds; file in the run folder that says to
+"""FileTarget in the study's folder that one program at a time holds; file in the run folder that says to
 the loop where the hole is."""
 
 
@@ -60,9 +60,9 @@ class Sitting:
         times: How a trial begins and ends.
     """
 
-    loop: Loop
-    bench: Bench | Participant | None
-    page: OperatorPage
+    loop: DeploymentLoop
+    bench: TwinBench | Participant | None
+    page: PageSettings
     consent: Consent
     times: Times
 
@@ -71,7 +71,7 @@ class Sitting:
             raise ConfigError(
                 "study.do=run: in a study people move the machine; deploy=listen, not deploy=auto"
             )
-        if isinstance(self.bench, Bench) and self.bench.operator is not None:
+        if isinstance(self.bench, TwinBench) and self.bench.operator is not None:
             raise ConfigError(
                 "study.do=run: that operator follows advice that is not shown; bench=participant, or bench=twin"
             )
@@ -90,18 +90,18 @@ class Sitting:
         there = [who for who in data.plan["participants"] if who not in data.plan.get("erased", {})]
         if participant is not None and participant not in there:
             raise ConfigError(
-                f"study.participant={participant}: nobody of the plan; {choices(participant, there)}"
+                f"study.participant={participant}: nobody of the plan; {list_choices(participant, there)}"
             )
         target = session.folder / TARGET
         loop = replace(
-            self.loop, page=None, record=False, show=False, target=File(path=str(target))
+            self.loop, page=None, record=False, show=False, target=FileTarget(path=str(target))
         )
         limits, operators = (
             loop.limits,
             self.bench.operators if isinstance(self.bench, Participant) else {},
         )
         room = Sitters(
-            beside=Beside(
+            beside=PageProcessConfig(
                 self.page, machine, loop.guidance, session, limits.joints_s, limits.levers_s, loop.target_s,
                 loop.camera.stale_s if loop.camera else None,
             ),
@@ -119,7 +119,10 @@ class Sitting:
             loop.run(
                 machine,
                 session,
-                [*beside, Companion("study", "deploy.study.study_server:run", (room,), None)],
+                [
+                    *beside,
+                    CompanionProcess("study", "deploy.study.study_server:run", (room,), None),
+                ],
             )
 
 

@@ -17,12 +17,12 @@ from typing import Any
 from websockets.asyncio.server import ServerConnection
 
 from brokk_rl.signals import Frame
-from deploy.page.files import static
-from deploy.page.from_loop import Beside, LoopFeed
-from deploy.page.protocol import Drawn, Feed, Shown, Wish
+from deploy.page.loop_feed import LoopFeed, PageProcessConfig
+from deploy.page.protocol import DrawReport, OperatorRequest, PageFeed, PageState
+from deploy.page.server import read_static_files
 from deploy.page.settings import LINK
 from deploy.runtime.process import Stop
-from deploy.runtime.shm_layout import Exchange
+from deploy.runtime.shm_layout import LoopMemory
 from deploy.study.conductor import Conductor, Words
 from deploy.study.trial import Times
 from deploy.study.twin_control import LoopStage
@@ -53,7 +53,7 @@ class Sitters:
         port: Where the twin can be put elsewhere; `None` on a machine.
     """
 
-    beside: Beside
+    beside: PageProcessConfig
     folder: Path
     participant: str | None
     words: Words
@@ -64,14 +64,14 @@ class Sitters:
     port: int | None
 
 
-def run(stop: Stop, sitters: Sitters, exchange: Exchange) -> None:
+def run(stop: Stop, sitters: Sitters, memory: LoopMemory) -> None:
     """Leads sittings until it is asked to stop.
 
     Raises:
         LinkError: the page's address is taken.
     """
     beside = sitters.beside
-    stage = LoopStage(exchange, beside.machine, sitters.target, sitters.port)
+    stage = LoopStage(memory, beside.machine, sitters.target, sitters.port)
     seed = beside.session.stream
     conductor = Conductor(
         sitters.folder,
@@ -93,28 +93,28 @@ def run(stop: Stop, sitters: Sitters, exchange: Exchange) -> None:
         )
 
     try:
-        feed = StudyFeed(LoopFeed(beside, exchange), conductor)
+        feed = StudyFeed(LoopFeed(beside, memory), conductor)
         beside.page.serve(stop, beside.machine, feed, beside.session, tell, StudyPages(conductor))
     finally:
         conductor.close()
 
 
 class StudyFeed:
-    """The loop's feed as a study shows it; see `deploy.page.protocol.Feed`.
+    """The loop's feed as a study shows it; see `deploy.page.protocol.PageFeed`.
 
     Args:
         feed: The loop's.
         conductor: Of the sitting.
     """
 
-    def __init__(self, feed: Feed, conductor: Conductor) -> None:
+    def __init__(self, feed: PageFeed, conductor: Conductor) -> None:
         self._feed, self._conductor = feed, conductor
 
     def news(self) -> int | None:
         """See `Feed`."""
         return self._feed.news() if self._conductor.shows_advice else None
 
-    def shown(self) -> Shown:
+    def shown(self) -> PageState:
         """See `Feed`."""
         shown = self._feed.shown()
         if self._conductor.shows_advice:
@@ -125,20 +125,20 @@ class StudyFeed:
         """See `Feed`."""
         return self._feed.frame(after_s)
 
-    def wish(self, wish: Wish) -> bool:
+    def wish(self, wish: OperatorRequest) -> bool:
         """See `Feed`; `stop` ends the trial too."""
         if wish.kind != "stop":
             return False
         self._conductor.take({"do": "stop_trial"})
         return True
 
-    def drawn(self, drawn: Drawn) -> None:
+    def drawn(self, drawn: DrawReport) -> None:
         """See `Feed`."""
         self._feed.drawn(drawn)
 
 
 class StudyPages:
-    """The study's pages and their WebSocket; see `deploy.page.server.Annex`.
+    """The study's pages and their WebSocket; see `deploy.page.server.PageExtension`.
 
     What is asked of the participant lies over the operator's page; in a trial it is a bar at its
     upper edge.
@@ -151,8 +151,8 @@ class StudyPages:
 
     def __init__(self, conductor: Conductor) -> None:
         self._conductor = conductor
-        kind, index = static("deploy.page")["/index.html"]
-        self.files: Mapping[str, tuple[str, bytes]] = static("deploy.study") | {
+        kind, index = read_static_files("deploy.page")["/index.html"]
+        self.files: Mapping[str, tuple[str, bytes]] = read_static_files("deploy.study") | {
             "/": (kind, index.replace(b"</head>", HEAD, 1))
         }
 

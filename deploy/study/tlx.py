@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
-from brokk_rl.errors import choices
+from brokk_rl.errors import list_choices
 
 SCALES = {
     "mental": "Mental demand",
@@ -43,7 +43,7 @@ def check(answers: Mapping) -> list[str]:
         found.append(f"{', '.join(lacking)} not answered: no raw score")
     for scale, value in ratings.items():
         if scale not in SCALES:
-            found.append(f"unknown scale '{scale}'; {choices(scale, SCALES)}")
+            found.append(f"unknown scale '{scale}'; {list_choices(scale, SCALES)}")
         elif value is not None and not (isinstance(value, (int, float)) and 0 <= value <= 100):
             found.append(f"{scale} is {value!r}, expected 0 to 100: not counted")
     if chosen and _weights(chosen) is None:

@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from brokk_rl import record
-from brokk_rl.chain import tool
 from brokk_rl.errors import BrokkError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.study import folder as folders
@@ -165,7 +165,9 @@ class Attempt:
         elif self._phase == "running" and sight.q is not None:
             inside = (
                 insertion(
-                    tool(self._machine, sight.q).tip_in_base_m[None], self._hole, self._success
+                    compute_tool_kinematics(self._machine, sight.q).tip_in_base_m[None],
+                    self._hole,
+                    self._success,
                 )
                 is not None
             )

@@ -14,13 +14,13 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from deploy.policy.adviser import REASONS, Advised
-from deploy.recorder import reading
+from deploy.policy.policy_process import REASONS, AdviceStatus
+from deploy.recorder import capture_reader
 from deploy.recorder.capture import MCAP
-from deploy.recorder.conversion import CaptureLog
-from deploy.runtime.shm_layout import Exchange
+from deploy.recorder.conversion import CaptureLogReader
+from deploy.runtime.shm_layout import LoopMemory
 from deploy.study.design import Hole
-from deploy.twin.faults import ask
+from deploy.twin.faults import request_fault
 
 FRESH_S = 0.3
 """Age of positions and advice from which they are not there."""
@@ -79,23 +79,23 @@ class LoopStage:
     """The loop's machine or twin.
 
     Args:
-        exchange: Of the loop.
+        memory: Of the loop.
         machine: The machine.
         target: File that says to the loop where the hole is.
         port: Where the twin can be told to be put elsewhere; `None` on a machine.
     """
 
     def __init__(
-        self, exchange: Exchange, machine: Machine, target: Path, port: int | None
+        self, memory: LoopMemory, machine: Machine, target: Path, port: int | None
     ) -> None:
-        self._exchange, self._machine, self._target, self._port = exchange, machine, target, port
+        self._memory, self._machine, self._target, self._port = memory, machine, target, port
 
     def sight(self) -> Sight:
         """See `Stage`."""
         state, advice, controls = (
-            self._exchange.state.read(),
-            self._exchange.advice.read(),
-            self._exchange.controls.read(),
+            self._memory.state.read(),
+            self._memory.advice.read(),
+            self._memory.controls.read(),
         )
         now_s = time.monotonic()
         fresh = (
@@ -103,7 +103,7 @@ class LoopStage:
             and now_s - float(state["q_t_s"]) < FRESH_S
             and bool(state["q_plausible"])
         )
-        advised = Advised.NO_STATE
+        advised = AdviceStatus.NO_STATE
         if advice is not None and now_s - float(advice["t_s"]) < FRESH_S:
             advised = REASONS[int(advice["reason"])]
         recording = controls is not None and bool(controls["recording"])
@@ -117,7 +117,7 @@ class LoopStage:
         if self._port is not None:
             place = {"q": start.tolist(), "hole_in_base_m": list(hole.center_in_base_m)}
             try:
-                ask(self._port, {"place": place}, timeout_s=2.0)
+                request_fault(self._port, {"place": place}, timeout_s=2.0)
             except OSError as error:
                 raise RecordingError(
                     f"the twin does not answer on port {self._port} ({error}); is it running?"
@@ -130,19 +130,21 @@ class LoopStage:
             if folder is None
             else {"kind": "record", "value": "on", "into": str(folder)}
         )
-        self._exchange.wishes.put(json.dumps(wish).encode())
+        self._memory.wishes.put(json.dumps(wish).encode())
 
     def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
         """See `Stage`."""
         path, patience_s = folder / MCAP, time.monotonic() + CLOSING_S
-        while not (path.exists() and reading.is_whole(path)) and time.monotonic() < patience_s:
+        while (
+            not (path.exists() and capture_reader.is_whole(path)) and time.monotonic() < patience_s
+        ):
             time.sleep(0.2)
         try:
-            return CaptureLog(longest_gap_s=GAP_S, shortest_s=0.0).between(
+            return CaptureLogReader(longest_gap_s=GAP_S, shortest_s=0.0).between(
                 path, self._machine, begin_s, end_s
             )
         except RecordingError:
-            found = CaptureLog(longest_gap_s=LONGEST_GAP_S, shortest_s=0.0).between(
+            found = CaptureLogReader(longest_gap_s=LONGEST_GAP_S, shortest_s=0.0).between(
                 path, self._machine, begin_s, end_s
             )
         return replace(

@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from brokk_rl.errors import BrokkError
-from deploy.runtime.process import Child, Stop
+from deploy.runtime.process import ChildProcess, Stop
 
 PATIENCE_S = 5.0
 
@@ -35,12 +35,12 @@ class Crew:
         self, build: str, parts: Sequence[tuple[Any, ...]], rows: Sequence[np.ndarray], count: int
     ) -> None:
         self._build, self._parts, self._rows, self._count = build, parts, rows, count
-        self._children: list[tuple[Child, Channel]] = []
+        self._children: list[tuple[ChildProcess, Channel]] = []
 
     def __enter__(self) -> Self:
         for number, part in enumerate(self._parts):
             mine, theirs = socket.socketpair()
-            child = Child(
+            child = ChildProcess(
                 f"twins {number + 1}",
                 "deploy.study.twin_pool:work",
                 (theirs.fileno(), self._build, part),

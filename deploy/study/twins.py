@@ -17,34 +17,34 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 
-from brokk_rl.chain import tool
 from brokk_rl.contracts.link import Connection
 from brokk_rl.contracts.operator import OperatorModel, OperatorView, TrialBatch
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.bus.description import Description
-from deploy.bus.wire import Wire, Wired
-from deploy.guard.limits import Limits
-from deploy.guidance import Guidance, LeverMap
-from deploy.policy.adviser import REASONS, Advised, Adviser, Counsel
-from deploy.policy.bundle import Bundle
-from deploy.runtime.receiver import Receiver
-from deploy.runtime.shm_layout import advice_fields, state_fields
+from deploy.bus.can_bus import CanBus, CanFrame
+from deploy.bus.description import BusDescription
+from deploy.guard.limits import GuardLimits
+from deploy.guidance import LeverGuidance, LeverMap
+from deploy.policy.bundle import PolicyBundle
+from deploy.policy.policy_process import REASONS, AdviceStatus, PolicyAdviser, PolicyProcessConfig
+from deploy.runtime.receiver import BusReceiver
+from deploy.runtime.shm_layout import build_advice_fields, build_state_fields
 from deploy.study.twin_pool import Crew, cores
 from deploy.twin.faults import FaultPort
-from deploy.twin.gateway import axis_full_rad
-from deploy.twin.remote import Remote
-from deploy.twin.twin import CYCLE_S, Running, Twin
+from deploy.twin.gateway import find_axis_full_rad
+from deploy.twin.remote import RadioRemote
+from deploy.twin.twin import CYCLE_S, RunningTwin, Twin
 
 BEGIN_S = 1000.0
 """Of the clock; nothing in the loop may take a small number for a time."""
 BEFORE_S = 1.0
 """For which everything runs before a trial begins: the policy's history is full then."""
-NO_BUS = Wire(interface="virtual", channel="none", bitrate=None, port=None)
-VALID = REASONS.index(Advised.VALID)
+NO_BUS = CanBus(interface="virtual", channel="none", bitrate=None, port=None)
+VALID = REASONS.index(AdviceStatus.VALID)
 TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,))])
 
 
@@ -64,8 +64,8 @@ class Twins:
 
     plant: Connection
     dbc: str
-    limits: Limits
-    guidance: Guidance
+    limits: GuardLimits
+    guidance: LeverGuidance
     policy: str
     settle_s: float
     num_processes: int
@@ -121,7 +121,7 @@ def desks(
     places: list[tuple[int, np.ndarray, np.ndarray, bool]],
 ) -> list[_Desk]:
     """Returns a desk for each of `places`: seed, start, rim, and whether advice is shown there."""
-    bundle, description = Bundle(ground.policy, machine), Description(ground.dbc, machine)
+    bundle, description = PolicyBundle(ground.policy, machine), BusDescription(ground.dbc, machine)
     made = [
         _Desk(ground, machine, description, bundle, replace(session, seed=seed), q, rim, guided)
         for seed, q, rim, guided in places
@@ -132,7 +132,7 @@ def desks(
 
 
 def _inserted(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray:
-    away = tool(machine, q).tip_in_base_m - trials.rim_in_base_m
+    away = compute_tool_kinematics(machine, q).tip_in_base_m - trials.rim_in_base_m
     return (np.hypot(away[:, 0], away[:, 1]) <= trials.clearance_m) & (
         away[:, 2] <= -trials.depth_m
     )
@@ -161,7 +161,7 @@ class _NoLog:
 
 @dataclass
 class _Shared:
-    """What an adviser reads and writes of an exchange."""
+    """What an adviser reads and writes of the shared memory."""
 
     state: _Newest
     advice: _Newest
@@ -174,12 +174,12 @@ class _Air:
     """Frames on their way from the twin."""
 
     def __init__(self) -> None:
-        self.frames: list[Wired] = []
+        self.frames: list[CanFrame] = []
 
-    def recv(self, timeout_s: float) -> Wired | None:
+    def recv(self, timeout_s: float) -> CanFrame | None:
         return None
 
-    def send(self, frame: Wired) -> None:
+    def send(self, frame: CanFrame) -> None:
         self.frames.append(frame)
 
 
@@ -187,7 +187,7 @@ class _Desk:
     """One trial: twin, remote and loop on a clock of their own."""
 
     def __init__(
-        self, ground: Twins, machine: Machine, description: Description, bundle: Bundle, session: Session, q: np.ndarray,
+        self, ground: Twins, machine: Machine, description: BusDescription, bundle: PolicyBundle, session: Session, q: np.ndarray,
         rim_m: np.ndarray, guided: bool,
     ) -> None:  # fmt: skip
         self._seed, self._guided = session.seed, guided
@@ -205,27 +205,27 @@ class _Desk:
             seconds=None,
             realtime=False,
         )
-        self._twin = Running(twin, machine, self._link, self._air, FaultPort(None))
+        self._twin = RunningTwin(twin, machine, self._link, self._air, FaultPort(None))
         self._remote, self._receiver = (
-            Remote(description),
-            Receiver(description, machine, ground.limits),
+            RadioRemote(description),
+            BusReceiver(description, machine, ground.limits),
         )
         self._remote.deadman = True
         target = np.zeros((), TARGET)
         target["t_s"], target["center_in_base_m"] = BEGIN_S, rim_m
-        fields = state_fields(machine.num_joints), advice_fields(machine.num_joints)
+        fields = build_state_fields(machine.num_joints), build_advice_fields(machine.num_joints)
         self._shared = _Shared(
             _Newest(fields[0]), _Newest(fields[1]), _Newest(TARGET, target), None, _NoLog()
         )
-        counsel = Counsel(
+        counsel = PolicyProcessConfig(
             machine, ground.policy, ground.guidance, ground.limits.joints_s, 1e9, None
         )
-        self._adviser = Adviser(counsel, bundle, self._shared)  # type: ignore[arg-type]
+        self._adviser = PolicyAdviser(counsel, bundle, self._shared)  # type: ignore[arg-type]
         self._own, self._display = (
             LeverMap(machine.levers, machine),
             LeverMap(ground.guidance.levers or machine.levers, machine),
         )
-        self._full_rad, self._cycles = axis_full_rad(machine), 0
+        self._full_rad, self._cycles = find_axis_full_rad(machine), 0
         self._rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
         self._shown = np.zeros(machine.num_joints)
 

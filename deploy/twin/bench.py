@@ -10,13 +10,13 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.guidance import Guidance, LeverMap
-from deploy.runtime.supervisor import Companion
+from deploy.guidance import LeverGuidance, LeverMap
+from deploy.runtime.supervisor import CompanionProcess
 from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 
 @spec
-class Bench:
+class TwinBench:
     """What stands in for machine and operator.
 
     Attributes:
@@ -32,7 +32,7 @@ class Bench:
     twin: Twin
     plant: Connection
     operator: Follower | None
-    guidance: Guidance
+    guidance: LeverGuidance
     assumed: dict[str, Any] | None
 
     def check(self) -> None:
@@ -41,10 +41,10 @@ class Bench:
                 "bench: the remote is played by the twin (twin.remote=true) or by an operator, not by both or neither"
             )
 
-    def companions(self, machine: Machine, session: Session) -> list[Companion]:
+    def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
         """Returns the processes to run beside the loop."""
         found = [
-            Companion(
+            CompanionProcess(
                 "twin",
                 "deploy.twin.twin:run",
                 (self.twin, machine, self.plant, session),
@@ -55,9 +55,9 @@ class Bench:
             levers = LeverMap(self.guidance.levers or machine.levers, machine)
             wire, dbc, seed = self.twin.wire, self.twin.dbc, session.stream("operator")
             found.append(
-                Companion(
+                CompanionProcess(
                     "operator",
-                    "deploy.twin.remote:operate",
+                    "deploy.twin.remote:run_operator",
                     (wire, dbc, machine, self.operator, levers, seed),
                     TWIN_PRIORITY,
                 )

@@ -14,9 +14,9 @@ import socket
 import time
 from dataclasses import dataclass, field
 
-from brokk_rl.errors import ConfigError, choices
-from deploy.bus.description import Layout
-from deploy.bus.wire import Wired
+from brokk_rl.errors import ConfigError, list_choices
+from deploy.bus.can_bus import CanFrame
+from deploy.bus.description import MessageLayout
 
 FRAME_FAULTS = (
     "drop",
@@ -51,7 +51,7 @@ KNOWN = ("none", *FRAME_FAULTS, *SIGNAL_FAULTS, *MACHINE_FAULTS)
 
 
 @dataclass
-class Faults:
+class ActiveFaults:
     """The faults that are on.
 
     Attributes:
@@ -59,8 +59,8 @@ class Faults:
     """
 
     until_s: dict[tuple[str, str], float] = field(default_factory=dict)
-    _held: dict[str, Wired] = field(default_factory=dict)
-    _late: list[tuple[float, Wired]] = field(default_factory=list)
+    _held: dict[str, CanFrame] = field(default_factory=dict)
+    _late: list[tuple[float, CanFrame]] = field(default_factory=list)
     _chance: random.Random = field(default_factory=lambda: random.Random(0))
     _since_s: dict[str, float] = field(default_factory=dict)
     _place: tuple[list[float], list[float]] | None = None
@@ -89,7 +89,7 @@ class Faults:
                 f"fault: expected JSON with 'fault', got {text[:80]!r} ({error})"
             ) from error
         if fault not in KNOWN:
-            raise ConfigError(f"fault: there is no '{fault}'; {choices(str(fault), KNOWN)}")
+            raise ConfigError(f"fault: there is no '{fault}'; {list_choices(str(fault), KNOWN)}")
         if fault == "none":
             self.until_s.clear()
         else:
@@ -109,7 +109,7 @@ class Faults:
         """Returns how long ago a fault was asked for."""
         return now_s - self._since_s.get(fault, now_s)
 
-    def pass_on(self, layout: Layout, frame: Wired, now_s: float) -> list[Wired]:
+    def pass_on(self, layout: MessageLayout, frame: CanFrame, now_s: float) -> list[CanFrame]:
         """Returns what is to be sent now in place of `frame`."""
         name = layout.name
 
@@ -125,7 +125,9 @@ class Faults:
             data[layout.crc_byte] ^= 0x5A
         if on("short"):
             del data[-1]
-        frame = Wired(frame.frame_id ^ (0x10 if on("wrong_id") else 0), bytes(data), frame.extended)
+        frame = CanFrame(
+            frame.frame_id ^ (0x10 if on("wrong_id") else 0), bytes(data), frame.extended
+        )
         if on("delay"):
             self._late.append((now_s + 0.2, frame))
             return []
@@ -137,7 +139,7 @@ class Faults:
             return [frame, held]
         return [frame, frame] if on("duplicate") else [frame]
 
-    def due(self, now_s: float) -> list[Wired]:
+    def due(self, now_s: float) -> list[CanFrame]:
         """Returns the frames that were held up until now."""
         ripe = [frame for at_s, frame in self._late if at_s <= now_s]
         self._late = [(at_s, frame) for at_s, frame in self._late if at_s > now_s]
@@ -158,7 +160,7 @@ class FaultPort:
             self._socket.bind(("127.0.0.1", port))
             self._socket.setblocking(False)
 
-    def poll(self, faults: Faults) -> str | None:
+    def poll(self, faults: ActiveFaults) -> str | None:
         """Takes a request that has come in, if any, and answers it; returns its text."""
         if self._socket is None:
             return None
@@ -182,7 +184,7 @@ class FaultPort:
             self._socket.close()
 
 
-def ask(port: int, request: dict[str, object], timeout_s: float = 1.0) -> str:
+def request_fault(port: int, request: dict[str, object], timeout_s: float = 1.0) -> str:
     """Sends a request to a twin on this computer and returns its answer."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         asking.settimeout(timeout_s)

@@ -16,10 +16,10 @@ from enum import Enum
 import numpy as np
 
 from brokk_rl.machine import Machine
-from deploy.bus.description import COUNTER, LEVER_AXES, Description
-from deploy.bus.protection import Channel, Fault, Trust
-from deploy.bus.wire import Wired
-from deploy.guidance import AXES, LeverMap, full_angles_rad
+from deploy.bus.can_bus import CanFrame
+from deploy.bus.description import COUNTER, LEVER_AXES, BusDescription
+from deploy.bus.protection import ChannelTrust, MessageFault, ProtectedChannel
+from deploy.guidance import AXES, LeverMap, find_full_angles_rad
 
 TIMEOUT_S = 0.07
 """Age of the last valid command from which there is none; three cycles and a half, within the 100
@@ -53,28 +53,33 @@ class Gateway:
         heard_s: Since when the PC is heard.
     """
 
-    def __init__(self, description: Description, machine: Machine) -> None:
+    def __init__(self, description: BusDescription, machine: Machine) -> None:
         self._description, self._machine = description, machine
         self._command = description.command
         self._remote = description.layouts[description.message_of("DeadMan")]
-        self._channels = {one.name: Channel(one.modulus) for one in (self._command, self._remote)}
+        self._channels = {
+            one.name: ProtectedChannel(one.modulus) for one in (self._command, self._remote)
+        }
         self._map = LeverMap(machine.levers, machine)
-        self._axis_full_rad = axis_full_rad(machine)
+        self._axis_full_rad = find_axis_full_rad(machine)
         self._u, self._u_s, self._mode, self._idle = np.zeros(machine.num_joints), -np.inf, 0, 0
         self._lever, self._remote_s = np.zeros(len(AXES)), -np.inf
         self._button = self._deadman = self._on = False
         self.estop, self.heard_s = False, np.inf
 
-    def take(self, frame: Wired, now_s: float) -> None:
+    def take(self, frame: CanFrame, now_s: float) -> None:
         """Takes in a frame of PC or remote."""
         layout = self._description.by_id.get(frame.frame_id)
         if layout is None or layout.name not in self._channels:
             return
         channel, values = self._channels[layout.name], self._description.decode(layout, frame.data)
-        if isinstance(values, Fault):
+        if isinstance(values, MessageFault):
             channel.refuse(values)
             return
-        if channel.take(int(values[COUNTER])) is not None or channel.trust is not Trust.VALID:
+        if (
+            channel.take(int(values[COUNTER])) is not None
+            or channel.trust is not ChannelTrust.VALID
+        ):
             return
         if layout is self._remote:
             self._lever = np.array([values[f"Lever_{axis}"] for axis in LEVER_AXES])
@@ -120,9 +125,9 @@ class Gateway:
         return self._button
 
     def _trusts(self, name: str) -> bool:
-        return self._channels[name].trust is not Trust.INVALID
+        return self._channels[name].trust is not ChannelTrust.INVALID
 
 
-def axis_full_rad(machine: Machine) -> np.ndarray:
+def find_axis_full_rad(machine: Machine) -> np.ndarray:
     """Returns the angle of each of the four axes at full deflection, `(4,)`; 1 where no joint hangs on it."""
-    return np.array(full_angles_rad(machine.levers))
+    return np.array(find_full_angles_rad(machine.levers))

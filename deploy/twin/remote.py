@@ -10,15 +10,15 @@ import numpy as np
 
 from brokk_rl.contracts.actuator import Follower
 from brokk_rl.machine import Machine
-from deploy.bus.description import LEVER_AXES, Description
-from deploy.bus.wire import Wire, Wired
+from deploy.bus.can_bus import CanBus, CanFrame
+from deploy.bus.description import LEVER_AXES, BusDescription
 from deploy.guidance import AXES, LeverMap
-from deploy.runtime.process import Pace, Stop
-from deploy.runtime.shm_layout import Exchange
-from deploy.twin.gateway import axis_full_rad
+from deploy.runtime.process import CycleTimer, Stop
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.twin.gateway import find_axis_full_rad
 
 
-class Remote:
+class RadioRemote:
     """Makes the remote's messages.
 
     Args:
@@ -31,7 +31,7 @@ class Remote:
         on: Whether it is switched on.
     """
 
-    def __init__(self, description: Description) -> None:
+    def __init__(self, description: BusDescription) -> None:
         self._description = description
         self._layout = description.layouts[description.message_of("DeadMan")]
         self.period_s = self._layout.period_s
@@ -40,29 +40,29 @@ class Remote:
         self.on = True
         self._counter = 0
 
-    def frame(self, frozen: int | None = None) -> Wired:
+    def frame(self, frozen: int | None = None) -> CanFrame:
         """Returns the next message; `frozen` is a counter that stands still, a fault."""
         values: dict[str, float] = {
             f"Lever_{axis}": value for axis, value in zip(LEVER_AXES, self.levers, strict=True)
         }
         values |= {"ButtonRight": self.button_right, "DeadMan": self.deadman, "RemoteOn": self.on}
         self._counter = self._counter + 1 if frozen is None else frozen
-        return Wired(
+        return CanFrame(
             self._layout.frame_id,
             self._description.encode(self._layout.name, values, self._counter),
             self._layout.extended,
         )
 
 
-def operate(
+def run_operator(
     stop: Stop,
-    wire: Wire,
+    wire: CanBus,
     dbc: str,
     machine: Machine,
     follower: Follower,
     levers: LeverMap,
     seed: int,
-    exchange: Exchange,
+    memory: LoopMemory,
 ) -> None:
     """Runs a simulated operator: reads the outlet as a person reads the page, and moves the levers as `follower` says.
 
@@ -71,10 +71,10 @@ def operate(
     import torch
 
     torch.manual_seed(seed)
-    description = Description(dbc, machine)
-    remote, hands = Remote(description), follower.build(machine, 1, torch.device("cpu"))
+    description = BusDescription(dbc, machine)
+    remote, hands = RadioRemote(description), follower.build(machine, 1, torch.device("cpu"))
     per_period = round(machine.period_s / remote.period_s)
-    full_rad, pace, cycle = axis_full_rad(machine), Pace(remote.period_s), 0
+    full_rad, pace, cycle = find_axis_full_rad(machine), CycleTimer(remote.period_s), 0
     remote.deadman = True
     own = LeverMap(
         machine.levers, machine
@@ -85,9 +85,9 @@ def operate(
             pace.begin()
             if cycle % per_period == 0:
                 with torch.inference_mode():
-                    proposed = torch.as_tensor(_proposed(exchange, levers), dtype=torch.float32)[
-                        None
-                    ]
+                    proposed = torch.as_tensor(
+                        _read_displayed_command(memory, levers), dtype=torch.float32
+                    )[None]
                     given = hands.step(proposed)[0].numpy().astype(float)
                 angles_rad, remote.button_right = own.levers(given)
                 remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
@@ -95,9 +95,9 @@ def operate(
             bus.send(remote.frame())
 
 
-def _proposed(exchange: Exchange, levers: LeverMap) -> np.ndarray:
+def _read_displayed_command(memory: LoopMemory, levers: LeverMap) -> np.ndarray:
     """Returns the commands that the shown lever positions stand for."""
-    advice: Any = exchange.advice.read()
+    advice: Any = memory.advice.read()
     if advice is None or time.monotonic() - float(advice["t_s"]) > 0.5:
         return np.zeros(len(levers.full_rad))
     return levers.command(np.array(advice["lever_rad"]), bool(advice["button_right"]))

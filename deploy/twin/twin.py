@@ -19,13 +19,12 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
-from deploy.bus.description import GATEWAY, Description
-from deploy.bus.header import c_header
-from deploy.bus.wire import Wire, Wired
-from deploy.runtime.process import Pace, Stop, ask_for_priority
-from deploy.twin.faults import FaultPort, Faults
+from deploy.bus.can_bus import CanBus, CanFrame
+from deploy.bus.description import GATEWAY, BusDescription, generate_c_header
+from deploy.runtime.process import CycleTimer, Stop, ask_for_priority
+from deploy.twin.faults import ActiveFaults, FaultPort
 from deploy.twin.gateway import NOBODY, PC, Gateway
-from deploy.twin.remote import Remote
+from deploy.twin.remote import RadioRemote
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +57,7 @@ class Twin:
         realtime: Whether to ask for real-time priority: a machine is never late.
     """
 
-    wire: Wire
+    wire: CanBus
     dbc: str
     remote: bool
     deadman: bool
@@ -84,13 +83,13 @@ class Twin:
         if self.realtime:
             ask_for_priority(TWIN_PRIORITY)
         session.folder.mkdir(parents=True, exist_ok=True)
-        write_text(session.folder / HEADER, c_header(Description(self.dbc, machine)))
+        write_text(session.folder / HEADER, generate_c_header(BusDescription(self.dbc, machine)))
         with (
             plant.build(machine, 1, session) as link,
             self.wire.open() as bus,
             FaultPort(self.fault_port) as port,
         ):
-            Running(self, machine, link, bus, port).run(stop)
+            RunningTwin(self, machine, link, bus, port).run(stop)
 
 
 def run(
@@ -99,25 +98,25 @@ def run(
     machine: Machine,
     plant: Connection,
     session: Session,
-    exchange: Any = None,
+    memory: Any = None,
 ) -> None:
     """Runs a twin as a child process."""
     twin.run(stop, machine, plant, session)
 
 
-class Bus(Protocol):
+class FrameBus(Protocol):
     """Where a twin's messages go: an open wire, or whatever stands in for one."""
 
-    def recv(self, timeout_s: float) -> Wired | None:
+    def recv(self, timeout_s: float) -> CanFrame | None:
         """Returns the next frame, `None` when none came in time."""
         ...
 
-    def send(self, frame: Wired) -> None:
+    def send(self, frame: CanFrame) -> None:
         """Sends a frame."""
         ...
 
 
-class Running:
+class RunningTwin:
     """A twin at work; `run` in real time, or cycle by cycle by whoever keeps the time.
 
     Args:
@@ -128,7 +127,9 @@ class Running:
         port: Where faults are asked for.
     """
 
-    def __init__(self, twin: Twin, machine: Machine, link: Link, bus: Bus, port: FaultPort) -> None:
+    def __init__(
+        self, twin: Twin, machine: Machine, link: Link, bus: FrameBus, port: FaultPort
+    ) -> None:
         self._twin, self._machine, self._link, self._bus, self._port = (
             twin,
             machine,
@@ -136,13 +137,16 @@ class Running:
             bus,
             port,
         )
-        self._description = Description(twin.dbc, machine)
-        self._gateway, self._remote = Gateway(self._description, machine), Remote(self._description)
-        self._faults, self._pace = Faults(), Pace(CYCLE_S)
+        self._description = BusDescription(twin.dbc, machine)
+        self._gateway, self._remote = (
+            Gateway(self._description, machine),
+            RadioRemote(self._description),
+        )
+        self._faults, self._pace = ActiveFaults(), CycleTimer(CYCLE_S)
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
         self._q = self._before = np.asarray(link.read().q, dtype=float)
-        self._flow, self._oil_c = np.zeros(machine.num_joints), _oil_c(link)
+        self._flow, self._oil_c = np.zeros(machine.num_joints), _read_oil_c(link)
         self._source, self._grip_s = NOBODY, -np.inf
         self._period_began_s = -np.inf
         self._stuck: np.ndarray | None = None
@@ -165,7 +169,7 @@ class Running:
                 log.warning("%s", error)
                 self._pace.wait()
 
-    def hear(self, frame: Wired, now_s: float) -> None:
+    def hear(self, frame: CanFrame, now_s: float) -> None:
         """Takes in a frame of PC or remote, and acts on it if it stops the machine."""
         if frame.frame_id not in self._own:
             self._gateway.take(frame, now_s)
@@ -187,7 +191,10 @@ class Running:
             self._period_began_s = now_s if late else self._period_began_s + self._machine.period_s
             self._before = self._q
             self._link.send(Command(flow))
-            self._q, self._oil_c = np.asarray(self._link.read().q, dtype=float), _oil_c(self._link)
+            self._q, self._oil_c = (
+                np.asarray(self._link.read().q, dtype=float),
+                _read_oil_c(self._link),
+            )
         values = self._positions(now_s) | said | {"Stamp": int(1e3 * now_s) % 65536 / 1e3}
         for layout in self._description.sent_by(GATEWAY):
             self._send(layout.name, values, now_s)
@@ -196,14 +203,14 @@ class Running:
         if faults.on("second_sender", "", now_s):
             command = self._description.command
             self._bus.send(
-                Wired(
+                CanFrame(
                     command.frame_id,
                     self._description.encode(command.name, {}, self._counters.get("JointPos1", 0)),
                 )
             )
         if faults.on("flood", "", now_s):
             for _ in range(FLOOD):
-                self._bus.send(Wired(0x1FFF0000, bytes(8)))
+                self._bus.send(CanFrame(0x1FFF0000, bytes(8)))
 
     def _place(self, q: list[float], hole_in_base_m: list[float]) -> None:
         """Puts machine and block elsewhere, as between two trials of a study; a plant that cannot be put stays where it is."""
@@ -276,7 +283,7 @@ class Running:
             name, values, FROZEN if self._faults.on("freeze_counter", name, now_s) else counter
         )
         for one in self._faults.pass_on(
-            layout, Wired(layout.frame_id, data, layout.extended), now_s
+            layout, CanFrame(layout.frame_id, data, layout.extended), now_s
         ):
             self._bus.send(one)
 
@@ -308,7 +315,7 @@ class Running:
         return values | {f"Valid_{name}": valid for name in names}
 
 
-def _oil_c(link: Link) -> float:
+def _read_oil_c(link: Link) -> float:
     """Returns the oil's temperature as the bus can say it, in degrees Celsius."""
     extra = getattr(link, "extra", dict)()
     return (

@@ -11,12 +11,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from brokk_rl.comparison import EVALUATION
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.compare import EVALUATION
 from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
 from brokk_rl.modes.train import Train
 from brokk_rl.rl.policy import CONTRACT, Trained

@@ -22,7 +22,7 @@ from rich.console import Console
 from brokk_rl.contracts.actuator import Effect
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import BrokkError, ConfigError, RecordingError, choices
+from brokk_rl.errors import BrokkError, ConfigError, RecordingError, list_choices
 from brokk_rl.modes.evaluate import Evaluation
 from brokk_rl.report import Cell, Report, Tone
 from brokk_rl.rl.runner import Training
@@ -272,7 +272,7 @@ class StoryStage:
         for name in self.takes:
             if name not in (*HANDED_ON_GROUPS, "device"):
                 raise ConfigError(
-                    f"a stage takes '{name}', which the story does not have; {choices(name, (*HANDED_ON_GROUPS, 'device'))}"
+                    f"a stage takes '{name}', which the story does not have; {list_choices(name, (*HANDED_ON_GROUPS, 'device'))}"
                 )
 
 

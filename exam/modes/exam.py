@@ -21,7 +21,7 @@ from rich.table import Table
 from actuators.excite.plan.schedule import Approach
 from brokk_rl import record
 from brokk_rl.contracts.actuator import ActuatorFit, Excitation
-from brokk_rl.errors import ConfigError, RecordingError, choices
+from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
@@ -111,7 +111,7 @@ class ExamSettings:
         for name in self.mix.troubles:
             if name not in self.plants.effects:
                 raise ConfigError(
-                    f"exam.mix.troubles: no plant has '{name}'; {choices(name, self.plants.effects)}"
+                    f"exam.mix.troubles: no plant has '{name}'; {list_choices(name, self.plants.effects)}"
                 )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from exam.plants.plant_parameters import PlantParameters
 from exam.plants.valve import LAND_LEAK
 
@@ -161,6 +161,8 @@ def apply_faults(numbers: PlantParameters, faults: Mapping[str, FaultSizes]) -> 
     found = {name: value.copy() for name, value in numbers.items()}
     for name, size in faults.items():
         if name not in FAULTS:
-            raise ConfigError(f"exam: no plant has the effect '{name}'; {choices(name, FAULTS)}")
+            raise ConfigError(
+                f"exam: no plant has the effect '{name}'; {list_choices(name, FAULTS)}"
+            )
         FAULTS[name](found, size)
     return found

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.signal import lfilter
 
-from brokk_rl.errors import ConfigError, choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command, JointState
 from brokk_rl.spec import spec
@@ -240,7 +240,7 @@ class HydraulicPlants:
             if specimen.roughness not in self.roughness:
                 raise ConfigError(
                     f"exam: no roughness '{specimen.roughness}' in exam.plants.roughness; "
-                    f"{choices(specimen.roughness, self.roughness)}"
+                    f"{list_choices(specimen.roughness, self.roughness)}"
                 )
             make, numbers = plant_parameters.draw_plant(
                 machine, specimen.seed, self.roughness[specimen.roughness]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.contracts.vision import HolePose, Observer, Sighting
+from brokk_rl.contracts.vision import FrameDetections, HolePose, Observer
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
@@ -112,7 +112,9 @@ class Tally:
         )
 
 
-def judge(observer: Observer, frame: Frame, truth: dataset.Truth) -> tuple[Tally, Sighting]:
+def judge(
+    observer: Observer, frame: Frame, truth: dataset.SceneTruth
+) -> tuple[Tally, FrameDetections]:
     """Returns what was counted on one frame, and what the finder saw in it: nothing where it refused the frame as a whole."""
     tally = Tally(frames=1)
     start = time.perf_counter()
@@ -120,14 +122,16 @@ def judge(observer: Observer, frame: Frame, truth: dataset.Truth) -> tuple[Tally
         sighting = observer.look(frame)
     except FrameError:
         tally.refused = 1
-        sighting = Sighting([], [], [], None)
+        sighting = FrameDetections([], [], [], None)
     for stage, value in {**sighting.ms, "total": 1000 * (time.perf_counter() - start)}.items():
         tally.ms[stage] = [value]
     compare(sighting.holes, truth, frame, tally)
     return tally, sighting
 
 
-def compare(holes: Sequence[HolePose], truth: dataset.Truth, frame: Frame, tally: Tally) -> None:
+def compare(
+    holes: Sequence[HolePose], truth: dataset.SceneTruth, frame: Frame, tally: Tally
+) -> None:
     """Adds one frame: each true hole is found by the target nearest to its line of sight, each target finds one at most.
 
     Holes of which more than half of the rim is hidden, or that leave the picture, need not be
@@ -185,7 +189,7 @@ def _beside(pose: HolePose, center: np.ndarray, eye: np.ndarray) -> float:
     return float(np.linalg.norm(apart - (apart @ ray) * ray))
 
 
-def _in(circle: dataset.Circle, in_base: bool) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _in(circle: dataset.TrueCircle, in_base: bool) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return (
         (circle.center_in_base_m, circle.axis_in_base)
         if in_base

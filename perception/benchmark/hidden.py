@@ -167,7 +167,7 @@ def _patch(
 def _seen(owner: np.ndarray, ellipses: np.ndarray) -> np.ndarray:
     """Returns the part of each rim inside which its own ellipse is seen, `(C,)`."""
     inner = ellipses - (0, 0, 0.7, 0.7, 0)
-    points, _, length = conic.sample(inner, np.arange(180) * (np.pi / 90))
+    points, _, length = conic.sample_ellipses(inner, np.arange(180) * (np.pi / 90))
     place = np.rint((points + 0.5) * SUPERSAMPLING - 0.5).astype(int)
     mine = owner[place[..., 1], place[..., 0]] == np.arange(1, len(ellipses) + 1)[:, None]
     return (mine * length).sum(1) / length.sum(1)

@@ -158,7 +158,9 @@ def overlap(first: np.ndarray, second: np.ndarray) -> float:
     if np.hypot(first[0] - second[0], first[1] - second[1]) > first[2] + second[2]:
         return 0.0
     angles = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    one, two = (conic.sample(e[None], angles)[0][0].astype(np.float32) for e in (first, second))
+    one, two = (
+        conic.sample_ellipses(e[None], angles)[0][0].astype(np.float32) for e in (first, second)
+    )
     shared = cv2.intersectConvexConvex(one, two)[0]
     return float(shared / (cv2.contourArea(one) + cv2.contourArea(two) - shared))
 
@@ -181,7 +183,7 @@ def matches(found: Sequence[Ellipse], truth: np.ndarray, least: float = 0.8) -> 
 def moved(circle: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Returns the ellipses `(C, 5)` that circles, rows like theirs, are after a homography."""
     back = np.linalg.inv(homography)
-    return conic.ellipse_of(back.T @ conic.form(circle) @ back)
+    return conic.convert_forms_to_ellipses(back.T @ conic.build_quadratic_forms(circle) @ back)
 
 
 def _fill(canvas: np.ndarray, ellipse: np.ndarray, level: float) -> None:

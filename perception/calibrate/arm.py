@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 
 from brokk_rl import record
-from brokk_rl.chain import tool
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from perception.calibrate import rigid
 
@@ -37,7 +37,7 @@ def links(machine: Machine, q: np.ndarray) -> Links:
     Raises:
         ConfigError: the machine's geometry is not known.
     """
-    found = tool(machine, q)
+    found = compute_tool_kinematics(machine, q)
     origins, axes, along, tip = (
         found.joints_in_base_m,
         found.axes_in_base,

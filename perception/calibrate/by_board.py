@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from rich.progress import Progress
 
-from brokk_rl.contracts.vision import SourceSpec
+from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
@@ -69,7 +69,7 @@ class ByBoard:
         temperature_c: Of the day, for the record; `null` where nobody measured.
     """
 
-    source: SourceSpec
+    source: FrameSourceSpec
     board: BoardSpec
     joints: str
     corner_px: float

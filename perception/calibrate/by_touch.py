@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import yaml
 
-from brokk_rl.contracts.vision import SourceSpec
+from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
@@ -56,7 +56,7 @@ class ByTouch:
         temperature_c: Of the day, for the record; `null` where nobody measured.
     """
 
-    source: SourceSpec
+    source: FrameSourceSpec
     points: str
     tip_std_m: float
     click_px: float

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from brokk_rl.errors import FrameError
-from perception.sources import soundness
+from perception.sources import validation
 
 SCHEMA = 1
 Place = str | tuple[tuple[float, ...], ...] | None
@@ -43,7 +43,7 @@ def placed(given: Place, where: str) -> Placed:
     if given is None:
         return Placed(None, None)
     if not isinstance(given, str):
-        return Placed(soundness.pose(given, where), None)
+        return Placed(validation.check_pose(given, where), None)
     told, where = read(Path(given), where), f"{where}={given}"
     cov = np.asarray(told.get("covariance", np.zeros((6, 6))), float)
     if (
@@ -54,7 +54,7 @@ def placed(given: Place, where: str) -> Placed:
         raise FrameError(
             f"{where}: covariance: expected a covariance of six numbers, (6, 6); calibrate again"
         )
-    return Placed(soundness.pose(told["T_base_cam"], where), (cov + cov.T) / 2)
+    return Placed(validation.check_pose(told["T_base_cam"], where), (cov + cov.T) / 2)
 
 
 def read(path: Path, where: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def fit_ellipses(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Returns the ellipses that fit weighted points best, `(C, 5)`, rows of NaN where they determine none.
 
     Halir and Flusser (1998), the numerically stable form of Fitzgibbon's direct fit, on points
@@ -37,9 +37,11 @@ def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         return result
     t = -np.linalg.solve(s3[known], s2[known].transpose(0, 2, 1))
     m = s1[known] + s2[known] @ t
-    a, b, c = a1 = _largest(m[:, [2, 1, 0]] * np.array([0.5, -1.0, 0.5])[:, None])
+    a, b, c = a1 = _find_dominant_eigenvectors(
+        m[:, [2, 1, 0]] * np.array([0.5, -1.0, 0.5])[:, None]
+    )
     d, e, f = (t @ a1.T[:, :, None])[:, :, 0].T
-    fitted = _ellipse(a, b / 2, c, d / 2, e / 2, f)
+    fitted = _convert_coefficients(a, b / 2, c, d / 2, e / 2, f)
     fitted[4 * a * c - b * b <= 0] = np.nan
     fitted[:, :4] *= scale[known][:, None]
     fitted[:, :2] += center[known]
@@ -47,7 +49,7 @@ def fit(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return result
 
 
-def _largest(m: np.ndarray) -> np.ndarray:
+def _find_dominant_eigenvectors(m: np.ndarray) -> np.ndarray:
     """Returns the eigenvectors to the largest eigenvalues of matrices `(C, 3, 3)` whose eigenvalues are real, `(3, C)`.
 
     Of a direct fit it is the only positive one, which belongs to the ellipse. By the cubic's roots:
@@ -83,7 +85,7 @@ def _largest(m: np.ndarray) -> np.ndarray:
     return normals[best, :, np.arange(len(best))].T
 
 
-def form(ellipses: np.ndarray) -> np.ndarray:
+def build_quadratic_forms(ellipses: np.ndarray) -> np.ndarray:
     """Returns the forms `(C, 3, 3)` of ellipses `(C, 5)`, negative inside, with `F = (distance / axis)² - 1` along the axes."""
     x, y, a, b, theta = np.moveaxis(np.asarray(ellipses, dtype=float), -1, 0)
     u = np.stack([np.cos(theta), np.sin(theta)], -1) / a[..., None]
@@ -96,9 +98,9 @@ def form(ellipses: np.ndarray) -> np.ndarray:
     return np.concatenate([top, np.concatenate([side, last[..., None]], -1)[..., None, :]], -2)
 
 
-def ellipse_of(forms: np.ndarray) -> np.ndarray:
+def convert_forms_to_ellipses(forms: np.ndarray) -> np.ndarray:
     """Returns the ellipses `(C, 5)` of forms `(C, 3, 3)`, rows of NaN where a form is no ellipse."""
-    return _ellipse(
+    return _convert_coefficients(
         forms[:, 0, 0],
         forms[:, 0, 1],
         forms[:, 1, 1],
@@ -108,7 +110,7 @@ def ellipse_of(forms: np.ndarray) -> np.ndarray:
     )
 
 
-def _ellipse(
+def _convert_coefficients(
     a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, e: np.ndarray, last: np.ndarray
 ) -> np.ndarray:
     """Returns the ellipses `(C, 5)` of `a x² + 2 b xy + c y² + 2 d x + 2 e y + last`, rows of NaN where that is none."""
@@ -136,28 +138,30 @@ def _ellipse(
     return result
 
 
-def beside(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def measure_sampson_distance(
+    ellipses: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns Sampson's distance of points `(C, P, 2)` from their ellipses `(C, 5)`, negative inside, `(C, P)`.
 
     With it, the outward unit normals of the ellipses there, `(C, P, 2)`.
     """
-    value, slope = _value(ellipses, points)
-    length = np.maximum(np.sqrt(dot(slope, slope)), 1e-12)
+    value, slope = _evaluate_forms(ellipses, points)
+    length = np.maximum(np.sqrt(sum_products(slope, slope)), 1e-12)
     return value / length, slope / length[..., None]
 
 
-def slopes(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:
+def measure_form_gradients(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Returns the length of the gradient of each ellipse's form at its points, `(C, P)`: turns algebraic into geometric error."""
-    slope = _value(ellipses, points)[1]
-    return np.sqrt(dot(slope, slope))
+    slope = _evaluate_forms(ellipses, points)[1]
+    return np.sqrt(sum_products(slope, slope))
 
 
-def dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def sum_products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Returns the products of vectors of the picture, `(…, 2)`; much faster than a sum over so short an axis."""
     return one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1]
 
 
-def sample(
+def sample_ellipses(
     ellipses: np.ndarray, angles_rad: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns points, outward unit normals, `(C, P, 2)` each, and the arc length per radian `(C, P)` at eccentric angles `(P,)`."""
@@ -173,19 +177,19 @@ def sample(
     return points, outward, length
 
 
-def radii(ellipse: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def measure_radii(ellipse: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns how far places lie from an ellipse's centre in its own radii: 1 on it; shapes of `x` and `y`, which may differ."""
     c, s = np.cos(ellipse[4]), np.sin(ellipse[4])
     dx, dy = x - ellipse[0], y - ellipse[1]
     return np.hypot((c * dx + s * dy) / ellipse[2], (c * dy - s * dx) / ellipse[3])
 
 
-def perimeter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def compute_perimeter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Returns the circumference by Ramanujan's first formula."""
     return np.pi * (3 * (a + b) - np.sqrt((3 * a + b) * (a + 3 * b)))
 
 
-def _value(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _evaluate_forms(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     x, y, a, b, theta = (column[:, None] for column in ellipses.T)
     c, s = np.cos(theta), np.sin(theta)
     dx, dy = points[..., 0] - x, points[..., 1] - y
@@ -196,7 +200,7 @@ def _value(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
     return u * u + v * v - 1.0, slope
 
 
-def on_plane(
+def project_onto_plane(
     ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the curve on the plane `m · P = 1` that a camera sees as an ellipse, exactly.
@@ -217,11 +221,13 @@ def on_plane(
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
     homography = camera_matrix @ np.column_stack([first, second, origin])
-    curve = ellipse_of((homography.T @ form(ellipse) @ homography)[None])[0]
+    curve = convert_forms_to_ellipses(
+        (homography.T @ build_quadratic_forms(ellipse) @ homography)[None]
+    )[0]
     return origin + curve[0] * first + curve[1] * second, curve[2:4]
 
 
-def circles(
+def solve_circle_poses(
     ellipse: np.ndarray, camera_matrix: np.ndarray, radius_m: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns the circles of a known radius that a camera sees as an ellipse: two of them, told apart by something else.
@@ -236,7 +242,7 @@ def circles(
     Returns:
         Centre `(3,)` m and unit normal towards the camera `(3,)` of each.
     """
-    cone = camera_matrix.T @ form(ellipse) @ camera_matrix
+    cone = camera_matrix.T @ build_quadratic_forms(ellipse) @ camera_matrix
     values, vectors = np.linalg.eigh(
         cone if np.linalg.det(cone) < 0 else -cone
     )  # one negative value: the cone's axis

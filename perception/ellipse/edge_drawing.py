@@ -7,8 +7,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
-from perception.ellipse.arcs import ArcDetector
-from perception.ellipse.contour_arcs import ContourArcs
+from perception.ellipse.detector import ArcDetector, ContourArcs
 
 
 @spec
@@ -60,12 +59,12 @@ class EdgeDrawing:
 
         def propose(gray: np.ndarray) -> np.ndarray:
             drawing.detectEdges(gray.copy())
-            return rows_of(drawing.detectEllipses())
+            return convert_detections(drawing.detectEllipses())
 
         return ArcDetector(self.arcs, propose)
 
 
-def rows_of(found: np.ndarray | None) -> np.ndarray:
+def convert_detections(found: np.ndarray | None) -> np.ndarray:
     """Returns ellipses `(C, 5)` of what Edge Drawing answers, `(C, 1, 6)`: centre, radius of a circle, semi-axes, degrees."""
     if found is None or not len(found):
         return np.empty((0, 5))

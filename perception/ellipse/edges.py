@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 SCALE = 16.0
 """Gradients are given to Canny as whole numbers; in a dark picture they are a few grey levels a
@@ -55,7 +56,7 @@ class Edges:
 
     def cut(self, tolerance_px: float, corner_rad: float, least: int) -> Edges:
         """Returns the same edges with their convex arcs and their runs from corner to corner; see `_pieces`."""
-        arcs, runs = _pieces(self, tolerance_px, corner_rad, least)
+        arcs, runs = _split_chains(self, tolerance_px, corner_rad, least)
         step = np.zeros(len(self.points))
         step[2:-2] = (
             np.linalg.norm(self.points[4:] - self.points[:-4], axis=1) / 4
@@ -93,7 +94,7 @@ class Edges:
         return np.column_stack([start, stop])[near & smooth]
 
 
-def find(
+def detect_edges(
     gray: np.ndarray,
     roi: np.ndarray | None,
     sigma_px: float,
@@ -126,7 +127,7 @@ def find(
     some = np.s_[::2, ::2] if magnitude.size < MANY else np.s_[::4, ::4]
     looked = magnitude[some].ravel() if roi is None else magnitude[some][roi[some]]
     if not looked.size:
-        return _none(gray.shape)
+        return _make_empty_edges(gray.shape)
     ranks = [round(part / 100.0 * (looked.size - 1)) for part in (50.0, percentile)]
     median, upper = np.partition(looked, ranks)[ranks]
     sigma = float(median) / 1.18  # of a Rayleigh distribution
@@ -143,19 +144,19 @@ def find(
         if len(c) >= least
     ]
     if not contours:
-        return _none(gray.shape)
-    pixels, spans = _chains(contours, gray.shape, least)
+        return _make_empty_edges(gray.shape)
+    pixels, spans = _chain_pixels(contours, gray.shape, least)
     if not len(pixels):
-        return _none(gray.shape)
-    points, directions = _refined(pixels, gx, gy, magnitude)
+        return _make_empty_edges(gray.shape)
+    points, directions = _refine_points(pixels, gx, gy, magnitude)
     strength = magnitude[pixels[:, 1], pixels[:, 0]]
     return Edges(
-        points, directions, strength, _nearest(pixels, gray.shape, near_px), spans, NO_SPANS,
+        points, directions, strength, _map_nearest_edges(pixels, gray.shape, near_px), spans, NO_SPANS,
         np.full(len(points), -1), np.empty(0),
     )  # fmt: skip
 
 
-def _pieces(
+def _split_chains(
     edges: Edges, tolerance_px: float, corner_rad: float, least: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns convex arcs and runs as spans of edge points, `(A, 2)`: chains cut at corners, arcs also where they bend back.
@@ -199,7 +200,7 @@ def _pieces(
     )
     back = np.concatenate([[False], (turn[1:] * turn[:-1] < 0) & inner[1:] & inner[:-1]])
     found = []
-    place = _places(fine, spans, corners, owner)
+    place = _locate_corners(fine, spans, corners, owner)
     for cuts in ((sharp | back | straight) & inner, (sharp | straight) & inner):
         bounds = np.unique(np.concatenate([spans.ravel(), place[np.flatnonzero(cuts) + 1]]))
         pieces = np.column_stack([bounds[:-1], bounds[1:]])
@@ -210,7 +211,7 @@ def _pieces(
     return found[0], found[1]
 
 
-def _places(
+def _locate_corners(
     fine: np.ndarray, spans: np.ndarray, corners: np.ndarray, owner: np.ndarray
 ) -> np.ndarray:
     """Returns the number of the edge point at which each corner of the polygon of a span stands."""
@@ -230,7 +231,7 @@ def _places(
     return member[order[np.searchsorted(keys[order], key(owner, corners))]]
 
 
-def _chains(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndarray, np.ndarray]:
+def _chain_pixels(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns edge pixels `(E, 2)` in order, each once, and unbranched spans.
 
     A contour runs around a line of edge pixels: along both sides of an open one, inside and outside
@@ -270,21 +271,21 @@ def _chains(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndarray, n
     return pixels, joined
 
 
-def _refined(
+def _refine_points(
     pixels: np.ndarray, gx: np.ndarray, gy: np.ndarray, magnitude: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns where along its gradient each edge pixel's gradient is strongest, by a parabola through three samples."""
     x, y = pixels[:, 0], pixels[:, 1]
     here = np.maximum(magnitude[y, x], 1e-6)
     direction = np.column_stack([gx[y, x], gy[y, x]]) / here[:, None]
-    before, after = (_bilinear(magnitude, pixels + side * direction) for side in (-1.0, 1.0))
+    before, after = (_interpolate(magnitude, pixels + side * direction) for side in (-1.0, 1.0))
     bend = before - 2 * here + after
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = np.where(bend < 0, 0.5 * (before - after) / bend, 0.0)
     return pixels + np.clip(shift, -0.75, 0.75)[:, None] * direction, direction
 
 
-def _nearest(pixels: np.ndarray, shape: tuple, near_px: int) -> np.ndarray:
+def _map_nearest_edges(pixels: np.ndarray, shape: tuple, near_px: int) -> np.ndarray:
     """Returns the number of the edge pixel nearest to each pixel not farther from one than that, `(h, w)`, -1 elsewhere.
 
     Each edge pixel writes its number around itself, the farthest place first: a distance transform
@@ -301,7 +302,7 @@ def _nearest(pixels: np.ndarray, shape: tuple, near_px: int) -> np.ndarray:
     return np.ascontiguousarray(number.reshape(height, width)[near_px:-near_px, near_px:-near_px])
 
 
-def _bilinear(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _interpolate(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Returns the picture between its pixels, at `(E, 2)` points away from its border."""
     height, width = picture.shape
     x0, y0 = (
@@ -315,7 +316,7 @@ def _bilinear(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
     return top * (1 - fy) + bottom * fy
 
 
-def _none(shape: tuple) -> Edges:
+def _make_empty_edges(shape: tuple) -> Edges:
     empty = np.empty((0, 2))
     run = np.empty(0, int)
     return Edges(
@@ -327,4 +328,95 @@ def _none(shape: tuple) -> Edges:
         NO_SPANS,
         run,
         np.empty(0),
+    )
+
+
+INSET = 3
+"""Points at the end of an arc that are bent by what it meets there."""
+NEAREST = 16
+"""Arcs that are looked at as the next one."""
+STRAIGHT_PX = 0.35
+"""What deviates less from its chord bends nowhere."""
+
+
+def group_arcs(arcs: np.ndarray, edges: Edges, numbers: Sequence[int]) -> list[np.ndarray]:
+    """Returns groups of so many arcs each, `(M, number)`, numbers into `arcs`, each the likeliest next one of the one before.
+
+    Where a circle's arc ends and its next one begins, the chord between them halves the angle
+    between their tangents; of an ellipse nearly so. Both bend to the same side, with the bright on
+    the same side, about as strongly.
+    """
+    following = _find_successors(arcs, edges) if len(arcs) > 1 else np.full(len(arcs), -1)
+    found = []
+    for number in numbers:
+        groups = np.flatnonzero(following >= 0)[:, None]
+        for _ in range(number - 1):
+            groups = groups[following[groups[:, -1]] >= 0]
+            groups = np.column_stack([groups, following[groups[:, -1]]])
+        groups = np.sort(groups, 1)
+        groups = groups[(groups[:, 1:] > groups[:, :-1]).all(1)]
+        key = groups @ (len(arcs) ** np.arange(number)[::-1])
+        found.append(groups[np.unique(key, return_index=True)[1]])
+    return found
+
+
+def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
+    """Returns the number of the arc that follows each one best, `(A,)`, -1 for none."""
+    inset = np.minimum(INSET, (arcs[:, 1] - arcs[:, 0]) // 4)
+    first, last, middle = arcs[:, 0] + inset, arcs[:, 1] - 1 - inset, arcs.sum(1) // 2
+    start, stop = edges.points[first], edges.points[last]
+    towards = (start + stop) / 2 - edges.points[middle]
+    chord = stop - start
+    side = chord[:, 0] * towards[:, 1] - chord[:, 1] * towards[:, 0]
+    turned = side < 0  # all run so that the inside is on the same hand
+    start, stop = np.where(turned[:, None], stop, start), np.where(turned[:, None], start, stop)
+    polarity = np.sign((edges.directions[middle] * towards).sum(1))
+    depth, width = np.linalg.norm(towards, axis=1), np.linalg.norm(chord, axis=1)
+    bend = 8 * depth / np.maximum(width**2 + 4 * depth**2, 1e-9)
+    head, tail = (_compute_tangents(edges, place, polarity) for place in (first, last))
+    head, tail = np.where(turned[:, None], tail, head), np.where(turned[:, None], head, tail)
+    usable = np.flatnonzero((depth > STRAIGHT_PX) & (width > 2))
+    result = np.full(len(arcs), -1)
+    if len(usable) < 2:
+        return result
+    near = KDTree(start[usable]).query(stop[usable], k=min(NEAREST, len(usable)))[1]
+    other = usable[near]
+    gap = start[other] - stop[usable][:, None]
+    length = np.maximum(np.linalg.norm(gap, axis=-1), 1e-6)
+    leaving = _measure_turn(tail[usable][:, None], gap)
+    arriving = _measure_turn(gap, head[other])
+    total = leaving + arriving
+    mean_bend = (bend[usable][:, None] + bend[other]) / 2
+    ratio = np.maximum(bend[usable][:, None], bend[other]) / np.maximum(
+        np.minimum(bend[usable][:, None], bend[other]), 1e-9
+    )
+    uneven = np.abs(leaving - arriving)
+    strength = np.abs(
+        np.log(np.maximum(2 * np.sin(np.clip(total, 0.02, np.pi) / 2) / length, 1e-6) / mean_bend)
+    )
+    good = (
+        (other != usable[:, None])
+        & (polarity[other] == polarity[usable][:, None])
+        & (uneven < 0.6)
+        & (ratio < 5)
+    )
+    good &= (leaving > -0.1) & (arriving > -0.1) & (total < 2.6) & (strength < 1.1)
+    cost = np.where(good, uneven + 0.5 * strength + 0.2 * np.log(ratio), np.inf)
+    best = np.argmin(cost, 1)
+    rows = np.arange(len(usable))
+    result[usable] = np.where(np.isfinite(cost[rows, best]), other[rows, best], -1)
+    return result
+
+
+def _compute_tangents(edges: Edges, place: np.ndarray, polarity: np.ndarray) -> np.ndarray:
+    """Returns the direction in which an arc runs at a point, with its inside on the right hand of a picture, `(A, 2)`."""
+    near = np.clip(place[:, None] + np.array([-1, 0, 1]), 0, len(edges.directions) - 1)
+    inward = edges.directions[near].sum(1) * polarity[:, None]
+    return np.column_stack([inward[:, 1], -inward[:, 0]])
+
+
+def _measure_turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Returns the signed angle from one direction to another, rad."""
+    return np.arctan2(
+        first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0], (first * second).sum(-1)
     )

@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from rich.progress import Progress
 
-from brokk_rl.contracts.vision import SourceSpec
+from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
-from perception.dataset import Circle, Label, Truth
+from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.label import placing as label_placing
 from perception.label import refine
 from perception.label.camera import CameraPose, CameraTracker
@@ -62,7 +62,7 @@ class Labelling:
         min_depth_share: Least part of the block's known depth that must agree with it.
     """
 
-    source: SourceSpec
+    source: FrameSourceSpec
     camera: CameraSpec
     placing: str
     noise_per_m: float
@@ -233,7 +233,9 @@ class Labelling:
         away = np.abs(offsets(outline, smooth_gray(frame), self.reach_px, np.inf))
         return float(np.nan_to_num(away, nan=self.reach_px).mean())
 
-    def _masks(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> tuple[Label, float | None]:
+    def _masks(
+        self, cuboid: Cuboid, frame: Frame, pose: np.ndarray
+    ) -> tuple[FrameLabel, float | None]:
         """Returns the masks, and which part of the known depth agrees with the block."""
         there = look(cuboid, sight_lines(frame), pose)
         block = there.face >= 0
@@ -255,12 +257,12 @@ class Labelling:
             for one in (near, far)
         )
         shown = block & ~near & ~far
-        return Label(shown, shown & there.mouth, block & near), share
+        return FrameLabel(shown, shown & there.mouth, block & near), share
 
 
 def _truth(
     cuboid: Cuboid, frame: Frame, pose: np.ndarray, outline_px: float, noise_per_m: float
-) -> Truth:
+) -> SceneTruth:
     """Returns the block and its holes as a truth file has them; without a known base the world stands in for it."""
     camera_from_world = np.linalg.inv(pose)
     base = pose if frame.base_from_camera is None else frame.base_from_camera
@@ -274,7 +276,7 @@ def _truth(
         )
         seen = len(mouth_outline(cuboid, number, frame, pose, noise_per_m, 0.0).points_m)
         circles.append(
-            Circle(
+            TrueCircle(
                 tuple(center.tolist()), tuple(rotation[:, 2].tolist()), tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
                 tuple((base[:3, :3] @ rotation[:, 2]).tolist()), mouth.radius_m, 0.0, 1.0 - seen / 72, seen > 0,
             )
@@ -284,15 +286,15 @@ def _truth(
         "rotation": rotation.tolist(),
         "half_m": (cuboid.size_m / 2.0).tolist(),
     }
-    return Truth("real", {"outline_px": outline_px}, tuple(circles), (), place)
+    return SceneTruth("real", {"outline_px": outline_px}, tuple(circles), (), place)
 
 
 def _overlay(
-    cuboid: Cuboid, frame: Frame, pose: np.ndarray, found: Label, good: bool
+    cuboid: Cuboid, frame: Frame, pose: np.ndarray, found: FrameLabel, good: bool
 ) -> np.ndarray:
     """Returns the frame with block, mouths and what hides them in colour, and the block's edges."""
     picture = frame.color.astype(np.float32)
-    for mask, colour in ((found.block, GREEN), (found.arm, ORANGE), (found.mouth, RED)):
+    for mask, colour in ((found.block, GREEN), (found.arm, ORANGE), (found.hole_mask, RED)):
         picture[mask] = 0.6 * picture[mask] + 0.4 * np.array(colour, np.float32)
     picture = picture.astype(np.uint8)
     for begin, end in cuboid.edges(pose[:3, 3]):

@@ -19,13 +19,13 @@ from rich.table import Table
 
 from brokk_rl.contracts.vision import (
     Ellipse,
+    FinderSpec,
+    FrameDetections,
+    FrameSourceSpec,
     HolePose,
     Observer,
     Overlay,
-    PerceptionBackend,
     Rejection,
-    Sighting,
-    SourceSpec,
     Target,
 )
 from brokk_rl.errors import ConfigError, FrameError
@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 
 @spec
-class Looking:
+class PerceiveOptions:
     """What to look at.
 
     Attributes:
@@ -60,11 +60,11 @@ class Looking:
 
 
 @dataclass(frozen=True)
-class Entry:
+class FrameEntry:
     """One frame: its name, what came out of it, and why it was refused as a whole."""
 
     name: str
-    sighting: Sighting | None
+    sighting: FrameDetections | None
     target: Target | None
     refused: str | None
 
@@ -77,12 +77,12 @@ class Entry:
             "ms": {k: round(v, 3) for k, v in self.sighting.ms.items()},
         }
         if until == "ellipses":
-            return plain | {"ellipses": [_ellipse(one) for one in self.sighting.ellipses]}
+            return plain | {"ellipses": [_describe_ellipse(one) for one in self.sighting.ellipses]}
         return plain | {
-            "holes": [_hole(one) for one in self.sighting.holes],
-            "rejected": [_rejection(one) for one in self.sighting.rejected],
+            "holes": [_describe_hole(one) for one in self.sighting.holes],
+            "rejected": [_describe_rejection(one) for one in self.sighting.rejected],
             "target": self.target and {
-                **_hole(self.target.pose),
+                **_describe_hole(self.target.pose),
                 "num_frames": self.target.num_frames, "age_s": self.target.age_s, "stale": self.target.stale,
             },
         }  # fmt: skip
@@ -102,11 +102,11 @@ class Perceive:
     """
 
     session: Session
-    perception: PerceptionBackend
-    source: SourceSpec
-    gallery: SourceSpec
+    perception: FinderSpec
+    source: FrameSourceSpec
+    gallery: FrameSourceSpec
     overlay: Overlay
-    perceive: Looking
+    perceive: PerceiveOptions
 
     def run(self) -> None:
         """Writes `holes.json`, `explain.txt` and `overlays/<name>.png` into the run folder.
@@ -123,7 +123,7 @@ class Perceive:
             )
         observer = cast(Observer, built)
         folder = self.session.folder
-        entries: list[Entry] = []
+        entries: list[FrameEntry] = []
         try:
             for entry, frame in self._entries(observer):
                 entries.append(entry)
@@ -142,7 +142,7 @@ class Perceive:
         self._show(entries)
         log.info("holes: %s", folder / "holes.json")
 
-    def _entries(self, observer: Observer) -> Iterator[tuple[Entry, Frame | None]]:
+    def _entries(self, observer: Observer) -> Iterator[tuple[FrameEntry, Frame | None]]:
         """Yields each frame of the source with what came out of it."""
         only_ellipses = self.perceive.until == "ellipses"
         with (
@@ -156,7 +156,7 @@ class Perceive:
                 try:
                     frame = source.read_latest()
                 except FrameError as error:
-                    yield Entry(f"{number:05d}", None, None, str(error)), None
+                    yield FrameEntry(f"{number:05d}", None, None, str(error)), None
                     log.warning("%s", error)
                 else:
                     if frame is None:
@@ -165,14 +165,18 @@ class Perceive:
                 number += 1
                 progress.update(task, completed=number)
 
-    def _entry(self, observer: Observer, frame: Frame, number: int, only_ellipses: bool) -> Entry:
+    def _entry(
+        self, observer: Observer, frame: Frame, number: int, only_ellipses: bool
+    ) -> FrameEntry:
         name = Path(frame.name).name or f"{number:05d}"
         if only_ellipses:
             start = time.perf_counter()
             found = observer.ellipses(frame)
-            return Entry(
+            return FrameEntry(
                 name,
-                Sighting([], [], found, None, {"ellipse": 1000.0 * (time.perf_counter() - start)}),
+                FrameDetections(
+                    [], [], found, None, {"ellipse": 1000.0 * (time.perf_counter() - start)}
+                ),
                 None,
                 None,
             )
@@ -180,10 +184,10 @@ class Perceive:
             sighting = observer.look(frame)
         except FrameError as error:
             log.warning("%s", error)
-            return Entry(name, None, None, str(error))
-        return Entry(name, sighting, observer.follow(sighting, frame.t_s), None)
+            return FrameEntry(name, None, None, str(error))
+        return FrameEntry(name, sighting, observer.follow(sighting, frame.t_s), None)
 
-    def _write(self, folder: Path, entries: list[Entry], observer: Observer) -> None:
+    def _write(self, folder: Path, entries: list[FrameEntry], observer: Observer) -> None:
         write_json(
             folder / "holes.json",
             {"schema": 1, "frames": [entry.plain(self.perceive.until) for entry in entries]},
@@ -192,14 +196,14 @@ class Perceive:
             return
         lines = []
         for entry in entries:
-            lines.append(f"{entry.name}: {entry.refused or _told(entry.sighting)}")
+            lines.append(f"{entry.name}: {entry.refused or _count_holes(entry.sighting)}")
             lines += [
                 f"  {observer.explain(one)}"
                 for one in (entry.sighting.rejected if entry.sighting else ())
             ]
         write_text(folder / "explain.txt", "\n".join(lines) + "\n")
 
-    def _show(self, entries: list[Entry]) -> None:
+    def _show(self, entries: list[FrameEntry]) -> None:
         used = [entry.sighting for entry in entries if entry.sighting]
         table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
         table.add_row("frames", f"{len(used)} used, {len(entries) - len(used)} refused")
@@ -232,12 +236,12 @@ def _least(*numbers: int | None) -> int | None:
     return min((number for number in numbers if number is not None), default=None)
 
 
-def _told(sighting: Sighting | None) -> str:
+def _count_holes(sighting: FrameDetections | None) -> str:
     count = len(sighting.holes) if sighting else 0
     return "no hole" if not count else "1 hole" if count == 1 else f"{count} holes"
 
 
-def _hole(pose: HolePose) -> dict[str, Any]:
+def _describe_hole(pose: HolePose) -> dict[str, Any]:
     return {
         "center_m": pose.center_m.tolist(), "axis": pose.axis.tolist(), "radius_m": float(pose.radius_m),
         "cov_m2": pose.cov_m2.tolist(), "axis_cov_rad2": pose.axis_cov_rad2.tolist(),
@@ -245,15 +249,15 @@ def _hole(pose: HolePose) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _rejection(one: Rejection) -> dict[str, Any]:
+def _describe_rejection(one: Rejection) -> dict[str, Any]:
     value, limit = (float(v) if math.isfinite(v) else None for v in (one.value, one.limit))
     return {
         "stage": one.stage, "reason": one.reason, "value": value, "limit": limit,
-        "ellipse": one.ellipse and _ellipse(one.ellipse),
+        "ellipse": one.ellipse and _describe_ellipse(one.ellipse),
     }  # fmt: skip
 
 
-def _ellipse(one: Ellipse) -> dict[str, float]:
+def _describe_ellipse(one: Ellipse) -> dict[str, float]:
     return {
         "x": one.x,
         "y": one.y,

@@ -15,7 +15,14 @@ import numpy as np
 
 from brokk_rl.signals import Frame
 from perception.ellipse import conic
-from perception.pose.plane import Plane, inverse_depth, middle, parted, sandwich, yielding
+from perception.pose.plane import (
+    FacePlane,
+    compute_inverse_depth,
+    compute_psi_slope,
+    compute_upper_median,
+    estimate_sandwich_covariance,
+    number_cells,
+)
 
 SMOOTH_PX = 1.0
 """Blur of both pictures: noise would shrink the slope."""
@@ -41,7 +48,7 @@ LARGEST_PX = 1.0
 
 
 @dataclass(frozen=True)
-class Pair:
+class StereoPatch:
     """A part of both pictures, smooth, in a resolution in which it is small.
 
     Attributes:
@@ -73,7 +80,10 @@ class Pair:
     def on_plane(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
         """Returns where `right` shows the points of a plane that the left one has at such places, columns `(h, w)`."""
         return (
-            u - self.pull_px * inverse_depth(m, self.camera_matrix, u, v) - self.right_column + 0.5
+            u
+            - self.pull_px * compute_inverse_depth(m, self.camera_matrix, u, v)
+            - self.right_column
+            + 0.5
         ) / self.shrink - 0.5
 
     def seen(
@@ -96,9 +106,9 @@ class Pair:
         return (x > 3) & (x < self.right.shape[1] - 4)
 
 
-def pair(
+def crop_pair(
     frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, outer: float
-) -> Pair | None:
+) -> StereoPatch | None:
     """Returns the surroundings of an ellipse `(5,)`, up to `outer` of its radii, in both pictures; `None` without a right one."""
     if frame.right is None or frame.baseline_m is None or frame.right.shape != frame.color.shape:
         return None
@@ -110,7 +120,7 @@ def pair(
         return None
     shrink = max(1, -(-(right - left) // WIDE_PX))
     pull_px = float(frame.camera_matrix[0, 0]) * frame.baseline_m
-    shift = pull_px * inverse_depth(
+    shift = pull_px * compute_inverse_depth(
         m, frame.camera_matrix, np.array([[left, right]]), np.array([[top], [bottom]])
     )
     first = max(0, int(left - shift.max()) - 8 * shrink)
@@ -131,19 +141,19 @@ def pair(
     one, other = (
         cv2.GaussianBlur(picture.astype(np.float32), (0, 0), SMOOTH_PX) for picture in small
     )
-    return Pair(one, other, shrink, (left, top), first, frame.camera_matrix, pull_px)
+    return StereoPatch(one, other, shrink, (left, top), first, frame.camera_matrix, pull_px)
 
 
-def aligned(
-    both: Pair,
-    face: Plane,
+def align_plane(
+    both: StereoPatch,
+    face: FacePlane,
     frame: Frame,
     allowed: np.ndarray,
     ellipse: np.ndarray,
     inner: float,
     cell_px: int,
     bias_per_m: float,
-) -> Plane | None:
+) -> FacePlane | None:
     """Returns the plane by which the two pictures agree best on the face; `face` itself where too little of it is in sight.
 
     `None` where they do not agree: the right picture is another's, or shifted.
@@ -172,7 +182,7 @@ def aligned(
         np.rint(u[0]).astype(int).clip(0, allowed.shape[1] - 1),
     )
     depth = frame.depth_m[pixel]
-    radii = conic.radii(ellipse, u, v)
+    radii = conic.measure_radii(ellipse, u, v)
     with np.errstate(invalid="ignore"):
         off = np.abs(1.0 / depth - face.inverse_depth(both.camera_matrix, u, v))
         on = allowed[pixel] & (off < 3.0 * face.sigma) & (radii > inner) & (radii < face.extent)
@@ -220,7 +230,7 @@ def aligned(
         )
         gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
         off = seen - gain * mine
-        scale = 1.4826 * middle(np.abs(off)) + 1e-6
+        scale = 1.4826 * compute_upper_median(np.abs(off)) + 1e-6
         heavy *= np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
         step = np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
         m = m - step
@@ -236,12 +246,12 @@ def aligned(
     ):
         return face
     cell = (v_on // cell_px).astype(np.int64) * 10_000 + (u_on // cell_px).astype(np.int64)
-    slopes = (push[:3] * yielding(off / (TUKEY * scale))).T
-    cov = sandwich(slopes, heavy[:3].T, off, parted(cell))
-    return face if cov is None else merged(face, replace(face, m=m, cov=cov), bias_per_m)
+    slopes = (push[:3] * compute_psi_slope(off / (TUKEY * scale))).T
+    cov = estimate_sandwich_covariance(slopes, heavy[:3].T, off, number_cells(cell))
+    return face if cov is None else merge_planes(face, replace(face, m=m, cov=cov), bias_per_m)
 
 
-def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:
+def merge_planes(first: FacePlane, second: FacePlane, bias_per_m: float) -> FacePlane:
     """Returns the plane between two, each weighted by what it knows best; the whole of the first may be off by a bias."""
     doubt = first.cov + np.diag([0.0, 0.0, bias_per_m**2])
     weights = [np.linalg.inv(cov) for cov in (doubt, second.cov)]
@@ -249,9 +259,9 @@ def merged(first: Plane, second: Plane, bias_per_m: float) -> Plane:
     return replace(second, m=cov @ (weights[0] @ first.m + weights[1] @ second.m), cov=cov)
 
 
-def disagreement(
-    both: Pair,
-    face: Plane,
+def measure_parallax(
+    both: StereoPatch,
+    face: FacePlane,
     depth_m: np.ndarray,
     ellipse: np.ndarray,
     inner: float,
@@ -282,7 +292,7 @@ def disagreement(
     if down[1] <= down[0] or across[1] <= across[0]:
         return float("nan"), 0.0
     u, v = both.places(np.arange(*across), np.arange(*down))
-    radii = conic.radii(ellipse, u, v)
+    radii = conic.measure_radii(ellipse, u, v)
     rows, columns = (
         np.rint(some).astype(int).clip(0, most - 1)
         for some, most in zip((v[:, 0], u[0]), depth_m.shape, strict=True)
@@ -293,7 +303,7 @@ def disagreement(
             1.0 / depth - face.inverse_depth(both.camera_matrix, u, v) > 4 * face.sigma
         ).astype(np.uint8)
     shown = both.inside(u, v, face.m) & (cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0)
-    hidden = shown & (radii < inner) & _hidden(both, face, depth_m, u, v)
+    hidden = shown & (radii < inner) & _find_hidden_from_right(both, face, depth_m, u, v)
     covered = float(hidden.sum() / max(np.count_nonzero(shown & (radii < inner)), 1))
     shown &= ~hidden
     within, around = shown & (radii < inner), shown & (radii > ring[0]) & (radii < ring[1])
@@ -311,8 +321,8 @@ def disagreement(
     return float(np.std(off[within])) / max(usual, 0.1), covered
 
 
-def _hidden(
-    both: Pair, face: Plane, depth_m: np.ndarray, u: np.ndarray, v: np.ndarray
+def _find_hidden_from_right(
+    both: StereoPatch, face: FacePlane, depth_m: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> np.ndarray:
     """Says which points of a face, `(h, w)`, seen by the left camera, something nearer hides from the right one."""
     rows = np.rint(v[:, 0]).astype(int).clip(0, len(depth_m) - 1)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from perception.ellipse import conic
-from perception.pose.plane import Plane
+from perception.pose.plane import FacePlane
 
 INSIDE, RING = 0.8, (1.15, 1.8)
 """Radii: the inside without the rim's blur, and the ring around that shows how bright the face
@@ -47,12 +47,12 @@ class Interior:
     contrast: float
 
 
-def interior(
+def measure_interior(
     gray: np.ndarray,
     depth_m: np.ndarray,
     ellipse: np.ndarray,
     camera_matrix: np.ndarray,
-    plane: Plane | None,
+    plane: FacePlane | None,
 ) -> Interior:
     """Returns what is seen inside an ellipse `(5,)`; slope and depth need the plane of the face."""
     x, y, a = ellipse[:3]
@@ -61,7 +61,7 @@ def interior(
     bottom, right = min(gray.shape[0], int(y + reach) + 2), min(gray.shape[1], int(x + reach) + 2)
     part = gray[top:bottom, left:right].astype(np.float32)
     rows, columns = np.ogrid[top:bottom, left:right]
-    radii = conic.radii(ellipse, columns, rows)
+    radii = conic.measure_radii(ellipse, columns, rows)
     inside, ring = radii < INSIDE, (radii > RING[0]) & (radii < RING[1])
     if inside.sum() < 8 or ring.sum() < 8:
         return Interior(*[np.nan] * 6)
@@ -91,9 +91,9 @@ def interior(
         clearly = max(4 * plane.sigma, CLEARLY_M * float(plane.m @ middle) ** 2)
         deeper = float(np.mean(behind[inside & known] > clearly)) if (inside & known).any() else 0.0
         into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
-        away = _places(inside, left, top) - (x, y)
+        away = _list_pixels(inside, left, top) - (x, y)
         along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
-        drift = _gradient(part[ring], _places(ring, left, top) - (x, y)) * min(
+        drift = _fit_brightness_gradient(part[ring], _list_pixels(ring, left, top) - (x, y)) * min(
             darkness, 1.0
         )  # of dust, over hole and face alike
         values = values - away @ drift
@@ -101,13 +101,13 @@ def interior(
         slope = float(apart @ values / max(float(apart @ apart), 1e-9)) / max(
             face * (1.0 - darkness), 1.0
         )
-    around = _darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
+    around = _measure_darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
     return Interior(
-        darkness, slope, deeper, unknown, around, _contrast(smooth[ring], face * darkness)
+        darkness, slope, deeper, unknown, around, _measure_contrast(smooth[ring], face * darkness)
     )
 
 
-def _contrast(ring: np.ndarray, dark: float) -> float:
+def _measure_contrast(ring: np.ndarray, dark: float) -> float:
     """Returns by how much `dark` is darker than a ring, in standard deviations of its grain.
 
     The edge of a shadow across the ring is no grain: the darker of its two parts (Otsu 1979)
@@ -126,12 +126,12 @@ def _contrast(ring: np.ndarray, dark: float) -> float:
     return (level - dark) / max(grain, 1.0)
 
 
-def _darkest_around(
+def _measure_darkest_around(
     gray: np.ndarray,
     depth_m: np.ndarray,
     ellipse: np.ndarray,
     camera_matrix: np.ndarray,
-    plane: Plane | None,
+    plane: FacePlane | None,
 ) -> float:
     """Returns the grey level of the darkest hundredth of what is on or behind the face around an ellipse; 0 where nothing is."""
     x, y, wide = ellipse[0], ellipse[1], WIDE * ellipse[2]
@@ -150,13 +150,13 @@ def _darkest_around(
     return float(np.percentile(near, 1.0)) if near.size else 0.0
 
 
-def _places(there: np.ndarray, left: int, top: int) -> np.ndarray:
+def _list_pixels(there: np.ndarray, left: int, top: int) -> np.ndarray:
     """Returns column and row of the pixels of a part of a picture, `(P, 2)`."""
     line, column = np.nonzero(there)
     return np.column_stack([column + left, line + top])
 
 
-def _gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray:
+def _fit_brightness_gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray:
     """Returns the mean slope of brightness `(P,)` over places of a ring `(P, 2)`, `(2,)` grey levels a pixel.
 
     What departs much from it does not count.

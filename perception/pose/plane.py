@@ -32,7 +32,7 @@ bands of rows instead."""
 
 
 @dataclass(frozen=True)
-class Plane:
+class FacePlane:
     """A plane in camera coordinates.
 
     Attributes:
@@ -62,7 +62,7 @@ class Plane:
 
     def inverse_depth(self, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Returns its inverse depth at columns and rows of a picture, of broadcast shapes; see `inverse_depth`."""
-        return inverse_depth(self.m, camera_matrix, u, v)
+        return compute_inverse_depth(self.m, camera_matrix, u, v)
 
     def point(self, ray: np.ndarray) -> np.ndarray:
         """Returns where a ray `(3,)` with z = 1 meets it."""
@@ -70,7 +70,7 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Support:
+class FaceSupport:
     """Pixels of the face around an ellipse, outwards.
 
     Attributes:
@@ -89,7 +89,7 @@ class Support:
     known: float
 
 
-def inverse_depth(
+def compute_inverse_depth(
     m: np.ndarray, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> np.ndarray:
     """Returns inverse depth on a plane `m · P = 1` at columns and rows of a picture: linear in both, so of whole rows at once."""
@@ -97,7 +97,7 @@ def inverse_depth(
     return across * u + (down * v + middle)
 
 
-def support(
+def collect_support(
     depth_m: np.ndarray,
     allowed: np.ndarray,
     camera_matrix: np.ndarray,
@@ -108,7 +108,7 @@ def support(
     outer: float,
     most: int,
     cell_px: int,
-) -> Support:
+) -> FaceSupport:
     """Returns the pixels with known depth between `inner` and `outer` radii of an ellipse `(5,)`.
 
     A circle of a known radius says itself about how far away it is and how its plane leans: what is
@@ -134,7 +134,7 @@ def support(
     step = max(1, int(np.sqrt(area / most)))
     rows, columns = np.ogrid[top:bottom:step, left:right:step]
     depth = depth_m[top:bottom:step, left:right:step]
-    radii = conic.radii(ellipse, columns, rows)
+    radii = conic.measure_radii(ellipse, columns, rows)
     good = (
         (allowed[top:bottom:step, left:right:step] | (radii < certain))
         & np.isfinite(depth)
@@ -150,16 +150,16 @@ def support(
     line, place = np.nonzero(good)
     radii, inverse = radii[good], 1.0 / depth[good].astype(float)
     v, u = top + step * line, left + step * place
-    cell = parted(v // cell_px * (width // cell_px + 1) + u // cell_px)
+    cell = number_cells(v // cell_px * (width // cell_px + 1) + u // cell_px)
     outwards = np.argsort(radii)
     u, v, radii, inverse, cell = (some[outwards] for some in (u, v, radii, inverse, cell))
     rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera_matrix).T
-    return Support(rays, inverse, radii, cell, known)
+    return FaceSupport(rays, inverse, radii, cell, known)
 
 
-def fit(
-    points: Support, rings: tuple[float, ...], floor: float, generator: np.random.Generator
-) -> Plane | None:
+def fit_plane(
+    points: FaceSupport, rings: tuple[float, ...], floor: float, generator: np.random.Generator
+) -> FacePlane | None:
     """Returns the plane that the points around the ellipse lie on, grown from the ring near it outwards.
 
     `None` where they determine none: there are too few, they lie on a line, or nearly all that
@@ -178,7 +178,7 @@ def fit(
     if not rings:
         return None
     number = int(np.searchsorted(points.radii, rings[0]))
-    m = _guess(points.rays[:number], points.inverse[:number], generator)
+    m = _guess_plane(points.rays[:number], points.inverse[:number], generator)
     extent = rings[0]
     first = sigma = reach = floor
     rays = weight = points.rays[:0]
@@ -188,7 +188,13 @@ def fit(
         for _ in range(3):
             residual = inverse - rays @ m
             tight = np.abs(residual)
-            scale = max(1.4826 * middle(tight[tight < max(8 * sigma, middle(tight) * 1.5)]), floor)
+            scale = max(
+                1.4826
+                * compute_upper_median(
+                    tight[tight < max(8 * sigma, compute_upper_median(tight) * 1.5)]
+                ),
+                floor,
+            )
             sigma = (
                 scale if ring == rings[0] else min(scale, 1.2 * first)
             )  # what else comes into sight is no noise
@@ -204,24 +210,24 @@ def fit(
         first = sigma if ring == rings[0] else first
         extent = ring
     residual = points.inverse[:number] - rays @ m
-    cov = sandwich(
-        rays * yielding(residual / reach)[:, None],
+    cov = estimate_sandwich_covariance(
+        rays * compute_psi_slope(residual / reach)[:, None],
         rays * weight[:, None],
         residual,
         points.cell[:number],
     )
     if cov is None:
         return None
-    return Plane(m, cov, sigma, int(np.count_nonzero(weight)), extent)
+    return FacePlane(m, cov, sigma, int(np.count_nonzero(weight)), extent)
 
 
-def middle(values: np.ndarray) -> float:
+def compute_upper_median(values: np.ndarray) -> float:
     """Returns the median of many values `(P,)`, of an even number the larger one in the middle."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
 
 
-def _guess(
+def _guess_plane(
     rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40
 ) -> np.ndarray:
     """Returns the plane through three points that most points lie nearest to (least median of squares)."""
@@ -236,7 +242,7 @@ def _guess(
     return planes[np.argmin(np.partition(off, middle, axis=0)[middle])]
 
 
-def parted(cell: np.ndarray) -> np.ndarray:
+def number_cells(cell: np.ndarray) -> np.ndarray:
     """Returns the numbers of cells `(P,)` from 0 on, of points row by row; where there are too few, of bands of rows instead."""
     cell = np.unique(cell, return_inverse=True)[1]
     return (
@@ -246,7 +252,7 @@ def parted(cell: np.ndarray) -> np.ndarray:
     )
 
 
-def yielding(off: np.ndarray) -> np.ndarray:
+def compute_psi_slope(off: np.ndarray) -> np.ndarray:
     """Returns by how much of a residual, `off` in reaches of Tukey's biweight `(P,)`, its pull changes, over its weight.
 
     A residual that grows counts less and less: a fit gives way to noise further than its weights
@@ -256,7 +262,7 @@ def yielding(off: np.ndarray) -> np.ndarray:
     return (1.0 - 5.0 * square) / (1.0 - square)
 
 
-def sandwich(
+def estimate_sandwich_covariance(
     slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: np.ndarray
 ) -> np.ndarray | None:
     """Returns the covariance of a fit of three numbers, `(3, 3)`, by how it changes without each cell, in which noise may be alike.

@@ -40,7 +40,7 @@ and beside one, those whose edge is drawn towards what stands there by the blur 
 
 
 @dataclass(frozen=True)
-class Circle:
+class RimCircle:
     """A circle on a plane.
 
     Attributes:
@@ -61,7 +61,7 @@ class Circle:
 
 
 @dataclass(frozen=True)
-class Chart:
+class PlaneChart:
     """Coordinates on a plane, m: the place `origin + x first + y second` for each `(x, y)`."""
 
     origin: np.ndarray
@@ -85,12 +85,14 @@ class Chart:
         back = np.linalg.inv(
             self.camera_matrix @ np.column_stack([self.first, self.second, self.origin])
         )
-        return conic.ellipse_of(
-            (back.T @ conic.form(np.array([x, y, radius, radius, 0.0])) @ back)[None]
+        return conic.convert_forms_to_ellipses(
+            (back.T @ conic.build_quadratic_forms(np.array([x, y, radius, radius, 0.0])) @ back)[
+                None
+            ]
         )[0]
 
 
-def circle(
+def fit_rim_circle(
     gray: np.ndarray,
     ellipse: np.ndarray,
     camera_matrix: np.ndarray,
@@ -99,7 +101,7 @@ def circle(
     tolerance: float,
     center_px: float,
     shape_px: float,
-) -> Circle | None:
+) -> RimCircle | None:
     """Returns the circle on the plane `m · P = 1` whose rim has the most edges of dark to bright; `None` where nothing agrees.
 
     Args:
@@ -117,26 +119,28 @@ def circle(
     normal = m / np.linalg.norm(m)
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
-    chart = Chart(ray / (m @ ray), first, np.cross(normal, first), m, camera_matrix)
+    chart = PlaneChart(ray / (m @ ray), first, np.cross(normal, first), m, camera_matrix)
     size = float(np.sqrt(ellipse[2] * ellipse[3]))
-    profiles = _edges(gray, ellipse, max(NARROW_PX, 0.25 * size), chart)
+    profiles = _find_profile_edges(gray, ellipse, max(NARROW_PX, 0.25 * size), chart)
     if profiles is None:
         return None
-    found = _agreed(*profiles, radius_m, tolerance)
+    found = _vote_for_circle(*profiles, radius_m, tolerance)
     for _ in range(2):
         if found is None:
             return None
         seen = chart.seen(found)
-        profiles = _edges(gray, seen, NARROW_PX, chart) if np.isfinite(seen).all() else None
+        profiles = (
+            _find_profile_edges(gray, seen, NARROW_PX, chart) if np.isfinite(seen).all() else None
+        )
         if profiles is None:
             return None
-        found, cov, rms_px, coverage = _fitted(found, *profiles, center_px, shape_px)
+        found, cov, rms_px, coverage = _fit_circle(found, *profiles, center_px, shape_px)
         if found is not None and abs(found[2] - radius_m) > 1.5 * tolerance * radius_m:
             return None
     if found is None:
         return None
     axes = np.column_stack([chart.first, chart.second])
-    return Circle(
+    return RimCircle(
         chart.origin + axes @ found[:2],
         float(found[2]),
         axes @ cov @ axes.T,
@@ -146,8 +150,8 @@ def circle(
     )
 
 
-def _edges(
-    gray: np.ndarray, ellipse: np.ndarray, reach_px: float, chart: Chart
+def _find_profile_edges(
+    gray: np.ndarray, ellipse: np.ndarray, reach_px: float, chart: PlaneChart
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Returns the steepest places of profiles across an ellipse on the plane, and how long a pixel is there.
 
@@ -155,9 +159,10 @@ def _edges(
         Places `(P, PEAKS, 2)` m, NaN where there are fewer, and the length on the plane of a pixel
         along each profile `(P,)`.
     """
-    number = int(np.clip(2 * conic.perimeter(ellipse[2], ellipse[3]), 48, 144))
+    number = int(np.clip(2 * conic.compute_perimeter(ellipse[2], ellipse[3]), 48, 144))
     points, outward, _ = (
-        value[0] for value in conic.sample(ellipse[None], np.arange(number) * (2 * np.pi / number))
+        value[0]
+        for value in conic.sample_ellipses(ellipse[None], np.arange(number) * (2 * np.pi / number))
     )
     offset = np.arange(-reach_px - 2.0, reach_px + 2.0 + 1e-9, STEP_PX)
     place = points[:, None] + offset[None, :, None] * outward[:, None]
@@ -200,7 +205,7 @@ def _edges(
     return edges, pixel_m
 
 
-def _agreed(
+def _vote_for_circle(
     edges: np.ndarray, pixel_m: np.ndarray, radius_m: float, tolerance: float
 ) -> np.ndarray | None:
     """Returns the circle `(x, y, radius)` through three edges that most profiles speak for."""
@@ -231,14 +236,14 @@ def _agreed(
     return circles[np.argmax(np.maximum(1 - (near / NEAR_PX) ** 2, 0.0).sum(1))]
 
 
-def _fitted(
+def _fit_circle(
     start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray, center_px: float, shape_px: float
 ) -> tuple[np.ndarray | None, np.ndarray, float, float]:
     """Returns the circle that fits the edges nearest to one, the covariance of its centre, its residual in px and its coverage."""
     found = start
     for scale_px in (NARROW_PX, INLIER_PX, 0.6 * INLIER_PX):
         away = edges - found[:2]
-        distance = np.sqrt(conic.dot(away, away))
+        distance = np.sqrt(conic.sum_products(away, away))
         off = (distance - found[2]) / pixel_m[:, None]
         best = np.argmin(np.where(np.isfinite(off), np.abs(off), np.inf), 1)
         rows = np.arange(len(edges))
@@ -246,7 +251,7 @@ def _fitted(
         off = np.where(np.isfinite(off), off, np.inf)
         weight = np.maximum(1 - (off / scale_px) ** 2, 0.0) ** 2
         coverage = float(np.mean(weight > 0))
-        beside = _beside_gaps(weight > 0)
+        beside = _find_profiles_beside_gaps(weight > 0)
         if np.count_nonzero(weight[~beside]) >= LEAST:
             weight[beside] = 0.0
         on = weight > 0
@@ -271,7 +276,7 @@ def _fitted(
     return found, cov, rms_px, coverage
 
 
-def _beside_gaps(on: np.ndarray) -> np.ndarray:
+def _find_profiles_beside_gaps(on: np.ndarray) -> np.ndarray:
     """Says which of the profiles around a circle, `(P,)` bool, lie in gaps of it or beside one."""
     place = np.arange(len(on))[:, None]
     gap = (

@@ -11,7 +11,7 @@ import numpy as np
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 from perception import dataset
-from perception.dataset import Circle, Label, Truth
+from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.render.drawing import compose
 from perception.render.rig import Rig
 from perception.render.scenes import Scene, Scenes
@@ -37,8 +37,8 @@ class Shot:
     right: np.ndarray | None
     depth_m: np.ndarray
     exact_depth_m: np.ndarray
-    label: Label
-    truth: Truth
+    label: FrameLabel
+    truth: SceneTruth
 
 
 @spec
@@ -103,13 +103,13 @@ class Studio:
         if partner is not None and self.depth == "matched":
             depth = self.stereo.depth_m(color, partner, self.rig.focal_px, self.rig.baseline_m)
         roles = np.array([solid.role for solid in scene.solids] + ["nothing"])[left.solid]
-        label = Label(roles == "block", left.mouth, roles == "arm")
+        label = FrameLabel(roles == "block", left.mouth, roles == "arm")
         return Shot(color, partner, depth, left.depth_m, label, self._truth(scene))
 
-    def _truth(self, scene: Scene) -> Truth:
+    def _truth(self, scene: Scene) -> SceneTruth:
         block = scene.block
         if block is None:
-            return Truth(self.scene.name, scene.conditions, (), (), {})
+            return SceneTruth(self.scene.name, scene.conditions, (), (), {})
         holes = tuple(
             self._circle(
                 block.pose.point(hole.center_m),
@@ -132,11 +132,11 @@ class Studio:
         )
         place = {name: np.asarray(value).tolist() for name, value in
                  (("center_m", block.pose.center_m), ("rotation", block.pose.rotation), ("half_m", block.half_m))}  # fmt: skip
-        return Truth(self.scene.name, scene.conditions, holes, decoys, place)
+        return SceneTruth(self.scene.name, scene.conditions, holes, decoys, place)
 
     def _circle(
         self, center: np.ndarray, axis: np.ndarray, radius_m: float, depth_m: float, hidden: float
-    ) -> Circle:
+    ) -> TrueCircle:
         base = self.rig.base_from_camera
         first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
         first /= np.linalg.norm(first)
@@ -149,7 +149,7 @@ class Studio:
                 (pixel.min(0) >= 0).all()
                 and (pixel.max(0) <= [self.rig.width - 1, self.rig.height - 1]).all()
             )
-        return Circle(
+        return TrueCircle(
             tuple(center.tolist()), tuple(axis.tolist()), tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
             tuple((base[:3, :3] @ axis).tolist()), float(radius_m), float(depth_m), float(hidden), in_view,
         )  # fmt: skip

@@ -18,7 +18,7 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception.segment.window import Window, around, block_box, halves, whole
+from perception.segment.window import Window, bound_block, center_window, cover_picture, tile_halves
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the networks that come with the package."""
@@ -73,7 +73,7 @@ class Onnx:
             NoSuchFile,
         )
 
-        path = found(self.weights)
+        path = find_weights(self.weights)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads
         try:
@@ -90,7 +90,7 @@ class Onnx:
             for key, value in meta.items()
             if key.startswith(PREFIX)
         }
-        size_px = checked_size(path, header)
+        size_px = check_size(path, header)
 
         def infer(picture: np.ndarray) -> np.ndarray:
             return session.run(None, {"picture": picture[None]})[0][0]  # type: ignore[index]
@@ -124,13 +124,13 @@ class Unet:
             CheckpointError: there is no such network, or it is none of ours.
             DeviceError: there is no such device.
         """
-        from perception.train import export
+        from perception.segment.unet import build_inference, read_checkpoint
 
         device = Session(out=".", seed=0, device=self.device).torch_device()
-        network, header = export.read(found(self.weights))
+        network, header = read_checkpoint(find_weights(self.weights))
         return NetworkSegmenter(
-            export.inference(network.to(device), device),
-            checked_size(Path(self.weights), header),
+            build_inference(network.to(device), device),
+            check_size(Path(self.weights), header),
             self.margin,
         )
 
@@ -149,25 +149,25 @@ class NetworkSegmenter:
 
     def segment(self, frame: Frame) -> Masks:
         """Returns both masks."""
-        window = whole(frame.color.shape, self._size_px)
+        window = cover_picture(frame.color.shape, self._size_px)
         block, mouth = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
         self._look(frame, window, block, mouth)
         if self._margin is None:
             return Masks(block, mouth)
-        box = block_box(block, THRESHOLD, SMALLEST_PIECE)
+        box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
         if box is None:
             part = np.zeros_like(block)
-            for half in halves(block.shape, self._size_px):
+            for half in tile_halves(block.shape, self._size_px):
                 self._look(frame, half, part, np.zeros_like(part))
                 np.maximum(block, part, out=block)
-            box = block_box(block, THRESHOLD, SMALLEST_PIECE)
+            box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
         for _ in range(CLOSER_LOOKS):
-            closer = window if box is None else around(box, self._size_px, self._margin)
+            closer = window if box is None else center_window(box, self._size_px, self._margin)
             if box is None or closer.width >= window.width:
                 break
             mouth[:] = 0.0
             self._look(frame, closer, block, mouth)
-            before, box = box, block_box(block, THRESHOLD, SMALLEST_PIECE)
+            before, box = box, bound_block(block, THRESHOLD, SMALLEST_PIECE)
             if box is not None and np.abs(np.subtract(box, before)).max() < STAYS * max(before[2:]):
                 break
         return Masks(block, mouth)
@@ -184,7 +184,7 @@ def as_input(picture: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(picture.transpose(2, 0, 1)).astype(np.float32) / np.float32(255.0)
 
 
-def found(weights: str) -> Path:
+def find_weights(weights: str) -> Path:
     """Returns the path of a network: as given if it exists, else the one of that name that ships with the package.
 
     Raises:
@@ -200,7 +200,7 @@ def found(weights: str) -> Path:
     )
 
 
-def checked_size(path: Path, header: dict) -> tuple[int, int]:
+def check_size(path: Path, header: dict) -> tuple[int, int]:
     """Returns width and height of a network's picture from the header of its file.
 
     Raises:

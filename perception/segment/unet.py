@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import nn
 from torch.nn import functional
+
+from brokk_rl.errors import CheckpointError
 
 CHANNELS = ("block", "mouth")
 """What the network tells apart; channels overlap: a mouth lies in its block."""
@@ -28,14 +35,15 @@ class UNet(nn.Module):
         super().__init__()
         self.widths = tuple(widths)
         self.down = nn.ModuleList(
-            _Pair(before, after) for before, after in zip((3, *widths[:-1]), widths, strict=True)
+            _ConvolutionPair(before, after)
+            for before, after in zip((3, *widths[:-1]), widths, strict=True)
         )
         back = list(widths[::-1])
         # each step up takes what came from below beside the bridge and leaves half as many, as the
         # size above has
         below, steps = back[0], []
         for here, above in zip(back[1:], [*back[2:], back[-1]], strict=True):
-            steps.append(_Pair(below + here, above))
+            steps.append(_ConvolutionPair(below + here, above))
             below = above
         self.up = nn.ModuleList(steps)
         self.head = nn.Conv2d(below, len(CHANNELS), 1)
@@ -53,8 +61,8 @@ class UNet(nn.Module):
         # the same picture then, but
         # for the noise
         picture = picture.sqrt()
-        mean = over_picture(picture)
-        spread = over_picture((picture - mean).square()).sqrt()
+        mean = average_picture(picture)
+        spread = average_picture((picture - mean).square()).sqrt()
         x, bridges = ((picture - mean) / (spread + DARKEST)).clamp(-BRIGHTEST, BRIGHTEST), []
         for number, pair in enumerate(self.down):
             x = pair(x if number == 0 else functional.max_pool2d(x, 2))
@@ -78,13 +86,43 @@ class Probabilities(nn.Module):
         return torch.sigmoid(self.network(picture))
 
 
-def over_picture(values: torch.Tensor) -> torch.Tensor:
+def read_checkpoint(path: Path) -> tuple[UNet, dict[str, Any]]:
+    """Return the network of a checkpoint, on the CPU and ready to use, and its header.
+
+    Raises:
+        CheckpointError: the file is corrupt or holds something else.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {})["brokk"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        network = UNet(header["widths"])
+        network.load_state_dict(tensors)
+    except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{path}: corrupt or no segmenter of ours ({error}); `brokk mode=train_perception` makes one"
+        ) from error
+    return network.eval().requires_grad_(False), header
+
+
+def build_inference(network: UNet, device: torch.device) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the network as a function from one picture to its probabilities."""
+    module = Probabilities(network).eval()
+
+    def infer(picture: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return module(torch.from_numpy(picture)[None].to(device))[0].cpu().numpy()
+
+    return infer
+
+
+def average_picture(values: torch.Tensor) -> torch.Tensor:
     """Returns the mean of each picture, `(B, 1, 1, 1)`."""
     # of means of rows: ONNX Runtime would add all 184,320 numbers of a picture one after the other
     return values.mean(3, keepdim=True).mean((1, 2), keepdim=True)
 
 
-def loss(logits: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+def compute_loss(logits: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Returns binary cross-entropy plus Dice (Milletari et al., 2016), both averaged over the channels.
 
     Args:
@@ -98,7 +136,7 @@ def loss(logits: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return entropy + (1.0 - (2.0 * shared + 1.0) / (both + 1.0)).mean()
 
 
-class _Pair(nn.Sequential):
+class _ConvolutionPair(nn.Sequential):
     """Two 3 x 3 convolutions, each normalised over the batch and rectified."""
 
     def __init__(self, before: int, after: int) -> None:

@@ -69,21 +69,21 @@ class Window:
         return (source[0], source[1]), (target[0], target[1])
 
 
-def whole(shape: tuple[int, ...], size_px: tuple[int, int]) -> Window:
+def cover_picture(shape: tuple[int, ...], size_px: tuple[int, int]) -> Window:
     """Returns the smallest window of the shape of `size_px` (width, height) that holds a picture `(H, W)`, in its middle."""
-    return around((0, 0, shape[1], shape[0]), size_px, 0.0)
+    return center_window((0, 0, shape[1], shape[0]), size_px, 0.0)
 
 
-def halves(shape: tuple[int, ...], size_px: tuple[int, int]) -> list[Window]:
+def tile_halves(shape: tuple[int, ...], size_px: tuple[int, int]) -> list[Window]:
     """Returns six windows of half the size of a picture `(H, W)` that overlap and together hold nearly all of it."""
     height, width = shape[:2]
     corners = [
         (across * width, down * height) for down in (0.05, 0.45) for across in (0.0, 0.25, 0.5)
     ]
-    return [around((*corner, 0.5 * width, 0.5 * height), size_px, 0.0) for corner in corners]
+    return [center_window((*corner, 0.5 * width, 0.5 * height), size_px, 0.0) for corner in corners]
 
 
-def around(
+def center_window(
     box: tuple[float, float, float, float], size_px: tuple[int, int], margin: float
 ) -> Window:
     """Returns the window of the shape of `size_px` in whose middle a box lies.
@@ -104,7 +104,7 @@ def around(
     )
 
 
-def block_box(
+def bound_block(
     block: np.ndarray, threshold: float, smallest: float
 ) -> tuple[int, int, int, int] | None:
     """Returns the box (left, top, width, height) around the block, px; `None` where there is none.

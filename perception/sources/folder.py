@@ -16,14 +16,14 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.calibrate.extrinsics import Place, placed
-from perception.sources import soundness
+from perception.sources import validation
 from perception.stereo import Stereo
 
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
 
 @spec
-class Folder:
+class FrameFolder:
     """Replays the frames of a folder; `camera.yaml` holds for all of them.
 
     Attributes:
@@ -58,7 +58,7 @@ class Folder:
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraModel:
     """What `camera.yaml` says; see `brokk_rl.signals.Frame`."""
 
     matrix: np.ndarray
@@ -68,7 +68,7 @@ class Camera:
     cov: np.ndarray | None = None
 
 
-def read_camera(path: Path) -> Camera:
+def read_camera(path: Path) -> CameraModel:
     """Reads `camera.yaml`.
 
     Raises:
@@ -90,11 +90,13 @@ def read_camera(path: Path) -> Camera:
     optional: dict[str, Any] = {
         name: told[name] for name in ("baseline_m", "T_base_cam") if told.get(name) is not None
     }
-    return Camera(
-        soundness.matrix(told["K"], where),
-        soundness.distortion(told.get("dist"), where),
-        soundness.baseline(optional["baseline_m"], where) if "baseline_m" in optional else None,
-        soundness.pose(optional["T_base_cam"], where) if "T_base_cam" in optional else None,
+    return CameraModel(
+        validation.check_matrix(told["K"], where),
+        validation.check_distortion(told.get("dist"), where),
+        validation.check_baseline(optional["baseline_m"], where)
+        if "baseline_m" in optional
+        else None,
+        validation.check_pose(optional["T_base_cam"], where) if "T_base_cam" in optional else None,
     )
 
 
@@ -121,19 +123,19 @@ def read_picture(path: Path) -> np.ndarray:
 class FolderSource:
     """An open folder; see `brokk_rl.contracts.vision.FrameSource`."""
 
-    def __init__(self, settings: Folder) -> None:
+    def __init__(self, settings: FrameFolder) -> None:
         self._settings, self._place = settings, Path(settings.folder)
         self._stems: list[Path] = []
-        self._camera: Camera | None = None
+        self._camera: CameraModel | None = None
         self._next = 0
 
     @property
     def num_frames(self) -> int:
         """How many frames there are."""
-        return len(self._stems) or len(dataset.stems(self._place))
+        return len(self._stems) or len(dataset.list_stems(self._place))
 
     def __enter__(self) -> FolderSource:
-        self._stems, self._next = dataset.stems(self._place), 0
+        self._stems, self._next = dataset.list_stems(self._place), 0
         path = self._place / dataset.CAMERA
         self._camera = (
             None if self._settings.needs == "nothing" and not path.exists() else read_camera(path)
@@ -167,14 +169,18 @@ class FolderSource:
         picture = read_picture(paths[dataset.COLOR])
         if self._settings.needs == "nothing" and picture.ndim == 2:
             picture = np.repeat(picture[..., None], 3, 2)
-        color = soundness.color(picture, str(paths[dataset.COLOR]))
+        color = validation.convert_color(picture, str(paths[dataset.COLOR]))
         height, width = color.shape[:2]
-        camera = self._camera or Camera(_guessed(height, width), None, None, None)
-        soundness.fits(camera.matrix, height, width, str(self._place / dataset.CAMERA))
+        camera = self._camera or CameraModel(_guess_camera_matrix(height, width), None, None, None)
+        validation.check_matrix_fits(
+            camera.matrix, height, width, str(self._place / dataset.CAMERA)
+        )
         right = None
         if paths[dataset.RIGHT].exists():
-            right = soundness.color(read_picture(paths[dataset.RIGHT]), str(paths[dataset.RIGHT]))
-            soundness.same_size(color, right, str(paths[dataset.RIGHT]), "the right picture")
+            right = validation.convert_color(
+                read_picture(paths[dataset.RIGHT]), str(paths[dataset.RIGHT])
+            )
+            validation.check_same_size(color, right, str(paths[dataset.RIGHT]), "the right picture")
         depth = self._depth(stem, color, right, camera)
         return Frame(
             color=color, depth_m=depth, camera_matrix=camera.matrix, base_from_camera=camera.base_from_camera, t_s=t_s,
@@ -182,7 +188,7 @@ class FolderSource:
         )  # fmt: skip
 
     def _depth(
-        self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: Camera
+        self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: CameraModel
     ) -> np.ndarray:
         """Returns the depth of a frame: what is stored, else what its two pictures tell."""
         stored, millimetres = (
@@ -192,12 +198,12 @@ class FolderSource:
         if stored.exists() or millimetres.exists():
             where = stored if stored.exists() else millimetres
             values = (
-                _array(stored)
+                _load_array(stored)
                 if stored.exists()
-                else soundness.depth_of_png(read_picture(millimetres), str(millimetres))
+                else validation.convert_png_depth(read_picture(millimetres), str(millimetres))
             )
-            found = soundness.depth(values, str(where), least)
-            soundness.same_size(color, found, str(where), "depth")
+            found = validation.check_depth(values, str(where), least)
+            validation.check_same_size(color, found, str(where), "depth")
             return found
         if self._settings.needs != "depth":
             return np.full(color.shape[:2], np.nan, np.float32)
@@ -212,17 +218,17 @@ class FolderSource:
         matched = self._settings.stereo.depth_m(
             color, right, float(camera.matrix[0, 0]), camera.baseline_m
         )
-        return soundness.depth(matched, f"{stem}: matching left and right", least)
+        return validation.check_depth(matched, f"{stem}: matching left and right", least)
 
 
-def _array(path: Path) -> np.ndarray:
+def _load_array(path: Path) -> np.ndarray:
     try:
         return np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise FrameError(f"{path}: truncated or no array ({error})") from error
 
 
-def _guessed(height: int, width: int) -> np.ndarray:
+def _guess_camera_matrix(height: int, width: int) -> np.ndarray:
     """Returns the camera matrix of an ordinary lens, for pictures of which nothing is known."""
     return np.array(
         [[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]]

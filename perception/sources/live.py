@@ -11,11 +11,11 @@ import numpy as np
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception.sources import soundness
+from perception.sources import validation
 
 
 @dataclass(frozen=True)
-class Lens:
+class LensCalibration:
     """What a camera says of itself: camera matrix `(3, 3)`, distortion or `None`, baseline in m or `None`."""
 
     matrix: np.ndarray
@@ -24,7 +24,7 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Capture:
+class RawCapture:
     """One capture: RGB, depth in m as the camera tells it (0, NaN and infinite where unknown), time it was taken, right picture."""
 
     color: np.ndarray
@@ -33,14 +33,14 @@ class Capture:
     right: np.ndarray | None = None
 
 
-class Device(Protocol):
+class CameraDevice(Protocol):
     """A camera's own library, behind three methods."""
 
-    def open(self) -> Lens:
+    def open(self) -> LensCalibration:
         """Opens the camera; raises a `FrameError` when that fails."""
         ...
 
-    def capture(self, timeout_s: float) -> Capture | None:
+    def capture(self, timeout_s: float) -> RawCapture | None:
         """Waits for a new capture; `None` when there is none within the time."""
         ...
 
@@ -96,7 +96,7 @@ class LiveSource:
 
     def __init__(
         self,
-        device: Device,
+        device: CameraDevice,
         name: str,
         fresh: Freshness,
         base_from_camera: np.ndarray | None,
@@ -104,14 +104,14 @@ class LiveSource:
     ) -> None:
         self._device, self._name, self._fresh = device, name, fresh
         self._pose, self._pose_cov = base_from_camera, camera_cov
-        self._lens: Lens | None = None
+        self._lens: LensCalibration | None = None
         self._last_s = -np.inf
 
     def __enter__(self) -> LiveSource:
         try:
             lens = self._device.open()
-            self._lens = Lens(
-                soundness.matrix(lens.matrix, self._name), lens.distortion, lens.baseline_m
+            self._lens = LensCalibration(
+                validation.check_matrix(lens.matrix, self._name), lens.distortion, lens.baseline_m
             )
         except BaseException:
             self._device.close()
@@ -152,12 +152,14 @@ class LiveSource:
             f"{self._name}: no new frame for {self._fresh.timeout_s:g} s{stale}. Is it plugged in?"
         )
 
-    def _frame(self, capture: Capture, lens: Lens) -> Frame:
-        soundness.same_size(capture.color, capture.depth_m, self._name, "depth")
-        soundness.fits(lens.matrix, capture.color.shape[0], capture.color.shape[1], self._name)
+    def _frame(self, capture: RawCapture, lens: LensCalibration) -> Frame:
+        validation.check_same_size(capture.color, capture.depth_m, self._name, "depth")
+        validation.check_matrix_fits(
+            lens.matrix, capture.color.shape[0], capture.color.shape[1], self._name
+        )
         return Frame(
             color=capture.color,
-            depth_m=soundness.depth(capture.depth_m, self._name, self._fresh.least_known),
+            depth_m=validation.check_depth(capture.depth_m, self._name, self._fresh.least_known),
             camera_matrix=lens.matrix,
             base_from_camera=self._pose,
             camera_cov=self._pose_cov,

@@ -11,8 +11,8 @@ import numpy as np
 from brokk_rl.errors import FrameError
 from brokk_rl.spec import spec
 from perception.calibrate.extrinsics import Place, placed
-from perception.sources import soundness
-from perception.sources.live import Capture, Freshness, Lens, LiveSource
+from perception.sources import validation
+from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
 
 
 @spec
@@ -54,7 +54,7 @@ class RealSenseDevice:
         self._pipeline: Any = None
         self._started = False
 
-    def open(self) -> Lens:
+    def open(self) -> LensCalibration:
         """Opens the camera.
 
         Raises:
@@ -86,10 +86,12 @@ class RealSenseDevice:
         matrix = np.array([[lens.fx, 0.0, lens.ppx], [0.0, lens.fy, lens.ppy], [0.0, 0.0, 1.0]])
         coefficients = np.array(lens.coeffs, float)
         if lens.model == rs.distortion.inverse_brown_conrady and coefficients.any():
-            coefficients = forward(coefficients, matrix, size)
-        return Lens(matrix, soundness.distortion(coefficients.tolist(), "RealSense camera"), None)
+            coefficients = invert_distortion(coefficients, matrix, size)
+        return LensCalibration(
+            matrix, validation.check_distortion(coefficients.tolist(), "RealSense camera"), None
+        )
 
-    def capture(self, timeout_s: float) -> Capture | None:
+    def capture(self, timeout_s: float) -> RawCapture | None:
         """Returns the next capture, `None` when there is none in time."""
         try:
             frames = self._align.process(
@@ -106,7 +108,7 @@ class RealSenseDevice:
         # knows: the time of arrival, then
         own_clock = color.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock
         t_s = time.time() if own_clock else float(color.get_timestamp()) * 1e-3
-        return Capture(np.array(color.get_data(), np.uint8), values, t_s)
+        return RawCapture(np.array(color.get_data(), np.uint8), values, t_s)
 
     def now_s(self) -> float:
         """Returns the host's time: captures are stamped by it."""
@@ -119,7 +121,7 @@ class RealSenseDevice:
             self._pipeline.stop()
 
 
-def forward(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def invert_distortion(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Returns OpenCV's coefficients `k1 k2 p1 p2 k3` of a lens of which the inverse is told, `(5,)`.
 
     OpenCV's polynomial says where a ray is seen, RealSense's inverse one, the same in form, which
@@ -137,12 +139,12 @@ def forward(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> n
             (rows.ravel() - matrix[1, 2]) / matrix[1, 1],
         ]
     )
-    ray = seen + _bend(seen) @ inverse
-    table = _bend(ray)
+    ray = seen + _tabulate_distortion(seen) @ inverse
+    table = _tabulate_distortion(ray)
     return np.linalg.lstsq(table.reshape(-1, 5), (seen - ray).ravel(), rcond=None)[0]
 
 
-def _bend(point: np.ndarray) -> np.ndarray:
+def _tabulate_distortion(point: np.ndarray) -> np.ndarray:
     """Returns by how much each coefficient moves points `(2, M)` of the plane z = 1, `(2, M, 5)`."""
     x, y = point
     r2 = x * x + y * y

@@ -23,7 +23,7 @@ from perception.stereo import Stereo
 
 
 @spec
-class Simulated:
+class SimulatedCamera:
     """A rendered camera that looks at the scene of the borehole task.
 
     Attributes:
@@ -78,7 +78,7 @@ class SimulatedSource:
     Whoever runs the simulation calls `show` before each `read_latest`.
     """
 
-    def __init__(self, settings: Simulated) -> None:
+    def __init__(self, settings: SimulatedCamera) -> None:
         self._settings = settings
         self._studio = Studio(
             rig=settings.rig,

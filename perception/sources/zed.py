@@ -11,8 +11,8 @@ import numpy as np
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.spec import spec
 from perception.calibrate.extrinsics import Place, placed
-from perception.sources import soundness
-from perception.sources.live import Capture, Freshness, Lens, LiveSource
+from perception.sources import validation
+from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
 
 _TRIES_S = 0.005
 
@@ -78,7 +78,7 @@ class ZedDevice:
         self._camera: Any = None
         self.has_ended = False
 
-    def open(self) -> Lens:
+    def open(self) -> LensCalibration:
         """Opens the camera.
 
         Raises:
@@ -94,7 +94,7 @@ class ZedDevice:
         settings, init = self._settings, sl.InitParameters()
         init.camera_resolution = getattr(sl.RESOLUTION, settings.resolution)
         init.camera_fps = settings.rate_hz
-        init.depth_mode = _named(sl.DEPTH_MODE, settings.depth_mode, "source.depth_mode")
+        init.depth_mode = _look_up(sl.DEPTH_MODE, settings.depth_mode, "source.depth_mode")
         init.coordinate_units = sl.UNIT.METER
         init.coordinate_system = sl.COORDINATE_SYSTEM.IMAGE  # x right, y down, z forward
         init.depth_minimum_distance, init.depth_maximum_distance = (
@@ -126,9 +126,9 @@ class ZedDevice:
             calibration.left_cam
         )  # rectified: its distortion is that of the raw picture, which is not used
         matrix = np.array([[left.fx, 0.0, left.cx], [0.0, left.fy, left.cy], [0.0, 0.0, 1.0]])
-        return Lens(matrix, None, abs(float(calibration.get_camera_baseline())))
+        return LensCalibration(matrix, None, abs(float(calibration.get_camera_baseline())))
 
-    def capture(self, timeout_s: float) -> Capture | None:
+    def capture(self, timeout_s: float) -> RawCapture | None:
         """Returns the next capture, `None` when there is none in time or the recording has ended."""
         sl, until = self._sl, time.monotonic() + timeout_s
         while (status := self._camera.grab(self._runtime)) != sl.ERROR_CODE.SUCCESS:
@@ -144,10 +144,10 @@ class ZedDevice:
         self._camera.retrieve_measure(self._depth, sl.MEASURE.DEPTH)
         t_s = self._camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds() * 1e-9
         color, right = (
-            soundness.color(np.asarray(mat.get_data()), "ZED camera")
+            validation.convert_color(np.asarray(mat.get_data()), "ZED camera")
             for mat in (self._picture, self._right)
         )
-        return Capture(
+        return RawCapture(
             color, np.array(self._depth.get_data(), np.float32), t_s, right
         )  # the SDK reuses its memory
 
@@ -167,7 +167,7 @@ class ZedDevice:
             camera.close()
 
 
-def _named(names: Any, name: str, where: str) -> Any:
+def _look_up(names: Any, name: str, where: str) -> Any:
     if not hasattr(names, name):
         raise FrameError(f"{where}={name}: this SDK does not know it")
     return getattr(names, name)

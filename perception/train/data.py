@@ -24,7 +24,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.segment.network import SMALLEST_PIECE, THRESHOLD
-from perception.segment.window import Window, around, block_box, whole
+from perception.segment.window import Window, bound_block, center_window, cover_picture
 from perception.train.augment import Augmentation, augmented
 
 ROOM = 1.5
@@ -251,7 +251,7 @@ def _frame(stem: Path) -> tuple[np.ndarray, np.ndarray, str]:
             f"{path}: {picture.shape[1::-1]} px, its mask {label.block.shape[::-1]} px"
         )
     condition = dataset.read_truth(stem).scene if dataset.is_whole(stem) else "unknown"
-    known = np.stack([label.block, label.mouth], axis=-1).astype(np.uint8) * np.uint8(255)
+    known = np.stack([label.block, label.hole_mask], axis=-1).astype(np.uint8) * np.uint8(255)
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), known, condition
 
 
@@ -259,8 +259,8 @@ def _looks(
     known: np.ndarray, size_px: tuple[int, int], margin: float, generator: np.random.Generator
 ) -> list[Window]:
     """Returns the windows of both views of a frame."""
-    first = whole(known.shape, size_px)
-    box = block_box(known[..., 0] / 255.0, THRESHOLD, SMALLEST_PIECE)
+    first = cover_picture(known.shape, size_px)
+    box = bound_block(known[..., 0] / 255.0, THRESHOLD, SMALLEST_PIECE)
     if box is None:
         side = generator.uniform(0.2, 0.8) * np.array([known.shape[1], known.shape[0]])
         corner = generator.uniform(0.0, 1.0, 2) * (
@@ -268,6 +268,6 @@ def _looks(
         )
         box = (*corner, *side)
     room = ROOM * (1.0 + 2.0 * margin)
-    closer = around(box, size_px, (room - 1.0) / 2.0)
+    closer = center_window(box, size_px, (room - 1.0) / 2.0)
     room *= max(1.0, size_px[0] / ENLARGED / closer.width)
-    return [first, around(box, size_px, (room - 1.0) / 2.0)]
+    return [first, center_window(box, size_px, (room - 1.0) / 2.0)]

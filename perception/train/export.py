@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from brokk_rl.errors import CheckpointError, StorageError
-from perception.segment.network import PREFIX, SCHEMA, Infer
+from perception.segment.network import PREFIX, SCHEMA
 from perception.segment.unet import CHANNELS, Probabilities, UNet
 
 TENSORS, ONNX = "segmenter.safetensors", "segmenter.onnx"
@@ -49,36 +48,6 @@ def write(path: Path, network: UNet, header: Mapping[str, Any]) -> None:
         name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
     }
     write_bytes(path, save(tensors, metadata={"brokk": json.dumps(header)}))
-
-
-def read(path: Path) -> tuple[UNet, dict[str, Any]]:
-    """Returns the network of a checkpoint, on the CPU and ready to use, and its header.
-
-    Raises:
-        CheckpointError: it is corrupt or holds something else.
-    """
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {})["brokk"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-        network = UNet(header["widths"])
-        network.load_state_dict(tensors)
-    except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{path}: corrupt or no segmenter of ours ({error}); `brokk mode=train_perception` makes one"
-        ) from error
-    return network.eval().requires_grad_(False), header
-
-
-def inference(network: UNet, device: torch.device) -> Infer:
-    """Returns the network as a function from one picture to probabilities."""
-    module = Probabilities(network).eval()
-
-    def infer(picture: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return module(torch.from_numpy(picture)[None].to(device))[0].cpu().numpy()
-
-    return infer
 
 
 def write_onnx(

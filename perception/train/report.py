@@ -21,7 +21,7 @@ from rich.progress import (
 
 from perception.segment.network import THRESHOLD
 from perception.segment.unet import CHANNELS, UNet
-from perception.segment.window import around, whole
+from perception.segment.window import center_window, cover_picture
 from perception.train.data import LOOKS, ROOM, Views
 
 BATCH = 32
@@ -43,7 +43,9 @@ def looked_at(views: Views, size_px: tuple[int, int]) -> tuple[torch.Tensor, tor
         full[0] / ROOM,
     )
     seen = np.empty((len(views), len(LOOKS), 5, height, width), np.uint8)
-    for look, window in enumerate((whole(full, size_px), around(room, size_px, 0.0))):
+    for look, window in enumerate(
+        (cover_picture(full, size_px), center_window(room, size_px, 0.0))
+    ):
         for frame in range(len(views)):
             layers = views.layers[frame, look].numpy().transpose(1, 2, 0)
             for part in (slice(0, 3), slice(3, 5)):

@@ -14,8 +14,8 @@ import torch
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from perception.segment.network import found
-from perception.segment.unet import UNet, loss
+from perception.segment.network import find_weights
+from perception.segment.unet import UNet, compute_loss, read_checkpoint
 from perception.train import data as training_data
 from perception.train import export, report
 from perception.train.augment import Augmentation
@@ -170,7 +170,7 @@ class _Training:
         """Returns the network as the training begins with it."""
         network, settings = UNet(self._settings.widths), self._settings
         if settings.start is not None:
-            first, _ = export.read(found(settings.start))
+            first, _ = read_checkpoint(find_weights(settings.start))
             if first.widths != network.widths:
                 raise CheckpointError(
                     f"training.start: {settings.start} has widths {list(first.widths)}, training.widths are "
@@ -202,7 +202,7 @@ class _Training:
             group["lr"] = self._rate()
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._settings.bfloat16):
             logits = self._network(picture.to(memory_format=torch.channels_last))
-        value = loss(logits.float(), target)
+        value = compute_loss(logits.float(), target)
         self._optimizer.zero_grad(set_to_none=True)
         value.backward()
         torch.nn.utils.clip_grad_norm_(self._network.parameters(), 1.0)

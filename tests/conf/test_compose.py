@@ -15,7 +15,7 @@ from brokk_rl import registry
 OVERRIDES = ("experiment", "ablation", "preset", "search")
 PARTS = [
     (entry.group, entry.name)
-    for entry in registry.options()
+    for entry in registry.list_options()
     if entry.group not in (*OVERRIDES, "mode")
 ]
 
@@ -59,7 +59,7 @@ def test_every_job_of_every_ablation_composes(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "entry", registry.options(), ids=lambda entry: f"{entry.group}={entry.name}"
+    "entry", registry.list_options(), ids=lambda entry: f"{entry.group}={entry.name}"
 )
 def test_every_option_says_in_one_line_what_it_is(entry: registry.Option) -> None:
     assert len(entry.summary()) > 10

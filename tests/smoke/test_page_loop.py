@@ -18,10 +18,9 @@ from desk import free_port
 from PIL import Image
 from websockets.asyncio.client import connect
 
-from deploy.page.demo import BLOCK_M, TARGETS
-from deploy.page.demo_camera import Camera
+from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
 
-FRAME = Camera(640, 360, BLOCK_M, TARGETS).frame(0, 0.0)
+FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).frame(0, 0.0)
 TOKEN = "correct horse battery staple"
 
 

@@ -15,7 +15,7 @@ from hydra.utils import instantiate
 from actuators.person import Person
 from brokk_rl.checks import check_task
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine, exclusive_mask
+from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.observation import Encoder
 from brokk_rl.rl.vec_env import ControlLoop
 from tasks.advice import Advice
@@ -121,7 +121,7 @@ def test_proposals_keep_the_masks(machine: Machine) -> None:
     for _ in range(40):
         wanted = torch.rand(8, 5, generator=generator) * 2 - 1
         wanted = torch.where(
-            exclusive_mask(exclusive, torch.rand(8, generator=generator) < 0.5), wanted, 0.0
+            mask_exclusive_joints(exclusive, torch.rand(8, generator=generator) < 0.5), wanted, 0.0
         )
         shown = adviser.proposal(wanted, proposed)
         proposed = torch.cat((proposed[:, 1:], shown[:, None]), 1)

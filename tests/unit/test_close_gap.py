@@ -94,7 +94,8 @@ def test_without_a_fall_there_is_nothing_to_regain() -> None:
 def test_the_interval_of_a_difference_is_newcombe_s() -> None:
     # his table II, case (a), 56/70 and 48/80: 0.0524 to 0.3339
     first, second = (
-        {"mean": k / n, "ci95": list(retraining.wilson(k, n))} for k, n in ((56, 70), (48, 80))
+        {"mean": k / n, "ci95": list(retraining.compute_wilson_interval(k, n))}
+        for k, n in ((56, 70), (48, 80))
     )
     assert retraining.subtract_rates(first, second)["ci95"] == pytest.approx(
         [0.0524, 0.3339], abs=5e-5

@@ -10,10 +10,15 @@ from typing import Any
 
 import pytest
 
-from brokk_rl.comparison_picture import unlike_most
+from brokk_rl.comparison import (
+    describe_differences,
+    find_differences,
+    find_runs,
+    group_results,
+    load_run,
+)
 from brokk_rl.errors import ConfigError
-from brokk_rl.intervals import student, wilson
-from brokk_rl.modes.compare import differing, find, grouped, load
+from brokk_rl.intervals import compute_student_interval, compute_wilson_interval
 
 
 def write_run(folder: Path, actuator: str, seed: int, strict: float, **more: Any) -> None:
@@ -51,35 +56,46 @@ def sweep(tmp_path: Path) -> Path:
 
 def test_wilson_is_that_of_the_books() -> None:
     # 8 of 10: centre (0.8 + 1.96²/20) / (1 + 1.96²/10) = 0.7167, half width 0.2266
-    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
-    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
-    assert wilson(0, 0) == (0.0, 1.0)
+    assert compute_wilson_interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
+    assert compute_wilson_interval(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
+    assert compute_wilson_interval(0, 0) == (0.0, 1.0)
 
 
 def test_student_is_that_of_the_books() -> None:
     # two values 0.2 and 0.4: mean 0.3, standard error 0.1, t(0.975, 1) = 12.706
-    assert student([0.2, 0.4]) == pytest.approx((0.3 - 1.2706, 0.3 + 1.2706), abs=1e-4)
-    assert student([0.2]) is None
+    assert compute_student_interval([0.2, 0.4]) == pytest.approx(
+        (0.3 - 1.2706, 0.3 + 1.2706), abs=1e-4
+    )
+    assert compute_student_interval([0.2]) is None
 
 
 def test_runs_are_found_in_their_order_below_a_sweep(sweep: Path) -> None:
     (sweep / "1_ideal").rename(sweep / "10_ideal")
-    assert [path.name for path in find([str(sweep)])] == ["0_ideal", "2_mlp", "3_mlp", "10_ideal"]
-    assert [path.name for path in find([str(sweep / "*_mlp"), str(sweep / "2_mlp")])] == [
+    assert [path.name for path in find_runs([str(sweep)])] == [
+        "0_ideal",
+        "2_mlp",
+        "3_mlp",
+        "10_ideal",
+    ]
+    assert [path.name for path in find_runs([str(sweep / "*_mlp"), str(sweep / "2_mlp")])] == [
         "2_mlp",
         "3_mlp",
     ]
 
 
 def test_only_what_differs_is_a_column_and_seeds_are_not(sweep: Path) -> None:
-    assert differing([load(folder) for folder in find([str(sweep)])]) == ["actuator"]
+    assert find_differences([load_run(folder) for folder in find_runs([str(sweep)])]) == [
+        "actuator"
+    ]
 
 
 def test_seeds_become_one_row_with_the_interval_over_them(sweep: Path) -> None:
     results = [
-        result for folder in find([str(sweep)]) for result in load(folder).results(["actuator"])
+        result
+        for folder in find_runs([str(sweep)])
+        for result in load_run(folder).results(["actuator"])
     ]
-    ideal, mlp = grouped(results)
+    ideal, mlp = group_results(results)
     assert ideal["variation"] == {"actuator": "ideal"}
     assert ideal["seeds"] == [0, 1]
     assert ideal["success_strict"]["mean"] == pytest.approx(0.3)
@@ -88,8 +104,8 @@ def test_seeds_become_one_row_with_the_interval_over_them(sweep: Path) -> None:
 
 
 def test_a_single_run_has_the_interval_of_its_episodes(sweep: Path) -> None:
-    (single,) = grouped(load(sweep / "2_mlp").results([]))
-    assert single["success_strict"]["ci95"] == wilson(90, 100)
+    (single,) = group_results(load_run(sweep / "2_mlp").results([]))
+    assert single["success_strict"]["ci95"] == compute_wilson_interval(90, 100)
 
 
 def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
@@ -100,7 +116,7 @@ def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
         "time_to_insert_s": {"median": None},
     }
     write_run(tmp_path / "run", "mlp", 0, 0.9, policies={"trained": figures, "classical": figures})
-    rows = grouped(load(tmp_path / "run").results([]))
+    rows = group_results(load_run(tmp_path / "run").results([]))
     assert [row["policy"] for row in rows] == ["trained", "classical"]
     assert rows[0]["success_paper"] == {"mean": None, "ci95": None}
 
@@ -108,10 +124,10 @@ def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
 def test_a_broken_evaluation_is_named(sweep: Path) -> None:
     (sweep / "0_ideal" / "evaluation.json").write_text("{}")
     with pytest.raises(ConfigError, match=r"0_ideal.*episodes"):
-        load(sweep / "0_ideal").results([])
+        load_run(sweep / "0_ideal").results([])
     (sweep / "0_ideal" / "evaluation.json").write_text("{")
     with pytest.raises(ConfigError, match="cannot be read"):
-        load(sweep / "0_ideal")
+        load_run(sweep / "0_ideal")
 
 
 def test_the_command_writes_table_csv_and_picture(
@@ -138,10 +154,10 @@ def test_an_evaluation_elsewhere_belongs_to_the_run_that_trained(tmp_path: Path)
         write_run(elsewhere, "hydraulic", 0, 0.5 if actuator == "ideal" else 0.7)
         # it was written on another machine; both folders were moved together
         (elsewhere / "resolved.yaml").write_text(f"policy: {{folder: /gone/{trained.name}}}\n")
-    runs = [load(folder) for folder in find([str(tmp_path / "*_there")])]
-    columns = differing(runs)
+    runs = [load_run(folder) for folder in find_runs([str(tmp_path / "*_there")])]
+    columns = find_differences(runs)
     assert columns == ["actuator", "evaluated on"]
-    ideal, mlp = grouped([result for run in runs for result in run.results(columns)])
+    ideal, mlp = group_results([result for run in runs for result in run.results(columns)])
     assert (ideal["variation"], ideal["seeds"]) == (
         {"actuator": "ideal", "evaluated on": "hydraulic"},
         [0, 1],
@@ -158,7 +174,7 @@ def test_a_sweep_over_a_whole_node_is_told_apart_by_its_values(tmp_path: Path) -
         (tmp_path / str(index) / "resolved.yaml").write_text(
             f"task: {{reward: {{progress: {{weight: {weight}}}}}}}\n"
         )
-    assert differing([load(folder) for folder in find([str(tmp_path)])]) == [
+    assert find_differences([load_run(folder) for folder in find_runs([str(tmp_path)])]) == [
         "task.reward.progress.weight"
     ]
 
@@ -183,8 +199,7 @@ def test_a_row_says_only_what_most_others_do_not_share() -> None:
         {"task.noise.a": 1, "rl.a": 3},
         {"task.noise.a": 4, "rl.a": 2},
     ]
-    assert unlike_most([{"variation": row} for row in rows]) == ["", "rl.a 3", "noise.a 4"]
-    assert unlike_most([{"variation": {"task.memory": 13}}, {"variation": {"task.memory": 1}}]) == [
-        "memory 13",
-        "memory 1",
-    ]
+    assert describe_differences([{"variation": row} for row in rows]) == ["", "rl.a 3", "noise.a 4"]
+    assert describe_differences(
+        [{"variation": {"task.memory": 13}}, {"variation": {"task.memory": 1}}]
+    ) == ["memory 13", "memory 1"]

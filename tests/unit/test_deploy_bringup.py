@@ -17,12 +17,12 @@ from desk import DBC, free_port
 from actuators.excite.plan.drive import NominalMachine
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from deploy.bus.description import Description
-from deploy.bus.wire import Wire
-from deploy.guard.motion import judge
-from deploy.runtime.process import Child, Pace
-from deploy.twin.faults import ask
-from deploy.twin.remote import Remote
+from deploy.bringup import measure_joint_response
+from deploy.bus.can_bus import CanBus
+from deploy.bus.description import BusDescription
+from deploy.runtime.process import ChildProcess, CycleTimer
+from deploy.twin.faults import request_fault
+from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import Twin
 
 T_S = np.arange(0, 12, 0.01)
@@ -39,7 +39,7 @@ def answer(sign: float, dead_s: float, speed: float = 0.2) -> tuple[np.ndarray, 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_sign_dead_time_and_speed_of_a_joint_are_found(sign: float, dead_s: float) -> None:
     q, flow = answer(sign, dead_s)
-    found = judge(T_S, q, flow, travel=2.0)
+    found = measure_joint_response(T_S, q, flow, travel=2.0)
     assert found is not None and found.agrees is (sign > 0)
     assert found.dead_time_s == pytest.approx(dead_s, abs=0.02) and found.speed == pytest.approx(
         0.2, abs=0.02
@@ -48,16 +48,16 @@ def test_sign_dead_time_and_speed_of_a_joint_are_found(sign: float, dead_s: floa
 
 def test_a_joint_that_moved_one_way_only_or_not_at_all_says_nothing() -> None:
     q, flow = answer(1.0, 0.5)
-    assert judge(T_S[:600], q[:600], flow[:600], 2.0) is None
-    assert judge(T_S, np.zeros_like(q), flow, 2.0) is None
+    assert measure_joint_response(T_S[:600], q[:600], flow[:600], 2.0) is None
+    assert measure_joint_response(T_S, np.zeros_like(q), flow, 2.0) is None
 
 
-def operator(stop: threading.Event, wire: Wire, port: int, machine: Machine) -> None:
+def operator(stop: threading.Event, wire: CanBus, port: int, machine: Machine) -> None:
     """Does what the checklist asks for: dead-man, emergency stop, then each joint both ways."""
-    remote = Remote(Description(DBC, machine))
+    remote = RadioRemote(BusDescription(DBC, machine))
     begun_s, asked = time.monotonic(), False
     with wire.open([]) as bus:
-        pace = Pace(remote.period_s)
+        pace = CycleTimer(remote.period_s)
         while not stop.is_set():
             pace.wait()
             pace.begin()
@@ -67,7 +67,7 @@ def operator(stop: threading.Event, wire: Wire, port: int, machine: Machine) -> 
             remote.deadman = 0.5 < t_s % 2 < 1.0
             if int(t_s) % 4 == 1 and not asked:
                 with contextlib.suppress(TimeoutError):
-                    ask(port, {"fault": "estop", "seconds": 0.3})
+                    request_fault(port, {"fault": "estop", "seconds": 0.3})
             asked = int(t_s) % 4 == 1
             part, remote.button_right = t_s % 4.8, t_s >= 4.8
             pushed = (0.6 if part < 2.0 else -0.6) if 1.0 < part < 1.6 or 3.4 < part < 4.0 else 0.0
@@ -80,7 +80,7 @@ def test_the_checklist_runs_with_an_operator_and_finds_a_sound_machine(
     brokk: Callable[..., Any], machine: Machine, tmp_path: Path
 ) -> None:
     bus_port, port = free_port(), free_port()
-    wire = Wire(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=bus_port)
+    wire = CanBus(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=bus_port)
     twin = Twin(
         wire=wire,
         dbc=DBC,
@@ -92,7 +92,7 @@ def test_the_checklist_runs_with_an_operator_and_finds_a_sound_machine(
         realtime=False,
     )
     session, stop = Session(out=str(tmp_path / "twin"), seed=0, device="cpu"), threading.Event()
-    child = Child(
+    child = ChildProcess(
         "twin", "deploy.twin.twin:run", (twin, machine, NominalMachine(), session), (), 60
     )
     time.sleep(2.0)

@@ -21,20 +21,19 @@ from hypothesis import strategies as st
 from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from deploy.bus import description as described
-from deploy.bus.description import Description
-from deploy.bus.header import c_header
-from deploy.bus.protection import Channel, Fault, Trust, crc8
-from deploy.bus.wire import Replay, Wire, Wired
+from deploy.bus.can_bus import BusReplay, CanBus, CanFrame
+from deploy.bus.description import BusDescription, generate_c_header
+from deploy.bus.protection import ChannelTrust, MessageFault, ProtectedChannel, compute_crc8
 
 
 @pytest.fixture(scope="module")
-def bus(machine: Machine) -> Description:
-    return Description(DBC, machine)
+def bus(machine: Machine) -> BusDescription:
+    return BusDescription(DBC, machine)
 
 
 @given(st.binary(max_size=8), st.integers(0, 0xFFFF))
 def test_the_crc_is_that_of_sae_j1850_over_data_and_data_id(data: bytes, data_id: int) -> None:
-    assert crc8(data, data_id) == Crc8SaeJ1850.calc(data + data_id.to_bytes(2, "little"))
+    assert compute_crc8(data, data_id) == Crc8SaeJ1850.calc(data + data_id.to_bytes(2, "little"))
 
 
 @settings(max_examples=50)
@@ -42,7 +41,7 @@ def test_the_crc_is_that_of_sae_j1850_over_data_and_data_id(data: bytes, data_id
 def test_commands_arrive_as_they_were_sent_to_half_a_step(
     machine: Machine, u: list[float], counter: int
 ) -> None:
-    bus = Description(DBC, machine)
+    bus = BusDescription(DBC, machine)
     names = [f"Command_q{j}" for j in range(1, 6)]
     data = bus.encode("ValveCmd", dict(zip(names, u, strict=True)) | {"CommandMode": 1}, counter)
     values = bus.decode(bus.command, data)
@@ -56,36 +55,36 @@ def test_commands_arrive_as_they_were_sent_to_half_a_step(
     )
 
 
-def test_every_single_wrong_bit_is_found_in_every_message(bus: Description) -> None:
+def test_every_single_wrong_bit_is_found_in_every_message(bus: BusDescription) -> None:
     for layout in bus.layouts.values():
         data = bus.encode(layout.name, {}, 3)
         for bit in range(8 * len(data)):
             wrong = bytearray(data)
             wrong[bit // 8] ^= 1 << bit % 8
-            assert bus.decode(layout, bytes(wrong)) is Fault.CRC
+            assert bus.decode(layout, bytes(wrong)) is MessageFault.CRC
 
 
-def test_a_message_under_the_name_of_another_is_found(bus: Description) -> None:
+def test_a_message_under_the_name_of_another_is_found(bus: BusDescription) -> None:
     for one, other in itertools.permutations(
         [layout for layout in bus.layouts.values() if layout.length == 8], 2
     ):
-        assert bus.decode(other, bus.encode(one.name, {}, 1)) is Fault.CRC
-    assert bus.decode(bus.command, bus.encode("ValveCmd", {}, 1)[:-1]) is Fault.LENGTH
+        assert bus.decode(other, bus.encode(one.name, {}, 1)) is MessageFault.CRC
+    assert bus.decode(bus.command, bus.encode("ValveCmd", {}, 1)[:-1]) is MessageFault.LENGTH
 
 
-def heard(channel: Channel, counters: list[int | None]) -> list[Fault | None]:
+def heard(channel: ProtectedChannel, counters: list[int | None]) -> list[MessageFault | None]:
     return [
-        channel.refuse(Fault.CRC) if counter is None else channel.take(counter)
+        channel.refuse(MessageFault.CRC) if counter is None else channel.take(counter)
         for counter in counters
     ]
 
 
 def test_a_channel_is_believed_after_two_messages_in_order() -> None:
-    channel = Channel(16)
+    channel = ProtectedChannel(16)
     heard(channel, [7])
-    assert channel.trust is Trust.INIT
+    assert channel.trust is ChannelTrust.INIT
     heard(channel, [8])
-    assert channel.trust is Trust.VALID
+    assert channel.trust is ChannelTrust.VALID
 
 
 @pytest.mark.parametrize(
@@ -93,56 +92,72 @@ def test_a_channel_is_believed_after_two_messages_in_order() -> None:
     [
         (
             [0, 1, 2, 15, 0],
-            [None, None, None, Fault.SEQUENCE, None],
-            Trust.VALID,
+            [None, None, None, MessageFault.SEQUENCE, None],
+            ChannelTrust.VALID,
         ),  # one out of order
-        ([14, 15, 0, 1], [None] * 4, Trust.VALID),  # the counter goes round
-        ([0, 1, 5, 6], [None] * 4, Trust.VALID),  # three lost
-        ([0, 1, 6, 7], [None, None, Fault.SEQUENCE, None], Trust.VALID),  # four lost: one error
-        ([0, 1, 1, 1], [None, None, Fault.REPEATED, Fault.REPEATED], Trust.INVALID),  # stands still
-        ([0, 1, None, None], [None, None, Fault.CRC, Fault.CRC], Trust.INVALID),
-        ([0, 1, None, 2, None, 3], [None, None, Fault.CRC, None, Fault.CRC, None], Trust.VALID),
-        ([None, None, None], [Fault.CRC] * 3, Trust.INIT),
+        ([14, 15, 0, 1], [None] * 4, ChannelTrust.VALID),  # the counter goes round
+        ([0, 1, 5, 6], [None] * 4, ChannelTrust.VALID),  # three lost
+        (
+            [0, 1, 6, 7],
+            [None, None, MessageFault.SEQUENCE, None],
+            ChannelTrust.VALID,
+        ),  # four lost: one error
+        (
+            [0, 1, 1, 1],
+            [None, None, MessageFault.REPEATED, MessageFault.REPEATED],
+            ChannelTrust.INVALID,
+        ),  # stands still
+        (
+            [0, 1, None, None],
+            [None, None, MessageFault.CRC, MessageFault.CRC],
+            ChannelTrust.INVALID,
+        ),
+        (
+            [0, 1, None, 2, None, 3],
+            [None, None, MessageFault.CRC, None, MessageFault.CRC, None],
+            ChannelTrust.VALID,
+        ),
+        ([None, None, None], [MessageFault.CRC] * 3, ChannelTrust.INIT),
     ],
     ids=str,
 )
 def test_a_channel_judges_by_counter_and_crc(
-    counters: list[int | None], faults: list[Fault | None], trust: Trust
+    counters: list[int | None], faults: list[MessageFault | None], trust: ChannelTrust
 ) -> None:
-    channel = Channel(16)
+    channel = ProtectedChannel(16)
     assert heard(channel, counters) == faults
     assert channel.trust is trust
 
 
 def test_what_became_invalid_needs_ten_good_messages() -> None:
-    channel = Channel(16)
+    channel = ProtectedChannel(16)
     heard(channel, [0, 1, None, None])
     heard(channel, list(range(2, 11)))
-    assert channel.trust is Trust.INVALID
+    assert channel.trust is ChannelTrust.INVALID
     heard(channel, [11])
-    assert channel.trust is Trust.VALID
+    assert channel.trust is ChannelTrust.VALID
 
 
 def test_errors_that_come_often_but_never_twice_in_a_row_still_count() -> None:
-    channel = Channel(16)
+    channel = ProtectedChannel(16)
     story: list[int | None] = [0, 1]
     for number in range(2, 16):
         story += [None, number] if number % 2 == 0 else [None]
     heard(channel, story)
-    assert channel.trust is Trust.INVALID
+    assert channel.trust is ChannelTrust.INVALID
 
 
 def test_lost_messages_are_counted() -> None:
-    channel = Channel(16)
+    channel = ProtectedChannel(16)
     heard(channel, [0, 1, 4, 5])
     assert channel.lost == 2
 
 
-def _virtual(tmp_path: Path) -> Wire:
-    return Wire(interface="virtual", channel=str(tmp_path), bitrate=None, port=None)
+def _virtual(tmp_path: Path) -> CanBus:
+    return CanBus(interface="virtual", channel=str(tmp_path), bitrate=None, port=None)
 
 
-def _udp(_: Path) -> Wire:
+def _udp(_: Path) -> CanBus:
     return udp()
 
 
@@ -151,35 +166,37 @@ WIRES = pytest.mark.parametrize("make", [_virtual, _udp], ids=["virtual", "udp_m
 
 
 @WIRES
-def test_a_wire_carries_frames_to_all_others(make: Callable[[Path], Wire], tmp_path: Path) -> None:
-    wire, frame = make(tmp_path), Wired(0x0D001027, b"12345678")
+def test_a_wire_carries_frames_to_all_others(
+    make: Callable[[Path], CanBus], tmp_path: Path
+) -> None:
+    wire, frame = make(tmp_path), CanFrame(0x0D001027, b"12345678")
     with wire.open() as one, wire.open() as two, wire.open([0x123]) as three:
         one.send(frame)
-        one.send(Wired(0x123, b"\x01", extended=False))
+        one.send(CanFrame(0x123, b"\x01", extended=False))
         assert two.recv(1.0) == frame
-        assert three.recv(1.0) == Wired(0x123, b"\x01", extended=False)
+        assert three.recv(1.0) == CanFrame(0x123, b"\x01", extended=False)
 
 
 @WIRES
-def test_a_silent_wire_says_nothing_in_time(make: Callable[[Path], Wire], tmp_path: Path) -> None:
+def test_a_silent_wire_says_nothing_in_time(make: Callable[[Path], CanBus], tmp_path: Path) -> None:
     with make(tmp_path).open() as one:
         assert one.recv(0.01) is None and one.recv(0.0) is None and one.recv(-1.0) is None
 
 
 @WIRES
 def test_a_closed_wire_is_an_error_and_may_be_closed_again(
-    make: Callable[[Path], Wire], tmp_path: Path
+    make: Callable[[Path], CanBus], tmp_path: Path
 ) -> None:
     one = make(tmp_path).open()
     one.close()
     one.close()
     with pytest.raises(LinkError):
-        one.send(Wired(1, b""))
+        one.send(CanFrame(1, b""))
 
 
 def test_a_wire_that_is_not_there_is_an_error_that_says_what_to_change() -> None:
     with pytest.raises(LinkError, match=r"bus\.channel=nowhere"):
-        Wire(interface="socketcan", channel="nowhere", bitrate=None, port=None).open()
+        CanBus(interface="socketcan", channel="nowhere", bitrate=None, port=None).open()
 
 
 def test_a_replay_says_what_was_recorded_in_its_own_time_and_sends_nothing(tmp_path: Path) -> None:
@@ -193,8 +210,8 @@ def test_a_replay_says_what_was_recorded_in_its_own_time_and_sends_nothing(tmp_p
                 is_rx=number != 3,
             )
             writer.on_message_received(message)
-    with Replay(path=str(path), speed=2.0).open() as one:
-        one.send(Wired(0x200, b""))
+    with BusReplay(path=str(path), speed=2.0).open() as one:
+        one.send(CanFrame(0x200, b""))
         found = [one.recv(0.5) for _ in range(4)]
         assert [frame.frame_id for frame in found if frame] == [
             0x100,
@@ -208,7 +225,7 @@ def test_a_replay_says_what_was_recorded_in_its_own_time_and_sends_nothing(tmp_p
 
 def test_a_replay_of_nothing_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match="nothing"):
-        Replay(path=str(tmp_path / "nothing.blf"), speed=1.0).open()
+        BusReplay(path=str(tmp_path / "nothing.blf"), speed=1.0).open()
 
 
 @pytest.mark.parametrize(
@@ -223,24 +240,24 @@ def test_a_replay_of_nothing_is_refused(tmp_path: Path) -> None:
 def test_a_description_that_does_not_do_is_refused(
     machine: Machine, tmp_path: Path, old: str, new: str, message: str
 ) -> None:
-    text = described.located(DBC).read_text()
+    text = described.resolve_package_path(DBC).read_text()
     assert old in text
     path = tmp_path / "other.dbc"
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(ConfigError, match=message):
-        Description(str(path), machine)
+        BusDescription(str(path), machine)
 
 
 def test_another_layout_with_the_same_names_is_as_good(machine: Machine, tmp_path: Path) -> None:
     text = (
-        described.located(DBC)
+        described.resolve_package_path(DBC)
         .read_text()
         .replace("2365591591", "291")
         .replace('"GenMsgCycleTime" BO_ 291 20', '"GenMsgCycleTime" BO_ 291 50')
     )
     path = tmp_path / "other.dbc"
     path.write_text(text)
-    bus = Description(str(path), machine)
+    bus = BusDescription(str(path), machine)
     assert bus.command.frame_id == 291 and not bus.command.extended and bus.command.period_s == 0.05
 
 
@@ -252,15 +269,15 @@ def test_a_description_for_other_joints_is_refused(machine: Machine) -> None:
         levers=(),
     )
     with pytest.raises(ConfigError, match="Command_j0"):
-        Description(DBC, other)
+        BusDescription(DBC, other)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-def test_the_header_computes_the_same_crc_in_c(bus: Description, tmp_path: Path) -> None:
+def test_the_header_computes_the_same_crc_in_c(bus: BusDescription, tmp_path: Path) -> None:
     layout = bus.command
     data = bus.encode("ValveCmd", {"Command_q1": 0.4}, 5)
     numbers = ", ".join(map(str, data))
-    (tmp_path / "bus.h").write_text(c_header(bus))
+    (tmp_path / "bus.h").write_text(generate_c_header(bus))
     (tmp_path / "main.c").write_text(
         f"""#include <stdio.h>
 #include "bus.h"
@@ -278,8 +295,8 @@ int main(void) {{
     assert int(found) == data[layout.crc_byte]
 
 
-def test_the_header_for_a_gateway_says_what_the_description_says(bus: Description) -> None:
-    text = c_header(bus)
+def test_the_header_for_a_gateway_says_what_the_description_says(bus: BusDescription) -> None:
+    text = generate_c_header(bus)
     assert (
         "#define BROKK_VALVE_CMD_ID 0xD001027u" in text
         and "#define BROKK_VALVE_CMD_DATA_ID 0x1031u" in text

@@ -17,18 +17,17 @@ from brokk_rl.contracts.vision import HolePose
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from deploy.page.demo import BLOCK_M, TARGETS
-from deploy.page.demo_camera import Camera as DemoCamera
-from deploy.page.from_loop import GIVEN, Beside, LoopFeed
-from deploy.page.pointing import borehole_at
-from deploy.page.protocol import Wish
-from deploy.recorder import reading
-from deploy.recorder.capture import Capture, Log, Pictures
+from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
+from deploy.page.loop_feed import GIVEN, LoopFeed, PageProcessConfig
+from deploy.page.protocol import OperatorRequest
+from deploy.page.scene import locate_borehole
+from deploy.recorder import capture_reader
+from deploy.recorder.capture import CaptureConfig, CaptureWriter, PictureSampler
 from deploy.runtime import perception_process
-from deploy.runtime.operator_requests import Recorder, Wanted
-from deploy.runtime.perception_process import Camera, KnownHoles, frame_of
-from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import Aim, File, Given, Seen
+from deploy.runtime.operator_requests import RecordingControl, RequestHandler
+from deploy.runtime.perception_process import CameraConfig, KnownHoles, read_frame
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.target import DetectedTarget, FileTarget, GivenTarget, TargetSelector
 
 MACHINE = option("machine", "brokk170")
 FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).frame(0, 12.0)
@@ -52,8 +51,8 @@ def seen_at(frame: Frame, center_m: Any) -> tuple[float, float]:
 
 
 @pytest.fixture
-def exchange() -> Iterator[Exchange]:
-    found = Exchange.new(MACHINE.num_joints, commands=False, frame_px=PIXELS)
+def exchange() -> Iterator[LoopMemory]:
+    found = LoopMemory.new(MACHINE.num_joints, commands=False, frame_px=PIXELS)
     yield found
     found.close()
 
@@ -62,28 +61,30 @@ def exchange() -> Iterator[Exchange]:
 def test_a_click_into_a_borehole_gives_its_centre_though_its_mouth_has_no_depth(
     target: Any,
 ) -> None:
-    found = borehole_at(FRAME, *seen_at(FRAME, np.array(target.center_in_base_m)), target.radius_m)
+    found = locate_borehole(
+        FRAME, *seen_at(FRAME, np.array(target.center_in_base_m)), target.radius_m
+    )
     assert found is not None
     off_m = np.linalg.norm(found[0] - np.array(target.center_in_base_m))
     assert off_m < 0.012 and 0.005 < found[1] < 0.05
 
 
 def test_a_click_at_the_sky_or_without_a_calibrated_camera_gives_none() -> None:
-    assert borehole_at(FRAME, 0.5, 0.01, 0.05) is None
+    assert locate_borehole(FRAME, 0.5, 0.01, 0.05) is None
     x, y = seen_at(FRAME, np.array(TARGETS[0].center_in_base_m))
-    assert borehole_at(replace(FRAME, base_from_camera=None), x, y, 0.05) is None
+    assert locate_borehole(replace(FRAME, base_from_camera=None), x, y, 0.05) is None
 
 
-def test_a_frame_is_handed_on_whole_or_shrunk_with_its_camera(exchange: Exchange) -> None:
+def test_a_frame_is_handed_on_whole_or_shrunk_with_its_camera(exchange: LoopMemory) -> None:
     assert exchange.frame is not None and exchange.frame.peek("t_s") is None
     perception_process._publish(exchange.frame, FRAME, PIXELS, 5.0)
     assert exchange.frame.peek("t_s") == 5.0 and exchange.frame.number == 1
-    whole = frame_of(exchange.frame.read())
+    whole = read_frame(exchange.frame.read())
     assert np.array_equal(whole.color, FRAME.color) and np.array_equal(
         whole.depth_m, FRAME.depth_m, equal_nan=True
     )
     perception_process._publish(exchange.frame, FRAME, PIXELS // 4, 6.0)
-    small = frame_of(exchange.frame.read())
+    small = read_frame(exchange.frame.read())
     assert small.color.shape == (180, 320, 3) and exchange.frame.number == 2
     center_m = np.array(TARGETS[0].center_in_base_m)
     assert seen_at(small, center_m) == pytest.approx(seen_at(FRAME, center_m), abs=0.003)
@@ -133,23 +134,23 @@ def test_a_base_that_moved_is_noticed_within_a_few_sightings() -> None:
     assert known.plain()[0]["center_in_base_m"][0] > 2.645
 
 
-def show(exchange: Exchange, *poses: HolePose, now_s: float | None = None) -> None:
+def show(exchange: LoopMemory, *poses: HolePose, now_s: float | None = None) -> None:
     known = KnownHoles(10.0)
     known.take(list(poses), time.monotonic() if now_s is None else now_s)
     known.write(exchange.holes, time.monotonic())
 
 
-def aimed(exchange: Exchange) -> list[float]:
+def aimed(exchange: LoopMemory) -> list[float]:
     record = exchange.target.read()
     assert record is not None
     return [round(float(value), 4) for value in record["center_in_base_m"]]
 
 
 def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(
-    exchange: Exchange, tmp_path: Path
+    exchange: LoopMemory, tmp_path: Path
 ) -> None:
     path = tmp_path / "target.json"
-    aim = Aim(File(path=str(path)).build(), exchange.target, exchange.holes)
+    aim = TargetSelector(FileTarget(path=str(path)).build(), exchange.target, exchange.holes)
     aim.refresh()
     assert exchange.target.read() is None
     path.write_text('{"center_in_base_m": [2.6, 0.0, 0.75]}')
@@ -170,20 +171,24 @@ def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(
         aim.refresh()
 
 
-def eyes_place(exchange: Exchange, row: int) -> Any:
-    from deploy.runtime.target import holes_of, place_of
+def eyes_place(exchange: LoopMemory, row: int) -> Any:
+    from deploy.runtime.target import locate_hole, read_holes
 
-    return place_of(holes_of(exchange.holes)[row])
+    return locate_hole(read_holes(exchange.holes)[row])
 
 
-def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(exchange: Exchange) -> None:
-    aim = Aim(Given(center_in_base_m=(2.6, 0.0, 0.4)).build(), exchange.target, exchange.holes)
+def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(
+    exchange: LoopMemory,
+) -> None:
+    aim = TargetSelector(
+        GivenTarget(center_in_base_m=(2.6, 0.0, 0.4)).build(), exchange.target, exchange.holes
+    )
     aim.refresh()
     first = exchange.target.peek("t_s")
     aim.refresh()
     again = exchange.target.peek("t_s")
     assert first is not None and again is not None and again > first
-    aim = Aim(Seen(score=0.5).build(), exchange.target, exchange.holes)
+    aim = TargetSelector(DetectedTarget(score=0.5).build(), exchange.target, exchange.holes)
     show(exchange, pose(2.6, 0.0, score=0.4))
     aim.refresh()
     assert aimed(exchange) == [2.6, 0.0, 0.4]
@@ -197,10 +202,10 @@ def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(exchange:
 
 
 @pytest.fixture
-def feed(exchange: Exchange, tmp_path: Path) -> LoopFeed:
+def feed(exchange: LoopMemory, tmp_path: Path) -> LoopFeed:
     session = Session(out=str(tmp_path), seed=1, device="cpu")
     return LoopFeed(
-        Beside(
+        PageProcessConfig(
             option("page", "local"),
             MACHINE,
             option("guidance", "machine"),
@@ -215,18 +220,20 @@ def feed(exchange: Exchange, tmp_path: Path) -> LoopFeed:
 
 
 def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
-    exchange: Exchange, feed: LoopFeed, tmp_path: Path
+    exchange: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
-    aim = Aim(File(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes)
-    wanted = Wanted(
+    aim = TargetSelector(
+        FileTarget(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes
+    )
+    wanted = RequestHandler(
         exchange,
-        Recorder(exchange, tmp_path, lambda folder: None),
+        RecordingControl(exchange, tmp_path, lambda folder: None),
         aim,
         armed=False,
         commands=False,
     )  # type: ignore[arg-type,return-value]
     center_m = np.array(TARGETS[1].center_in_base_m)
-    point = Wish("point", "{:.4f},{:.4f}".format(*seen_at(FRAME, center_m)))
+    point = OperatorRequest("point", "{:.4f},{:.4f}".format(*seen_at(FRAME, center_m)))
     assert not feed.wish(point), "there is no picture yet"
     assert exchange.frame is not None
     perception_process._publish(exchange.frame, FRAME, PIXELS, time.monotonic())
@@ -242,7 +249,9 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
         ("1", False),
         ("2", True),
     ], "perception knows it by now"
-    assert feed.wish(Wish("target", "1")) and not feed.wish(Wish("target", "9"))
+    assert feed.wish(OperatorRequest("target", "1")) and not feed.wish(
+        OperatorRequest("target", "9")
+    )
     wanted.refresh()
     assert aimed(exchange) == [2.95, -0.4, 0.75]
 
@@ -272,13 +281,13 @@ class Blinking:
     def find(self, frame: Frame) -> None: ...
 
     def look(self, frame: Frame) -> Any:
-        from brokk_rl.contracts.vision import Sighting
+        from brokk_rl.contracts.vision import FrameDetections
 
-        return Sighting([pose(2.6, 0.0)], [], [], None)
+        return FrameDetections([pose(2.6, 0.0)], [], [], None)
 
 
 def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recorded(
-    exchange: Exchange,
+    exchange: LoopMemory,
 ) -> None:
     source: Any = Blinking()
     perception_process.run(lambda: False, camera(source), exchange)
@@ -289,31 +298,36 @@ def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recor
     ] == [2.6, 0.0, 0.75]
 
 
-def camera(source: Any) -> Camera:
-    return Camera(
+def camera(source: Any) -> CameraConfig:
+    return CameraConfig(
         source=source, finder=source, rate_hz=100.0, num_px=PIXELS, forget_s=10.0, stale_s=1.0, record_hz=1.0
     )  # fmt: skip
 
 
 def test_pictures_are_recorded_as_often_as_asked_and_come_back(
-    exchange: Exchange, tmp_path: Path
+    exchange: LoopMemory, tmp_path: Path
 ) -> None:
     import cv2
 
     assert exchange.frame is not None
-    pictures = Pictures(exchange.frame, 2.0)
+    pictures = PictureSampler(exchange.frame, 2.0)
     assert pictures.due() is None
-    with Log(Capture(tmp_path, "deploy:dbc/example_gateway.dbc", MACHINE, {}, 2.0)) as log:
+    with CaptureWriter(
+        CaptureConfig(tmp_path, "deploy:dbc/example_gateway.dbc", MACHINE, {}, 2.0)
+    ) as log:
         for number in range(3):
             perception_process._publish(exchange.frame, FRAME, PIXELS, 100.0 + number)
             if (picture := pictures.due()) is not None:
                 log.add_picture(*picture)
     import base64
 
-    found = reading.read(tmp_path / "capture.mcap").messages["camera"]
+    found = capture_reader.read_capture(tmp_path / "capture.mcap").messages["camera"]
     assert [t_s for t_s, _ in found] == [100.0], "the other two came within half a second"
     picture = cv2.imdecode(
         np.frombuffer(base64.b64decode(found[0][1]["data"]), np.uint8), cv2.IMREAD_COLOR
     )
     assert picture is not None and np.abs(picture[..., ::-1].astype(int) - FRAME.color).mean() < 6
-    assert Pictures(exchange.frame, 0.0).due() is None and Pictures(None, 2.0).due() is None
+    assert (
+        PictureSampler(exchange.frame, 0.0).due() is None
+        and PictureSampler(None, 2.0).due() is None
+    )

@@ -18,10 +18,10 @@ from stage import DBC, Mode, Stage
 
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
-from deploy.recorder import reading
-from deploy.recorder.capture import MCAP, Capture, Log
+from deploy.recorder import capture_reader
+from deploy.recorder.capture import MCAP, CaptureConfig, CaptureWriter
 from deploy.recorder.capture import run as record
-from deploy.runtime.shm_layout import Exchange
+from deploy.runtime.shm_layout import LoopMemory
 
 MODES = get_args(Mode)
 COMMANDING = ("collect", "auto")
@@ -201,11 +201,11 @@ def test_a_wall_clock_that_is_moved_by_an_hour_changes_nothing(
 def test_a_full_disk_ends_the_log_says_so_and_leaves_what_was_written(
     machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    exchange, capture = (
-        Exchange.new(machine.num_joints, commands=False),
-        Capture(tmp_path, DBC, machine, {"source": "test"}, 0.0),
+    memory, capture = (
+        LoopMemory.new(machine.num_joints, commands=False),
+        CaptureConfig(tmp_path, DBC, machine, {"source": "test"}, 0.0),
     )
-    sync, flush, count = os.fsync, Log.flush, [0]
+    sync, flush, count = os.fsync, CaptureWriter.flush, [0]
 
     def full(file: int) -> None:
         count[0] += 1
@@ -213,18 +213,18 @@ def test_a_full_disk_ends_the_log_says_so_and_leaves_what_was_written(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         sync(file)
 
-    def often(self: Log) -> None:
-        exchange.policy_log.put(b'J{"topic": "advice", "t_s": 1.0}')
+    def often(self: CaptureWriter) -> None:
+        memory.policy_log.put(b'J{"topic": "advice", "t_s": 1.0}')
         flush(self)
 
-    exchange.policy_log.put(b'J{"topic": "advice", "t_s": 0.5}')
+    memory.policy_log.put(b'J{"topic": "advice", "t_s": 0.5}')
     monkeypatch.setattr(os, "fsync", full)
-    monkeypatch.setattr(Log, "flush", often)
+    monkeypatch.setattr(CaptureWriter, "flush", often)
     monkeypatch.setattr("deploy.recorder.capture.FLUSH_S", 0.0)
     with pytest.raises(StorageError, match=r"No space left.*nothing more is recorded"):
-        record(lambda: False, capture, exchange)
-    assert reading.read(tmp_path / MCAP).messages["advice"][0][0] == 0.5
-    exchange.close()
+        record(lambda: False, capture, memory)
+    assert capture_reader.read_capture(tmp_path / MCAP).messages["advice"][0][0] == 0.5
+    memory.close()
 
 
 @pytest.mark.parametrize("again_s", [None, 2.0])

@@ -12,16 +12,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brokk_rl.errors import ConfigError
-from deploy.guard.guard import Decision, Guard, Request, Seen, State, Trip
-from deploy.guard.limits import Limits, body_of
-from deploy.guard.plausibility import Plausibility
+from deploy.guard.guard import (
+    CommandRequest,
+    Guard,
+    GuardDecision,
+    GuardInput,
+    GuardState,
+    GuardTrip,
+)
+from deploy.guard.limits import GuardLimits, build_joint_bounds
+from deploy.guard.plausibility import PlausibilityFilter
 
-BODY = body_of([-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [False, True, False])
-LIMITS = Limits(
+BODY = build_joint_bounds([-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [False, True, False])
+LIMITS = GuardLimits(
     max_command=0.8, max_rate_1_s=5.0, overrun=0.001, neutral=0.05, stop_margin=0.1, joints_s=0.15, levers_s=0.16, status_s=0.17,
     request_s=0.18, ignored_s=0.3, gap_s=0.2, jump_margin=3.0, jump_slack=0.01, range_slack=0.2, num_jumps=3,
 )  # fmt: skip
-WELL = Seen(
+WELL = GuardInput(
     q=(0.0, 0.0, 1.0), joints_age_s=0.01, joints_plausible=True, trusted=True, levers_age_s=0.01, lever=0.0, deadman=True,
     status_age_s=0.01, estop=False, bus_up=True, alone=True, followed=True,
 )  # fmt: skip
@@ -33,26 +40,26 @@ DT = 0.02
 class Hand:
     """A guard whose clock goes on by `DT` with each decision."""
 
-    def __init__(self, limits: Limits = LIMITS) -> None:
+    def __init__(self, limits: GuardLimits = LIMITS) -> None:
         self.guard, self.now_s = Guard(limits, BODY), 100.0
 
     def decide(
         self,
-        seen: Seen = WELL,
+        seen: GuardInput = WELL,
         u: tuple[float, ...] | None = STILL,
         armed: bool = True,
         **change: Any,
-    ) -> Decision:
+    ) -> GuardDecision:
         self.now_s += change.pop("dt", DT)
         age_s = change.pop("age_s", 0.0)
-        request = None if u is None else Request(u, age_s)
+        request = None if u is None else CommandRequest(u, age_s)
         return self.guard.decide(self.now_s, armed, replace(seen, **change), request)
 
     def active(self) -> Hand:
         """Goes the way an operator goes: arm, release, press."""
         self.decide(RELEASED, dt=0.01)
-        assert self.decide(RELEASED).state is State.READY
-        assert self.decide(WELL).state is State.ACTIVE
+        assert self.decide(RELEASED).state is GuardState.READY
+        assert self.decide(WELL).state is GuardState.ACTIVE
         return self
 
 
@@ -60,14 +67,14 @@ def test_nothing_is_sent_until_somebody_arms_it_on_purpose() -> None:
     hand = Hand()
     for seen in (WELL, RELEASED, WELL):
         decision = hand.decide(seen, (0.5, 0.0, 0.5), armed=False)
-        assert decision.state is State.SILENT and not decision.sends and decision.u == STILL
-    assert decision.trip is Trip.NOT_ARMED
+        assert decision.state is GuardState.SILENT and not decision.sends and decision.u == STILL
+    assert decision.trip is GuardTrip.NOT_ARMED
 
 
 def test_what_is_wrong_is_said_in_silence_too() -> None:
     hand = Hand()
     hand.decide(armed=False)
-    assert hand.decide(armed=False, estop=True).trip is Trip.ESTOP
+    assert hand.decide(armed=False, estop=True).trip is GuardTrip.ESTOP
 
 
 def test_arming_alone_moves_nothing_and_neither_does_a_dead_man_held_from_the_start() -> None:
@@ -75,17 +82,19 @@ def test_arming_alone_moves_nothing_and_neither_does_a_dead_man_held_from_the_st
     hand.decide(WELL)
     decision = hand.decide(WELL, (0.5, 0.0, 0.0))
     assert (
-        decision.state is State.LATCHED
+        decision.state is GuardState.LATCHED
         and decision.sends
         and decision.u == STILL
-        and decision.trip is Trip.NOT_ARMED
+        and decision.trip is GuardTrip.NOT_ARMED
     )
 
 
 def test_the_way_to_the_valves_is_release_then_press() -> None:
     hand = Hand().active()
     decision = hand.decide(u=(0.05, 0.0, -0.05))
-    assert decision == Decision(State.ACTIVE, (0.05, 0.0, -0.05), Trip.NONE, Trip.NONE)
+    assert decision == GuardDecision(
+        GuardState.ACTIVE, (0.05, 0.0, -0.05), GuardTrip.NONE, GuardTrip.NONE
+    )
 
 
 def test_the_first_cycle_with_the_dead_man_pressed_still_sends_zero() -> None:
@@ -93,68 +102,72 @@ def test_the_first_cycle_with_the_dead_man_pressed_still_sends_zero() -> None:
     hand.decide(RELEASED)
     hand.decide(RELEASED)
     decision = hand.decide(WELL, (0.5, 0.0, 0.0))
-    assert decision.state is State.ACTIVE and decision.u == STILL
+    assert decision.state is GuardState.ACTIVE and decision.u == STILL
 
 
 def test_a_released_dead_man_is_zero_in_the_same_cycle_and_may_be_pressed_again() -> None:
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.0))
     decision = hand.decide(RELEASED, (0.1, 0.0, 0.0))
-    assert decision.state is State.READY and decision.u == STILL and decision.trip is Trip.DEADMAN
-    assert hand.decide(u=(0.1, 0.0, 0.0)).state is State.ACTIVE
+    assert (
+        decision.state is GuardState.READY
+        and decision.u == STILL
+        and decision.trip is GuardTrip.DEADMAN
+    )
+    assert hand.decide(u=(0.1, 0.0, 0.0)).state is GuardState.ACTIVE
     assert hand.decide(u=(0.05, 0.0, 0.0)).u == (0.05, 0.0, 0.0)
 
 
 WRONG = [
-    ({"bus_up": False}, Trip.BUS_DOWN),
-    ({"dt": LIMITS.gap_s + 0.001}, Trip.TIME_GAP),
-    ({"dt": -0.001}, Trip.TIME_GAP),
-    ({"estop": True}, Trip.ESTOP),
-    ({"trusted": False}, Trip.CHANNEL_INVALID),
-    ({"status_age_s": LIMITS.status_s + 0.001}, Trip.STATUS_STALE),
-    ({"status_age_s": math.inf}, Trip.STATUS_STALE),
-    ({"levers_age_s": LIMITS.levers_s + 0.001}, Trip.LEVERS_STALE),
-    ({"joints_age_s": LIMITS.joints_s + 0.001}, Trip.JOINTS_STALE),
-    ({"joints_age_s": math.nan}, Trip.JOINTS_STALE),
-    ({"joints_plausible": False}, Trip.JOINTS_INVALID),
-    ({"q": (0.0, math.nan, 0.0)}, Trip.JOINTS_INVALID),
-    ({"q": (0.0, 0.0, math.inf)}, Trip.JOINTS_INVALID),
-    ({"alone": False}, Trip.SECOND_SENDER),
-    ({"lever": LIMITS.neutral + 0.001}, Trip.LEVER),
-    ({"lever": math.nan}, Trip.LEVER),
+    ({"bus_up": False}, GuardTrip.BUS_DOWN),
+    ({"dt": LIMITS.gap_s + 0.001}, GuardTrip.TIME_GAP),
+    ({"dt": -0.001}, GuardTrip.TIME_GAP),
+    ({"estop": True}, GuardTrip.ESTOP),
+    ({"trusted": False}, GuardTrip.CHANNEL_INVALID),
+    ({"status_age_s": LIMITS.status_s + 0.001}, GuardTrip.STATUS_STALE),
+    ({"status_age_s": math.inf}, GuardTrip.STATUS_STALE),
+    ({"levers_age_s": LIMITS.levers_s + 0.001}, GuardTrip.LEVERS_STALE),
+    ({"joints_age_s": LIMITS.joints_s + 0.001}, GuardTrip.JOINTS_STALE),
+    ({"joints_age_s": math.nan}, GuardTrip.JOINTS_STALE),
+    ({"joints_plausible": False}, GuardTrip.JOINTS_INVALID),
+    ({"q": (0.0, math.nan, 0.0)}, GuardTrip.JOINTS_INVALID),
+    ({"q": (0.0, 0.0, math.inf)}, GuardTrip.JOINTS_INVALID),
+    ({"alone": False}, GuardTrip.SECOND_SENDER),
+    ({"lever": LIMITS.neutral + 0.001}, GuardTrip.LEVER),
+    ({"lever": math.nan}, GuardTrip.LEVER),
 ]
 ASKED = [
-    (None, 0.0, Trip.REQUEST_STALE),
-    ((0.1, 0.0, 0.0), LIMITS.request_s + 0.001, Trip.REQUEST_STALE),
-    ((0.1, 0.0, 0.0), math.nan, Trip.REQUEST_STALE),
-    ((math.nan, 0.0, 0.0), 0.0, Trip.REQUEST_INVALID),
-    ((0.0, 0.0, math.inf), 0.0, Trip.REQUEST_INVALID),
-    ((1.002, 0.0, 0.0), 0.0, Trip.REQUEST_INVALID),
-    ((0.0, 0.0, -1.002), 0.0, Trip.REQUEST_INVALID),
-    ((0.1, 0.0), 0.0, Trip.REQUEST_INVALID),
-    ((0.1, 0.1, 0.0), 0.0, Trip.REQUEST_EXCLUSIVE),
-    ((0.0, -0.1, 1e-9), 0.0, Trip.REQUEST_EXCLUSIVE),
+    (None, 0.0, GuardTrip.REQUEST_STALE),
+    ((0.1, 0.0, 0.0), LIMITS.request_s + 0.001, GuardTrip.REQUEST_STALE),
+    ((0.1, 0.0, 0.0), math.nan, GuardTrip.REQUEST_STALE),
+    ((math.nan, 0.0, 0.0), 0.0, GuardTrip.REQUEST_INVALID),
+    ((0.0, 0.0, math.inf), 0.0, GuardTrip.REQUEST_INVALID),
+    ((1.002, 0.0, 0.0), 0.0, GuardTrip.REQUEST_INVALID),
+    ((0.0, 0.0, -1.002), 0.0, GuardTrip.REQUEST_INVALID),
+    ((0.1, 0.0), 0.0, GuardTrip.REQUEST_INVALID),
+    ((0.1, 0.1, 0.0), 0.0, GuardTrip.REQUEST_EXCLUSIVE),
+    ((0.0, -0.1, 1e-9), 0.0, GuardTrip.REQUEST_EXCLUSIVE),
 ]
 
 
 @pytest.mark.parametrize(("change", "trip"), WRONG, ids=str)
 def test_anything_wrong_is_zero_in_the_same_cycle_and_latches_until_release_and_press(
-    change: dict[str, Any], trip: Trip
+    change: dict[str, Any], trip: GuardTrip
 ) -> None:
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.1))
     decision = hand.decide(u=(0.1, 0.0, 0.1), **change)
     assert (
-        decision.state is State.LATCHED
+        decision.state is GuardState.LATCHED
         and decision.u == STILL
         and decision.trip is trip
         and decision.cause is trip
     )
     again = hand.decide(u=(0.1, 0.0, 0.1))
-    assert again.state is State.LATCHED and again.u == STILL and again.trip is trip
-    assert hand.decide(RELEASED).state is State.READY
+    assert again.state is GuardState.LATCHED and again.u == STILL and again.trip is trip
+    assert hand.decide(RELEASED).state is GuardState.READY
     pressed = hand.decide(WELL)
-    assert pressed.state is State.ACTIVE and pressed.cause is Trip.NONE
+    assert pressed.state is GuardState.ACTIVE and pressed.cause is GuardTrip.NONE
 
 
 @pytest.mark.parametrize(
@@ -174,24 +187,24 @@ def test_what_ends_a_motion_is_known_when_it_is_seen_and_nothing_else_needs_hast
 
 @pytest.mark.parametrize(("change", "trip"), WRONG, ids=str)
 def test_nobody_is_let_out_of_the_latch_while_something_is_wrong(
-    change: dict[str, Any], trip: Trip
+    change: dict[str, Any], trip: GuardTrip
 ) -> None:
     hand = Hand()
     hand.decide(RELEASED)
     hand.decide(RELEASED)
-    assert hand.decide(RELEASED, **change).state is State.LATCHED
-    assert hand.decide(RELEASED, **change).state is State.LATCHED
+    assert hand.decide(RELEASED, **change).state is GuardState.LATCHED
+    assert hand.decide(RELEASED, **change).state is GuardState.LATCHED
     assert hand.decide(WELL).trip is trip
 
 
 @pytest.mark.parametrize(("u", "age_s", "trip"), ASKED, ids=str)
 def test_a_request_that_makes_no_sense_is_refused_before_use(
-    u: tuple[float, ...] | None, age_s: float, trip: Trip
+    u: tuple[float, ...] | None, age_s: float, trip: GuardTrip
 ) -> None:
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.1))
     decision = hand.decide(u=u, age_s=age_s)
-    assert decision.state is State.LATCHED and decision.u == STILL and decision.trip is trip
+    assert decision.state is GuardState.LATCHED and decision.u == STILL and decision.trip is trip
 
 
 @pytest.mark.parametrize(
@@ -205,20 +218,24 @@ def test_a_request_that_makes_no_sense_is_refused_before_use(
 )  # fmt: skip
 def test_what_lies_on_a_limit_is_allowed(change: dict[str, Any]) -> None:
     hand = Hand().active()
-    assert hand.decide(**change).state is State.ACTIVE
+    assert hand.decide(**change).state is GuardState.ACTIVE
 
 
 def test_a_request_is_not_judged_before_it_can_have_an_effect() -> None:
     hand = Hand().active()
-    assert hand.decide(RELEASED, u=None).state is State.READY
+    assert hand.decide(RELEASED, u=None).state is GuardState.READY
 
 
 def test_disarming_is_silence_at_once() -> None:
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.0))
     decision = hand.decide(u=(0.1, 0.0, 0.0), armed=False)
-    assert decision.state is State.SILENT and decision.u == STILL and decision.cause is Trip.NONE
-    assert hand.decide().state is State.LATCHED
+    assert (
+        decision.state is GuardState.SILENT
+        and decision.u == STILL
+        and decision.cause is GuardTrip.NONE
+    )
+    assert hand.decide().state is GuardState.LATCHED
 
 
 def test_commands_grow_by_the_rate_and_end_at_the_limit() -> None:
@@ -299,7 +316,7 @@ cycles = st.fixed_dictionaries(
 @settings(max_examples=200, deadline=None)
 @given(st.lists(cycles, max_size=40))
 def test_whatever_happens_the_guard_keeps_its_promises(story: list[dict[str, Any]]) -> None:
-    hand, before, state, pressed = Hand(), STILL, State.SILENT, False
+    hand, before, state, pressed = Hand(), STILL, GuardState.SILENT, False
     for cycle in story:
         dt = cycle["dt"]
         decision = hand.decide(WELL, **cycle)
@@ -316,7 +333,7 @@ def test_whatever_happens_the_guard_keeps_its_promises(story: list[dict[str, Any
             )
             assert not (value > 0 and at >= upper) and not (value < 0 and at <= lower)
         if any(moved):
-            assert decision.state is State.ACTIVE and state is State.ACTIVE
+            assert decision.state is GuardState.ACTIVE and state is GuardState.ACTIVE
             assert (
                 cycle["armed"]
                 and cycle["deadman"]
@@ -330,16 +347,16 @@ def test_whatever_happens_the_guard_keeps_its_promises(story: list[dict[str, Any
                 and cycle["age_s"] <= LIMITS.request_s
             )
             assert dt <= LIMITS.gap_s and cycle["joints_age_s"] <= LIMITS.joints_s
-        if decision.state is State.ACTIVE and state is not State.ACTIVE:
-            assert state is State.READY and cycle["deadman"] and not any(moved)
-        if decision.state is State.READY:
+        if decision.state is GuardState.ACTIVE and state is not GuardState.ACTIVE:
+            assert state is GuardState.READY and cycle["deadman"] and not any(moved)
+        if decision.state is GuardState.READY:
             assert not cycle["deadman"]
         assert decision.sends == cycle["armed"]
         before, state, pressed = decision.u, decision.state, cycle["deadman"]
 
 
 def test_a_joint_that_jumps_is_refused_and_three_in_a_row_make_all_implausible() -> None:
-    watch = Plausibility(LIMITS, BODY)
+    watch = PlausibilityFilter(LIMITS, BODY)
     assert watch.accept(0, 1.00, 0.0)
     assert watch.accept(0, 1.01, 0.0249)  # 0.01 + 3 * 0.5 rad/s * 0.01 s
     for number in (1, 2, 3):
@@ -350,7 +367,7 @@ def test_a_joint_that_jumps_is_refused_and_three_in_a_row_make_all_implausible()
 
 
 def test_a_joint_that_stays_at_its_new_place_is_believed_once_it_could_have_got_there() -> None:
-    watch = Plausibility(LIMITS, BODY)
+    watch = PlausibilityFilter(LIMITS, BODY)
     watch.accept(2, 0.0, 1.0)
     found = [watch.accept(2, 0.01 * step, 1.5) for step in range(1, 40)]
     assert not any(found[:32]) and all(found[32:])  # (0.5 - 0.01) / 1.5 rad/s = 0.327 s
@@ -361,11 +378,11 @@ def test_a_joint_that_stays_at_its_new_place_is_believed_once_it_could_have_got_
     [(1.2, True), (1.2001, False), (-1.2, True), (-1.2001, False), (math.nan, False)],
 )
 def test_a_position_beyond_the_limits_is_refused(position: float, good: bool) -> None:
-    assert Plausibility(LIMITS, BODY).accept(0, 0.0, position) is good
+    assert PlausibilityFilter(LIMITS, BODY).accept(0, 0.0, position) is good
 
 
 def test_time_that_runs_backwards_gives_no_room_for_a_jump() -> None:
-    watch = Plausibility(LIMITS, BODY)
+    watch = PlausibilityFilter(LIMITS, BODY)
     watch.accept(0, 1.0, 0.0)
     assert not watch.accept(0, 0.0, 0.02) and watch.accept(0, 0.0, -0.0099)
 
@@ -408,13 +425,18 @@ def test_the_shipped_limits_are_limits() -> None:
 def test_a_gateway_that_does_not_follow_is_noticed() -> None:
     hand = Hand().active()
     for _ in range(3):
-        assert hand.decide(u=(0.05, 0.0, 0.0), dt=0.1 - 1e-9, followed=False).state is State.ACTIVE
+        assert (
+            hand.decide(u=(0.05, 0.0, 0.0), dt=0.1 - 1e-9, followed=False).state
+            is GuardState.ACTIVE
+        )
     assert hand.decide(u=(0.05, 0.0, 0.0), followed=True).u == (0.05, 0.0, 0.0)
     for _ in range(3):
         hand.decide(u=(0.05, 0.0, 0.0), dt=0.1, followed=False)
     decision = hand.decide(u=(0.05, 0.0, 0.0), dt=0.01, followed=False)
     assert (
-        decision.state is State.LATCHED and decision.u == STILL and decision.cause is Trip.IGNORED
+        decision.state is GuardState.LATCHED
+        and decision.u == STILL
+        and decision.cause is GuardTrip.IGNORED
     )
 
 
@@ -422,22 +444,22 @@ def test_a_gateway_has_all_of_the_time_that_it_is_given_to_follow() -> None:
     hand = Hand(replace(LIMITS, ignored_s=0.25)).active()
     hand.decide(followed=True, dt=0.125)
     for _ in range(2):  # times that binary numbers hold exactly
-        assert hand.decide(followed=False, dt=0.125).state is State.ACTIVE
-    assert hand.decide(followed=False, dt=0.125).cause is Trip.IGNORED
+        assert hand.decide(followed=False, dt=0.125).state is GuardState.ACTIVE
+    assert hand.decide(followed=False, dt=0.125).cause is GuardTrip.IGNORED
 
 
 def test_nobody_needs_to_follow_what_is_not_commanded() -> None:
     hand = Hand()
     for _ in range(100):
-        assert hand.decide(RELEASED, followed=False).trip in (Trip.DEADMAN, Trip.TIME_GAP)
-    assert hand.decide(WELL, followed=False).state is State.ACTIVE
-    assert hand.decide(WELL, estop=True, dt=0.19, followed=False).trip is Trip.ESTOP
+        assert hand.decide(RELEASED, followed=False).trip in (GuardTrip.DEADMAN, GuardTrip.TIME_GAP)
+    assert hand.decide(WELL, followed=False).state is GuardState.ACTIVE
+    assert hand.decide(WELL, estop=True, dt=0.19, followed=False).trip is GuardTrip.ESTOP
     hand.decide(WELL, dt=0.19, followed=False)
-    assert hand.decide(RELEASED, followed=False).state is State.READY
+    assert hand.decide(RELEASED, followed=False).state is GuardState.READY
 
 
 def test_the_states_have_the_numbers_that_travel_on_the_bus() -> None:
-    assert {state.name: state.value for state in State} == {
+    assert {state.name: state.value for state in GuardState} == {
         "SILENT": 0,
         "LATCHED": 1,
         "READY": 2,
@@ -452,10 +474,10 @@ def test_what_lies_exactly_on_a_limit_of_time_or_reach_is_allowed() -> None:
     hand.decide(RELEASED, dt=0.25)
     hand.decide(RELEASED, dt=0.25)
     assert (
-        hand.decide(WELL, dt=0.25).state is State.ACTIVE
-        and hand.decide(WELL, dt=0.25).trip is Trip.NONE
+        hand.decide(WELL, dt=0.25).state is GuardState.ACTIVE
+        and hand.decide(WELL, dt=0.25).trip is GuardTrip.NONE
     )
-    watch = Plausibility(limits, BODY)
+    watch = PlausibilityFilter(limits, BODY)
     assert (
         watch.accept(0, 0.0, 0.0)
         and watch.accept(0, 0.25, 0.5)
@@ -464,7 +486,7 @@ def test_what_lies_exactly_on_a_limit_of_time_or_reach_is_allowed() -> None:
 
 
 def test_positions_are_plausible_until_as_many_jumps_as_it_takes() -> None:
-    watch = Plausibility(LIMITS, BODY)
+    watch = PlausibilityFilter(LIMITS, BODY)
     for _ in range(LIMITS.num_jumps):
         assert watch.plausible
         watch.accept(1, 0.0, 9.0)

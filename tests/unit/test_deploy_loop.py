@@ -22,14 +22,18 @@ from hypothesis import strategies as st
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from deploy.guidance import AXES, LeverDisplay, LeverMap
-from deploy.policy.adviser import Advised, Adviser, Counsel
-from deploy.policy.bundle import Bundle
-from deploy.policy.sampling import Ring
-from deploy.runtime.operator_state import view
-from deploy.runtime.process import Pace
+from deploy.policy.bundle import PolicyBundle
+from deploy.policy.policy_process import (
+    AdviceStatus,
+    PolicyAdviser,
+    PolicyHistory,
+    PolicyProcessConfig,
+)
+from deploy.runtime.operator_state import read_snapshot
+from deploy.runtime.process import CycleTimer
 from deploy.runtime.shared_memory import Pipe, Slot
-from deploy.runtime.shm_layout import Exchange, state_fields
-from deploy.runtime.target import File
+from deploy.runtime.shm_layout import LoopMemory, build_state_fields
+from deploy.runtime.target import FileTarget
 
 SHIPPED = "tasks:policies/borehole_insertion"
 FIELDS = np.dtype([("a", float), ("b", float, (3,))])
@@ -77,7 +81,7 @@ def test_a_pipe_keeps_order_and_drops_only_what_finds_no_room(rounds: list[list[
 def test_a_deadline_that_was_missed_is_skipped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [100.0]
     monkeypatch.setattr("deploy.runtime.process.time.monotonic", lambda: clock[0])
-    pace = Pace(0.05)
+    pace = CycleTimer(0.05)
     for now_s, skipped, next_s in ((100.05, 0, 100.10), (100.11, 0, 100.15), (100.27, 2, 100.30)):
         clock[0] = now_s
         assert pace.begin() == skipped
@@ -91,7 +95,7 @@ def test_a_deadline_that_was_missed_is_skipped_and_counted(monkeypatch: pytest.M
 
 
 def state(machine: Machine, number: int, flow: float, q: float, now_s: float = 0.0) -> Any:
-    record = np.zeros((), state_fields(machine.num_joints))
+    record = np.zeros((), build_state_fields(machine.num_joints))
     record["t_s"] = record["q_t_s"] = now_s
     record["q"], record["flow_number"], record["flow_sum"], record["flow"] = (
         q,
@@ -106,7 +110,7 @@ def state(machine: Machine, number: int, flow: float, q: float, now_s: float = 0
 def test_the_ring_holds_positions_and_mean_flows_of_each_period_as_training_does(
     machine: Machine,
 ) -> None:
-    ring = Ring(machine)
+    ring = PolicyHistory(machine)
     for k in range(machine.num_history):
         assert not ring.full
         ring.sample(state(machine, 10 + 2 * k, 0.0, float(k)), missed=0)
@@ -118,7 +122,7 @@ def test_the_ring_holds_positions_and_mean_flows_of_each_period_as_training_does
 
 
 def test_one_missed_period_is_filled_in_and_two_empty_the_ring(machine: Machine) -> None:
-    ring = Ring(machine)
+    ring = PolicyHistory(machine)
     for k in range(13):
         ring.sample(state(machine, k + 1, 0.0, 1.0), missed=0)
     ring.sample(state(machine, 20, 0.0, 2.0), missed=1)
@@ -128,7 +132,7 @@ def test_one_missed_period_is_filled_in_and_two_empty_the_ring(machine: Machine)
 
 
 def test_valves_that_say_nothing_more_empty_the_ring(machine: Machine) -> None:
-    ring = Ring(machine)
+    ring = PolicyHistory(machine)
     for k in range(13):
         ring.sample(state(machine, k + 1, 0.0, 1.0), missed=0)
     late = state(machine, 13, 0.4, 1.0)
@@ -208,7 +212,7 @@ def change(folder: Path, name: str, **values: Any) -> None:
 
 
 def test_the_shipped_policy_acts_here_as_where_it_was_made(machine: Machine) -> None:
-    bundle = Bundle(SHIPPED, machine)
+    bundle = PolicyBundle(SHIPPED, machine)
     golden = json.loads(
         (Path(__file__).parents[2] / "tasks/policies/borehole_insertion/golden.json").read_text()
     )
@@ -226,9 +230,9 @@ def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
     }
     for field, other in others.items():
         with pytest.raises(CheckpointError, match=field):
-            Bundle(str(copied), other)
+            PolicyBundle(str(copied), other)
     with pytest.raises(CheckpointError, match="control"):
-        Bundle(str(copied), replace(machine, period_s=0.1, num_history=13))
+        PolicyBundle(str(copied), replace(machine, period_s=0.1, num_history=13))
 
 
 @pytest.mark.parametrize(
@@ -248,7 +252,7 @@ def test_a_contract_that_says_otherwise_is_refused(
 ) -> None:
     change(copied, "policy.json", **values)
     with pytest.raises(CheckpointError, match=message):
-        Bundle(str(copied), machine)
+        PolicyBundle(str(copied), machine)
 
 
 def test_a_policy_that_was_told_its_observations_otherwise_is_refused(
@@ -258,7 +262,7 @@ def test_a_policy_that_was_told_its_observations_otherwise_is_refused(
     observation["q"]["std"][0] *= 2
     change(copied, "policy.json", observation=observation)
     with pytest.raises(CheckpointError, match="'q'"):
-        Bundle(str(copied), machine)
+        PolicyBundle(str(copied), machine)
 
 
 def test_a_bundle_that_is_mixed_damaged_or_incomplete_is_refused(
@@ -268,76 +272,79 @@ def test_a_bundle_that_is_mixed_damaged_or_incomplete_is_refused(
     golden["command"][3][2] += 0.01
     (copied / "golden.json").write_text(json.dumps(golden))
     with pytest.raises(CheckpointError, match="answers"):
-        Bundle(str(copied), machine)
+        PolicyBundle(str(copied), machine)
     (copied / "golden.json").unlink()
     with pytest.raises(CheckpointError, match=r"golden\.json is missing"):
-        Bundle(str(copied), machine)
+        PolicyBundle(str(copied), machine)
     content = (copied / "policy.onnx").read_bytes()
     (copied / "policy.onnx").write_bytes(content[: len(content) // 2])
     with pytest.raises(CheckpointError, match="damaged"):
-        Bundle(str(copied), machine)
+        PolicyBundle(str(copied), machine)
     with pytest.raises(CheckpointError, match=r"policy\.json is missing"):
-        Bundle("nowhere", machine)
+        PolicyBundle("nowhere", machine)
 
 
 @pytest.fixture
-def adviser(machine: Machine) -> Adviser:
-    exchange = Exchange.new(machine.num_joints, commands=False)
-    counsel = Counsel(
+def adviser(machine: Machine) -> PolicyAdviser:
+    memory = LoopMemory.new(machine.num_joints, commands=False)
+    counsel = PolicyProcessConfig(
         machine, SHIPPED, option("guidance", "machine"), stale_s=0.15, target_s=60.0, pitch_rad=None
     )
-    return Adviser(counsel, Bundle(SHIPPED, machine), exchange)
+    return PolicyAdviser(counsel, PolicyBundle(SHIPPED, machine), memory)
 
 
 def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(
-    adviser: Adviser, machine: Machine
+    adviser: PolicyAdviser, machine: Machine
 ) -> None:
-    exchange, now_s, found = adviser._exchange, 1000.0, []
-    assert adviser.cycle(0, now_s) is Advised.NO_STATE
+    memory, now_s, found = adviser._memory, 1000.0, []
+    assert adviser.cycle(0, now_s) is AdviceStatus.NO_STATE
     for k in range(30):
         now_s += machine.period_s
         record = state(machine, 10 + k, 0.0, 0.0, now_s)
         record["q"] = machine.home
-        exchange.state.write(record)
+        memory.state.write(record)
         if k == 15:
-            target = exchange.target.new()
+            target = memory.target.new()
             target["t_s"], target["center_in_base_m"] = now_s, (2.6, 0.0, 0.75)
-            exchange.target.write(target)
+            memory.target.write(target)
         found.append(adviser.cycle(0, now_s))
     assert (
-        found[:12] == [Advised.WARMING_UP] * 12
-        and found[12:15] == [Advised.NO_TARGET] * 3
-        and set(found[15:]) == {Advised.VALID}
+        found[:12] == [AdviceStatus.WARMING_UP] * 12
+        and found[12:15] == [AdviceStatus.NO_TARGET] * 3
+        and set(found[15:]) == {AdviceStatus.VALID}
     )
-    shown = view(exchange)
+    shown = read_snapshot(memory)
     assert shown.advice is not None and shown.advice.valid and any(shown.advice.command)
-    assert adviser.cycle(0, now_s + 0.16) is Advised.STALE
-    advice = exchange.advice.read()
-    assert advice is not None and not advice["u"].any() and exchange.request is None
-    json.dumps(view(exchange).plain(), allow_nan=False)
+    assert adviser.cycle(0, now_s + 0.16) is AdviceStatus.STALE
+    advice = memory.advice.read()
+    assert advice is not None and not advice["u"].any() and memory.request is None
+    json.dumps(read_snapshot(memory).plain(), allow_nan=False)
 
 
 @pytest.mark.parametrize(
     ("change", "reason"),
-    [({"q_plausible": False}, Advised.IMPLAUSIBLE), ({"trusted": False}, Advised.IMPLAUSIBLE)],
+    [
+        ({"q_plausible": False}, AdviceStatus.IMPLAUSIBLE),
+        ({"trusted": False}, AdviceStatus.IMPLAUSIBLE),
+    ],
 )
 def test_positions_that_are_not_to_be_believed_give_no_advice(
-    adviser: Adviser, machine: Machine, change: dict[str, bool], reason: Advised
+    adviser: PolicyAdviser, machine: Machine, change: dict[str, bool], reason: AdviceStatus
 ) -> None:
     record = state(machine, 1, 0.0, 0.0, 1000.0)
     for name, value in change.items():
         record[name] = value
-    adviser._exchange.state.write(record)
+    adviser._memory.state.write(record)
     assert adviser.cycle(0, 1000.0) is reason
 
 
 def test_an_answer_that_makes_no_sense_is_not_shown(
-    adviser: Adviser, machine: Machine, monkeypatch: pytest.MonkeyPatch
+    adviser: PolicyAdviser, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    exchange, now_s = adviser._exchange, 1000.0
-    target = exchange.target.new()
+    memory, now_s = adviser._memory, 1000.0
+    target = memory.target.new()
     target["t_s"] = now_s
-    exchange.target.write(target)
+    memory.target.write(target)
     for answer in (
         np.array([np.nan, 0, 0, 0, 0]),
         np.array([1.1, 0, 0, 0, 0]),
@@ -346,16 +353,16 @@ def test_an_answer_that_makes_no_sense_is_not_shown(
         monkeypatch.setattr(adviser._bundle, "command", lambda _, answer=answer: answer[None])
         for _ in range(14):
             now_s += machine.period_s
-            exchange.state.write(state(machine, int(now_s * 100), 0.0, 0.0, now_s))
+            memory.state.write(state(machine, int(now_s * 100), 0.0, 0.0, now_s))
             reason = adviser.cycle(0, now_s)
-        assert reason is Advised.REJECTED
-        advice = exchange.advice.read()
+        assert reason is AdviceStatus.REJECTED
+        advice = memory.advice.read()
         assert advice is not None and not advice["u"].any()
 
 
 def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_path: Path) -> None:
     path = tmp_path / "target.json"
-    target = File(path=str(path)).build()
+    target = FileTarget(path=str(path)).build()
     assert target.news([]) is None
     path.write_text('{"center_in_base_m": [2.5, 0.1, 0.7]}')
     os.utime(path, ns=(time.time_ns() - 5 * 10**9,) * 2)
@@ -374,7 +381,14 @@ def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_pa
 
 
 def test_the_machines_computer_needs_no_torch_no_simulator_and_no_trainer() -> None:
-    modules = "deploy.runtime.supervisor, deploy.policy.adviser, deploy.runtime.bus_process, deploy.recorder.capture, deploy.link"
+    rooms = (
+        "runtime.supervisor",
+        "policy.policy_process",
+        "runtime.bus_process",
+        "recorder.capture",
+        "link",
+    )
+    modules = ", ".join(f"deploy.{name}" for name in rooms)
     code = f"import sys, {modules}; print([m for m in ('torch', 'warp', 'mujoco', 'rsl_rl') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

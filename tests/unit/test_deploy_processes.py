@@ -13,7 +13,7 @@ from composed import option
 from desk import COMMAND, Desk
 
 from brokk_rl.machine import Machine
-from deploy.runtime.operator_state import view
+from deploy.runtime.operator_state import read_snapshot
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 SLACK = 3.0 if os.environ.get("CI") or os.cpu_count() == 2 else 1.0
@@ -72,14 +72,14 @@ def test_a_fault_stops_the_machine_in_time(
     found_s = _stopped(desk, fault, since_s)
     desk.fault("none")
     assert found_s <= limit_s + 0.02 * SLACK
-    safety = view(desk.exchange).safety
+    safety = read_snapshot(desk.memory).safety
     assert safety is not None and safety.state in ("LATCHED", "READY")
 
 
 def _stopped(desk: Desk, fault: str, since_s: float) -> float:
     if fault == "silent":  # the gateway says nothing either: what the guard sends decides
         while time.monotonic() < since_s + 1.0:
-            safety = view(desk.exchange).safety
+            safety = read_snapshot(desk.memory).safety
             if safety is not None and not any(safety.sent):
                 return time.monotonic() - since_s
             time.sleep(0.001)
@@ -96,7 +96,7 @@ def test_the_operators_lever_always_wins(desk: Desk) -> None:
         values["FlowSource"] == 1 and values["Flow_q1"] == 0 and values["Flow_q4"] > 0.4
         for _, values in heard
     )
-    state = desk.exchange.state.read()
+    state = desk.memory.state.read()
     assert state is not None and not state["sent"].any()
 
 
@@ -107,7 +107,7 @@ def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero_but_is_never_used
     desk.set_moving()
     desk.fault(fault, "JointPos1", 0.5)
     time.sleep(0.5)
-    state = desk.exchange.state.read()
+    state = desk.memory.state.read()
     assert state is not None and (state["lost"] > 0 or state["refused"] > 0)
     assert bool(state["q_plausible"])
 
@@ -131,6 +131,6 @@ def test_a_process_that_dies_or_hangs_stops_the_machine(desk: Desk, name: str, n
 
 def test_what_is_shown_says_who_has_the_valves(desk: Desk) -> None:
     desk.set_moving()
-    safety = view(desk.exchange).safety
+    safety = read_snapshot(desk.memory).safety
     assert safety is not None and safety.state == "ACTIVE" and safety.commands
     assert [round(abs(u), 3) for u in safety.sent] == [round(abs(u), 3) for u in COMMAND]

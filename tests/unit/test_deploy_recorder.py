@@ -18,22 +18,22 @@ from mcap.reader import make_reader
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
-from deploy.bus.description import Description
-from deploy.recorder import reading
-from deploy.recorder.capture import BLF, MCAP, Capture, Log
-from deploy.recorder.conversion import CaptureLog
+from deploy.bus.description import BusDescription
+from deploy.recorder import capture_reader
+from deploy.recorder.capture import BLF, MCAP, CaptureConfig, CaptureWriter
+from deploy.recorder.conversion import CaptureLogReader
 from deploy.runtime.bus_process import FRAME, FRAMES, TEXT
 
-READER = CaptureLog(longest_gap_s=0.15, shortest_s=1.0)
+READER = CaptureLogReader(longest_gap_s=0.15, shortest_s=1.0)
 
 
 def write(
     folder: Path, machine: Machine, seconds: float = 3.0, gap_s: float = 0.0, close: bool = True
-) -> Log:
+) -> CaptureWriter:
     """Writes a capture of a machine whose first joint follows a known path: q1 = 0.1 t, flow a step of 0.5 at 1.025 s."""
     bus, log = (
-        Description(DBC, machine),
-        Log(Capture(folder, DBC, machine, {"source": "test"}, 0.0)),
+        BusDescription(DBC, machine),
+        CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 0.0)),
     )
     begun_s, counter = time.monotonic(), 0
     for k in range(round(seconds * 100)):
@@ -105,12 +105,12 @@ def test_nothing_that_was_flushed_is_lost_when_the_log_is_killed(
     machine: Machine, tmp_path: Path
 ) -> None:
     log = write(tmp_path, machine, close=False)  # never closed, as after SIGKILL
-    contents = reading.read(tmp_path / MCAP)
+    contents = capture_reader.read_capture(tmp_path / MCAP)
     positions = contents.messages["JointPos1"]
     assert (
         not contents.whole and positions[-1][0] - positions[0][0] >= 2.49
     )  # flushed last at 2.5 s
-    frames = list(reading.frames(tmp_path / BLF))
+    frames = list(capture_reader.iterate_blf_frames(tmp_path / BLF))
     assert (
         frames[-1].timestamp - frames[0].timestamp >= 2.49
         and abs(frames[0].timestamp - time.time()) < 60
@@ -123,11 +123,11 @@ def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(
     machine: Machine, tmp_path: Path, part: float
 ) -> None:
     write(tmp_path, machine)
-    whole = len(reading.read(tmp_path / MCAP).messages["JointPos1"])
+    whole = len(capture_reader.read_capture(tmp_path / MCAP).messages["JointPos1"])
     for name in (MCAP, BLF):
         content = (tmp_path / name).read_bytes()
         (tmp_path / f"cut_{name}").write_bytes(content[: int(part * len(content))])
-    count = reading.recover_mcap(tmp_path / f"cut_{MCAP}", tmp_path / "new.mcap")
+    count = capture_reader.recover_mcap(tmp_path / f"cut_{MCAP}", tmp_path / "new.mcap")
     with (tmp_path / "new.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
     assert (
@@ -135,28 +135,33 @@ def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(
         and summary.statistics is not None
         and summary.statistics.message_count == count
     )
-    found = reading.read(tmp_path / "new.mcap")
+    found = capture_reader.read_capture(tmp_path / "new.mcap")
     assert (
         found.whole
         and found.facts["source"] == "test"
         and 0 < len(found.messages["JointPos1"]) <= whole
     )
     assert len(found.messages["JointPos1"]) >= min(1.0, part - 0.25) * whole
-    assert reading.recover_blf(tmp_path / f"cut_{BLF}", tmp_path / "new.blf") == len(
+    assert capture_reader.recover_blf(tmp_path / f"cut_{BLF}", tmp_path / "new.blf") == len(
         list(can.BLFReader(tmp_path / "new.blf"))
     )
 
 
 def test_frames_that_were_refused_are_kept_and_said(machine: Machine, tmp_path: Path) -> None:
-    bus = Description(DBC, machine)
-    with Log(Capture(tmp_path, DBC, machine, {}, 0.0)) as log:
+    bus = BusDescription(DBC, machine)
+    with CaptureWriter(CaptureConfig(tmp_path, DBC, machine, {}, 0.0)) as log:
         payload = bytearray(bus.encode("JointPos1", {}, 1))
         payload[0] ^= 1
         log.add(
             FRAMES + FRAME.pack(time.monotonic(), bus.layouts["JointPos1"].frame_id, 0, 8) + payload
         )
-    assert reading.read(tmp_path / MCAP).messages["refused"][0][1]["fault"] == "wrong CRC"
-    assert bytes(next(iter(reading.frames(tmp_path / BLF))).data) == bytes(payload)
+    assert (
+        capture_reader.read_capture(tmp_path / MCAP).messages["refused"][0][1]["fault"]
+        == "wrong CRC"
+    )
+    assert bytes(next(iter(capture_reader.iterate_blf_frames(tmp_path / BLF))).data) == bytes(
+        payload
+    )
 
 
 def test_a_step_of_the_wall_clock_shows_nowhere(
@@ -164,7 +169,7 @@ def test_a_step_of_the_wall_clock_shows_nowhere(
 ) -> None:
     real, shift_ns = time.time_ns, 0
     monkeypatch.setattr("time.time_ns", lambda: real() + shift_ns)
-    with Log(Capture(tmp_path, DBC, machine, {}, 0.0)) as log:
+    with CaptureWriter(CaptureConfig(tmp_path, DBC, machine, {}, 0.0)) as log:
         for shift_ns in (0, 3600 * 10**9, -3600 * 10**9):  # noqa: B007
             log.add(
                 TEXT
@@ -216,7 +221,7 @@ def test_messages_of_numbers_are_kept_by_column_and_others_as_they_are() -> None
         (0.2, {"q": 2, "sent": False}),
         (0.3, {"q": -1.0, "sent": True}),
     ]
-    messages = reading.Messages()
+    messages = capture_reader.TopicMessages()
     for t_s, values in said:
         messages.add(t_s, values)
     assert (

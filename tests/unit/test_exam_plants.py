@@ -10,7 +10,7 @@ import torch
 from composed import option
 
 from brokk_rl.kinematics import Kinematics
-from brokk_rl.machine import Machine, exclusive_mask
+from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.signals import Command
 from exam.plants import out_of_library_faults
 from exam.plants.electronics import CommandBus
@@ -392,7 +392,7 @@ def test_chance_alone_leaves_most_of_the_stated_floor(
     levels = generator.uniform(-1.0, 1.0, shape) * (
         generator.random(shape) > 0.3
     )  # as excitation=levels: 0.3 of them rest
-    levels *= exclusive_mask(machine.is_exclusive, generator.random(shape[:2]) < 0.3)
+    levels *= mask_exclusive_joints(machine.is_exclusive, generator.random(shape[:2]) < 0.3)
     path = []
     for u in np.repeat(levels, 30, 0):
         path.append(twice.read().q)

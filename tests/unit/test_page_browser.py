@@ -15,7 +15,7 @@ from browser import LEVERS, SHOWN, TOKEN, Scripted, chromium, served
 from PIL import Image
 
 from brokk_rl.signals import Frame
-from deploy.page.protocol import Stream, Wish
+from deploy.page.protocol import OperatorRequest, SourceAge
 
 SIZE = {"width": 1280, "height": 800}
 TRAVEL = 95.0
@@ -189,7 +189,7 @@ def test_what_is_stale_is_grey_and_says_so(
 def test_a_stream_that_stops_grows_old_by_itself(
     feed: Scripted, port: int, opened: Callable[..., Any]
 ) -> None:
-    feed.now = replace(feed.now, streams=(Stream("positions", 0.0, 0.1), *SHOWN.streams[1:]))
+    feed.now = replace(feed.now, streams=(SourceAge("positions", 0.0, 0.1), *SHOWN.streams[1:]))
     page = opened(port)
     page.wait_for_selector("#streams li[data-stream=positions]:not(.stale)")
     # a clock that gains 0.2 s whenever it is asked: whatever came is that old when it is drawn
@@ -228,7 +228,7 @@ def test_the_page_comes_back_after_the_server_was_away(
         eventually(
             lambda: page.keyboard.press("g") or feed.wishes
         )  # until then it says that it has no connection
-        assert set(feed.wishes) == {Wish("start", "")}
+        assert set(feed.wishes) == {OperatorRequest("start", "")}
 
 
 def test_safety_and_connection_are_told_apart_in_words(
@@ -271,17 +271,17 @@ def test_everything_is_done_by_keys_and_by_gloves(
 ) -> None:
     page = opened(port, query="?lang=de")
     for key, wish in (
-        ("g", Wish("start", "")),
-        ("Escape", Wish("stop", "")),
-        ("r", Wish("record", "on")),
-        ("2", Wish("target", "B")),
+        ("g", OperatorRequest("start", "")),
+        ("Escape", OperatorRequest("stop", "")),
+        ("r", OperatorRequest("record", "on")),
+        ("2", OperatorRequest("target", "B")),
     ):
         page.keyboard.press(key)
         eventually(lambda wish=wish: feed.wishes[-1:] == [wish])
     for name, wish in (
-        ("#start", Wish("start", "")),
-        ("#stop", Wish("stop", "")),
-        ("#record", Wish("record", "on")),
+        ("#start", OperatorRequest("start", "")),
+        ("#stop", OperatorRequest("stop", "")),
+        ("#record", OperatorRequest("record", "on")),
     ):
         page.click(name)
         eventually(lambda wish=wish: feed.wishes[-1] == wish)
@@ -314,7 +314,7 @@ def test_without_dead_man_or_token_nothing_is_done_and_the_page_says_why(
     until(page, "document.getElementById('answer').textContent === 'Refused: hold the dead-man'")
     assert feed.wishes == []
     page.click("#stop")
-    eventually(lambda: feed.wishes == [Wish("stop", "")])
+    eventually(lambda: feed.wishes == [OperatorRequest("stop", "")])
     feed.now = SHOWN
     for token in ("wrong", None):
         stranger = opened(port, token=token)
@@ -357,7 +357,7 @@ def test_the_scene_shows_machine_points_and_picture(
         [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.6], [0, 0, 0, 1]]
     )
     matrix = np.array([[120.0, 0, 79.5], [0, 120.0, 44.5], [0, 0, 1.0]])
-    feed.now = replace(SHOWN, streams=(*SHOWN.streams, Stream("camera", 0.0, 1e6)))
+    feed.now = replace(SHOWN, streams=(*SHOWN.streams, SourceAge("camera", 0.0, 1e6)))
     page = opened(port, scene=True)
     until(page, "window.measured.frames === 0")
     feed.picture = Frame(color, np.full((90, 160), 3.0, np.float32), matrix, pose, 1.0)
@@ -378,7 +378,7 @@ def _share(page: Any, name: str, color: list[int], within: int = 25) -> float:
 def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(
     feed: Scripted, port: int, opened: Callable[..., Any]
 ) -> None:
-    feed.now = replace(SHOWN, streams=(*SHOWN.streams, Stream("camera", 0.0, 1e6)))
+    feed.now = replace(SHOWN, streams=(*SHOWN.streams, SourceAge("camera", 0.0, 1e6)))
     page = opened(port)
     until(page, "!document.getElementById('camera').hidden")
     box = page.locator("#picture").bounding_box()

@@ -13,31 +13,32 @@ import pytest
 from composed import option
 
 from brokk_rl.session import Session
-from deploy.guard.guard import State
-from deploy.page.from_loop import Beside, LoopFeed
-from deploy.page.protocol import Drawn, Levers, Wish
-from deploy.policy.adviser import REASONS, Advised
+from deploy.guard.guard import GuardState
+from deploy.guidance import LeverPositions
+from deploy.page.loop_feed import LoopFeed, PageProcessConfig
+from deploy.page.protocol import DrawReport, OperatorRequest
+from deploy.policy.policy_process import REASONS, AdviceStatus
 from deploy.runtime.bus_process import TEXT, TRIPS
-from deploy.runtime.operator_requests import Recorder, Wanted
-from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import Aim, File
+from deploy.runtime.operator_requests import RecordingControl, RequestHandler
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.target import FileTarget, TargetSelector
 
 MACHINE = option("machine", "brokk170")
 FULL_RAD = 0.35
 
 
 @pytest.fixture
-def exchange() -> Iterator[Exchange]:
-    found = Exchange.new(MACHINE.num_joints, commands=True)
+def memory() -> Iterator[LoopMemory]:
+    found = LoopMemory.new(MACHINE.num_joints, commands=True)
     yield found
     found.close()
 
 
 @pytest.fixture
-def feed(exchange: Exchange, tmp_path: Path) -> LoopFeed:
+def feed(memory: LoopMemory, tmp_path: Path) -> LoopFeed:
     session = Session(out=str(tmp_path), seed=1, device="cpu")
     return LoopFeed(
-        Beside(
+        PageProcessConfig(
             option("page", "local"),
             MACHINE,
             option("guidance", "machine"),
@@ -46,30 +47,30 @@ def feed(exchange: Exchange, tmp_path: Path) -> LoopFeed:
             0.15,
             600.0,
         ),
-        exchange,
+        memory,
     )
 
 
-def say(exchange: Exchange, **changes: Any) -> None:
+def say(memory: LoopMemory, **changes: Any) -> None:
     """Publishes a state in which all is well, with `changes`."""
-    record, now_s = exchange.state.new(), time.monotonic()
+    record, now_s = memory.state.new(), time.monotonic()
     record["t_s"] = record["q_t_s"] = record["levers_t_s"] = now_s
     record["q"], record["lever"] = MACHINE.home, [0.1, -0.2, 0.3, -0.4]
     record["q_plausible"] = record["trusted"] = record["alone"] = record["bus_up"] = record[
         "deadman"
     ] = True
-    record["guard"], record["trip"] = State.SILENT.value, TRIPS.index(TRIPS[0])
+    record["guard"], record["trip"] = GuardState.SILENT.value, TRIPS.index(TRIPS[0])
     for name, value in changes.items():
         record[name] = value
-    exchange.state.write(record)
+    memory.state.write(record)
 
 
-def advise(exchange: Exchange, reason: Advised = Advised.VALID, **changes: Any) -> None:
-    record = exchange.advice.new()
+def advise(memory: LoopMemory, reason: AdviceStatus = AdviceStatus.VALID, **changes: Any) -> None:
+    record = memory.advice.new()
     record["t_s"], record["number"], record["reason"] = time.monotonic(), 5, REASONS.index(reason)
     for name, value in changes.items():
         record[name] = value
-    exchange.advice.write(record)
+    memory.advice.write(record)
 
 
 def test_before_anything_came_everything_is_missing(feed: LoopFeed) -> None:
@@ -80,40 +81,40 @@ def test_before_anything_came_everything_is_missing(feed: LoopFeed) -> None:
     assert json.dumps(shown.plain())
 
 
-def test_levers_are_parts_of_full(exchange: Exchange, feed: LoopFeed) -> None:
-    say(exchange)
-    advise(exchange, lever_rad=[FULL_RAD, -FULL_RAD / 2, 0.0, FULL_RAD / 4])
+def test_levers_are_parts_of_full(memory: LoopMemory, feed: LoopFeed) -> None:
+    say(memory)
+    advise(memory, lever_rad=[FULL_RAD, -FULL_RAD / 2, 0.0, FULL_RAD / 4])
     shown = feed.shown()
-    assert shown.own == Levers(0.1, -0.2, 0.3, -0.4, False)
+    assert shown.own == LeverPositions(0.1, -0.2, 0.3, -0.4, False)
     assert shown.advice is not None
-    assert shown.advice.levers == Levers(1.0, -0.5, 0.0, 0.25, False)
+    assert shown.advice.levers == LeverPositions(1.0, -0.5, 0.0, 0.25, False)
     assert (shown.advice.valid, shown.advice.number) == (True, 5)
     assert shown.alive and shown.deadman
 
 
 def test_the_button_is_announced_while_the_levers_go_through_neutral(
-    exchange: Exchange, feed: LoopFeed
+    memory: LoopMemory, feed: LoopFeed
 ) -> None:
-    say(exchange)
+    say(memory)
     wants_q2 = [0.0, 0.7, 0.0, 0.0, 0.0]
-    advise(exchange, u=wants_q2, lever_rad=[0.3, 0.0, 0.0, 0.0])
+    advise(memory, u=wants_q2, lever_rad=[0.3, 0.0, 0.0, 0.0])
     advice = feed.shown().advice
     assert advice is not None and advice.button_due_s == pytest.approx(0.3 / 2.0)  # at 2 rad/s
-    advise(exchange, u=wants_q2, lever_rad=[0.0, 0.0, 0.1, 0.0], button_right=True)
+    advise(memory, u=wants_q2, lever_rad=[0.0, 0.0, 0.1, 0.0], button_right=True)
     advice = feed.shown().advice
     assert advice is not None and advice.button_due_s == 0.0
-    advise(exchange, u=[0.3, 0.0, 0.0, 0.0, 0.0])
+    advise(memory, u=[0.3, 0.0, 0.0, 0.0, 0.0])
     advice = feed.shown().advice
     assert advice is not None and advice.button_due_s is None
 
 
-def test_old_things_are_old(exchange: Exchange, feed: LoopFeed) -> None:
+def test_old_things_are_old(memory: LoopMemory, feed: LoopFeed) -> None:
     now_s = time.monotonic()
-    say(exchange, q_t_s=now_s - 0.2, levers_t_s=now_s - 0.3)
-    advise(exchange, t_s=now_s - 1.0)
-    target = exchange.target.new()
+    say(memory, q_t_s=now_s - 0.2, levers_t_s=now_s - 0.3)
+    advise(memory, t_s=now_s - 1.0)
+    target = memory.target.new()
     target["t_s"], target["center_in_base_m"] = now_s - 700.0, [2.6, 0.0, 0.75]
-    exchange.target.write(target)
+    memory.target.write(target)
     assert {stream.name for stream in feed.shown().streams if stream.stale} == {
         "positions",
         "levers",
@@ -123,29 +124,29 @@ def test_old_things_are_old(exchange: Exchange, feed: LoopFeed) -> None:
     assert not feed.shown().deadman, "a dead-man of which nothing was heard is not held"
 
 
-def test_the_borehole_and_the_way_to_it(exchange: Exchange, feed: LoopFeed) -> None:
-    say(exchange)
-    target = exchange.target.new()
+def test_the_borehole_and_the_way_to_it(memory: LoopMemory, feed: LoopFeed) -> None:
+    say(memory)
+    target = memory.target.new()
     target["t_s"], target["center_in_base_m"], target["std_m"] = (
         time.monotonic(),
         [2.6, 0.0, 0.75],
         0.003,
     )
-    exchange.target.write(target)
+    memory.target.write(target)
     shown = feed.shown()
     assert shown.targets[0].center_in_base_m == (2.6, 0.0, 0.75) and shown.targets[0].std_m == 0.003
     assert shown.path_in_base_m[-1] == pytest.approx((2.6, 0.0, 0.65))
-    assert feed.wish(Wish("target", shown.targets[0].name))
-    assert not feed.wish(Wish("target", "another"))
-    feed.wish(Wish("stop", ""))
+    assert feed.wish(OperatorRequest("target", shown.targets[0].name))
+    assert not feed.wish(OperatorRequest("target", "another"))
+    feed.wish(OperatorRequest("stop", ""))
     stopped = feed.shown()
     assert not stopped.guiding and stopped.path_in_base_m == ()
 
 
-def test_what_was_wished_and_drawn_is_recorded(exchange: Exchange, feed: LoopFeed) -> None:
-    feed.drawn(Drawn(7, 12.5, 0.002, 1))
-    feed.wish(Wish("record", "on"))
-    said = [json.loads(data.removeprefix(TEXT)) for data in exchange.page_log.take()]
+def test_what_was_wished_and_drawn_is_recorded(memory: LoopMemory, feed: LoopFeed) -> None:
+    feed.drawn(DrawReport(7, 12.5, 0.002, 1))
+    feed.wish(OperatorRequest("record", "on"))
+    said = [json.loads(data.removeprefix(TEXT)) for data in memory.page_log.take()]
     assert [one["topic"] for one in said] == ["drawn", "wish"]
     assert (said[0]["advice"], said[0]["at_s"]) == (7, 12.5)
 
@@ -167,66 +168,68 @@ class Process:
 
 
 def wanted(
-    exchange: Exchange, tmp_path: Path, commands: bool = True
-) -> tuple[Wanted, list[Process]]:
+    memory: LoopMemory, tmp_path: Path, commands: bool = True
+) -> tuple[RequestHandler, list[Process]]:
     started: list[Process] = []
 
     def start(folder: Path) -> Any:
         started.append(Process(folder))
         return started[-1]
 
-    aim = Aim(File(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes)
-    return Wanted(
-        exchange, Recorder(exchange, tmp_path, start), aim, armed=False, commands=commands
+    aim = TargetSelector(
+        FileTarget(path=str(tmp_path / "none.json")).build(), memory.target, memory.holes
+    )
+    return RequestHandler(
+        memory, RecordingControl(memory, tmp_path, start), aim, armed=False, commands=commands
     ), started
 
 
-def controls(exchange: Exchange) -> Any:
-    found = exchange.controls.read()
+def controls(memory: LoopMemory) -> Any:
+    found = memory.controls.read()
     assert found is not None
     return found
 
 
-def test_start_arms_and_stop_disarms(exchange: Exchange, feed: LoopFeed, tmp_path: Path) -> None:
-    supervisor, _ = wanted(exchange, tmp_path)
+def test_start_arms_and_stop_disarms(memory: LoopMemory, feed: LoopFeed, tmp_path: Path) -> None:
+    supervisor, _ = wanted(memory, tmp_path)
     supervisor.refresh()
-    assert not controls(exchange)["armed"]
+    assert not controls(memory)["armed"]
     for kind, armed in (("start", True), ("stop", False), ("start", True)):
-        feed.wish(Wish(kind, ""))
+        feed.wish(OperatorRequest(kind, ""))
         supervisor.refresh()
-        assert controls(exchange)["armed"] == armed
-    feed.wish(Wish("start", ""))
-    feed.wish(Wish("stop", ""))
+        assert controls(memory)["armed"] == armed
+    feed.wish(OperatorRequest("start", ""))
+    feed.wish(OperatorRequest("stop", ""))
     supervisor.refresh()
-    assert not controls(exchange)["armed"], "the last word counts"
+    assert not controls(memory)["armed"], "the last word counts"
 
 
 def test_nothing_is_armed_where_nothing_is_ever_sent(
-    exchange: Exchange, feed: LoopFeed, tmp_path: Path
+    memory: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
-    supervisor, _ = wanted(exchange, tmp_path, commands=False)
-    feed.wish(Wish("start", ""))
+    supervisor, _ = wanted(memory, tmp_path, commands=False)
+    feed.wish(OperatorRequest("start", ""))
     supervisor.refresh()
-    assert not controls(exchange)["armed"]
+    assert not controls(memory)["armed"]
 
 
 def test_recordings_begin_and_end_one_at_a_time(
-    exchange: Exchange, feed: LoopFeed, tmp_path: Path
+    memory: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
-    supervisor, started = wanted(exchange, tmp_path)
-    exchange.bus_log.put(b"old")
+    supervisor, started = wanted(memory, tmp_path)
+    memory.bus_log.put(b"old")
     supervisor.refresh()
-    assert exchange.bus_log.waiting == 0, "what nobody records does not pile up"
-    feed.wish(Wish("record", "on"))
+    assert memory.bus_log.waiting == 0, "what nobody records does not pile up"
+    feed.wish(OperatorRequest("record", "on"))
     supervisor.refresh()
     assert [one.folder for one in started] == [tmp_path]
     assert feed.shown().recording.on
-    feed.wish(Wish("record", "off"))
-    feed.wish(Wish("record", "on"))
-    feed.wish(Wish("record", "off"))
+    feed.wish(OperatorRequest("record", "off"))
+    feed.wish(OperatorRequest("record", "on"))
+    feed.wish(OperatorRequest("record", "off"))
     supervisor.refresh()
     assert started[0].asked and not feed.shown().recording.on
-    feed.wish(Wish("record", "on"))
+    feed.wish(OperatorRequest("record", "on"))
     supervisor.refresh()
     assert len(started) == 1, "the first still writes its last words"
     started[0].code = 0
@@ -236,10 +239,10 @@ def test_recordings_begin_and_end_one_at_a_time(
 
 
 def test_a_log_that_died_is_not_started_again_in_secret(
-    exchange: Exchange, feed: LoopFeed, tmp_path: Path
+    memory: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
-    supervisor, started = wanted(exchange, tmp_path)
-    feed.wish(Wish("record", "on"))
+    supervisor, started = wanted(memory, tmp_path)
+    feed.wish(OperatorRequest("record", "on"))
     supervisor.refresh()
     started[0].code = -9
     supervisor.refresh()
@@ -248,7 +251,7 @@ def test_a_log_that_died_is_not_started_again_in_secret(
 
 
 def test_other_lever_patterns_have_their_own_full_angles(
-    exchange: Exchange, tmp_path: Path
+    memory: LoopMemory, tmp_path: Path
 ) -> None:
     session = Session(out=str(tmp_path), seed=1, device="cpu")
     guidance = option("guidance", "iso")
@@ -256,9 +259,10 @@ def test_other_lever_patterns_have_their_own_full_angles(
         guidance, levers=tuple(replace(one, max_angle_rad=0.5) for one in guidance.levers)
     )
     feed = LoopFeed(
-        Beside(option("page", "local"), MACHINE, wide, session, 0.15, 0.15, 600.0), exchange
+        PageProcessConfig(option("page", "local"), MACHINE, wide, session, 0.15, 0.15, 600.0),
+        memory,
     )
-    say(exchange)
-    advise(exchange, lever_rad=[0.25, 0.0, 0.0, 0.0])
+    say(memory)
+    advise(memory, lever_rad=[0.25, 0.0, 0.0, 0.0])
     advice = feed.shown().advice
     assert advice is not None and advice.levers.left_theta == pytest.approx(0.5)

@@ -19,21 +19,20 @@ from PIL import Image
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.signals import Frame
-from deploy.page import access, cloud
+from deploy.page import access, frame_codec
 from deploy.page.clock import PageClock
-from deploy.page.demo import Demo
-from deploy.page.files import load
-from deploy.page.latest_value import Room
-from deploy.page.protocol import Stream, Wish
-from deploy.page.scene import approach
-from deploy.page.settings import link
+from deploy.page.demo import DemoMachine
+from deploy.page.protocol import OperatorRequest, SourceAge
+from deploy.page.scene import plan_approach
+from deploy.page.server import SendWindow, load_files
+from deploy.page.settings import build_link
 
-MINE = access.names("127.0.0.1", 8170, ())
+MINE = access.list_own_hosts("127.0.0.1", 8170, ())
 
 
 @pytest.mark.parametrize("host", ["localhost:8170", "127.0.0.1:8170", "[::1]:8170"])
 def test_a_page_of_this_server_may_connect(host: str) -> None:
-    assert access.same_origin(f"http://{host}", host, MINE)
+    assert access.is_same_origin(f"http://{host}", host, MINE)
 
 
 @pytest.mark.parametrize(
@@ -53,26 +52,28 @@ def test_a_page_of_this_server_may_connect(host: str) -> None:
     ],
 )
 def test_nobody_else_may(origin: str | None, host: str | None) -> None:
-    assert not access.same_origin(origin, host, MINE)
+    assert not access.is_same_origin(origin, host, MINE)
 
 
 def test_in_a_network_the_names_are_those_of_the_configuration() -> None:
-    names = access.names("0.0.0.0", 80, ("site.lan",))
+    names = access.list_own_hosts("0.0.0.0", 80, ("site.lan",))
     assert "site.lan:80" in names
     assert "evil.example:80" not in names
 
 
 def test_only_the_whole_token_fits() -> None:
-    assert access.token_fits(TOKEN, TOKEN)
+    assert access.matches_token(TOKEN, TOKEN)
     assert not any(
-        access.token_fits(given, TOKEN)
+        access.matches_token(given, TOKEN)
         for given in (None, 7, "", TOKEN[:-1], TOKEN + " ", [TOKEN], "ключ")
     )
 
 
 def test_wishes_are_read() -> None:
-    assert access.read_wish('{"kind": "record", "value": "on"}') == Wish("record", "on")
-    assert access.read_wish('{"kind": "stop", "value": ""}') == Wish("stop", "")
+    assert access.parse_request('{"kind": "record", "value": "on"}') == OperatorRequest(
+        "record", "on"
+    )
+    assert access.parse_request('{"kind": "stop", "value": ""}') == OperatorRequest("stop", "")
 
 
 @given(
@@ -82,7 +83,7 @@ def test_wishes_are_read() -> None:
     ).map(json.dumps)
 )
 def test_nonsense_is_no_wish_and_no_error(text: str) -> None:
-    assert access.read_wish(text) is None
+    assert access.parse_request(text) is None
 
 
 @pytest.mark.parametrize(
@@ -99,27 +100,27 @@ def test_nonsense_is_no_wish_and_no_error(text: str) -> None:
     ],
 )
 def test_a_wish_that_is_not_quite_one_is_none(found: dict[str, object]) -> None:
-    assert access.read_wish(json.dumps(found)) is None
+    assert access.parse_request(json.dumps(found)) is None
 
 
 def test_without_the_dead_man_only_stop_goes_through() -> None:
     assert SHOWN.safety is not None
     released = replace(SHOWN, safety=replace(SHOWN.safety, deadman=False))
     stopped = replace(SHOWN, safety=replace(SHOWN.safety, estop=True))
-    old = replace(SHOWN, streams=(Stream("levers", 0.2, 0.15),))
+    old = replace(SHOWN, streams=(SourceAge("levers", 0.2, 0.15),))
     dead, unknown = replace(SHOWN, alive=False), replace(SHOWN, safety=None)
     for shown in (released, stopped, old, dead, unknown):
         for wish in (
-            Wish("start", ""),
-            Wish("record", "on"),
-            Wish("record", "off"),
-            Wish("target", "A"),
+            OperatorRequest("start", ""),
+            OperatorRequest("record", "on"),
+            OperatorRequest("record", "off"),
+            OperatorRequest("target", "A"),
         ):
-            assert access.refusal(wish, shown) == "deadman"
-        assert access.refusal(Wish("stop", ""), shown) is None
-    assert access.refusal(Wish("start", ""), SHOWN) is None
-    assert access.refusal(Wish("target", "B"), SHOWN) is None
-    assert access.refusal(Wish("target", "C"), SHOWN) == "target"
+            assert access.find_refusal(wish, shown) == "deadman"
+        assert access.find_refusal(OperatorRequest("stop", ""), shown) is None
+    assert access.find_refusal(OperatorRequest("start", ""), SHOWN) is None
+    assert access.find_refusal(OperatorRequest("target", "B"), SHOWN) is None
+    assert access.find_refusal(OperatorRequest("target", "C"), SHOWN) == "target"
 
 
 def frame(height: int, width: int) -> Frame:
@@ -134,10 +135,10 @@ def frame(height: int, width: int) -> Frame:
 
 def test_depth_comes_back_to_the_millimetre_and_unknown_stays_unknown() -> None:
     sent = frame(17, 33)
-    message = cloud.encode(sent, 640, 90)
+    message = frame_codec.encode_frame(sent, 640, 90)
     length = int.from_bytes(message[:4], "little")
     header = json.loads(message[4 : 4 + length])
-    back_m = cloud.depth_m(
+    back_m = frame_codec.decode_depth_m(
         message[4 + length : 4 + length + header["depth_bytes"]], header["width"], header["height"]
     )
     np.testing.assert_array_equal(np.isnan(back_m), np.isnan(sent.depth_m))
@@ -150,7 +151,7 @@ def test_depth_comes_back_to_the_millimetre_and_unknown_stays_unknown() -> None:
 
 
 def test_the_picture_is_a_jpeg_in_the_right_colours() -> None:
-    message = cloud.encode(frame(16, 32), 640, 95)
+    message = frame_codec.encode_frame(frame(16, 32), 640, 95)
     length = int.from_bytes(message[:4], "little")
     jpeg = message[4 + length + json.loads(message[4 : 4 + length])["depth_bytes"] :]
     with Image.open(io.BytesIO(jpeg)) as picture:
@@ -159,13 +160,15 @@ def test_the_picture_is_a_jpeg_in_the_right_colours() -> None:
 
 
 def test_a_frame_is_shrunk_and_its_camera_with_it() -> None:
-    message = cloud.encode(frame(40, 80), 40, 80)
+    message = frame_codec.encode_frame(frame(40, 80), 40, 80)
     header = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
     assert (header["width"], header["height"], header["focal_px"]) == (40, 20, [200.0, 205.0])
 
 
 def test_what_is_too_far_or_infinite_is_unknown() -> None:
-    low, high = cloud.planes(np.array([[np.inf, 70.0, -1.0, 0.5, np.nan]], np.float32)).astype(int)
+    low, high = frame_codec.encode_depth_planes(
+        np.array([[np.inf, 70.0, -1.0, 0.5, np.nan]], np.float32)
+    ).astype(int)
     assert (low + 256 * high).tolist() == [[0, 0, 0, 1000, 999]], (
         "0 mm, 0, 0, then 500 up and 500 down"
     )
@@ -173,7 +176,9 @@ def test_what_is_too_far_or_infinite_is_unknown() -> None:
 
 def test_depth_and_colour_of_different_sizes_are_refused() -> None:
     with pytest.raises(FrameError, match="expected one size"):
-        cloud.encode(replace(frame(16, 32), depth_m=np.ones((8, 8), np.float32)), 640, 80)
+        frame_codec.encode_frame(
+            replace(frame(16, 32), depth_m=np.ones((8, 8), np.float32)), 640, 80
+        )
 
 
 @given(
@@ -226,7 +231,7 @@ def test_nonsense_about_draw_times_is_noticed(text: str) -> None:
 
 
 def test_a_page_has_no_more_undrawn_messages_than_the_limit() -> None:
-    room = Room(2)
+    room = SendWindow(2)
     room.sent(1)
     assert room._free.is_set()
     room.sent(2)
@@ -238,16 +243,17 @@ def test_a_page_has_no_more_undrawn_messages_than_the_limit() -> None:
 def test_the_way_leads_over_the_rim_and_then_down_the_axis() -> None:
     center_m, up = np.array([2.0, 0.0, 0.5]), np.array([0.0, 0.0, 1.0])
     assert np.allclose(
-        approach(np.array([1.0, 1.0, 1.0]), center_m, up), [(1, 1, 1), (2, 0, 0.8), (2, 0, 0.4)]
+        plan_approach(np.array([1.0, 1.0, 1.0]), center_m, up),
+        [(1, 1, 1), (2, 0, 0.8), (2, 0, 0.4)],
     )
     assert np.allclose(
-        approach(np.array([2.0, 0.01, 0.6]), center_m, up), [(2.0, 0.01, 0.6), (2, 0, 0.4)]
+        plan_approach(np.array([2.0, 0.01, 0.6]), center_m, up), [(2.0, 0.01, 0.6), (2, 0, 0.4)]
     )
 
 
 def test_the_demo_keeps_to_the_machine() -> None:
     machine, now_s = option("machine", "brokk170"), [0.0]
-    demo: Demo = option("feed", "demo")
+    demo: DemoMachine = option("feed", "demo")
     feed = replace(demo, frames=False).build(machine)
     feed._clock, feed._began_s = lambda: now_s[0], 0.0
     before, speeds = None, []
@@ -277,7 +283,7 @@ def test_the_demo_keeps_to_the_machine() -> None:
 
 def test_the_link_carries_the_token_where_browsers_keep_it_to_themselves() -> None:
     page = option("page", "local")
-    address = link(page, 8170, TOKEN)
+    address = build_link(page, 8170, TOKEN)
     assert address.index("#") < address.index(TOKEN)
     assert TOKEN not in json.dumps(page.setup(option("machine", "brokk170")))
 
@@ -292,15 +298,15 @@ def test_settings_that_make_no_sense_are_refused(change: dict[str, object]) -> N
 
 
 def test_both_languages_say_everything() -> None:
-    text = load(b"")["/words.js"][1].decode()
+    text = load_files(b"")["/words.js"][1].decode()
     german, english = text.split("const EN")
     keys = {
         name: set(re.findall(r'(?:^|[{,]\s*)"?([\w\- ,\']+?)"?:\s*"', part, re.M))
         for name, part in (("de", german), ("en", english))
     }
     assert keys["en"] <= keys["de"]
-    from deploy.guard.guard import Trip
-    from deploy.policy.adviser import Advised
+    from deploy.guard.guard import GuardTrip
+    from deploy.policy.policy_process import AdviceStatus
 
-    said = {one.value for one in (*Trip, *Advised)} - {"valid"}
+    said = {one.value for one in (*GuardTrip, *AdviceStatus)} - {"valid"}
     assert said - {key for key in said if f'"{key}":' in german or f" {key}:" in german} == set()

@@ -13,7 +13,7 @@ from browser import TOKEN, Scripted, served
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from deploy.page.protocol import Shown
+from deploy.page.protocol import PageState
 
 
 @pytest.fixture
@@ -72,7 +72,7 @@ def test_the_feed_is_asked_for_everything_no_faster_than_the_page_is_fed() -> No
     class Counted(Scripted):
         asked = 0
 
-        def shown(self) -> Shown:
+        def shown(self) -> PageState:
             self.asked += 1
             return super().shown()
 

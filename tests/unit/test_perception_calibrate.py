@@ -23,7 +23,7 @@ from brokk_rl.record import Recording
 from perception import dataset
 from perception.calibrate import arm, clock, hand_eye, rigid, start, touched
 from perception.calibrate.extrinsics import point_std_m
-from perception.sources.folder import Folder
+from perception.sources.folder import FrameFolder
 
 EXACT = np.diag([0.0005, 0.0005, 0.001, 0.001, 0.001, 0.0005]) ** 2
 """How a board of 0.8 m is seen at 2 m: its corners to 0.1 px."""
@@ -278,7 +278,7 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     assert told["other_half"]["median_m"] < 0.01
     (lost,) = (one for one in told["poses"] if one["name"] == "020")
     assert "corners of the board" in lost["left_out"]
-    folder = Folder(
+    folder = FrameFolder(
         folder=str(footage), rate_hz=1.0, least_known=0.0, needs="camera", base_from_camera="run/calibration.yaml",
         stereo=option("stereo", "sgbm"),
     )  # fmt: skip

@@ -42,7 +42,7 @@ def test_a_fit_returns_the_ellipse_that_opencv_returns() -> None:
             80 + 30 * s * np.cos(turn) + 12 * c * np.sin(turn),
         ]
     )
-    found = conic.fit(points[None], np.ones((1, 40)))[0]
+    found = conic.fit_ellipses(points[None], np.ones((1, 40)))[0]
     (x, y), axes, _ = cv2.fitEllipseDirect(points.astype(np.float32))
     assert found[:4] == pytest.approx([x, y, max(axes) / 2, min(axes) / 2], abs=1e-2)
     assert found == pytest.approx([50, 80, 30, 12, 0.7], abs=1e-6)
@@ -50,14 +50,14 @@ def test_a_fit_returns_the_ellipse_that_opencv_returns() -> None:
 
 def test_points_on_a_line_are_no_ellipse() -> None:
     line = np.column_stack([np.arange(20.0), 2 * np.arange(20.0)])
-    assert np.isnan(conic.fit(line[None], np.ones((1, 20)))).all()
+    assert np.isnan(conic.fit_ellipses(line[None], np.ones((1, 20)))).all()
 
 
 def test_a_rim_on_its_plane_is_the_circle_that_it_is() -> None:
     center, axis = np.array([0.2, 0.1, 2.0]), np.array([0.3, -0.5, -0.8])
     axis /= np.linalg.norm(axis)
-    seen = conic.fit(rim(center, axis, 0.05)[None], np.ones((1, 100)))[0]
-    found, axes = conic.on_plane(seen, K, axis / (axis @ center))
+    seen = conic.fit_ellipses(rim(center, axis, 0.05)[None], np.ones((1, 100)))[0]
+    found, axes = conic.project_onto_plane(seen, K, axis / (axis @ center))
     assert found == pytest.approx(center, abs=1e-9)
     assert axes == pytest.approx([0.05, 0.05], abs=1e-9)
 
@@ -65,8 +65,10 @@ def test_a_rim_on_its_plane_is_the_circle_that_it_is() -> None:
 def test_one_of_the_two_circles_of_a_known_radius_is_the_true_one() -> None:
     center, axis = np.array([-0.3, 0.2, 1.5]), np.array([-0.2, -0.6, -0.77])
     axis /= np.linalg.norm(axis)
-    seen = conic.fit(rim(center, axis, 0.05)[None], np.ones((1, 100)))[0]
-    best = min(conic.circles(seen, K, 0.05), key=lambda one: np.linalg.norm(one[0] - center))
+    seen = conic.fit_ellipses(rim(center, axis, 0.05)[None], np.ones((1, 100)))[0]
+    best = min(
+        conic.solve_circle_poses(seen, K, 0.05), key=lambda one: np.linalg.norm(one[0] - center)
+    )
     assert best[0] == pytest.approx(center, abs=1e-6)
     assert best[1] == pytest.approx(axis, abs=1e-6)
 
@@ -223,9 +225,9 @@ def test_what_edge_drawing_proposes_is_judged_like_the_rest(
     seen = option("perception/ellipse", "edge_drawing").build().detect(picture, None, None)
     assert len(seen) == 1
     assert row(seen[0])[:4] == pytest.approx([60, 50, 30, 20], abs=0.8)
-    rows = edge_drawing.rows_of(found)
+    rows = edge_drawing.convert_detections(found)
     assert rows == pytest.approx(np.array([[60, 50, 30, 20, np.pi / 2], [120, 50, 25, 25, 0]]))
-    assert len(edge_drawing.rows_of(None)) == 0
+    assert len(edge_drawing.convert_detections(None)) == 0
 
 
 def row(one: Ellipse) -> np.ndarray:

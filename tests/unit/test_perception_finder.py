@@ -14,10 +14,10 @@ from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, SizePrior
 from brokk_rl.errors import FrameError
 from perception import dataset, search
 from perception.benchmark.cells import Tally, compare, judge
-from perception.finder import Finder, rectified
+from perception.finder import StagedFinder, rectify
 
 
-def finder_with(masks: Masks) -> Finder:
+def finder_with(masks: Masks) -> StagedFinder:
     """Returns the default finder with a segmenter that always says the same."""
     segmenter = SimpleNamespace(build=lambda: SimpleNamespace(segment=lambda frame: masks))
     return replace(option("perception", "plane_conic"), segmenter=segmenter).build()
@@ -60,16 +60,16 @@ def test_a_flat_disc_is_refused_in_words() -> None:
 def test_lens_distortion_is_taken_out() -> None:
     frame, _, _ = drawn()
     bent = replace(frame, distortion=np.array([0.05, 0.0, 0.0, 0.0]))
-    straight = rectified(bent)
+    straight = rectify(bent)
     assert straight.distortion is None
     known = straight.depth_m[np.isfinite(straight.depth_m)]
     assert np.isin(known, frame.depth_m).all()
-    assert rectified(replace(frame, distortion=np.zeros(5))).color is frame.color
+    assert rectify(replace(frame, distortion=np.zeros(5))).color is frame.color
 
 
 def test_figures_are_counted_as_by_hand() -> None:
-    def circle(x: float, depth_m: float) -> dataset.Circle:
-        return dataset.Circle(
+    def circle(x: float, depth_m: float) -> dataset.TrueCircle:
+        return dataset.TrueCircle(
             (x, 0, 2), (0, 0, -1), (x, 0, 2), (0, 0, -1), 0.05, depth_m, 0.0, True
         )
 
@@ -86,7 +86,9 @@ def test_figures_are_counted_as_by_hand() -> None:
             0.0,
         )
 
-    truth = dataset.Truth("test", {}, (circle(0.0, 0.3), circle(0.5, 0.3)), (circle(1.0, 0.0),), {})
+    truth = dataset.SceneTruth(
+        "test", {}, (circle(0.0, 0.3), circle(0.5, 0.3)), (circle(1.0, 0.0),), {}
+    )
     tally = Tally()
     compare([pose(0.0, 2.003), pose(1.01), pose(3.0)], truth, drawn()[0], tally)
     assert (tally.true, tally.found, tally.decoys, tally.fooled, tally.false) == (2, 1, 1, 1, 1)
@@ -98,10 +100,10 @@ def test_figures_are_counted_as_by_hand() -> None:
 
 def test_a_frame_that_is_refused_counts_as_one_in_which_nothing_was_found() -> None:
     frame, masks, _ = drawn()
-    hole = dataset.Circle(
+    hole = dataset.TrueCircle(
         tuple(CENTER), tuple(AXIS), tuple(CENTER), tuple(AXIS), 0.05, 0.3, 0.0, True
     )
-    truth = dataset.Truth("test", {}, (hole,), (), {})
+    truth = dataset.SceneTruth("test", {}, (hole,), (), {})
     seen, _ = judge(finder_with(masks), frame, truth)
     assert seen.is_perfect and seen.row()["position_mm_median"] < 2.0
     blind = option("perception", "plane_conic").build()
@@ -121,7 +123,7 @@ def test_beside_an_arm_a_face_is_searched_where_nobody_knows_its_depth() -> None
     mask = np.zeros(depth_m.shape, bool)
     mask[100:400, 100:300] = True
     frame = replace(drawn()[0], depth_m=depth_m)
-    (level,) = search.levels(frame, mask, 0.05, 0.25, 8.0)
+    (level,) = search.plan_search_levels(frame, mask, 0.05, 0.25, 8.0)
     # a hole has 13 px there, 17 at most: the whole strip is searched, the arm no farther than a rim
     # reaches, the ground likewise
     seen = np.repeat(np.repeat(level.region > 0, search.STEP, 0), search.STEP, 1)
@@ -157,7 +159,9 @@ def test_an_ellipse_that_is_too_large_where_it_lies_is_none() -> None:
     ]
     found = [
         one
-        for level in search.levels(frame, np.ones(depth_m.shape, bool), 0.05, 0.35, 10.0)
+        for level in search.plan_search_levels(
+            frame, np.ones(depth_m.shape, bool), 0.05, 0.35, 10.0
+        )
         for one in level.detect(Drawn(seen), np.zeros(depth_m.shape, np.uint8))
     ]
     assert {one.x for one in found} == {150.0}
@@ -174,7 +178,7 @@ def test_the_rim_of_a_mouth_that_something_of_unknown_depth_cuts_is_looked_at() 
     mask = (columns > 120) & (columns < 520) & (rows > 80) & (rows <= 260)
     matrix = np.array([[1056.0, 0.0, 320.0], [0.0, 1056.0, 240.0], [0.0, 0.0, 1.0]])
     frame = replace(drawn()[0], depth_m=depth_m, camera_matrix=matrix)
-    found = search.levels(frame, mask, 0.05, 0.35, 6.5)
+    found = search.plan_search_levels(frame, mask, 0.05, 0.35, 6.5)
     assert found and not any(
         level.nearest_m is None or level.nearest_m.any() for level in found
     )  # nothing stands before the face
@@ -190,7 +194,7 @@ def test_the_edge_of_what_stands_before_a_face_is_no_rim_and_beside_it_one_looks
     def looked(depth_m: np.ndarray) -> tuple[int, np.ndarray]:
         """Returns the finest resolution, and what of the whole one is looked at in it."""
         frame = replace(drawn()[0], depth_m=depth_m.astype(np.float32), camera_matrix=matrix)
-        found = search.levels(frame, mask, 0.05, 0.35, 6.5)
+        found = search.plan_search_levels(frame, mask, 0.05, 0.35, 6.5)
         level = min(found, key=lambda level: level.shrink)
         detector = Drawn([])
         level.detect(detector, np.zeros(mask.shape, np.uint8))

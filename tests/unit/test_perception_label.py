@@ -85,7 +85,7 @@ def test_labels_from_three_sloppy_clicks_are_those_of_the_renderer(
     for number, view in enumerate(views):
         label = dataset.read_label(out / "frames" / f"{number:02d}")
         assert cuboid.overlap(label.block, view.block) > 0.95
-        assert cuboid.overlap(label.mouth, view.mouth) > 0.8
+        assert cuboid.overlap(label.hole_mask, view.mouth) > 0.8
         assert (label.arm & ~view.occluder).sum() < 0.01 * view.block.sum()
         assert (label.block & view.occluder).sum() < 0.01 * view.block.sum()
     truth = dataset.read_truth(out / "frames" / "00")

@@ -20,7 +20,7 @@ def folder(tmp_path: Path) -> Path:
     place.mkdir()
     dataset.write_camera(place, K, np.eye(4), None)
     frame, masks, _ = drawn()
-    label = dataset.Label(
+    label = dataset.FrameLabel(
         masks.block > 0.5, np.zeros(masks.block.shape, bool), np.zeros(masks.block.shape, bool)
     )
     for number in range(3):
@@ -33,7 +33,7 @@ def folder(tmp_path: Path) -> Path:
 def test_holes_overlays_and_refusals_are_written(folder: Path, brokk: Callable) -> None:
     done = brokk(
         "mode=perceive", f"perceive.input={folder}", "session.out=out", "perception/segmenter=truth",
-        "perception.pose.estimator.looks.mouth=0", "perception.tracking.filter.confirm=1",
+        "perception.pose.looks.mouth=0", "perception.filter.confirm=1",
     )  # fmt: skip
     assert done.code == 0, done.err
     frames = json.loads(Path("out/holes.json").read_text())["frames"]

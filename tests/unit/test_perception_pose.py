@@ -13,8 +13,8 @@ from drawn import AXIS, CENTER, RAYS, K, drawn
 from brokk_rl.contracts.vision import HolePose, Rejection
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, plane, rim
-from perception.pose.estimator import gray_of
-from perception.pose.estimator import vector as pose_row
+from perception.pose.plane_conic import as_row as pose_row
+from perception.pose.plane_conic import convert_to_gray
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,9 @@ def test_in_noise_a_face_is_aligned_without_bias_and_as_surely_as_is_claimed() -
     m, row, pull_px = AXIS / (AXIS @ CENTER), pose_row(ellipse), K[0, 0] * 0.12
     off, ray = 0.3 / pull_px, CENTER / CENTER[2]
     depth = (1.0 / (RAYS @ m + off)).astype(np.float32)
-    begin = plane.Plane(m + np.array([0.0, 0.0, off]), np.eye(3) * 1e-4, 0.5 / pull_px, 1000, 7.0)
+    begin = plane.FacePlane(
+        m + np.array([0.0, 0.0, off]), np.eye(3) * 1e-4, 0.5 / pull_px, 1000, 7.0
+    )
     errors, claims = [], []
     for _ in range(16):
         views = both_views(m, pull_px, generator)
@@ -80,9 +82,9 @@ def test_in_noise_a_face_is_aligned_without_bias_and_as_surely_as_is_claimed() -
             as_color(120 + 16 * one + generator.normal(0, 6, one.shape)) for one in views
         )
         seen = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
-        both = alignment.pair(seen, gray_of(seen), begin.m, row, begin.extent)
+        both = alignment.crop_pair(seen, convert_to_gray(seen), begin.m, row, begin.extent)
         assert both is not None
-        found = alignment.aligned(both, begin, seen, masks.block > 0.5, row, 1.25, 24, 1.0)
+        found = alignment.align_plane(both, begin, seen, masks.block > 0.5, row, 1.25, 24, 1.0)
         assert found is not None
         errors.append(float((found.m - m) @ ray) * pull_px)
         claims.append(float(np.sqrt(ray @ found.cov @ ray)) * pull_px)
@@ -106,17 +108,17 @@ def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() ->
     )
     frame = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
     allowed = masks.block > 0.5
-    points = plane.support(depth, allowed, K, row, 0.05, 1.25, 2.6, 7.0, 8000, 24)
-    face = plane.fit(points, (2.6, 7.0), 2e-4, generator)
+    points = plane.collect_support(depth, allowed, K, row, 0.05, 1.25, 2.6, 7.0, 8000, 24)
+    face = plane.fit_plane(points, (2.6, 7.0), 2e-4, generator)
     assert face is not None
-    both = alignment.pair(frame, gray_of(frame), face.m, row, face.extent)
+    both = alignment.crop_pair(frame, convert_to_gray(frame), face.m, row, face.extent)
     assert both is not None
-    mended = alignment.aligned(both, face, frame, allowed, row, 1.25, 24, 1e-3)
+    mended = alignment.align_plane(both, face, frame, allowed, row, 1.25, 24, 1e-3)
     shifted = replace(frame, right=np.roll(partner, 7, 0))
-    other = alignment.pair(shifted, gray_of(frame), face.m, row, face.extent)
+    other = alignment.crop_pair(shifted, convert_to_gray(frame), face.m, row, face.extent)
     assert other is not None
     assert (
-        alignment.aligned(other, face, shifted, allowed, row, 1.25, 24, 1e-3) is None
+        alignment.align_plane(other, face, shifted, allowed, row, 1.25, 24, 1e-3) is None
     )  # rows that belong to others
     ray = CENTER / CENTER[2]
     assert mended is not None
@@ -214,9 +216,9 @@ def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(
     m, row, pull_px = AXIS / (AXIS @ CENTER), pose_row(ellipse), K[0, 0] * 0.12
     left, right = (120 + 60 * one for one in both_views(m, pull_px, np.random.default_rng(5)))
     columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
-    left[conic.radii(row, columns, rows) < 1] = 15  # a flat disc
+    left[conic.measure_radii(row, columns, rows) < 1] = 15  # a flat disc
     back = columns + pull_px * (RAYS @ m) / (1 - pull_px * m[0] / K[0, 0])
-    right[conic.radii(row, back, rows) < 1] = 15
+    right[conic.measure_radii(row, back, rows) < 1] = 15
     depth_m = (1.0 / (RAYS @ m)).astype(np.float32)
     if arm:  # from 5 px beside it on, 0.5 m away: 127 px of disparity where the face has 53
         edge = int(ellipse.x + ellipse.a + 5)
@@ -247,10 +249,10 @@ def test_the_edge_of_a_shadow_across_the_face_is_no_grain() -> None:
     even = generator.normal(150, 6, 4000).astype(np.float32)
     half = np.concatenate([even[:2000], even[2000:] - 40])
     # the darker part lies 30 above what is inside, five standard deviations of its grain
-    assert appearance._contrast(half, 80.0) == pytest.approx(5.0, rel=0.25)
+    assert appearance._measure_contrast(half, 80.0) == pytest.approx(5.0, rel=0.25)
     # even grain, as far: its darker half lies 0.67 standard deviations nearer, and varies half as
     # much
-    assert appearance._contrast(even, 120.0) == pytest.approx((5.0 - 0.67) / 0.5, rel=0.25)
+    assert appearance._measure_contrast(even, 120.0) == pytest.approx((5.0 - 0.67) / 0.5, rel=0.25)
 
 
 def test_what_stands_before_a_face_may_be_darker_than_dust(estimator) -> None:
@@ -270,7 +272,7 @@ def test_a_rim_knows_its_centre_by_what_is_seen_of_it(seen_rad: float) -> None:
     edges = np.full((72, rim.PEAKS, 2), np.nan)
     on = np.abs(angles) <= seen_rad
     edges[on, 0] = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])[on]
-    found, cov, rms_px, coverage = rim._fitted(
+    found, cov, rms_px, coverage = rim._fit_circle(
         np.array([0.0, 0.0, 0.05]), edges, np.full(72, 0.002), 0.03, 0.06
     )
     assert (
@@ -298,7 +300,7 @@ def test_edges_beside_what_hides_the_rest_of_a_rim_do_not_draw_its_circle() -> N
     beside = np.minimum(np.arange(on.sum()), np.arange(on.sum())[::-1])
     radius = 0.05 - 0.002 * inward_px[beside]
     edges[on, 0] = radius[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])[on]
-    found, _, rms_px, coverage = rim._fitted(
+    found, _, rms_px, coverage = rim._fit_circle(
         np.array([0.0, 0.0, 0.05]), edges, np.full(144, 0.002), 0.03, 0.06
     )
     assert found is not None and coverage == pytest.approx(on.mean())
@@ -353,8 +355,10 @@ def test_the_covariance_of_a_plane_is_that_of_its_repetitions(rings: tuple[float
     cell, radii = np.arange(2000) // 4, np.repeat([1.5, 2.5], 1000)
     fits = []
     for _ in range(150):
-        support = plane.Support(rays, rays @ m + generator.normal(0, sigma, 2000), radii, cell, 1.0)
-        found = plane.fit(support, rings, 1e-5, generator)
+        support = plane.FaceSupport(
+            rays, rays @ m + generator.normal(0, sigma, 2000), radii, cell, 1.0
+        )
+        found = plane.fit_plane(support, rings, 1e-5, generator)
         assert found is not None
         fits.append(found)
     spread, claimed = (
@@ -380,7 +384,7 @@ def test_what_few_cells_say_of_a_plane_is_not_taken_for_sure() -> None:
         off = generator.normal(0, 1, 50)[cell] + generator.normal(0, 0.3, len(x))
         m = bread @ rays.T @ off
         fits.append(m)
-        cov = plane.sandwich(rays, rays, off - rays @ m, cell)
+        cov = plane.estimate_sandwich_covariance(rays, rays, off - rays @ m, cell)
         assert cov is not None
         claims.append(np.diag(cov))
     spread, claimed = np.std(fits, axis=0), np.sqrt(np.mean(claims, axis=0))
@@ -391,16 +395,16 @@ def test_points_on_a_line_or_of_one_patch_alone_determine_no_plane() -> None:
     generator, m = np.random.default_rng(5), np.array([0.1, 0.4, 0.7])
     line = np.column_stack([np.full(400, 0.25), np.linspace(-0.2, 0.2, 400), np.ones(400)])
     for rays in (line, np.ones((400, 3))):
-        support = plane.Support(rays, rays @ m, np.full(400, 2.0), np.arange(400) // 20, 1.0)
-        assert plane.fit(support, (2.6,), 2e-4, generator) is None
+        support = plane.FaceSupport(rays, rays @ m, np.full(400, 2.0), np.arange(400) // 20, 1.0)
+        assert plane.fit_plane(support, (2.6,), 2e-4, generator) is None
     rays = np.column_stack([generator.uniform(-0.1, 0.1, (400, 2)), np.ones(400)])
     lonely = np.where(
         np.arange(400) < 240, rays @ m, rays @ m + generator.uniform(1.0, 9.0, 400)
     )  # the rest agrees with nothing
     cell = np.maximum(np.arange(400) - 240, 0) // 10
     assert (
-        plane.fit(
-            plane.Support(rays, lonely, np.full(400, 2.0), cell, 1.0), (2.6,), 2e-4, generator
+        plane.fit_plane(
+            plane.FaceSupport(rays, lonely, np.full(400, 2.0), cell, 1.0), (2.6,), 2e-4, generator
         )
         is None
     )
@@ -414,8 +418,8 @@ def test_a_plane_ignores_another_face() -> None:
         rays[:, 0] < 0.15, rays @ m, rays @ np.array([1.5, 0.4, 0.475])
     ) + generator.normal(0, 0.002, 4000)
     radii = 1.25 + 30 * np.linalg.norm(rays[:, :2], axis=1)
-    found = plane.fit(
-        plane.Support(rays, inverse, radii, np.arange(4000) // 10, 1.0),
+    found = plane.fit_plane(
+        plane.FaceSupport(rays, inverse, radii, np.arange(4000) // 10, 1.0),
         (2.6, 4.0, 7.0, 12.0),
         2e-4,
         generator,

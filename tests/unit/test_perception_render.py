@@ -313,11 +313,11 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(name: str, rig: Rig) -> No
         shot = studio(name, rig).shot(compose(kind(name), rig, chance), chance)
         assert shot.color.shape == shot.right.shape == (270, 480, 3)
         assert (
-            not (shot.label.mouth & ~shot.label.block).any()
+            not (shot.label.hole_mask & ~shot.label.block).any()
             and not (shot.label.arm & shot.label.block).any()
         )
         if not any(hole.hidden < 1 for hole in shot.truth.holes):
-            assert not shot.label.mouth.any()
+            assert not shot.label.hole_mask.any()
         for hole in shot.truth.holes[:1]:
             center, base = np.array(hole.center_m), rig.base_from_camera
             assert np.array(hole.axis) @ center < 0  # out of the hole, towards the camera
@@ -326,7 +326,7 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(name: str, rig: Rig) -> No
             )
             x, y = rig.left.project(center)
             if hole.hidden == 0:
-                assert shot.label.mouth[round(y), round(x)]
+                assert shot.label.hole_mask[round(y), round(x)]
                 assert (
                     shot.exact_depth_m[round(y), round(x)] > center[2] - 0.06
                 )  # the rim or deeper
@@ -423,12 +423,12 @@ def test_truth_and_masks_come_back_as_they_were_written(rig: Rig, tmp_path: Path
         shot.truth.decoys
     )
     np.testing.assert_allclose(again.holes[0].center_m, shot.truth.holes[0].center_m)
-    np.testing.assert_array_equal(dataset.read_label(stem).mouth, shot.label.mouth)
-    assert dataset.stems(tmp_path) == [stem]
+    np.testing.assert_array_equal(dataset.read_label(stem).hole_mask, shot.label.hole_mask)
+    assert dataset.list_stems(tmp_path) == [stem]
     with pytest.raises(FrameError, match="no truth"):
         dataset.read_truth(tmp_path / "other")
     with pytest.raises(FrameError, match="no such folder"):
-        dataset.stems(tmp_path / "nowhere")
+        dataset.list_stems(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(

@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 from brokk_rl.errors import CheckpointError, ConfigError, FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
-from perception.dataset import Label
+from perception.dataset import FrameLabel
 from perception.render.drawing import compose
 from perception.render.studio import Studio
 from perception.segment import network as segment_network
+from perception.segment.depth_plane import snap_to_edges
 from perception.segment.network import NetworkSegmenter
-from perception.segment.plane_segmenter import onto_edges
 from perception.segment.unet import UNet
-from perception.segment.window import Window, around, block_box, whole
+from perception.segment.window import Window, bound_block, center_window, cover_picture
 from perception.train import export
 
 SIZE_PX = (640, 360)
@@ -37,7 +37,7 @@ def test_planes_before_their_surroundings_are_the_block(
     eye = (-distance_m * np.cos(around_rad), -distance_m * np.sin(around_rad), 1.1)
     view = cuboid.seen(cuboid.looking(eye, (0.1, 0.0, 0.3)), SIZE_PX, noise_per_m=0.0024)
     masks = option("perception/segmenter", "depth_plane").build().segment(view.frame)
-    assert masks.mouth is None
+    assert masks.hole_mask is None
     assert masks.block.shape == view.block.shape and masks.block.dtype == np.float32
     assert masks.block.min() >= 0.0 and masks.block.max() <= 1.0
     found = masks.block > 0.5
@@ -90,7 +90,7 @@ def test_a_sloppy_edge_moves_onto_that_of_the_picture() -> None:
     gray[:, 160:] = 180
     sloppy = np.zeros((90, 160), np.float32)
     sloppy[:, 78:] = 1.0  # two pixels, four of the picture, off
-    moved = onto_edges(sloppy, gray, 4, 0.04)
+    moved = snap_to_edges(sloppy, gray, 4, 0.04)
     plain = np.abs(np.repeat(np.repeat(sloppy, 2, 0), 2, 1) - (gray > 100)).mean()
     assert np.abs((moved > 0.5) - (gray > 100).astype(float)).mean() < 0.5 * plain
 
@@ -120,17 +120,17 @@ def test_a_window_brings_back_what_it_took(
 
 def test_windows_keep_the_shape_and_hold_what_they_are_around() -> None:
     for shape in ((1080, 1920, 3), (480, 640, 3), (720, 1280, 3)):
-        window = whole(shape, (320, 192))
+        window = cover_picture(shape, (320, 192))
         assert window.left <= 0 and window.top <= 0
         assert window.left + window.width >= shape[1] and window.top + window.height >= shape[0]
         assert window.width / window.height == pytest.approx(320 / 192, rel=0.01)
-    closer = around((100, 50, 40, 60), (320, 192), 0.25)
+    closer = center_window((100, 50, 40, 60), (320, 192), 0.25)
     assert (closer.width, closer.height) == (150, 90)  # 60 px high, a quarter on each side
     assert (closer.left + closer.width / 2, closer.top + closer.height / 2) == (120, 80)
     block = np.zeros((50, 50), np.float32)
-    assert block_box(block, 0.5, 0.2) is None
+    assert bound_block(block, 0.5, 0.2) is None
     block[10:30, 20:40], block[45:47, 0:2] = 1.0, 1.0  # a speck that does not count
-    assert block_box(block, 0.5, 0.2) == (20, 10, 20, 20)
+    assert bound_block(block, 0.5, 0.2) == (20, 10, 20, 20)
 
 
 def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
@@ -150,11 +150,11 @@ def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
         )
 
     once = NetworkSegmenter(infer, (160, 96), None).segment(frame)
-    assert once.mouth is not None and once.mouth.max() == 0.0
+    assert once.hole_mask is not None and once.hole_mask.max() == 0.0
     twice = NetworkSegmenter(infer, (160, 96), 0.15).segment(frame)
     assert len(shown) == 3 and shown[2].shape == (3, 96, 160)
     true_mouth, true_block = frame.color[..., 0] == 255, frame.color[..., 0] > 0
-    assert twice.mouth is not None and cuboid.overlap(twice.mouth > 0.5, true_mouth) > 0.7
+    assert twice.hole_mask is not None and cuboid.overlap(twice.hole_mask > 0.5, true_mouth) > 0.7
     assert cuboid.overlap(twice.block > 0.5, true_block) > 0.95
 
 
@@ -186,20 +186,20 @@ def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts_and_again_
     empty = NetworkSegmenter(
         lambda picture: np.zeros((2, 96, 160), np.float32), (160, 96), 0.15
     ).segment(frame)
-    assert not empty.block.any() and empty.mouth is not None and not empty.mouth.any()
+    assert not empty.block.any() and empty.hole_mask is not None and not empty.hole_mask.any()
 
 
 def test_the_truth_is_what_lies_beside_the_frame(tmp_path: Path) -> None:
     view = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90))
     stem = tmp_path / "0001"
     dataset.write_frame(
-        stem, view.frame.color, None, label=Label(view.block, view.mouth, view.occluder)
+        stem, view.frame.color, None, label=FrameLabel(view.block, view.mouth, view.occluder)
     )
     truth = option("perception/segmenter", "truth").build()
     masks = truth.segment(replace(view.frame, name=str(stem)))
     np.testing.assert_array_equal(masks.block > 0.5, view.block)
-    assert masks.mouth is not None
-    np.testing.assert_array_equal(masks.mouth > 0.5, view.mouth)
+    assert masks.hole_mask is not None
+    np.testing.assert_array_equal(masks.hole_mask > 0.5, view.mouth)
     with pytest.raises(FrameError, match="live source"):
         truth.segment(view.frame)
     with pytest.raises(FrameError, match="no mask"):
@@ -221,7 +221,7 @@ def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path:
         ).build()
         found.append(segmenter.segment(view.frame))
     np.testing.assert_allclose(found[0].block, found[1].block, atol=1e-4)
-    np.testing.assert_allclose(found[0].mouth, found[1].mouth, atol=1e-4)
+    np.testing.assert_allclose(found[0].hole_mask, found[1].hole_mask, atol=1e-4)
 
 
 def test_a_network_that_ships_is_loaded_by_its_name(
@@ -261,9 +261,9 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
         )
         masks, again = (segmenter.segment(frame) for segmenter in segmenters)
         np.testing.assert_allclose(masks.block, again.block, atol=0.01)
-        assert masks.mouth is not None
+        assert masks.hole_mask is not None
         for k, (said, known) in enumerate(
-            ((masks.block > 0.5, shot.label.block), (masks.mouth > 0.5, shot.label.mouth))
+            ((masks.block > 0.5, shot.label.block), (masks.hole_mask > 0.5, shot.label.hole_mask))
         ):
             shared[k] += (said & known).sum()
             either[k] += (said | known).sum()

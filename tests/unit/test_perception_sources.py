@@ -20,8 +20,8 @@ from brokk_rl.signals import Frame
 from perception import dataset
 from perception.render.rig import Rig
 from perception.sources import realsense, simulator, zed
-from perception.sources.folder import Folder
-from perception.sources.live import Capture, Freshness, Lens, LiveSource
+from perception.sources.folder import FrameFolder
+from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
 
 HEIGHT, WIDTH = 90, 160
 MATRIX = np.array([[88.0, 0.0, 79.5], [0.0, 88.0, 44.5], [0.0, 0.0, 1.0]])
@@ -43,8 +43,8 @@ def frames(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def folder(path: Path, **changes: Any) -> Folder:
-    return Folder(
+def folder(path: Path, **changes: Any) -> FrameFolder:
+    return FrameFolder(
         folder=str(path),
         **(
             {
@@ -247,19 +247,19 @@ class Clock:
     def __init__(self, stamps: list[float | None], lag_s: float = 0.0) -> None:
         self.stamps, self.lag_s, self.now, self.closed, self.opened = stamps, lag_s, 0.0, 0, True
 
-    def open(self) -> Lens:
+    def open(self) -> LensCalibration:
         if not self.opened:
             raise FrameError("no camera")
-        return Lens(MATRIX, None, 0.12)
+        return LensCalibration(MATRIX, None, 0.12)
 
-    def capture(self, timeout_s: float) -> Capture | None:
+    def capture(self, timeout_s: float) -> RawCapture | None:
         if not self.stamps:
             return None
         stamp = self.stamps.pop(0)
         if stamp is None:
             return None
         self.now = stamp + self.lag_s
-        return Capture(np.zeros((*SIZE, 3), np.uint8), np.full(SIZE, 2.0, np.float32), stamp)
+        return RawCapture(np.zeros((*SIZE, 3), np.uint8), np.full(SIZE, 2.0, np.float32), stamp)
 
     def now_s(self) -> float:
         return self.now
@@ -412,7 +412,7 @@ def test_a_recording_of_a_zed_ends_and_knows_where_the_camera_was(
 def test_a_lens_whose_inverse_is_told_bends_as_opencv_says() -> None:
     inverse = np.array([0.06, -0.04, 0.0008, -0.0005, 0.01])
     matrix = np.array([[640.0, 0.0, 639.5], [0.0, 640.0, 359.5], [0.0, 0.0, 1.0]])
-    coefficients = realsense.forward(inverse, matrix, (1280, 720))
+    coefficients = realsense.invert_distortion(inverse, matrix, (1280, 720))
     pixel = np.array([[100.0, 60.0], [640.0, 300.0], [1200.0, 650.0]])
     x, y = ((pixel - matrix[:2, 2]) / 640.0).T
     r2, (k1, k2, p1, p2, k3) = x * x + y * y, inverse
@@ -509,7 +509,7 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
 
 def test_the_simulated_camera_sees_the_hole_of_the_task() -> None:
     rig: Rig = replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
-    spec: simulator.Simulated = replace(
+    spec: simulator.SimulatedCamera = replace(
         option("perception/source", "simulator"), rig=rig, num_frames=1
     )
     with spec.build() as source:
@@ -522,9 +522,11 @@ def test_the_simulated_camera_sees_the_hole_of_the_task() -> None:
         shot = source.shot(np.random.default_rng(0))
     np.testing.assert_allclose(shot.truth.holes[0].center_in_base_m, [2.4, 0.1, 0.7], atol=1e-9)
     np.testing.assert_allclose(shot.truth.holes[0].axis_in_base, [0.0, 0.0, 1.0], atol=1e-9)
-    assert shot.truth.holes[0].radius_m == 0.06 and shot.label.arm.any() and shot.label.mouth.any()
+    assert (
+        shot.truth.holes[0].radius_m == 0.06 and shot.label.arm.any() and shot.label.hole_mask.any()
+    )
     pixel = np.round(rig.left.project(np.array(shot.truth.holes[0].center_m))).astype(int)
-    assert shot.label.mouth[pixel[1], pixel[0]]
+    assert shot.label.hole_mask[pixel[1], pixel[0]]
     np.testing.assert_array_equal(frame.camera_matrix, rig.left.matrix)
     with spec.build() as source:
         source.show((-3.0, 0.0, 0.7, 0.0, 1.0, 0.05), np.zeros((0, 3)))

@@ -17,9 +17,9 @@ from safetensors.torch import load_file
 import conf
 import perception
 from perception import dataset
-from perception.dataset import Label
-from perception.segment.unet import loss
-from perception.train import data, export, report, training
+from perception.dataset import FrameLabel
+from perception.segment.unet import compute_loss, read_checkpoint
+from perception.train import data, report, training
 
 SMALL = (
     "training.size_px=[64,40]", "training.widths=[6,12,16]", "training.batch=6", "training.rate=0.01",
@@ -43,7 +43,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
             folder / f"{number:02d}",
             view.frame.color,
             None,
-            label=Label(view.block, view.mouth, view.occluder),
+            label=FrameLabel(view.block, view.mouth, view.occluder),
         )
     return folder
 
@@ -54,14 +54,14 @@ def test_the_loss_of_a_worked_example_is_right() -> None:
     # probabilities are one half everywhere: entropy ln 2; Dice (2 * 0.5 + 1) / (2 + 1) and 1 / (1 +
     # 1)
     expected = np.log(2.0) + 1.0 - (2.0 / 3.0 + 1.0 / 2.0) / 2.0
-    assert float(loss(logits, target)) == pytest.approx(expected, rel=1e-6)
+    assert float(compute_loss(logits, target)) == pytest.approx(expected, rel=1e-6)
 
 
 def test_what_is_trained_by_default_goes_on_from_the_network_that_ships() -> None:
     default = yaml.safe_load(
         Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text()
     )["training"]
-    network, header = export.read(
+    network, header = read_checkpoint(
         Path(next(iter(perception.__path__)), "weights/segmenter.safetensors")
     )
     assert default["widths"] == header["widths"] and default["size_px"] == header["size_px"]

@@ -23,18 +23,20 @@ def session(folder: Path, device: str = "cpu") -> Session:
 
 
 def test_a_process_started_by_hand_is_alone() -> None:
-    assert distributed.own() == distributed.Rank(0, 0, 1) and distributed.own().first
+    assert distributed.read_rank() == distributed.Rank(0, 0, 1) and distributed.read_rank().first
 
 
 def test_torchrun_says_which_process_this_is(monkeypatch: pytest.MonkeyPatch) -> None:
     told(monkeypatch, RANK=5, LOCAL_RANK=1, WORLD_SIZE=8)
-    assert distributed.own() == distributed.Rank(5, 1, 8) and not distributed.own().first
+    assert (
+        distributed.read_rank() == distributed.Rank(5, 1, 8) and not distributed.read_rank().first
+    )
 
 
 def test_half_an_environment_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     told(monkeypatch, WORLD_SIZE=2)
     with pytest.raises(ConfigError, match="RANK and LOCAL_RANK below WORLD_SIZE"):
-        distributed.own()
+        distributed.read_rank()
 
 
 def test_only_modes_that_share_their_work_run_in_several_processes(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import brokk_rl
+from brokk_rl import registry
 from brokk_rl.modes import doctor
-from brokk_rl.modes.doctor import Doctor, Finding, Limits
+from brokk_rl.modes.doctor import Doctor, DoctorFinding, DoctorLimits
 from brokk_rl.registry import Option
 
 
@@ -18,12 +22,35 @@ def option(folder: Path, group: str, text: str) -> Option:
     return Option(group, "a", "conf", folder / "a.yaml")
 
 
-def test_an_option_is_described_by_its_spec(tmp_path: Path) -> None:
-    text = "# Not this.\n_target_: brokk_rl.modes.list.List\n"
-    assert (
-        option(tmp_path, "mode", text).summary()
-        == "Prints the options of every config group, those of installed extensions too."
-    )
+def test_an_option_without_a_comment_is_described_by_its_target(tmp_path: Path) -> None:
+    text = "_target_: brokk_rl.modes.list.ListOptions\n"
+    summary = "List the options of every config group, one line each."
+    assert option(tmp_path, "mode", text).summary() == summary
+    assert option(tmp_path, "mode", "# Another.\n" + text).summary() == "Another."
+
+
+def test_targets_of_earlier_versions_are_renamed_wherever_yaml_may_hold_them() -> None:
+    renamed = registry.load_renamed_targets()
+    assert renamed, "a file of an earlier version would not load"
+    old, new = next(iter(renamed.items()))
+    text = f"a: {{_target_: {old}, b: 1}}\n_target_: '{old}'\nnote: {old}\n"
+    expected = f"a: {{_target_: {new}, b: 1}}\n_target_: '{new}'\nnote: {old}\n"
+    assert registry.rename_targets(text) == expected
+
+
+def test_the_version_needs_no_configuration(brokk: Callable[..., Any]) -> None:
+    done = brokk("--version")
+    assert done.code == 0
+    assert done.out.strip() == f"brokk {brokk_rl.__version__}"
+
+
+def test_a_reader_that_stops_early_causes_no_traceback() -> None:
+    command = [sys.executable, "-m", "brokk_rl", "mode=list"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout and process.stderr
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait(timeout=60) != 0
 
 
 def test_an_override_is_described_by_the_first_sentence_of_its_comment(tmp_path: Path) -> None:
@@ -45,33 +72,35 @@ def test_the_list_can_be_narrowed_to_a_group(brokk: Callable[..., Any]) -> None:
 
 
 def examine(
-    monkeypatch: pytest.MonkeyPatch, **probes: Callable[..., Iterator[Finding]]
-) -> dict[str, Finding]:
+    monkeypatch: pytest.MonkeyPatch, **probes: Callable[..., Iterator[DoctorFinding]]
+) -> dict[str, DoctorFinding]:
     """Runs the doctor with these probes, all others silent."""
     for name in (
-        "python",
-        "packages",
-        "processor",
-        "torch_devices",
-        "cuda_graphs",
-        "warp",
-        "rendering",
-        "disk",
-        "import_names",
-        "extensions",
+        "check_python",
+        "check_packages",
+        "check_processor",
+        "check_torch_devices",
+        "check_cuda_graphs",
+        "check_warp",
+        "check_rendering",
+        "check_disk",
+        "check_import_names",
+        "check_extensions",
     ):
         monkeypatch.setattr(doctor, name, probes.get(name, lambda *_: iter(())))
-    return dict(Doctor(doctor=Limits(folder="runs", min_free_gib=0.0)).findings())
+    return dict(Doctor(doctor=DoctorLimits(folder="runs", min_free_gib=0.0)).findings())
 
 
 def test_a_probe_that_breaks_is_a_warning_and_the_others_go_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def breaks() -> Iterator[Finding]:
+    def breaks() -> Iterator[DoctorFinding]:
         raise OSError("no such library")
         yield
 
-    found = examine(monkeypatch, warp=breaks, extensions=lambda: iter([Finding("ok", "none")]))
+    found = examine(
+        monkeypatch, check_warp=breaks, check_extensions=lambda: iter([DoctorFinding("ok", "none")])
+    )
     assert found["Warp"].level == "warn"
     assert "no such library" in found["Warp"].text
     assert found["extensions"].text == "none"
@@ -80,19 +109,21 @@ def test_a_probe_that_breaks_is_a_warning_and_the_others_go_on(
 def test_the_doctor_leaves_with_1_when_something_essential_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    examine(monkeypatch, python=lambda: iter([Finding("fail", "too old")]))
+    examine(monkeypatch, check_python=lambda: iter([DoctorFinding("fail", "too old")]))
     with pytest.raises(SystemExit) as left:
-        Doctor(doctor=Limits(folder="runs", min_free_gib=0.0)).run()
+        Doctor(doctor=DoctorLimits(folder="runs", min_free_gib=0.0)).run()
     assert left.value.code == 1
 
 
 def test_the_disk_is_examined_where_runs_will_be(tmp_path: Path) -> None:
-    assert next(doctor.disk(tmp_path / "runs" / "later", 0.0)).level == "ok"
-    assert next(doctor.disk(tmp_path, 1e9)).level == "warn"
+    assert next(doctor.check_disk(tmp_path / "runs" / "later", 0.0)).level == "ok"
+    assert next(doctor.check_disk(tmp_path, 1e9)).level == "warn"
 
 
 def test_our_import_names_are_ours() -> None:
-    assert [finding.level for finding in doctor.import_names() if finding.level == "fail"] == []
+    assert [
+        finding.level for finding in doctor.check_import_names() if finding.level == "fail"
+    ] == []
 
 
 @pytest.mark.slow
@@ -105,9 +136,9 @@ def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
         "CUDA graphs",
         "Warp",
         "kernel cache",
-        "rendering",
-        "disk",
+        "check_rendering",
+        "check_disk",
         "import names",
-        "extensions",
+        "check_extensions",
     ):
         assert topic in done.out

@@ -13,7 +13,7 @@ import torch
 
 from brokk_rl.cli import explain
 from brokk_rl.errors import ConfigError, DeviceError, StorageError
-from brokk_rl.session import Session, commit, read_record, write_json
+from brokk_rl.session import Session, describe_commit, read_record, write_json
 
 
 def session(folder: Path, seed: int = 0, device: str = "cpu") -> Session:
@@ -146,7 +146,7 @@ def test_a_broken_record_is_named(tmp_path: Path) -> None:
 
 
 def test_the_commit_is_that_of_our_checkout_or_none() -> None:
-    found = commit()
+    found = describe_commit()
     assert found is None or len(found.removesuffix("-dirty")) == 40
 
 

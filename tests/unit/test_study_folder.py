@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from brokk_rl import record
-from brokk_rl.chain import tool
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
@@ -23,7 +23,7 @@ RATE_HZ = 20.0
 
 
 def made(machine: Machine, order: str = "counterbalanced", count: int = 4) -> design.Design:
-    tip = tool(machine, machine.home).tip_in_base_m
+    tip = compute_tool_kinematics(machine, machine.home).tip_in_base_m
     hole = design.Hole(center_in_base_m=(tip[0], tip[1], tip[2] + 0.12), radius_m=0.05)
     return design.Design(
         num_participants=count, order=order, holes=dict.fromkeys("ABC", hole),  # type: ignore[arg-type]

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from brokk_rl.chain import tool
-from brokk_rl.kinematics import Kinematics
+from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from deploy.study import measures, tlx
@@ -31,13 +30,16 @@ def recorded(
 
 def test_the_tool_is_where_the_projects_kinematics_has_it(machine: Machine) -> None:
     q = np.random.default_rng(0).uniform(machine.lower, machine.upper, (20, 5))
-    here, there = tool(machine, q), Kinematics(machine).pose(torch.tensor(q, dtype=torch.float32))
+    here, there = (
+        compute_tool_kinematics(machine, q),
+        Kinematics(machine).pose(torch.tensor(q, dtype=torch.float32)),
+    )
     jacobian = Kinematics(machine).jacobian(torch.tensor(q, dtype=torch.float32))
     assert np.allclose(here.tip_in_base_m, there.tip_in_base_m, atol=1e-5)
     assert np.allclose(here.axis_in_base, there.axis_in_base, atol=1e-5)
     assert np.allclose(here.jacobian, jacobian.tip, atol=1e-5)
     step = 1e-6 * np.eye(5)[3]
-    slope = (tool(machine, q + step).axis_in_base - here.axis_in_base) / 1e-6
+    slope = (compute_tool_kinematics(machine, q + step).axis_in_base - here.axis_in_base) / 1e-6
     assert np.allclose(here.turn[..., 3], slope, atol=1e-4)
 
 
@@ -88,7 +90,10 @@ def test_a_trial_of_known_motion_gives_known_numbers(machine: Machine) -> None:
     )
     assert found["control_effort"] == pytest.approx(2.0 / 10.0)
     assert found["contacts"] == 0 and math.isnan(found["advice_error"])
-    turn, radius = 80 * 0.05 * 0.2, np.linalg.norm(tool(machine, machine.home).tip_in_base_m[:2])
+    turn, radius = (
+        80 * 0.05 * 0.2,
+        np.linalg.norm(compute_tool_kinematics(machine, machine.home).tip_in_base_m[:2]),
+    )
     alone = measures.measure(recorded(machine, q[:81], u[:81]), machine, hole, SUCCESS, 60.0)
     assert alone["path_m"] == pytest.approx(radius * turn / 2, rel=0.01) and math.isnan(
         alone["contacts"]
@@ -96,7 +101,7 @@ def test_a_trial_of_known_motion_gives_known_numbers(machine: Machine) -> None:
 
 
 def test_insertion_ends_the_trial(machine: Machine) -> None:
-    tip = tool(machine, machine.home).tip_in_base_m
+    tip = compute_tool_kinematics(machine, machine.home).tip_in_base_m
     q = np.repeat(machine.home[None], 100, 0)
     q[:50, 0] += 0.3  # far off until 2.5 s
     hole = Hole(center_in_base_m=(tip[0] + 0.012, tip[1], tip[2] + 0.101), radius_m=0.05)

@@ -15,8 +15,8 @@ import torch
 from composed import every, option
 
 from actuators.person import Person
-from brokk_rl.chain import tool
 from brokk_rl.contracts.operator import OperatorView
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from deploy.study.operators.hands import Hands
 from deploy.study.operators.traits import Traits
@@ -87,7 +87,7 @@ def worked(
 
 def found_after_s(q: np.ndarray, machine: Machine) -> np.ndarray:
     """Returns when the tip was in the hole, `(N,)`, inf where it never was; without a block to lean on a little is forgiven."""
-    tip = tool(machine, q).tip_in_base_m - RIM_M
+    tip = compute_tool_kinematics(machine, q).tip_in_base_m - RIM_M
     inside = (np.hypot(tip[..., 0], tip[..., 1]) < 0.02) & (tip[..., 2] < -0.05)
     return np.where(inside.any(0), inside.argmax(0) * machine.period_s, np.inf)
 

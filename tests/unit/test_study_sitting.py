@@ -21,7 +21,7 @@ from sitting import FACTS, Arm, conductor, in_trial, machine, plan, saved
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError
-from deploy.page.protocol import Wish
+from deploy.page.protocol import OperatorRequest
 from deploy.study import analysis, folder, tlx
 from deploy.study.conductor import Conductor
 from deploy.study.sitting import alone
@@ -245,11 +245,11 @@ def test_advice_leaves_the_loop_in_guided_trials_alone(tmp_path: Path, arm: Arm)
         arm.later(lead, 2.0)
         assert (feed.shown().advice is not None) == feed.shown().guiding == (condition == "guided")
         assert (
-            not feed.wish(Wish("record", "off"))
-            and not feed.wish(Wish("start", ""))
+            not feed.wish(OperatorRequest("record", "off"))
+            and not feed.wish(OperatorRequest("start", ""))
             and inner.wishes == []
         )
-        assert feed.wish(Wish("stop", "")) and not lead.running
+        assert feed.wish(OperatorRequest("stop", "")) and not lead.running
         arm.later(lead, 1.0)
         saved(lead, arm)
         lead.take({"do": "next"})

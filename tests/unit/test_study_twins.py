@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.chain import tool
 from brokk_rl.contracts.operator import OperatorView, TrialBatch
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.session import Session
 from brokk_rl.signals import Command
 from deploy.study.twins import BEFORE_S, desks
-from deploy.twin.faults import Faults
+from deploy.twin.faults import ActiveFaults
 
 MACHINE = option("machine", "brokk170")
 GROUND = option("ground", "twin")
@@ -60,7 +60,7 @@ def test_advice_is_shown_from_the_beginning_and_follows_hands_that_follow_it(
     for _ in range(round(12.0 / MACHINE.period_s)):
         first = shown.copy() if first is None else first
         q, shown = one.period(shown)
-    tip = tool(MACHINE, q).tip_in_base_m
+    tip = compute_tool_kinematics(MACHINE, q).tip_in_base_m
     assert first is not None and np.abs(first).max() > 0.02, (
         f"after {BEFORE_S} s the history is full"
     )
@@ -91,7 +91,7 @@ def test_a_twin_is_put_elsewhere_with_its_block(tmp_path: Path) -> None:
 
 
 def test_a_place_is_asked_for_once_and_nonsense_refused() -> None:
-    faults = Faults()
+    faults = ActiveFaults()
     faults.request(
         json.dumps({"place": {"q": [0.0] * 5, "hole_in_base_m": [2.6, 0.0, 0.75]}}).encode(), 0.0
     )

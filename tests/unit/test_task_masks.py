@@ -10,7 +10,7 @@ import pytest
 import torch
 from composed import option
 
-from brokk_rl.machine import Machine, exclusive_mask
+from brokk_rl.machine import Machine, mask_exclusive_joints
 from tasks.tool_pose import Action, Switch
 
 
@@ -123,7 +123,7 @@ def test_the_masks_are_the_papers_and_those_of_the_machine(machine: Machine) -> 
         assert (
             u[0].tolist()
             == paper
-            == exclusive_mask(machine.is_exclusive, positioning).astype(int).tolist()
+            == mask_exclusive_joints(machine.is_exclusive, positioning).astype(int).tolist()
         )
 
 

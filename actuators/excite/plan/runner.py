@@ -20,7 +20,7 @@ import numpy as np
 from actuators.excite.plan.guard import Guards, ToolSpeed
 from actuators.excite.plan.schedule import Approach, Plan
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine, exclusive_mask
+from brokk_rl.machine import Machine, mask_exclusive_joints
 
 log = logging.getLogger(__name__)
 
@@ -178,7 +178,7 @@ class Runner:
             np.abs(error) / (self._speed * approach.settle_s), approach.smallest, approach.level
         )
         first = far[:, ~exclusive].any(1)
-        return np.sign(error) * size * far * exclusive_mask(exclusive, ~first)
+        return np.sign(error) * size * far * mask_exclusive_joints(exclusive, ~first)
 
     def _guarded(self, u: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Returns the commands within the guards; exclusive joints wait for the others, whatever a program says."""

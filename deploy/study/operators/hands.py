@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine, exclusive_mask
+from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.spec import spec
 from deploy.study.operators.traits import Range, Traits
 
@@ -121,7 +121,7 @@ class HandsModel:
         priority = np.abs(asked) + 1e-6 * np.abs(self._hand)
         alone = np.where(self._exclusive, priority, 0.0).max(1)
         among = np.where(self._exclusive, 0.0, priority).max(1)
-        free = exclusive_mask(self._exclusive, alone > among)
+        free = mask_exclusive_joints(self._exclusive, alone > among)
         taken = asked != 0
         kept = taken & (self._held_s > 0) & (self._held_s < self._grip_s - 1e-6)
         ranked = np.where(free, priority + 2.0 * kept, -1.0)

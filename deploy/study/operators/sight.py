@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from brokk_rl.chain import tool
 from brokk_rl.contracts.operator import OperatorView
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.study.operators.traits import Range, Traits
@@ -84,7 +84,7 @@ class SightModel:
         if (self._steps - 1) % self._period:
             return False
         config, machine = self._config, self._machine
-        now = tool(machine, q)
+        now = compute_tool_kinematics(machine, q)
         left = view.rim_in_base_m - now.tip_in_base_m
         size = self._relative * np.linalg.norm(left, axis=1, keepdims=True) + self._finest_m
         chance = self._generator.standard_normal(left.shape)
@@ -107,7 +107,7 @@ class SightModel:
         machine, start = self._machine, q
         free = ~machine.is_exclusive
         for _ in range(ROUNDS):
-            at = tool(machine, q)
+            at = compute_tool_kinematics(machine, q)
             step = goal_m - at.tip_in_base_m
             step = step * np.minimum(
                 1.0, 0.6 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
@@ -143,6 +143,6 @@ class SightModel:
 
     def _reach(self, q: np.ndarray, rim_m: np.ndarray) -> np.ndarray:
         """Returns the distance of the hole from the first joint behind the exclusive ones, turned into the arm's plane, `(N,)`."""
-        origin = tool(self._machine, q).joints_in_base_m[:, self._reach_joint]
+        origin = compute_tool_kinematics(self._machine, q).joints_in_base_m[:, self._reach_joint]
         radius = np.hypot(origin[:, 0], origin[:, 1])
         return np.hypot(np.hypot(rim_m[:, 0], rim_m[:, 1]) - radius, rim_m[:, 2] - origin[:, 2])

@@ -26,7 +26,7 @@ BUS_OFF = 0x40
 
 
 @dataclass(frozen=True)
-class Wired:
+class CanFrame:
     """A frame as the bus carries it.
 
     Attributes:
@@ -41,7 +41,7 @@ class Wired:
 
 
 @spec
-class Wire:
+class CanBus:
     """A bus that python-can reaches.
 
     Attributes:
@@ -58,7 +58,7 @@ class Wire:
     bitrate: int | None
     port: int | None
 
-    def open(self, frame_ids: Sequence[int] | None = None) -> OpenWire:
+    def open(self, frame_ids: Sequence[int] | None = None) -> OpenCanBus:
         """Opens the bus.
 
         Args:
@@ -89,16 +89,16 @@ class Wire:
                 f"bus.interface={self.interface} bus.channel={self.channel}: cannot be opened ({error}). `ip link` shows the CAN "
                 "interfaces of this computer; bus=udp needs none"
             ) from error
-        return OpenWire(bus)
+        return OpenCanBus(bus)
 
 
-class OpenWire:
+class OpenCanBus:
     """An open bus; a context manager."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
 
-    def recv(self, timeout_s: float) -> Wired | None:
+    def recv(self, timeout_s: float) -> CanFrame | None:
         """Returns the next data frame, or `None` when none came in time, or an error frame that says nothing of its own.
 
         Raises:
@@ -112,9 +112,9 @@ class OpenWire:
             raise LinkError("bus: the controller has gone off the bus (bus-off)")
         if message is None or message.is_error_frame or message.is_remote_frame:
             return None
-        return Wired(message.arbitration_id, bytes(message.data), message.is_extended_id)
+        return CanFrame(message.arbitration_id, bytes(message.data), message.is_extended_id)
 
-    def send(self, frame: Wired) -> None:
+    def send(self, frame: CanFrame) -> None:
         """Sends a frame.
 
         Raises:
@@ -146,7 +146,7 @@ class OpenWire:
 
 
 @spec
-class Replay:
+class BusReplay:
     """Frames that were recorded once, said again in their own time: the same loop over yesterday's run. Nothing is sent.
 
     Attributes:
@@ -168,14 +168,14 @@ class Replay:
         """The file."""
         return self.path
 
-    def open(self, frame_ids: Sequence[int] | None = None) -> OpenReplay:
+    def open(self, frame_ids: Sequence[int] | None = None) -> OpenBusReplay:
         """Begins the replay; see `Wire.open`.
 
         Raises:
             LinkError: the file cannot be read.
         """
         try:
-            return OpenReplay(
+            return OpenBusReplay(
                 BLFReader(self.path),
                 self.speed,
                 None if frame_ids is None else frozenset(frame_ids),
@@ -184,7 +184,7 @@ class Replay:
             raise LinkError(f"bus.path={self.path}: nothing can be replayed ({error})") from error
 
 
-class OpenReplay:
+class OpenBusReplay:
     """A running replay; as `OpenWire`."""
 
     def __init__(self, reader: BLFReader, speed: float, frame_ids: frozenset[int] | None) -> None:
@@ -192,7 +192,7 @@ class OpenReplay:
         self._messages, self._next = iter(reader), None
         self._offset_s: float | None = None
 
-    def recv(self, timeout_s: float) -> Wired | None:
+    def recv(self, timeout_s: float) -> CanFrame | None:
         """Returns the next frame when its time has come; see `OpenWire.recv`.
 
         Raises:
@@ -208,9 +208,9 @@ class OpenReplay:
         if due_s > end_s:
             return None
         message, self._next = self._next, None
-        return Wired(message.arbitration_id, bytes(message.data), message.is_extended_id)
+        return CanFrame(message.arbitration_id, bytes(message.data), message.is_extended_id)
 
-    def send(self, frame: Wired) -> None:
+    def send(self, frame: CanFrame) -> None:
         """Sends nothing."""
 
     def close(self) -> None:

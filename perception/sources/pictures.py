@@ -18,7 +18,7 @@ BESIDE = (".depth.png", ".right.png", ".mask.png")
 
 
 @spec
-class Pictures:
+class PictureFolder:
     """Every picture of a folder, coloured or grey, without depth and without a camera.
 
     Attributes:

@@ -7,15 +7,22 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, PoseEstimator, PoseSpec, Rejection
+from brokk_rl.contracts.vision import (
+    Ellipse,
+    HolePose,
+    Masks,
+    PoseEstimator,
+    PoseEstimatorSpec,
+    Rejection,
+)
 from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, plane, rim
 from perception.pose.appearance import Interior
-from perception.pose.plane import Plane
-from perception.pose.rim import Circle
+from perception.pose.plane import FacePlane
+from perception.pose.rim import RimCircle
 
 UNTOLD, UNTOLD_SCORE = 0.8, 0.5
 """Part of an inside without depth, hidden from the right camera, from which on nobody can tell it
@@ -30,7 +37,7 @@ BESIDE = (1.15, 1.45)
 
 
 @spec
-class Looks:
+class AppearanceGates:
     """What a hole must look like inside; a flat dark disc of its size passes every test of geometry.
 
     Attributes:
@@ -114,19 +121,19 @@ class PlaneConic:
     bias_per_m: float
     center_px: float
     shape_px: float
-    looks: Looks
-    without_depth: PoseSpec | None
+    looks: AppearanceGates
+    without_depth: PoseEstimatorSpec | None
     blind: float
 
     def check(self) -> None:
         if not 0 < self.radius_tolerance < 1 or self.radius_m <= 0:
             raise ConfigError(
-                "perception.pose.estimator: expected radius_m > 0 and 0 < radius_tolerance < 1, got "
+                "perception.pose: expected radius_m > 0 and 0 < radius_tolerance < 1, got "
                 f"{self.radius_m} and {self.radius_tolerance}"
             )
         if not self.rings or list(self.rings) != sorted(self.rings) or self.rings[0] <= self.inner:
             raise ConfigError(
-                f"perception.pose.estimator.rings: expected increasing limits above inner={self.inner}, got {list(self.rings)}"
+                f"perception.pose.rings: expected increasing limits above inner={self.inner}, got {list(self.rings)}"
             )
 
     def build(self) -> PlaneConicEstimator:
@@ -147,13 +154,13 @@ class PlaneConicEstimator:
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Returns the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
         s = self.settings
-        row = vector(ellipse)
+        row = as_row(ellipse)
         gray, allowed = self._pictures(frame, masks)
         reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
-        points = plane.support(
+        points = plane.collect_support(
             frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px
         )
-        face = plane.fit(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
+        face = plane.fit_plane(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
         if face is None:
             if (
                 self._without_depth is not None
@@ -176,16 +183,16 @@ class PlaneConicEstimator:
         shape = self._shape(face, row, frame, ellipse)
         if isinstance(shape, Rejection):
             return shape
-        both = alignment.pair(frame, gray, face.m, row, face.extent)
+        both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
         if both is not None:
-            agreed = alignment.aligned(
+            agreed = alignment.align_plane(
                 both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m
             )
             both, face = (None, face) if agreed is None else (both, agreed)
             shape = self._shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
-        circle = rim.circle(
+        circle = rim.fit_rim_circle(
             gray,
             row,
             frame.camera_matrix,
@@ -208,9 +215,9 @@ class PlaneConicEstimator:
             limit = s.radius_m * (1.0 + np.sign(circle.radius_m - s.radius_m) * s.radius_tolerance)
             return Rejection("pose", "radius, m", circle.radius_m, float(limit), ellipse)
         row = circle.ellipse
-        inside = appearance.interior(gray, frame.depth_m, row, frame.camera_matrix, face)
+        inside = appearance.measure_interior(gray, frame.depth_m, row, frame.camera_matrix, face)
         parallax, covered = (
-            alignment.disagreement(both, face, frame.depth_m, row, *s.looks.parts)
+            alignment.measure_parallax(both, face, frame.depth_m, row, *s.looks.parts)
             if both
             else (float("nan"), 0.0)
         )
@@ -223,10 +230,11 @@ class PlaneConicEstimator:
             center_m=circle.center_m,
             axis=face.normal,
             radius_m=circle.radius_m,
-            cov_m2=covariance(face, circle, s.bias_per_m),
+            cov_m2=compute_center_covariance(face, circle, s.bias_per_m),
             axis_cov_rad2=face.normal_cov_rad2(),
             frame="camera",
-            score=float(ellipse.score) * (UNTOLD_SCORE if untold and masks.mouth is None else 1.0),
+            score=float(ellipse.score)
+            * (UNTOLD_SCORE if untold and masks.hole_mask is None else 1.0),
             t_s=frame.t_s,
         )
 
@@ -234,13 +242,13 @@ class PlaneConicEstimator:
         """Returns the grey picture and the pixels of the face, which all ellipses of a frame share."""
         if self._seen is None or self._seen[0] is not frame or self._seen[1] is not masks:
             allowed = masks.block > 0.5
-            if masks.mouth is not None:
-                allowed &= masks.mouth < 0.5
-            self._seen = frame, masks, gray_of(frame), allowed
+            if masks.hole_mask is not None:
+                allowed &= masks.hole_mask < 0.5
+            self._seen = frame, masks, convert_to_gray(frame), allowed
         return self._seen[2:]
 
     def _shape(
-        self, face: Plane, row: np.ndarray, frame: Frame, ellipse: Ellipse
+        self, face: FacePlane, row: np.ndarray, frame: Frame, ellipse: Ellipse
     ) -> bool | Rejection:
         """Returns whether an ellipse has size and shape of a rim with nothing forgiven, or which gate it does not pass."""
         s = self.settings
@@ -249,12 +257,12 @@ class PlaneConicEstimator:
         tilt = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         if tilt > s.tilt_rad:
             return Rejection("pose", "tilt of the face, rad", tilt, s.tilt_rad, ellipse)
-        _, axes = conic.on_plane(row, frame.camera_matrix, face.m)
+        _, axes = conic.project_onto_plane(row, frame.camera_matrix, face.m)
         if not np.isfinite(axes).all():
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
         seen = max(
-            1.0 - hidden_part(face, row, frame), s.coverage
+            1.0 - measure_hidden_part(face, row, frame), s.coverage
         )  # the less of a rim there is, the less it tells
         tolerance = AT_FIRST * s.radius_tolerance / seen * s.radius_m
         if abs(radius - s.radius_m) > tolerance:
@@ -279,8 +287,8 @@ class PlaneConicEstimator:
             return Rejection(
                 "pose", "brightness inside over outside", inside.darkness, looks.darkness, ellipse
             )
-        mouth = 0.0 if masks.mouth is None else inner_mean(masks.mouth, row)
-        if masks.mouth is not None and mouth < looks.mouth:
+        mouth = 0.0 if masks.hole_mask is None else average_inside(masks.hole_mask, row)
+        if masks.hole_mask is not None and mouth < looks.mouth:
             return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
         sure = mouth >= looks.sure_mouth
         shown = [
@@ -307,7 +315,7 @@ class PlaneConicEstimator:
                 looks.contrast,
                 ellipse,
             )
-        if untold and not np.isfinite(against) and (sure or masks.mouth is None):
+        if untold and not np.isfinite(against) and (sure or masks.hole_mask is None):
             return None
         return (
             None
@@ -316,7 +324,7 @@ class PlaneConicEstimator:
         )
 
 
-def covariance(face: Plane, circle: Circle, bias_per_m: float) -> np.ndarray:
+def compute_center_covariance(face: FacePlane, circle: RimCircle, bias_per_m: float) -> np.ndarray:
     """Returns the covariance of a centre, `(3, 3)` m²: along the ray by the plane's, on the plane by the circle's."""
     center = circle.center_m
     ray = center / center[2]
@@ -324,7 +332,7 @@ def covariance(face: Plane, circle: Circle, bias_per_m: float) -> np.ndarray:
     return np.outer(ray, ray) * depth_var + circle.cov_m2
 
 
-def hidden_part(face: Plane, row: np.ndarray, frame: Frame) -> float:
+def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float:
     """Returns the part of a rim on a face, about where an ellipse `(5,)` is, before which something nearer stands.
 
     It may be smaller than the rim; and where the nearer thing begins, its depth is often unknown.
@@ -332,7 +340,7 @@ def hidden_part(face: Plane, row: np.ndarray, frame: Frame) -> float:
     height, width = frame.depth_m.shape
     nearer = np.zeros(72, bool)
     for scale in BESIDE:
-        points = conic.sample(
+        points = conic.sample_ellipses(
             (row * [1.0, 1.0, scale, scale, 1.0])[None],
             np.linspace(0.0, 2 * np.pi, 72, endpoint=False),
         )[0][0]
@@ -348,21 +356,21 @@ def hidden_part(face: Plane, row: np.ndarray, frame: Frame) -> float:
     return float(nearer.mean())
 
 
-def vector(ellipse: Ellipse) -> np.ndarray:
+def as_row(ellipse: Ellipse) -> np.ndarray:
     """Returns centre, semi-axes and direction, `(5,)`."""
     return np.array([ellipse.x, ellipse.y, ellipse.a, ellipse.b, ellipse.theta_rad])
 
 
-def gray_of(frame: Frame) -> np.ndarray:
+def convert_to_gray(frame: Frame) -> np.ndarray:
     """Returns the frame's picture in grey, `(h, w)` uint8."""
     return cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
 
 
-def inner_mean(picture: np.ndarray, row: np.ndarray) -> float:
+def average_inside(picture: np.ndarray, row: np.ndarray) -> float:
     """Returns the mean of a picture within 0.8 of an ellipse."""
     x, y, a = row[:3]
     top, left = max(0, int(y - a)), max(0, int(x - a))
     part = picture[top : int(y + a) + 2, left : int(x + a) + 2]
     rows, columns = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
-    inside = conic.radii(row, columns, rows) < 0.8
+    inside = conic.measure_radii(row, columns, rows) < 0.8
     return float(part[inside].mean()) if inside.any() else 0.0

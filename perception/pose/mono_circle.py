@@ -9,7 +9,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.ellipse import conic
 from perception.pose import appearance
-from perception.pose.estimator import gray_of, vector
+from perception.pose.plane_conic import as_row, convert_to_gray
 
 
 @spec
@@ -48,9 +48,9 @@ class MonoCircleEstimator:
         if frame.base_from_camera is None:
             return Rejection("pose", "known pose of the camera", 0.0, 1.0, ellipse)
         expected = frame.base_from_camera[:3, :3].T @ np.array(s.normal_in_base)
-        row = vector(ellipse)
+        row = as_row(ellipse)
         center, normal = max(
-            conic.circles(row, frame.camera_matrix, s.radius_m),
+            conic.solve_circle_poses(row, frame.camera_matrix, s.radius_m),
             key=lambda one: float(one[1] @ expected),
         )
         angle = float(np.arccos(np.clip(normal @ expected, -1, 1)))
@@ -58,8 +58,8 @@ class MonoCircleEstimator:
             return Rejection(
                 "pose", "angle to the expected normal, rad", angle, s.normal_rad, ellipse
             )
-        dark = appearance.interior(
-            gray_of(frame), frame.depth_m, row, frame.camera_matrix, None
+        dark = appearance.measure_interior(
+            convert_to_gray(frame), frame.depth_m, row, frame.camera_matrix, None
         ).darkness
         if not dark <= s.darkness:
             return Rejection("pose", "brightness inside over outside", dark, s.darkness, ellipse)
@@ -75,7 +75,7 @@ class MonoCircleEstimator:
             if changed[3] > changed[2]:
                 changed = row - np.eye(5)[k] * std[k]
             other = min(
-                conic.circles(changed, frame.camera_matrix, s.radius_m),
+                conic.solve_circle_poses(changed, frame.camera_matrix, s.radius_m),
                 key=lambda one: -float(one[1] @ normal),
             )
             moves.append(other[0] - center)

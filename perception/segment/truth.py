@@ -14,7 +14,7 @@ from perception import dataset
 
 
 @spec
-class Truth:
+class TruthMasks:
     """Reads the masks that lie beside a rendered or labelled frame; what a perfect segmenter would say."""
 
     def build(self) -> TruthSegmenter:
@@ -40,4 +40,4 @@ class TruthSegmenter:
             raise FrameError(
                 f"{frame.name}{dataset.MASK}: {label.block.shape[::-1]} px, the frame has {frame.color.shape[1::-1]}"
             )
-        return Masks(label.block.astype(np.float32), label.mouth.astype(np.float32))
+        return Masks(label.block.astype(np.float32), label.hole_mask.astype(np.float32))

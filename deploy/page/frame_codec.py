@@ -16,7 +16,7 @@ import zstandard
 
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
-from deploy.picture import jpeg, shrunk
+from deploy.picture import encode_jpeg, shrink_picture
 
 LENGTH = struct.Struct("<I")
 M_PER_UNIT = 0.001
@@ -26,7 +26,7 @@ LEVEL = 1
 """Of zstd: higher ones take ten times as long for a few percent."""
 
 
-def encode(frame: Frame, width: int, quality: int) -> bytes:
+def encode_frame(frame: Frame, width: int, quality: int) -> bytes:
     """Returns the message of a frame, shrunk to `width` px where it is wider.
 
     Args:
@@ -46,11 +46,11 @@ def encode(frame: Frame, width: int, quality: int) -> bytes:
     size = round(part * full_width), round(part * full_height)
     color, depth_m = frame.color, frame.depth_m
     if part < 1.0:
-        color, depth_m = shrunk(color, *size), shrunk(depth_m, *size)
+        color, depth_m = shrink_picture(color, *size), shrink_picture(depth_m, *size)
     matrix = frame.camera_matrix.astype(float).copy()
     matrix[:2] *= part  # the half pixel that the grid moves by is a millimetre at 4 m
     pose = np.eye(4) if frame.base_from_camera is None else frame.base_from_camera
-    depth = zstandard.ZstdCompressor(level=LEVEL).compress(planes(depth_m).tobytes())
+    depth = zstandard.ZstdCompressor(level=LEVEL).compress(encode_depth_planes(depth_m).tobytes())
     header = json.dumps(
         {
             "t_s": frame.t_s, "width": size[0], "height": size[1], "m_per_unit": M_PER_UNIT, "depth_bytes": len(depth),
@@ -58,10 +58,10 @@ def encode(frame: Frame, width: int, quality: int) -> bytes:
             "base_from_camera": pose.astype(float).ravel().tolist(), "placed": frame.base_from_camera is not None,
         }
     ).encode()  # fmt: skip
-    return b"".join((LENGTH.pack(len(header)), header, depth, jpeg(color, quality)))
+    return b"".join((LENGTH.pack(len(header)), header, depth, encode_jpeg(color, quality)))
 
 
-def planes(depth_m: np.ndarray) -> np.ndarray:
+def encode_depth_planes(depth_m: np.ndarray) -> np.ndarray:
     """Returns the low and the high bytes, `(2, h, w)`, of depths, `(h, w)` in m, as 16-bit millimetres (0: unknown).
 
     Each stands as its difference to its left neighbour, modulo 2^16, from 0 outwards: 0, -1, 1, -2,
@@ -75,7 +75,7 @@ def planes(depth_m: np.ndarray) -> np.ndarray:
     return np.moveaxis(outwards.view(np.uint8).reshape(*units.shape, 2), -1, 0).copy()
 
 
-def depth_m(data: bytes, width: int, height: int) -> np.ndarray:
+def decode_depth_m(data: bytes, width: int, height: int) -> np.ndarray:
     """Returns the depths, `(h, w)` float32 in m and NaN where unknown, that `data` holds: as the page has them."""
     low, high = (
         np.frombuffer(zstandard.ZstdDecompressor().decompress(data), np.uint8)

@@ -8,7 +8,7 @@ from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, Rejection
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.ellipse import conic
-from perception.pose.estimator import vector
+from perception.pose.plane_conic import as_row
 
 
 @spec
@@ -52,7 +52,7 @@ class CentreDepthEstimator:
         if not np.isfinite(window).any():
             return Rejection("pose", "known depth at the centre", 0.0, 1.0, ellipse)
         ray = np.linalg.solve(frame.camera_matrix, np.array([ellipse.x, ellipse.y, 1.0]))
-        normals = self._normals(frame, vector(ellipse))
+        normals = self._normals(frame, as_row(ellipse))
         if len(normals) < 3:
             return Rejection(
                 "pose", "local normals around the rim", float(len(normals)), 3.0, ellipse
@@ -78,7 +78,7 @@ class CentreDepthEstimator:
     def _normals(self, frame: Frame, row: np.ndarray) -> np.ndarray:
         """Returns unit normals of the depth beside the rim, `(K, 3)`, from differences over a few pixels."""
         wide = row + np.array([0, 0, self.settings.ring_px, self.settings.ring_px, 0])
-        places = conic.sample(
+        places = conic.sample_ellipses(
             wide[None], np.arange(self.NUM_NORMALS) * 2 * np.pi / self.NUM_NORMALS
         )[0][0]
         step = max(2, round(self.settings.ring_px / 2))

@@ -1,29 +1,112 @@
-"""The detector of `perception.ellipse.contour_arcs`.
-
-It refines, judges and chooses among candidates: whole contours, arcs and groups of arcs.
-"""
+"""Ellipses from edges: convex arcs, grouped where they lie on one conic, judged by what supports them all around."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from brokk_rl.contracts.vision import Ellipse, SizePrior
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import spec
 from perception.ellipse import conic
 from perception.ellipse import edges as ellipse_edges
-from perception.ellipse import ends as ellipse_ends
-from perception.ellipse import groups as ellipse_groups
 from perception.ellipse import support as ellipse_support
 from perception.ellipse.edges import Edges
-from perception.ellipse.ends import STROKE_PX
-from perception.ellipse.support import ANGLES, NUM_SAMPLES, Candidates
+from perception.ellipse.support import ANGLES, NUM_SAMPLES, STROKE_PX, EllipseCandidates
 
-if TYPE_CHECKING:
-    from perception.ellipse.contour_arcs import ContourArcs
+
+@spec
+class ContourArcs:
+    """Ellipses by arc grouping on plain OpenCV: percentile Canny, convex arcs, co-conic groups, support by gradient direction.
+
+    Attributes:
+        sigma_px: Blur before the gradient.
+        percentile: Of the gradient's magnitude, the upper threshold of the edges.
+        noise: Least upper threshold in standard deviations of noise.
+        low: Lower threshold as a part of the upper one.
+        arc_tolerance_px: Polygon that finds where arcs bend back.
+        corner_rad: Turn of that polygon at which an arc ends.
+        arc_points: Least number of points of an arc.
+        reach_px: How far from an ellipse its edge points may lie, per px of the geometric mean of
+            the semi-axes `reach_relative`, at least this.
+        reach_relative: See `reach_px`.
+        angle_rad: Largest angle between the gradient at a supporting point and the ellipse's
+            normal.
+        coverage: Least part of the circumference with support.
+        gap: Largest part of the circumference without any.
+        rms_px: Largest standard deviation of the support's distances, plus `rms_relative` per px of
+            the geometric mean semi-axis; for an ellipse seen in part, as large a part of that.
+        rms_relative: See `rms_px`.
+        wave_px: Deviation of the support's distances in the mean over an eighth of a turn, which
+            noise leaves no trace in; together with that of its angles, over this and `wave_rad`, at
+            most 1 where half is seen, 2 where all is.
+        wave_rad: See `wave_px`; plus `wave_small` over the geometric mean semi-axis in px.
+        wave_small: See `wave_rad`.
+        angle_rms_rad: Largest standard deviation of the support's angles, plus `angle_rms_small`
+            over the geometric mean semi-axis in px; for an ellipse seen in part, as large a part of
+            that.
+        angle_rms_small: See `angle_rms_rad`.
+        purity: Least part of the supporting edges, from corner to corner, that lies on the ellipse.
+        departure: Largest part of the circumference where the supporting edges run on beside the
+            ellipse, up to their corners (spirals, hearts).
+        evidence: Least decimal exponent by which the support is no accident.
+        score: Least score of an ellipse that is seen nearly all around; of half of one less than
+            half of it will do.
+        prior_slack: By how much wider the limits of residual, angle and departure are, and the one
+            of purity lower, where a size is
+            given: it shuts out most of what else they do, and rims are chipped.
+        smallest_px: Least minor semi-axis.
+        flattest: Least ratio of the semi-axes.
+        prior_flattest: The same where a size is given: what has a known size lies on a face that is
+            seen.
+    """
+
+    sigma_px: float
+    percentile: float
+    noise: float
+    low: float
+    arc_tolerance_px: float
+    corner_rad: float
+    arc_points: int
+    reach_px: float
+    reach_relative: float
+    angle_rad: float
+    coverage: float
+    gap: float
+    rms_px: float
+    rms_relative: float
+    wave_px: float
+    wave_rad: float
+    wave_small: float
+    angle_rms_rad: float
+    angle_rms_small: float
+    purity: float
+    departure: float
+    evidence: float
+    score: float
+    prior_slack: float
+    smallest_px: float
+    flattest: float
+    prior_flattest: float
+
+    def check(self) -> None:
+        if not 0 < self.percentile < 100 or not 0 < self.low <= 1 or self.sigma_px <= 0:
+            raise ConfigError(
+                "perception.ellipse: expected 0 < percentile < 100, 0 < low <= 1 and sigma_px > 0, got "
+                f"{self.percentile}, {self.low} and {self.sigma_px}"
+            )
+        if not 0 < self.coverage <= 1 or self.arc_points < 6:
+            raise ConfigError(
+                f"perception.ellipse: expected 0 < coverage <= 1 and arc_points >= 6, got {self.coverage} and {self.arc_points}"
+            )
+
+    def build(self) -> ArcDetector:
+        """Returns a detector."""
+        return ArcDetector(self)
+
 
 NUM_SEEDS = 28
 """Points that stand for an arc in its first fit."""
@@ -54,10 +137,10 @@ TIGHT = 0.7
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedEllipses:
     """Candidates that passed, with the figures of `Ellipse` and the edge points behind each, `(C, NUM_SAMPLES)`, -1 for none."""
 
-    candidates: Candidates
+    candidates: EllipseCandidates
     support: np.ndarray
     rms_px: np.ndarray
     coverage: np.ndarray
@@ -93,7 +176,7 @@ class ArcDetector:
             return []
         limits = prior or SizePrior(0.0, float(max(part.shape)))
         where = None if roi is None else roi[top:bottom, left:right]
-        edges = ellipse_edges.find(
+        edges = ellipse_edges.detect_edges(
             part, where, s.sigma_px, s.percentile, s.noise, s.low, s.arc_points, self._near(limits)
         )
         if not len(edges.points):
@@ -129,17 +212,17 @@ class ArcDetector:
         parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int).reshape(
             -1, 2
         )
-        groups = [arcs[group] for group in ellipse_groups.find(arcs, edges, (4, 3, 2))]
+        groups = [arcs[group] for group in ellipse_edges.group_arcs(arcs, edges, (4, 3, 2))]
         if limits.lowest_px == 0:
-            parts = np.concatenate([parts, _within(arcs, self.settings.arc_points)])
+            parts = np.concatenate([parts, _split_arcs(arcs, self.settings.arc_points)])
         kinds = (spans[:, None], parts[:, None], *groups)
-        seeds = np.concatenate([_seeds(some) for some in kinds])
+        seeds = np.concatenate([_select_seed_points(some) for some in kinds])
         lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
         first = self.first(seeds, lengths, edges, limits)
         known = np.repeat(
             further[self._sized(further, limits, 1.5)], 2, 0
         )  # dark inside, and bright inside
-        first = Candidates(
+        first = EllipseCandidates(
             np.concatenate([first.ellipses, known]),
             np.concatenate([first.polarity, np.tile([1.0, -1.0], len(known) // 2)]),
         )
@@ -148,19 +231,21 @@ class ArcDetector:
             self._chosen(self.judge(refined, edges, limits), edges), key=lambda one: -one[3]
         )
 
-    def _chosen(self, judged: Judged, edges: Edges) -> list[tuple[np.ndarray, float, float, float]]:
+    def _chosen(
+        self, judged: JudgedEllipses, edges: Edges
+    ) -> list[tuple[np.ndarray, float, float, float]]:
         """Returns the candidates that share their support with no better one."""
         claimed = np.zeros(len(edges.points), bool)
         found = []
         for k in np.argsort(-judged.score, kind="stable"):
             mine = judged.support[k][judged.support[k] >= 0]
             one = judged.candidates[k : k + 1]
-            if claimed[mine].mean() > 0.4 or _other_side(
+            if claimed[mine].mean() > 0.4 or _is_other_side_of_line(
                 one.ellipses[0], [row for row, *_ in found]
             ):
                 continue
             claimed[mine] = True
-            number = max(NUM_SAMPLES, int(conic.perimeter(*one.ellipses[0, 2:4])) * 2)
+            number = max(NUM_SAMPLES, int(conic.compute_perimeter(*one.ellipses[0, 2:4])) * 2)
             dense = self._gather(one, edges, np.arange(number) * (2 * np.pi / number))[0][0]
             claimed[dense[dense >= 0]] = True
             found.append((one.ellipses[0], judged.rms_px[k], judged.coverage[k], judged.score[k]))
@@ -168,37 +253,37 @@ class ArcDetector:
 
     def first(
         self, seeds: np.ndarray, lengths: np.ndarray, edges: Edges, limits: SizePrior
-    ) -> Candidates:
+    ) -> EllipseCandidates:
         """Returns the candidates of seed points `(C, P)` that lie on an ellipse of a possible size, their gradients all one way.
 
         The arcs that the seeds stand for have `lengths`, `(C,)` points, which must be a good part
         of the circumference.
         """
-        smallest = conic.perimeter(
+        smallest = conic.compute_perimeter(
             np.array(limits.lowest_px / 1.5),
             np.array(limits.lowest_px / 1.5 * self._flattest(limits)),
         )
         seeds, lengths = (some[lengths >= LEAST_ARC * smallest] for some in (seeds, lengths))
         if not len(seeds):
-            return Candidates(np.empty((0, 5)), np.empty(0))
+            return EllipseCandidates(np.empty((0, 5)), np.empty(0))
         points = edges.points[seeds]
-        ellipses = conic.fit(points, np.ones(seeds.shape))
+        ellipses = conic.fit_ellipses(points, np.ones(seeds.shape))
         ellipses = ellipses.copy()
         possible = self._sized(ellipses, limits, 1.5)
         possible &= lengths >= LEAST_ARC * np.nan_to_num(
-            conic.perimeter(ellipses[:, 2], ellipses[:, 3])
+            conic.compute_perimeter(ellipses[:, 2], ellipses[:, 3])
         )
         ellipses, points, seeds = ellipses[possible], points[possible], seeds[possible]
-        off, outward = conic.beside(ellipses, points)
-        outward = conic.dot(outward, edges.directions[seeds])
+        off, outward = conic.measure_sampson_distance(ellipses, points)
+        outward = conic.sum_products(outward, edges.directions[seeds])
         reach = self._reach(ellipses)
         near = (np.abs(off) < reach[:, None]).mean(1) > 0.5
         keep = near & (np.abs(outward.mean(1)) > 0.5)
-        return Candidates(ellipses[keep], np.sign(outward.mean(1))[keep])
+        return EllipseCandidates(ellipses[keep], np.sign(outward.mean(1))[keep])
 
     def refine(
-        self, candidates: Candidates, edges: Edges, rounds_px: tuple[float, ...]
-    ) -> Candidates:
+        self, candidates: EllipseCandidates, edges: Edges, rounds_px: tuple[float, ...]
+    ) -> EllipseCandidates:
         """Returns the candidates fitted again to the edge points that support them.
 
         Points are weighted so that distances count, not form values, and so that those beside the
@@ -212,17 +297,19 @@ class ArcDetector:
                 candidates, edges, ANGLES[:: 1 if scale_px == ROUNDS_PX[-1] else 2]
             )
             size = np.sqrt(e[:, 2] * e[:, 3])
-            slope = conic.slopes(e, edges.points[support]) * size[:, None]
+            slope = conic.measure_form_gradients(e, edges.points[support]) * size[:, None]
             robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / 0.05) ** 2) ** 2
             weights = np.where(support >= 0, robust / np.maximum(slope, 1e-3) ** 2, 0.0)
-            ellipses = conic.fit(edges.points[support], weights)
+            ellipses = conic.fit_ellipses(edges.points[support], weights)
             keep = np.isfinite(ellipses).all(1) & (
                 (support >= 0).mean(1) >= (HALFWAY if number else LEAST_ARC)
             )
-            candidates = Candidates(ellipses[keep], candidates.polarity[keep])
+            candidates = EllipseCandidates(ellipses[keep], candidates.polarity[keep])
         return candidates
 
-    def judge(self, candidates: Candidates, edges: Edges, limits: SizePrior) -> Judged:
+    def judge(
+        self, candidates: EllipseCandidates, edges: Edges, limits: SizePrior
+    ) -> JudgedEllipses:
         """Returns the candidates with enough support of the right kind."""
         s = self.settings
         candidates = candidates[
@@ -230,18 +317,18 @@ class ArcDetector:
         ]
         e = candidates.ellipses
         if not len(e):
-            return Judged(
+            return JudgedEllipses(
                 candidates, np.empty((0, NUM_SAMPLES), int), np.empty(0), np.empty(0), np.empty(0)
             )
         support, off, along = self._gather(candidates, edges, ANGLES, TIGHT)
         there = support >= 0
-        length = conic.sample(e, ANGLES)[2]
+        length = conic.sample_ellipses(e, ANGLES)[2]
         coverage = (length * there).sum(1) / length.sum(1)
         count = np.maximum(there.sum(1), 1)
         rms = np.sqrt((off**2 * there).sum(1) / count)
         spread, angle = (
-            ellipse_support.typical(np.abs(off), there),
-            ellipse_support.typical(np.arccos(np.clip(along, -1, 1)), there),
+            ellipse_support.estimate_spread(np.abs(off), there),
+            ellipse_support.estimate_spread(np.arccos(np.clip(along, -1, 1)), there),
         )
         size = np.sqrt(e[:, 2] * e[:, 3])
         whole = np.clip(
@@ -257,37 +344,39 @@ class ArcDetector:
             & (rms <= TAIL * rms_limit)
             & (angle <= angle_limit)
         )
-        wave_px, wave_rad = ellipse_support.waves(candidates, edges, support, off)
+        wave_px, wave_rad = ellipse_support.measure_waviness(candidates, edges, support, off)
         form = np.hypot(
             wave_px / (s.wave_px + s.rms_relative * size * whole),
             wave_rad / (s.wave_rad + s.wave_small / size),
         )
         good &= form <= slack * (1 + whole)
         good &= (
-            ellipse_support.evidence(
-                coverage, angle, conic.perimeter(e[:, 2], e[:, 3]), s.angle_rad
+            ellipse_support.compute_evidence(
+                coverage, angle, conic.compute_perimeter(e[:, 2], e[:, 3]), s.angle_rad
             )
             >= s.evidence
         )
         candidates, support, length = candidates[good], support[good], length[good]
         rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
         rms_limit, angle_limit = rms_limit[good], angle_limit[good]
-        good = ellipse_support.gap(support >= 0, length) <= s.gap
-        screened = ellipse_ends.screened(candidates, edges, support, length)
-        good &= screened | (ellipse_support.purity(edges, support, length) >= s.purity / slack)
+        good = ellipse_support.measure_largest_gap(support >= 0, length) <= s.gap
+        screened = ellipse_support.find_occluded(candidates, edges, support, length)
+        good &= screened | (
+            ellipse_support.measure_purity(edges, support, length) >= s.purity / slack
+        )
         if limits.lowest_px == 0:
-            good &= ellipse_support.strength(edges, support) >= FAINT * np.percentile(
+            good &= ellipse_support.measure_strength(edges, support) >= FAINT * np.percentile(
                 edges.strength, 95.0
             ) * np.minimum(
                 SMALL_PX / np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3]), 1.0
             )
-            good[good] &= ~ellipse_ends.leaving(
+            good[good] &= ~ellipse_support.find_smooth_continuations(
                 candidates[good], edges, support[good], length[good]
             )
-            good[good] &= screened[good] | ~ellipse_ends.crossed(
+            good[good] &= screened[good] | ~ellipse_support.find_inward_outlines(
                 candidates[good], edges, support[good], length[good]
             )
-        departure = ellipse_support.departure(
+        departure = ellipse_support.measure_departure(
             candidates, edges, support, length, self._reach(candidates.ellipses)
         )
         good &= screened | (departure <= s.departure * slack)
@@ -301,12 +390,18 @@ class ArcDetector:
         good &= score * slack**2 >= s.score * np.maximum(
             np.clip(3 * coverage - 1.5, 0.0, 1.0), 0.9 * coverage
         )
-        return Judged(candidates[good], support[good], rms[good], coverage[good], score[good])
+        return JudgedEllipses(
+            candidates[good], support[good], rms[good], coverage[good], score[good]
+        )
 
     def _gather(
-        self, candidates: Candidates, edges: Edges, angles_rad: np.ndarray, tight: float = 1.0
+        self,
+        candidates: EllipseCandidates,
+        edges: Edges,
+        angles_rad: np.ndarray,
+        tight: float = 1.0,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return ellipse_support.gather(
+        return ellipse_support.gather_support(
             candidates,
             edges,
             angles_rad,
@@ -361,7 +456,7 @@ class ArcDetector:
         return int(np.ceil(self._within_reach(limits.highest_px))) + BESIDE_PX
 
 
-def _other_side(ellipse: np.ndarray, others: list[np.ndarray]) -> bool:
+def _is_other_side_of_line(ellipse: np.ndarray, others: list[np.ndarray]) -> bool:
     """Says whether an ellipse is one edge of a thin line and another one, found before, the other edge."""
     apart = np.abs(np.array(others).reshape(-1, 5) - ellipse)[:, :4]
     area = ellipse[2] * ellipse[3]
@@ -375,7 +470,7 @@ def _other_side(ellipse: np.ndarray, others: list[np.ndarray]) -> bool:
     )
 
 
-def _within(arcs: np.ndarray, least: int) -> np.ndarray:
+def _split_arcs(arcs: np.ndarray, least: int) -> np.ndarray:
     """Returns first, middle and last piece of each arc, of `least` points or more: its ends may belong to something else."""
     start, length = arcs[:, 0], arcs[:, 1] - arcs[:, 0]
     part = np.maximum((PIECE * length).astype(int), least)
@@ -388,7 +483,7 @@ def _within(arcs: np.ndarray, least: int) -> np.ndarray:
     )
 
 
-def _seeds(groups: np.ndarray) -> np.ndarray:
+def _select_seed_points(groups: np.ndarray) -> np.ndarray:
     """Returns evenly spread points of each group of spans `(C, G, 2)`, of each span as many as it is long, `(C, NUM_SEEDS)`."""
     ends = np.cumsum(groups[..., 1] - groups[..., 0], 1)
     place = (np.arange(NUM_SEEDS) + 0.5) / NUM_SEEDS * ends[:, -1:]

@@ -19,9 +19,9 @@ _FARTHEST_M = 200.0
 _RIGID = 1e-3
 
 
-def matrix(value: Any, where: str) -> np.ndarray:
+def check_matrix(value: Any, where: str) -> np.ndarray:
     """Returns a camera matrix, `(3, 3)`, or raises a `FrameError` where it is none."""
-    found = _numbers(value, (3, 3), f"{where}: K")
+    found = _parse_numbers(value, (3, 3), f"{where}: K")
     if found[0, 0] <= 0 or found[1, 1] <= 0:
         raise FrameError(
             f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected more than 0"
@@ -41,7 +41,7 @@ def matrix(value: Any, where: str) -> np.ndarray:
     return found
 
 
-def fits(camera_matrix: np.ndarray, height: int, width: int, where: str) -> None:
+def check_matrix_fits(camera_matrix: np.ndarray, height: int, width: int, where: str) -> None:
     """Refuses a camera matrix that cannot be that of a picture of this size."""
     ratio = camera_matrix[0, 0] / width
     if not _FIELD_RATIO[0] <= ratio <= _FIELD_RATIO[1]:
@@ -60,9 +60,11 @@ def fits(camera_matrix: np.ndarray, height: int, width: int, where: str) -> None
             )
 
 
-def distortion(value: Any, where: str) -> np.ndarray | None:
+def check_distortion(value: Any, where: str) -> np.ndarray | None:
     """Returns distortion coefficients, `None` where all of them are 0."""
-    found = np.asarray(_numbers([] if value is None else value, None, f"{where}: dist")).reshape(-1)
+    found = np.asarray(
+        _parse_numbers([] if value is None else value, None, f"{where}: dist")
+    ).reshape(-1)
     if len(found) not in _NUM_DISTORTION:
         raise FrameError(
             f"{where}: dist has {len(found)} coefficients, expected {', '.join(map(str, _NUM_DISTORTION))} of them"
@@ -72,9 +74,9 @@ def distortion(value: Any, where: str) -> np.ndarray | None:
     return found if np.any(found) else None
 
 
-def pose(value: Any, where: str) -> np.ndarray:
+def check_pose(value: Any, where: str) -> np.ndarray:
     """Returns a pose, `(4, 4)`, or raises a `FrameError` where it is none."""
-    found = _numbers(value, (4, 4), f"{where}: T_base_cam")
+    found = _parse_numbers(value, (4, 4), f"{where}: T_base_cam")
     turn = found[:3, :3]
     if (
         np.abs(found[3] - [0, 0, 0, 1]).max() > 1e-9
@@ -87,15 +89,15 @@ def pose(value: Any, where: str) -> np.ndarray:
     return found
 
 
-def baseline(value: Any, where: str) -> float:
+def check_baseline(value: Any, where: str) -> float:
     """Returns a baseline in m, or raises a `FrameError` where it is none."""
-    found = float(_numbers(value, (), f"{where}: baseline_m"))
+    found = float(_parse_numbers(value, (), f"{where}: baseline_m"))
     if not 1e-3 <= found <= 3.0:
         raise FrameError(f"{where}: baseline_m is {found:g}, expected 0.001 to 3 m; is it in mm?")
     return found
 
 
-def color(picture: np.ndarray, where: str) -> np.ndarray:
+def convert_color(picture: np.ndarray, where: str) -> np.ndarray:
     """Returns a picture as RGB, `(h, w, 3)` uint8; it comes as OpenCV reads it, blue first."""
     if picture.ndim != 3 or picture.shape[2] not in (3, 4):
         raise FrameError(f"{where}: a grey picture, expected colour (3 channels of 8 bits)")
@@ -104,7 +106,7 @@ def color(picture: np.ndarray, where: str) -> np.ndarray:
     return np.ascontiguousarray(picture[..., 2::-1])
 
 
-def depth_of_png(picture: np.ndarray, where: str) -> np.ndarray:
+def convert_png_depth(picture: np.ndarray, where: str) -> np.ndarray:
     """Returns depth in m, `(h, w)` float32 with NaN, of a picture in mm."""
     if picture.ndim != 2:
         raise FrameError(
@@ -117,7 +119,7 @@ def depth_of_png(picture: np.ndarray, where: str) -> np.ndarray:
     return np.where(picture > 0, picture.astype(np.float32) / 1000.0, np.float32(np.nan))
 
 
-def depth(values: np.ndarray, where: str, least_known: float) -> np.ndarray:
+def check_depth(values: np.ndarray, where: str, least_known: float) -> np.ndarray:
     """Returns depth in m, `(h, w)` float32, NaN where it was 0, negative or infinite: none of these is a depth."""
     if values.ndim != 2:
         raise FrameError(f"{where}: depth of shape {values.shape}, expected (height, width)")
@@ -135,7 +137,7 @@ def depth(values: np.ndarray, where: str, least_known: float) -> np.ndarray:
     return found
 
 
-def same_size(one: np.ndarray, other: np.ndarray, where: str, what: str) -> None:
+def check_same_size(one: np.ndarray, other: np.ndarray, where: str, what: str) -> None:
     """Refuses two pictures of one frame that differ in size."""
     if one.shape[:2] != other.shape[:2]:
         raise FrameError(
@@ -144,7 +146,7 @@ def same_size(one: np.ndarray, other: np.ndarray, where: str, what: str) -> None
         )
 
 
-def _numbers(value: Any, shape: tuple[int, ...] | None, where: str) -> np.ndarray:
+def _parse_numbers(value: Any, shape: tuple[int, ...] | None, where: str) -> np.ndarray:
     try:
         found = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -1,11 +1,9 @@
-"""The block from depth alone: bounded planes that stand in front of what surrounds them.
-
-Inverse depth is the natural coordinate: on a plane `n · P = d` it is linear in the picture, `1/z =
-(n / d) · (x, y, 1)` with `(x, y)` the pixel over the focal length, and a stereo matcher's noise in
-it is the same at every distance.
-"""
+"""A coarse grid of pixels with their lines of sight, and sums over many of them by rows and columns."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -15,7 +13,62 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.pose.plane import DEGENERATE
-from perception.segment.grid import Grid, squares
+
+ONE, X, Y, XX, XY, YY = (0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)
+"""Powers of y and x, in which sums over pixels are kept."""
+
+
+@dataclass(frozen=True)
+class SightGrid:
+    """The pixels that a coarse picture keeps: the line of sight `(x, y, 1)` at depth 1 of each, by column and by row.
+
+    Attributes:
+        x: `(w,)`.
+        y: `(h,)`.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+
+    @staticmethod
+    def of(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> SightGrid:
+        """Returns that of the middles of cells of `step` x `step` px."""
+        y, x = (
+            (
+                (np.arange(count) * step + step // 2 - camera_matrix[k, 2]) / camera_matrix[k, k]
+            ).astype(np.float32)
+            for count, k in zip(shape, (1, 0), strict=True)
+        )
+        return SightGrid(x, y)
+
+    def sight(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Returns the lines of sight of some of them, `(…, 3)`."""
+        return np.stack([self.x[columns], self.y[rows], np.ones(rows.shape, np.float32)], -1)
+
+    @cached_property
+    def half(self) -> SightGrid:
+        """Returns every second of them, in double precision."""
+        return SightGrid(self.x[::2].astype(float), self.y[::2].astype(float))
+
+    @cached_property
+    def powers(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns 1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: what sums over pixels are made of, by rows and columns."""
+        across, down = (
+            np.stack([np.ones_like(some), some, some * some]) for some in (self.x, self.y)
+        )
+        return across, down
+
+    def inverse(self, plane: np.ndarray) -> np.ndarray:
+        """Returns inverse depth on a plane, `(h, w)`."""
+        plane = plane.astype(self.x.dtype)
+        return plane[0] * self.x + (plane[1] * self.y + plane[2])[:, None]
+
+
+def arrange_squares(sums: np.ndarray) -> np.ndarray:
+    """Returns the sums of the products of x, y and 1 with each other, `(3, 3)`, among those of `x^i y^j`, `[j, i]`."""
+    return np.array(
+        [[sums[j, i] for j, i in row] for row in ((XX, XY, X), (XY, YY, Y), (X, Y, ONE))]
+    )
 
 
 @spec
@@ -96,13 +149,13 @@ class PlaneSegmenter:
         """
         height, width = frame.depth_m.shape
         step = max(1, round(width / self._settings.width_px))
-        inverse, known = _shrunk(frame.depth_m, step)
+        inverse, known = _shrink_depth(frame.depth_m, step)
         if known.mean() < self._settings.min_known:
             raise FrameError(
                 f"{frame.name or 'frame'}: depth is known in {known.mean():.1%} of the pixels, depth_plane needs "
                 f"{self._settings.min_known:.0%}; check the depth camera, or segment by colour (perception/segmenter=onnx)"
             )
-        grid = Grid.of(frame.camera_matrix, inverse.shape, step)
+        grid = SightGrid.of(frame.camera_matrix, inverse.shape, step)
         face = np.zeros(inverse.shape, np.uint8)
         for plane in self._planes(grid, inverse, known):
             face |= self._faces(plane, grid, inverse, known)
@@ -123,11 +176,11 @@ class PlaneSegmenter:
                 cv2.cvtColor(color, cv2.COLOR_RGB2GRAY),
                 face[top:bottom, left:right].astype(np.float32),
             )
-            sharp = onto_edges(small, gray, self._settings.edge_px, self._settings.edge_contrast)
+            sharp = snap_to_edges(small, gray, self._settings.edge_px, self._settings.edge_contrast)
             mask[part] = cv2.resize(sharp, size, interpolation=cv2.INTER_LINEAR)
         return Masks(mask, None)
 
-    def _planes(self, grid: Grid, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
+    def _planes(self, grid: SightGrid, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
         """Returns planes `n / d`, `(3,)`, the best supported first: each explains pixels that those before it do not."""
         settings, generator = self._settings, np.random.default_rng(self._settings.seed)
         found, rest = [], known.copy()
@@ -155,7 +208,7 @@ class PlaneSegmenter:
 
     def _trials(
         self,
-        grid: Grid,
+        grid: SightGrid,
         inverse: np.ndarray,
         rest: np.ndarray,
         there: np.ndarray,
@@ -186,7 +239,7 @@ class PlaneSegmenter:
         )
 
     def _refined(
-        self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray
+        self, plane: np.ndarray, grid: SightGrid, inverse: np.ndarray, known: np.ndarray
     ) -> np.ndarray:
         """Returns the least-squares plane of the pixels that agree with `plane`."""
         grid, inverse, known = grid.half, inverse[::2, ::2], known[::2, ::2]
@@ -195,7 +248,7 @@ class PlaneSegmenter:
             inside = (known & (np.abs(grid.inverse(plane) - inverse) < self._tolerance)).astype(
                 float
             )
-            sums = squares(down @ inside @ across.T)  # of x^i y^j over the pixels, [j, i]
+            sums = arrange_squares(down @ inside @ across.T)  # of x^i y^j over the pixels, [j, i]
             if np.linalg.cond(sums) > DEGENERATE:
                 break
             held = down[:2] @ (inside * inverse) @ across[:2].T
@@ -203,7 +256,7 @@ class PlaneSegmenter:
         return plane
 
     def _faces(
-        self, plane: np.ndarray, grid: Grid, inverse: np.ndarray, known: np.ndarray
+        self, plane: np.ndarray, grid: SightGrid, inverse: np.ndarray, known: np.ndarray
     ) -> np.ndarray:
         """Returns where connected pieces of a plane look like a face of a block, `(h, w)` uint8 of 0 and 1."""
         settings = self._settings
@@ -219,12 +272,12 @@ class PlaneSegmenter:
         ]
         nearer = (known & (excess > self._tolerance)).astype(np.uint8)
         nearer = np.asarray(cv2.morphologyEx(nearer, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
-        pieces = [_filled((labels == label).astype(np.uint8), nearer) for label in large]
+        pieces = [_fill_holes((labels == label).astype(np.uint8), nearer) for label in large]
         pieces = [piece for piece in pieces if piece[::2, ::2].any()]
         faces = np.zeros_like(support)
         # ground or wall? so are the pieces of it that something before them cuts off; of a face
         # that may hide all surroundings
-        extents_m = [_extents(piece, plane, grid) for piece in pieces]
+        extents_m = [_measure_extents(piece, plane, grid) for piece in pieces]
         wide = any(extent.prod() > settings.max_extent_m**2 for extent in extents_m)
         for piece, extent in zip(pieces, extents_m, strict=True):
             if self._fits(piece, extent, plane, grid) and (
@@ -234,12 +287,12 @@ class PlaneSegmenter:
         # an arm before a face cuts it in pieces, of which the smaller ones have little but the arm
         # around them
         for piece in pieces if faces.any() else ():
-            if _extents(faces | piece, plane, grid).max() <= settings.max_extent_m:
+            if _measure_extents(faces | piece, plane, grid).max() <= settings.max_extent_m:
                 faces |= piece
         return faces
 
     def _fits(
-        self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, grid: Grid
+        self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, grid: SightGrid
     ) -> bool:
         """Says whether a piece of a plane has the size of a face and looks at the camera."""
         if (
@@ -266,7 +319,9 @@ class PlaneSegmenter:
         return (behind + 0.5 * doubt) / (behind + before + doubt)
 
 
-def onto_edges(mask: np.ndarray, gray: np.ndarray, radius_px: int, contrast: float) -> np.ndarray:
+def snap_to_edges(
+    mask: np.ndarray, gray: np.ndarray, radius_px: int, contrast: float
+) -> np.ndarray:
     """Moves the edges of a small mask onto those of a larger picture by a guided filter (He and Sun, Fast Guided Filter, 2015).
 
     Args:
@@ -298,21 +353,21 @@ def onto_edges(mask: np.ndarray, gray: np.ndarray, radius_px: int, contrast: flo
     )
 
 
-def _shrunk(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+def _shrink_depth(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns inverse depth in 1/m at the middle of each `step` x `step` cell, `(h, w)` float32, and where it is known."""
     depth = depth_m[step // 2 :: step, step // 2 :: step]
     known = np.isfinite(depth) & (depth > 0)
     return np.divide(1.0, depth, out=np.zeros(depth.shape, np.float32), where=known), known
 
 
-def _filled(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
+def _fill_holes(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
     """Fills a piece's holes (a mouth, lost depth), except where something stands in front of it."""
     outlines, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     whole = cv2.drawContours(np.zeros_like(piece), outlines, -1, 1, cv2.FILLED)
     return np.where(nearer > 0, np.uint8(0), np.asarray(whole, np.uint8))
 
 
-def _extents(piece: np.ndarray, plane: np.ndarray, grid: Grid) -> np.ndarray:
+def _measure_extents(piece: np.ndarray, plane: np.ndarray, grid: SightGrid) -> np.ndarray:
     """Returns the two extents in m that a rectangle with the piece's second moments would have."""
     depth = piece[::2, ::2] / np.maximum(grid.half.inverse(plane), 1e-6)
     across, down = grid.half.powers
@@ -322,7 +377,7 @@ def _extents(piece: np.ndarray, plane: np.ndarray, grid: Grid) -> np.ndarray:
     )  # of x^i y^j, [j, i]
     number = np.count_nonzero(depth)
     middle = np.array([first[0, 1], first[1, 0], first[0, 0]]) / number
-    spread = np.linalg.eigvalsh(squares(second) / number - np.outer(middle, middle))[
+    spread = np.linalg.eigvalsh(arrange_squares(second) / number - np.outer(middle, middle))[
         1:
     ]  # the smallest is the plane's own thickness
     return np.sqrt(12.0 * np.maximum(spread, 0.0))

@@ -39,7 +39,7 @@ class Fusion:
     def check(self) -> None:
         if not 0 < self.stale_s <= self.forget_s or self.confirm < 1 or self.gate <= 0:
             raise ConfigError(
-                f"perception.tracking.filter: expected 0 < stale_s <= forget_s, confirm >= 1 and gate > 0, got {self.stale_s}, "
+                f"perception.filter: expected 0 < stale_s <= forget_s, confirm >= 1 and gate > 0, got {self.stale_s}, "
                 f"{self.forget_s}, {self.confirm} and {self.gate}"
             )
 

@@ -18,14 +18,17 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
+from rich.progress import track
 
 from brokk_rl.errors import RecordingError
-from deploy.recorder.capture import FACTS, DurableBlf
+from brokk_rl.record import matching
+from brokk_rl.spec import spec
+from deploy.recorder.capture import FACTS, DurableBlfWriter
 
 log = logging.getLogger(__name__)
 
 
-class Messages(Sequence[tuple[float, dict[str, Any]]]):
+class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
     """The messages of a topic, in order: (t_s, values); `t_s` is monotonic time.
 
     Topics of numbers alone, which is what a bus says, are kept by column: an hour of them takes a
@@ -81,7 +84,7 @@ class Messages(Sequence[tuple[float, dict[str, Any]]]):
 
 
 @dataclass
-class Contents:
+class CaptureContents:
     """What a capture holds.
 
     Attributes:
@@ -92,19 +95,19 @@ class Contents:
     """
 
     facts: dict[str, str] = field(default_factory=dict)
-    messages: dict[str, Messages] = field(default_factory=dict)
+    messages: dict[str, TopicMessages] = field(default_factory=dict)
     wall_ns: int = 0
     whole: bool = True
 
 
-def read(path: Path) -> Contents:
+def read_capture(path: Path) -> CaptureContents:
     """Reads the capture at `path` as far as it goes.
 
     Raises:
         RecordingError: there is none, or not even its beginning can be read.
     """
-    contents, topics = Contents(whole=is_whole(path)), {}
-    for record in _records(path):
+    contents, topics = CaptureContents(whole=is_whole(path)), {}
+    for record in _iterate_records(path):
         if isinstance(record, Metadata) and record.name == FACTS:
             contents.facts = dict(record.metadata)
         elif isinstance(record, Channel):
@@ -112,7 +115,7 @@ def read(path: Path) -> Contents:
         elif isinstance(record, Message):
             values = json.loads(record.data)
             contents.wall_ns = contents.wall_ns or record.log_time
-            contents.messages.setdefault(topics[record.channel_id], Messages()).add(
+            contents.messages.setdefault(topics[record.channel_id], TopicMessages()).add(
                 values.pop("t_s"), values
             )
     if not contents.facts:
@@ -144,7 +147,7 @@ def recover_mcap(path: Path, out: Path) -> int:
     with part.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="brokk", library="brokk-rl")
-        for record in _records(path):
+        for record in _iterate_records(path):
             if isinstance(record, Schema):
                 schemas.setdefault(
                     record.id, writer.register_schema(record.name, record.encoding, record.data)
@@ -179,9 +182,9 @@ def recover_mcap(path: Path, out: Path) -> int:
 def recover_blf(path: Path, out: Path) -> int:
     """Writes what can be read of a cut-off BLF as a whole one; returns the number of frames."""
     part, count = out.with_name(f".{out.name}.part"), 0
-    writer = DurableBlf(part)
+    writer = DurableBlfWriter(part)
     try:
-        for message in frames(path):
+        for message in iterate_blf_frames(path):
             writer.on_message_received(message)
             count += 1
     finally:
@@ -190,7 +193,7 @@ def recover_blf(path: Path, out: Path) -> int:
     return count
 
 
-def frames(path: Path) -> Iterator[can.Message]:
+def iterate_blf_frames(path: Path) -> Iterator[can.Message]:
     """Yields the frames of a BLF as far as it can be read."""
     try:
         with BLFReader(path) as reader:
@@ -201,7 +204,7 @@ def frames(path: Path) -> Iterator[can.Message]:
         log.warning("%s: ends before its end (%s)", path, error)
 
 
-def _records(path: Path) -> Iterator[Any]:
+def _iterate_records(path: Path) -> Iterator[Any]:
     """Yields records as far as the file can be read; chunks are opened."""
     try:
         file = path.open("rb")
@@ -223,3 +226,40 @@ def _records(path: Path) -> Iterator[Any]:
                 log.warning("%s: ends before its end (%s: %s)", path, type(error).__name__, error)
                 return
             yield from inner
+
+
+KINDS = {".mcap": recover_mcap, ".blf": recover_blf}
+
+
+@spec
+class CaptureRecovery:
+    """Captures to recover.
+
+    Attributes:
+        input: Glob, or list of globs, of `.mcap` and `.blf` files; what else lies beside them is
+            left out.
+    """
+
+    input: str | tuple[str, ...]
+
+    def run(self, folder: Path) -> None:
+        """Writes each recovered file under its own name, led by that of its folder, into `folder`.
+
+        Raises:
+            RecordingError: nothing matches, two would have the same name, or nothing can be read of
+                one.
+        """
+        candidates = matching(self.input, "capture")
+        paths = [path for path in candidates if path.suffix in KINDS]
+        if not paths:
+            raise RecordingError(
+                f"recover.input: {candidates[0]} is neither .mcap nor .blf, nor is anything else that matches"
+            )
+        names = [f"{path.resolve().parent.name}_{path.name}" for path in paths]
+        if len(set(names)) < len(names):
+            raise RecordingError(
+                "recover.input: two captures lie in folders of the same name; recover one after the other"
+            )
+        for path, name in track(list(zip(paths, names, strict=True)), "recovering", transient=True):
+            count = KINDS[path.suffix](path, folder / name)
+            log.info("%s: %d messages recovered into %s", path, count, folder / name)

@@ -16,31 +16,30 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.chain import tool
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from deploy.guidance import Guidance, full_angles_rad
-from deploy.page.pointing import borehole_at
+from deploy.guidance import LeverGuidance, find_full_angles_rad
 from deploy.page.protocol import (
-    Advice,
-    Drawn,
-    Recording,
+    BoreholeChoice,
+    DrawReport,
+    OperatorRequest,
+    PageState,
+    RecordingStatus,
     Safety,
-    Shown,
-    Stream,
-    Target,
+    ShownAdvice,
+    SourceAge,
     Vector,
-    Wish,
 )
-from deploy.page.scene import approach
-from deploy.page.settings import LINK, OperatorPage
+from deploy.page.scene import locate_borehole, plan_approach
+from deploy.page.settings import LINK, PageSettings
 from deploy.runtime import operator_state
 from deploy.runtime.bus_process import TEXT
-from deploy.runtime.perception_process import frame_of
+from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
-from deploy.runtime.shm_layout import Exchange
-from deploy.runtime.target import Place, holes_of, nearest, place_of
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.target import TargetPosition, find_nearest, locate_hole, read_holes
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +52,7 @@ pointed at."""
 
 
 @dataclass(frozen=True)
-class Beside:
+class PageProcessConfig:
     """What a page process is to do.
 
     Attributes:
@@ -67,9 +66,9 @@ class Beside:
         camera_s: Age from which the camera's picture is; `None`: there is no camera.
     """
 
-    page: OperatorPage
+    page: PageSettings
     machine: Machine
-    guidance: Guidance
+    guidance: LeverGuidance
     session: Session
     positions_s: float
     levers_s: float
@@ -77,7 +76,7 @@ class Beside:
     camera_s: float | None = None
 
 
-def run(stop: Stop, beside: Beside, exchange: Exchange) -> None:
+def run(stop: Stop, beside: PageProcessConfig, memory: LoopMemory) -> None:
     """Serves the page until it is asked to stop.
 
     Raises:
@@ -92,35 +91,38 @@ def run(stop: Stop, beside: Beside, exchange: Exchange) -> None:
             link,
         )
 
-    beside.page.serve(stop, beside.machine, LoopFeed(beside, exchange), beside.session, tell)
+    beside.page.serve(stop, beside.machine, LoopFeed(beside, memory), beside.session, tell)
 
 
 class LoopFeed:
-    """See `deploy.page.protocol.Feed`.
+    """See `deploy.page.protocol.PageFeed`.
 
     Args:
         beside: What is shown, and how.
-        exchange: Where to read and write.
+        memory: Where to read and write.
         clock: Monotonic time in s.
     """
 
     def __init__(
-        self, beside: Beside, exchange: Exchange, clock: Callable[[], float] = time.monotonic
+        self,
+        beside: PageProcessConfig,
+        memory: LoopMemory,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._beside, self._exchange, self._clock = beside, exchange, clock
+        self._beside, self._memory, self._clock = beside, memory, clock
         self._guiding, self._began_s = True, clock()
         machine = beside.machine
-        self._full_rad = full_angles_rad(beside.guidance.levers or machine.levers)
+        self._full_rad = find_full_angles_rad(beside.guidance.levers or machine.levers)
         self._exclusive = machine.is_exclusive
 
     def news(self) -> int | None:
         """See `Feed`."""
-        return self._exchange.advice.peek("number")
+        return self._memory.advice.peek("number")
 
-    def shown(self) -> Shown:
+    def shown(self) -> PageState:
         """See `Feed`."""
-        seen, beside = operator_state.view(self._exchange), self._beside
-        target, controls = self._exchange.target.read(), self._exchange.controls.read()
+        seen, beside = operator_state.read_snapshot(self._memory), self._beside
+        target, controls = self._memory.target.read(), self._memory.controls.read()
         found = self._targets(target)
         aimed = next((one for one in found if one.chosen), None)
         machine, proposed, safety = seen.machine, seen.advice, seen.safety
@@ -137,14 +139,14 @@ class LoopFeed:
         if beside.camera_s is not None:
             taken_s = self._frame_t_s()
             ages_s["camera"] = (None if taken_s is None else seen.t_s - taken_s, beside.camera_s)
-        return Shown(
+        return PageState(
             t_s=seen.t_s,
             alive=seen.alive,
             guiding=self._guiding,
             advice=proposed and self._advice(proposed),
             own=machine and machine.levers,
             q=machine and machine.q,
-            streams=tuple(Stream(name, *age) for name, age in ages_s.items()),
+            streams=tuple(SourceAge(name, *age) for name, age in ages_s.items()),
             safety=safety
             and Safety(
                 safety.commands,
@@ -154,7 +156,7 @@ class LoopFeed:
                 safety.estop,
                 safety.bus_up,
             ),
-            recording=Recording(
+            recording=RecordingStatus(
                 recording,
                 seen.t_s - float(controls["recording_t_s"])
                 if recording and controls is not None
@@ -168,12 +170,12 @@ class LoopFeed:
 
     def frame(self, after_s: float) -> Frame | None:
         """See `Feed`."""
-        slot, taken_s = self._exchange.frame, self._frame_t_s()
+        slot, taken_s = self._memory.frame, self._frame_t_s()
         if slot is None or taken_s is None or taken_s <= after_s or (record := slot.read()) is None:
             return None
-        return frame_of(record)
+        return read_frame(record)
 
-    def wish(self, wish: Wish) -> bool:
+    def wish(self, wish: OperatorRequest) -> bool:
         """See `Feed`."""
         facts: dict[str, Any] = {}
         if wish.kind in ("target", "point"):
@@ -187,7 +189,7 @@ class LoopFeed:
                 "std_m": place.std_m,
                 "t_s": place.t_s,
             }
-        taken = self._exchange.wishes.put(
+        taken = self._memory.wishes.put(
             json.dumps({"kind": wish.kind, "value": wish.value, **facts}).encode()
         )
         self._say("wish", {"kind": wish.kind, "value": wish.value, "taken": taken, **facts})
@@ -196,7 +198,7 @@ class LoopFeed:
             return taken or wish.kind == "stop"
         return taken
 
-    def drawn(self, drawn: Drawn) -> None:
+    def drawn(self, drawn: DrawReport) -> None:
         """See `Feed`; goes into the recording as topic `drawn`."""
         self._say(
             "drawn",
@@ -209,11 +211,11 @@ class LoopFeed:
         )
 
     def _say(self, topic: str, values: dict[str, Any]) -> None:
-        self._exchange.page_log.put(
+        self._memory.page_log.put(
             TEXT + json.dumps({"topic": topic, "t_s": self._clock(), **values}).encode()
         )
 
-    def _advice(self, proposed: operator_state.Advice) -> Advice:
+    def _advice(self, proposed: operator_state.Advice) -> ShownAdvice:
         levers = proposed.levers.parts(self._full_rad)
         due_s = 0.0 if levers.button_right else None
         if (
@@ -227,28 +229,28 @@ class LoopFeed:
             due_s = max(
                 self._beside.machine.period_s, most_rad / self._beside.guidance.max_rate_rad_s
             )
-        return Advice(proposed.valid, proposed.reason, proposed.number, levers, due_s)
+        return ShownAdvice(proposed.valid, proposed.reason, proposed.number, levers, due_s)
 
     def _frame_t_s(self) -> float | None:
-        return self._exchange.frame and self._exchange.frame.peek("t_s")
+        return self._memory.frame and self._memory.frame.peek("t_s")
 
-    def _targets(self, aim: Any | None) -> tuple[Target, ...]:
+    def _targets(self, aim: Any | None) -> tuple[BoreholeChoice, ...]:
         """Returns the boreholes that perception knows, and the one that the advice is for, whoever named it."""
-        holes = holes_of(self._exchange.holes)
-        chosen = None if aim is None else nearest(holes, np.array(aim["center_in_base_m"]))
+        holes = read_holes(self._memory.holes)
+        chosen = None if aim is None else find_nearest(holes, np.array(aim["center_in_base_m"]))
         found = [
-            Target(
-                str(int(hole["name"])), _vector(hole["center_in_base_m"]), _vector(hole["axis_in_base"]), float(hole["radius_m"]),
-                float(hole["std_m"]), float(hole["score"]), hole is chosen,
+            BoreholeChoice(
+                str(int(hole["name"])), _to_vector(hole["center_in_base_m"]), _to_vector(hole["axis_in_base"]),
+                float(hole["radius_m"]), float(hole["std_m"]), float(hole["score"]), hole is chosen,
             )
             for hole in holes
         ]  # fmt: skip
         if aim is not None and chosen is None:
             radius_m = self._beside.page.borehole_radius_m
             found.append(
-                Target(
+                BoreholeChoice(
                     GIVEN,
-                    _vector(aim["center_in_base_m"]),
+                    _to_vector(aim["center_in_base_m"]),
                     UP,
                     radius_m,
                     float(aim["std_m"]) or None,
@@ -258,31 +260,33 @@ class LoopFeed:
             )
         return tuple(found)
 
-    def _named(self, name: str) -> Place | None:
+    def _named(self, name: str) -> TargetPosition | None:
         """Returns where the borehole of that name is."""
         one = next(
-            (hole for hole in holes_of(self._exchange.holes) if str(int(hole["name"])) == name),
+            (hole for hole in read_holes(self._memory.holes) if str(int(hole["name"])) == name),
             None,
         )
-        return None if one is None else place_of(one)
+        return None if one is None else locate_hole(one)
 
-    def _pointed(self, value: str) -> Place | None:
+    def _pointed(self, value: str) -> TargetPosition | None:
         """Returns the borehole that a person points at: one that perception knows, else what is measured there."""
         frame = self.frame(-1.0)
         x, y = (float(part) for part in value.split(","))
-        found = frame and borehole_at(frame, x, y, self._beside.page.borehole_radius_m)
+        found = frame and locate_borehole(frame, x, y, self._beside.page.borehole_radius_m)
         if not frame or not found:
             return None
-        known = nearest(holes_of(self._exchange.holes), found[0])
-        return Place(*found, frame.t_s) if known is None else place_of(known)
+        known = find_nearest(read_holes(self._memory.holes), found[0])
+        return TargetPosition(*found, frame.t_s) if known is None else locate_hole(known)
 
-    def _path(self, q: tuple[float, ...], target: Target) -> tuple[Vector, ...]:
+    def _path(self, q: tuple[float, ...], target: BoreholeChoice) -> tuple[Vector, ...]:
         if not self._guiding or not self._beside.machine.has_bodies:
             return ()
-        tip_m = tool(self._beside.machine, np.array(q)).tip_in_base_m
-        return approach(tip_m, np.array(target.center_in_base_m), np.array(target.axis_in_base))
+        tip_m = compute_tool_kinematics(self._beside.machine, np.array(q)).tip_in_base_m
+        return plan_approach(
+            tip_m, np.array(target.center_in_base_m), np.array(target.axis_in_base)
+        )
 
 
-def _vector(values: Any) -> Vector:
+def _to_vector(values: Any) -> Vector:
     x, y, z = (float(value) for value in values)
     return x, y, z
