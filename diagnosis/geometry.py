@@ -21,8 +21,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import Case
-from diagnosis.found import Found
-from diagnosis.library import Kind, Still
+from diagnosis.effect_library import Found, Kind, Still
 
 TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 MIN_SAMPLES = 100

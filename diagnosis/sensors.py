@@ -16,8 +16,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import Case, parts
-from diagnosis.found import Found, interval
-from diagnosis.library import Kind, Still
+from diagnosis.effect_library import Found, Kind, Still, fit_interval
 
 SIZES = np.geomspace(0.05, 6.0, 25)
 REST_SPEED, MOVING_SPEED = 0.01, 0.08
@@ -123,7 +122,7 @@ def find_sensor_effects(
             continue
         parameters: dict[str, dict[str, Estimate]] = {}
         for j in np.flatnonzero(mask):
-            ends = np.array(interval(SIZES, likelihood[kind.name][:, j]))
+            ends = np.array(fit_interval(SIZES, likelihood[kind.name][:, j]))
             for name in kind.fitted:
                 mean, low, high = kind.numbers[name].none + kind.size(name) * ends
                 parameters.setdefault(name, {})[machine.joint_names[j]] = Estimate(

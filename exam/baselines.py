@@ -16,9 +16,9 @@ from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from diagnosis import sizes
+from diagnosis import responses
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Verdict, Where
-from diagnosis.noise import loss
+from diagnosis.residuals import robust_loss
 from exam import oracle
 from exam.oracle import JointErrors
 
@@ -124,15 +124,18 @@ def select_forward(errors: JointErrors, worth: SetScore) -> dict[str, float]:
 def score_held_out(errors: JointErrors, names: frozenset[str]) -> float:
     """Returns the gain in log likelihood on the half that was not fitted to."""
     return float(
-        loss(errors.z) - loss(errors.z - sizes.crossed(errors.z, errors.rays(names), errors.fold))
+        robust_loss(errors.z)
+        - robust_loss(errors.z - responses.crossed(errors.z, errors.rays(names), errors.fold))
     )
 
 
 def score_bic(errors: JointErrors, names: frozenset[str]) -> float:
     """Returns the gain in log likelihood on all entries, less the price of the parameters."""
     rays = errors.rays(names)
-    left = errors.z - sizes.predicted(rays, sizes.fitted(errors.z, rays))
-    return float(loss(errors.z) - loss(left)) - 0.5 * len(rays) * float(np.log(len(errors.z)))
+    left = errors.z - responses.predicted(rays, responses.fitted(errors.z, rays))
+    return float(robust_loss(errors.z) - robust_loss(left)) - 0.5 * len(rays) * float(
+        np.log(len(errors.z))
+    )
 
 
 def _build_answer(gains: dict[str, dict[str, float]]) -> Answer:

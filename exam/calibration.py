@@ -22,11 +22,12 @@ from scipy.optimize import minimize
 
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
-from diagnosis import answer, certainty, verdict, weighing
+from diagnosis import answer, decision
+from diagnosis import calibration as certainty
 from diagnosis.answer import Answer, Selected, Where
-from diagnosis.certainty import Certainty
-from diagnosis.engine import Prices
-from diagnosis.library import Kind
+from diagnosis.calibration import Certainty
+from diagnosis.detection import Prices
+from diagnosis.effect_library import Kind
 from exam import dataset, score
 from exam.score import QUIET_KINDS, CaseScore, ParameterScore
 
@@ -118,16 +119,16 @@ def answer_case(
     item: WeighedCase, prices: Prices, weights: Certainty, kinds: Sequence[Kind], machine: Machine
 ) -> tuple[Answer, ClaimSigns]:
     """Returns what the diagnosis would say at these prices, without numbers, and why it is so sure."""
-    found = verdict.likely(weighing.findings(item.told, prices, kinds), prices, weights)
-    unknown = verdict.is_unknown(found, prices, weights)
+    found = decision.likely(decision.restore_result(item.told, prices, kinds), prices, weights)
+    unknown = decision.is_unknown(found, prices, weights)
     selected = (
-        [] if unknown else [verdict.other(found, one, weights, machine) for one in found.others]
+        [] if unknown else [decision.other(found, one, weights, machine) for one in found.others]
     )
-    signs = [(one.kind.name, verdict.other_signs(found, weights, one)) for one in found.others]
+    signs = [(one.kind.name, decision.other_signs(found, weights, one)) for one in found.others]
     for name in found.chosen.names:
-        swaps = verdict.rivals(found, name)
-        like = verdict.same_as(swaps, verdict.own_gain(found, name))
-        signs.append((name, verdict.named_signs(found, prices, weights, name, swaps, like)))
+        swaps = decision.rivals(found, name)
+        like = decision.same_as(swaps, decision.own_gain(found, name))
+        signs.append((name, decision.named_signs(found, prices, weights, name, swaps, like)))
         joints = tuple(
             j
             for j, subset in zip(machine.joint_names, found.chosen.subsets, strict=True)
@@ -144,13 +145,13 @@ def answer_case(
         )
         selected += [] if unknown else [one]
     told = "unknown" if unknown else "effects" if selected else "none"
-    chance = verdict.unknown_chance(found, prices, weights)
-    ranked = tuple(verdict.ranking(found, selected, prices, weights, machine, chance))
+    chance = decision.unknown_chance(found, prices, weights)
+    ranked = tuple(decision.ranking(found, selected, prices, weights, machine, chance))
     said = Answer(
         verdict=told, selected=tuple(selected), ranking=ranked, where=Where({}, (), None), gap=None, next_experiment=None
     )  # fmt: skip
     return said, ClaimSigns(
-        certainty.outside(found), signs, verdict.none_signs(found, prices, weights)
+        certainty.outside(found), signs, decision.none_signs(found, prices, weights)
     )
 
 

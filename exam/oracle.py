@@ -17,11 +17,11 @@ import torch
 
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.machine import Machine
-from diagnosis import case, gap, library, simulator
-from diagnosis.evidence import Ray, rays
-from diagnosis.repair import repair
-from diagnosis.simulator import Base
-from diagnosis.sizes import Shape, fitted
+from diagnosis import baseline, case, effect_library, gap
+from diagnosis.baseline import Base
+from diagnosis.refine import repair
+from diagnosis.residuals import Ray, rays
+from diagnosis.responses import Shape, fitted
 
 MIN_RESPONSE = 1e-3
 """Change of an error, over its noise, below which an effect does nothing to a joint."""
@@ -71,12 +71,12 @@ def load_case_evidence(
         RecordingError: the simulator cannot be fitted.
     """
     with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
-        base = simulator.fitted(
+        base = baseline.fitted(
             case.load(folder, machine), fit, Path(scratch), 0, torch.device("cpu")
         )
     evidence, grown = base.field.evidence, {}
     shapes: list[dict[str, list[Shape]]] = [{} for _ in range(machine.num_joints)]
-    for kind in library.load(machine, None if names is None else tuple(names)):
+    for kind in effect_library.load_effects(machine, None if names is None else tuple(names)):
         if kind.target.stochastic or kind.target.side == "kinematics":
             continue
         ways = grown[kind.name] = rays(kind)

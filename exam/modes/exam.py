@@ -25,9 +25,9 @@ from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
-from diagnosis import answer, library
-from diagnosis.certainty import Certainty
-from diagnosis.engine import Prices
+from diagnosis import answer, effect_library
+from diagnosis.calibration import Certainty
+from diagnosis.detection import Prices
 from exam import dataset, oracle, report, run_cases, score
 from exam.calibration import PenaltyFit, load_weighed_cases, split_by_family
 from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
@@ -303,7 +303,7 @@ class Exam:
         settings = self.exam
         cases = load_weighed_cases([Path(folder) for folder in settings.answers.values()])
         classes, of_machine = settings.mix.classes, self._of_machine()
-        seed, kinds = self.session.stream("prices"), library.load(self.machine)
+        seed, kinds = self.session.stream("prices"), effect_library.load_effects(self.machine)
         fit = PenaltyFit(
             self.machine, kinds, classes, of_machine, settings.trials, seed, settings.workers
         )

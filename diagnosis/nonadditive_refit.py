@@ -1,13 +1,10 @@
-"""What effects do around a set that was found, where adding up what each does by itself is far off.
+"""The search around sets of effects whose responses do not add up.
 
-A saturation does nothing to a simulator whose dead band is missing, and a dead band of a third of
-the command changes what all
-others do. There the search goes on from the set: each effect is simulated in the company of the
-others, from none to far beyond its typical size, and what all of them together change is put down
-as the sum of what each adds to the rest. Sets that differ from the one found by one effect are then
-as right as their simulation. What pays only together with another is found by fitting all sizes of
-a set with one effect more, from many starts.
-Axes: `J` joints, `R` rays, `E` entries (increments of all windows, over the simulator's noise).
+The search adds up the responses of single effects. A saturation does nothing to a simulator without
+dead band, and a dead band of a third of the command changes the responses of all other effects.
+Where the sum is far off, each effect is simulated again beside the others of the set, and all sizes
+of a set with one more effect are fitted together from many starts.
+Axes: `J` joints, `R` growth paths, `E` entries (whitened increments).
 """
 
 from __future__ import annotations
@@ -17,26 +14,36 @@ from dataclasses import replace
 
 import numpy as np
 
-from diagnosis.evidence import GRID, Evidence, Ray, rays
-from diagnosis.noise import increments, loss
-from diagnosis.repair import Repair, repair, searched, simulate
+from diagnosis.refine import (
+    Repair,
+    known_sizes,
+    refit_from,
+    searched,
+    simulate,
+    subsets_of,
+    thinned,
+)
+from diagnosis.residuals import GRID, Evidence, Ray, rays, robust_loss, to_increments
+from diagnosis.responses import FELT, Shape
 from diagnosis.search import Chosen, Price, Table
-from diagnosis.shapes import FELT
-from diagnosis.sizes import Shape
 
 WIDE = tuple(sorted({*GRID, 4.0, 5.5, 7.5, 10.0, 14.0}))
 """Sizes, over the typical one, at which effects are simulated; numbers keep their bounds."""
+
 ROUGH = 0.7
 """A set that earns less than so much of what adding up promised does not add up."""
+
 LARGE = 2.6
 """Sizes over the typical one from which adding up is not trusted."""
 
-TRIED = 6
+ADDED_TRIED = 6
 """Effects that are tried beside a set by fitting all sizes together."""
-EACH = 4
+
+ADDED_THINNING = 4
 """They are tried on one of so many parts of the recordings."""
 
 Shapes = list[dict[str, list[Shape]]]
+
 Around = tuple[np.ndarray, dict[str, list[Ray]], Shapes]
 """The errors that are to be explained `(J, E)`, the rays of each effect, and what they do to each
 joint."""
@@ -54,7 +61,9 @@ def is_needed(evidence: Evidence, repaired: Repair, promised: float) -> bool:
         if np.abs(sizes).max() > LARGE
     ]
     hides = any(ray.kind.target.side == "command" for ray in far)
-    return hides or (bool(far) and float(loss(evidence.z) - loss(repaired.z)) < ROUGH * promised)
+    return hides or (
+        bool(far) and float(robust_loss(evidence.z) - robust_loss(repaired.z)) < ROUGH * promised
+    )
 
 
 def simulated(evidence: Evidence, grown: Mapping[str, Sequence[Ray]], repaired: Repair) -> Around:
@@ -97,7 +106,7 @@ def _response(evidence: Evidence, ray: Ray, ways: Sequence[Ray], repaired: Repai
     sizes = np.zeros((len(ray.sizes), len(company), repaired.sizes.shape[1]))
     sizes[:, : len(repaired.rays)] = repaired.sizes
     sizes[:, place] = ray.sizes[:, None]
-    ends = increments(simulate(evidence.candidates, company, sizes), evidence.start)
+    ends = to_increments(simulate(evidence.candidates, company, sizes), evidence.start)
     return evidence.whitened(ends - ends[np.flatnonzero(ray.sizes == 0.0)[0]])
 
 
@@ -115,7 +124,7 @@ def grown(
     that, a joint fit does. `price` is that of a joint with an effect, in the part of the recordings
     on which this is tried.
     """
-    part = thinned(evidence, EACH)
+    part = thinned(evidence, ADDED_THINNING)
     least = _losses(part, repaired.rays, repaired.sizes)
     found, most = None, 0.0
     for name in _promising(tables, chosen, ways):
@@ -125,7 +134,7 @@ def grown(
         ]
         rays_ = [ray for one in sorted(frozenset().union(*subsets)) for ray in ways[one]]
         mask = np.array([[ray.kind.name in subset for subset in subsets] for ray in rays_])
-        sizes = searched(part, rays_, mask, _known(rays_, repaired), np.random.default_rng(0))
+        sizes = searched(part, rays_, mask, known_sizes(rays_, repaired), np.random.default_rng(0))
         gain = least - _losses(part, rays_, sizes)
         new = np.array(
             [name in s and name not in old for s, old in zip(subsets, chosen.subsets, strict=True)]
@@ -135,9 +144,9 @@ def grown(
             kept = [
                 s if p else old for s, p, old in zip(subsets, pays, chosen.subsets, strict=True)
             ]
-            start = np.where(pays, sizes, _known(rays_, repaired))
+            start = np.where(pays, sizes, known_sizes(rays_, repaired))
             found, most = (kept, rays_, start), worth
-    return _repaired(evidence, ways, *found) if found else None
+    return refit_from(evidence, ways, *found) if found else None
 
 
 def best(
@@ -160,14 +169,14 @@ def best(
     for j in range(evidence.way.shape[2]):
         own = [subsets_of(one)[j] for one in tried]
         cost = [
-            float(loss(one.z[j])) + (price(j, s) if s else 0.0)
+            float(robust_loss(one.z[j])) + (price(j, s) if s else 0.0)
             for one, s in zip(tried, own, strict=True)
         ]
         closing = [k for k in np.argsort(cost) if squares[k + 1][j] < squares[0][j]]
         subsets.append(own[closing[0]] if closing else frozenset())
         if closing:
-            start[:, j] = _known(rays_, tried[closing[0]])[:, j]
-    return _repaired(evidence, ways, subsets, rays_, start) if any(subsets) else None
+            start[:, j] = known_sizes(rays_, tried[closing[0]])[:, j]
+    return refit_from(evidence, ways, subsets, rays_, start) if any(subsets) else None
 
 
 def paying(
@@ -187,71 +196,10 @@ def paying(
     return tuple(subsets)
 
 
-def without(
-    evidence: Evidence,
-    ways: Mapping[str, Sequence[Ray]],
-    repaired: Repair,
-    subsets: Sequence[frozenset[str]],
-) -> Repair:
-    """Returns the repair with fewer effects, fitted anew from its sizes."""
-    return _repaired(evidence, ways, subsets, repaired.rays, repaired.sizes)
-
-
-def subsets_of(repaired: Repair) -> tuple[frozenset[str], ...]:
-    """Returns the effects of each joint."""
-    return tuple(
-        frozenset(ray.kind.name for ray, has in zip(repaired.rays, mask, strict=True) if has)
-        for mask in repaired.mask.T
-    )
-
-
-def _repaired(
-    evidence: Evidence,
-    ways: Mapping[str, Sequence[Ray]],
-    subsets: Sequence[frozenset[str]],
-    rays_: Sequence[Ray],
-    sizes: np.ndarray,
-) -> Repair:
-    """Returns the repair with `subsets` whose fit begins at `sizes` `(R, J)` of `rays_`."""
-    place = {(ray.kind.name, ray.name): k for k, ray in enumerate(rays_)}
-    start = [
-        {n: np.array([sizes[place[n, ray.name], j] for ray in ways[n]]) for n in s}
-        for j, s in enumerate(subsets)
-    ]
-    return repair(evidence, subsets, ways, start)
-
-
-def thinned(evidence: Evidence, each: int) -> Evidence:
-    """Returns the simulator held against one of `each` parts of the recordings."""
-    rows = np.concatenate(evidence.groups[::each])
-    candidates = evidence.candidates
-    cut = replace(
-        candidates.cut, **{name: getattr(candidates.cut, name)[rows] for name in ("u", "q", "run")}
-    )
-    some = {
-        name: value[rows]
-        for name in ("claims", "mean", "bias", "late")
-        if (value := getattr(evidence, name, None)) is not None
-    }
-    return replace(
-        evidence,
-        candidates=replace(candidates, cut=cut, running_s=candidates.running_s[rows]),
-        **some,
-    )
-
-
-def _known(rays_: Sequence[Ray], repaired: Repair) -> np.ndarray:
-    """Returns the sizes that are known already, 0 where none is, `(R, J)`."""
-    sizes = {(ray.kind.name, ray.name): repaired.sizes[k] for k, ray in enumerate(repaired.rays)}
-    return np.stack(
-        [sizes.get((ray.kind.name, ray.name), np.zeros(repaired.sizes.shape[1])) for ray in rays_]
-    )
-
-
 def _losses(evidence: Evidence, rays_: Sequence[Ray], sizes: np.ndarray) -> np.ndarray:
     """Returns the loss of each joint at sizes `(R, J)`, `(J,)`."""
     paths = simulate(evidence.candidates, rays_, sizes[None])
-    return loss(evidence.whitened(evidence.error_of(paths))[:, 0], 1)
+    return robust_loss(evidence.whitened(evidence.error_of(paths))[:, 0], 1)
 
 
 def _promising(
@@ -265,4 +213,4 @@ def _promising(
             found[name] = found.get(name, 0.0) + max(0.0, table.score(subset | {name}).total - own)
     return sorted(
         found, key=lambda name: (ways[name][0].kind.target.side != "command", -found[name])
-    )[:TRIED]
+    )[:ADDED_TRIED]

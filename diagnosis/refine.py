@@ -1,40 +1,47 @@
-"""A simulator repaired by a set of effects: sizes fitted by simulation, what is left, and how sure the sizes are.
+"""Sizes of a set of effects fitted by simulation, the residuals that it leaves, and standard errors.
 
-Axes: `C` candidates, `R` rays, `J` joints, `E` entries (whitened increments), `W` windows, `K`
-steps.
+Axes: `C` candidates, `R` growth paths, `J` joints, `E` entries (whitened increments), `W` windows,
+`K` steps, `F` fits side by side.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.candidates import Candidates
-from diagnosis.evidence import Evidence, Ray
-from diagnosis.library import Kind
-from diagnosis.noise import loss, weight
-from diagnosis.sizes import PRIOR
+from diagnosis.effect_library import Candidates, Kind
+from diagnosis.residuals import Evidence, Ray, robust_loss, robust_weight
+from diagnosis.responses import PRIOR, plain_joints
+from diagnosis.search import LEAST, Chosen, Price, Subset
 
 STEPS = 6
 """Steps of a fit at most."""
+
 FEW = 2
 """The same where it is only to be told what is left without some effects."""
+
 STEP = 0.05
 """Finite difference, of the typical size."""
+
 STARTS = (1.0, 0.5, 1.6)
 """Multiples of the first guess at which a fit may begin: what adding up the effects said is far off
 where they are large."""
+
 DAMPING = (0.03, 1.0, 30.0)
 """Factors on the damping that are tried at each step."""
+
 WITHIN = (1e-4, 1e4)
 """Damping, over the diagonal of the normal matrix."""
+
 ENOUGH = 0.02
 """Gain in log likelihood below which a fit ends."""
+
 DRAWN, FOLLOWED, SPREAD = 40, 3, 0.5
 """Starts of a search, those of a joint that are followed, and how far they scatter (of the
 logarithm)."""
+
 BEYOND = 2.5
 """Sizes may grow to so many times the largest that was simulated before."""
 
@@ -273,7 +280,7 @@ class _Fit:
         step = np.zeros_like(off)
         for f, j in np.ndindex(damping.shape):
             rows = self.mask[:, j]
-            weighted = slopes[f, j][rows] * (weight(z[f, j]) * used[f])
+            weighted = slopes[f, j][rows] * (robust_weight(z[f, j]) * used[f])
             normal = weighted @ slopes[f, j][rows].T + np.eye(rows.sum()) / PRIOR**2
             damped = normal + damping[f, j] * np.diag(np.diag(normal))
             step[f, rows, j] = np.linalg.solve(
@@ -284,7 +291,7 @@ class _Fit:
 
 def _totals(z: np.ndarray, sizes: np.ndarray, used: np.ndarray | float) -> np.ndarray:
     """Returns the loss of errors `(F, J, E)` and sizes `(F, R, J)`, `(F, J)`."""
-    return (loss(z[..., None], -1) * used).sum(-1) + 0.5 * np.square(sizes / PRIOR).sum(1)
+    return (robust_loss(z[..., None], -1) * used).sum(-1) + 0.5 * np.square(sizes / PRIOR).sum(1)
 
 
 def _linear(
@@ -325,7 +332,7 @@ def _deviation(
     found = np.zeros(mask.shape)
     for j in np.flatnonzero(mask.any(0)):
         rows = mask[:, j]
-        weighted = slopes[j][rows] * weight(z[j])
+        weighted = slopes[j][rows] * robust_weight(z[j])
         inverse = np.linalg.inv(weighted @ slopes[j][rows].T + np.eye(rows.sum()) / PRIOR**2)
         scores = np.stack(
             [
@@ -342,4 +349,100 @@ def _deviation(
 
 def gain(before: np.ndarray, after: np.ndarray) -> float:
     """Returns by how much the loss of errors over the noise fell."""
-    return float(loss(before) - loss(after))
+    return float(robust_loss(before) - robust_loss(after))
+
+
+def kept(
+    evidence: Evidence,
+    chosen: Chosen,
+    repaired: Repair,
+    price: Price,
+    scatter: np.ndarray,
+    shared: Subset,
+) -> tuple[Subset, ...]:
+    """Returns the set without effects of no size worth naming, and without joints where it does not pay when it is simulated.
+
+    Args:
+        evidence: Errors of the simulator.
+        chosen: The set.
+        repaired: Its simulation, on halves of the recordings that sizes were not fitted to.
+        price: What a subset costs on a joint.
+        scatter: Mean square error over what the noise says, `(J,)`.
+        shared: Effects with one cause for all joints: they stay on all of them.
+    """
+    found = []
+    joints = zip(
+        plain_joints(evidence, scatter), plain_joints(evidence, scatter, repaired.z), strict=True
+    )
+    for j, (subset, (before, after)) in enumerate(zip(chosen.subsets, joints, strict=True)):
+        earned = float(before.loss.sum() - after.loss.sum()) + before.price - after.price
+        pays = earned > price(j, subset)
+        found.append(
+            frozenset(
+                name
+                for name in subset
+                if name in shared or (pays and repaired.size(name, j) >= LEAST)
+            )
+        )
+    return tuple(found)
+
+
+def without(
+    evidence: Evidence,
+    ways: Mapping[str, Sequence[Ray]],
+    repaired: Repair,
+    subsets: Sequence[frozenset[str]],
+) -> Repair:
+    """Returns the repair with fewer effects, fitted anew from its sizes."""
+    return refit_from(evidence, ways, subsets, repaired.rays, repaired.sizes)
+
+
+def subsets_of(repaired: Repair) -> tuple[frozenset[str], ...]:
+    """Returns the effects of each joint."""
+    return tuple(
+        frozenset(ray.kind.name for ray, has in zip(repaired.rays, mask, strict=True) if has)
+        for mask in repaired.mask.T
+    )
+
+
+def refit_from(
+    evidence: Evidence,
+    ways: Mapping[str, Sequence[Ray]],
+    subsets: Sequence[frozenset[str]],
+    rays_: Sequence[Ray],
+    sizes: np.ndarray,
+) -> Repair:
+    """Returns the repair with `subsets` whose fit begins at `sizes` `(R, J)` of `rays_`."""
+    place = {(ray.kind.name, ray.name): k for k, ray in enumerate(rays_)}
+    start = [
+        {n: np.array([sizes[place[n, ray.name], j] for ray in ways[n]]) for n in s}
+        for j, s in enumerate(subsets)
+    ]
+    return repair(evidence, subsets, ways, start)
+
+
+def thinned(evidence: Evidence, each: int) -> Evidence:
+    """Returns the simulator held against one of `each` parts of the recordings."""
+    rows = np.concatenate(evidence.groups[::each])
+    candidates = evidence.candidates
+    cut = replace(
+        candidates.cut, **{name: getattr(candidates.cut, name)[rows] for name in ("u", "q", "run")}
+    )
+    some = {
+        name: value[rows]
+        for name in ("claims", "mean", "bias", "late")
+        if (value := getattr(evidence, name, None)) is not None
+    }
+    return replace(
+        evidence,
+        candidates=replace(candidates, cut=cut, running_s=candidates.running_s[rows]),
+        **some,
+    )
+
+
+def known_sizes(rays_: Sequence[Ray], repaired: Repair) -> np.ndarray:
+    """Returns the sizes that are known already, 0 where none is, `(R, J)`."""
+    sizes = {(ray.kind.name, ray.name): repaired.sizes[k] for k, ray in enumerate(repaired.rays)}
+    return np.stack(
+        [sizes.get((ray.kind.name, ray.name), np.zeros(repaired.sizes.shape[1])) for ray in rays_]
+    )

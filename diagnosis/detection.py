@@ -12,17 +12,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from brokk_rl.spec import spec
-from diagnosis import around, frames, geometry, holding, library, remainder, sensors
+from diagnosis import (
+    effect_library,
+    geometry,
+    nonadditive_refit,
+    refine,
+    residual_model,
+    sensors,
+    timing,
+)
+from diagnosis.baseline import Base
 from diagnosis.case import Case
-from diagnosis.evidence import Evidence, Ray
-from diagnosis.found import Found
-from diagnosis.library import Kind
-from diagnosis.repair import Repair, repair
-from diagnosis.search import MOST, Chosen, Price, Table, choose
-from diagnosis.shapes import SMALL, Nulls, add, plain_joints, rays_of
-from diagnosis.simulator import Base
-from diagnosis.sizes import Shape
-from diagnosis.tied import tied
+from diagnosis.effect_library import Found, Kind
+from diagnosis.refine import Repair, repair
+from diagnosis.residuals import Evidence, Ray
+from diagnosis.responses import SMALL, Shape, add, plain_joints, rays_of
+from diagnosis.search import MOST, Chosen, Nulls, Price, Table, bind_shared_sizes, choose
 
 log = logging.getLogger(__name__)
 
@@ -130,7 +135,15 @@ class Search:
             evidence, geometry.is_tracked(self.case.field, self.case.machine)
         )
         small = {name: rays_of(ways[0].kind, SMALL) for name, ways in grown.items()}
-        known = Nulls(self.base, small, grown, plain_joints(evidence), shapes, self.shared)
+        known = Nulls(
+            nulls,
+            self.base.field.evidence.z.shape[1],
+            small,
+            grown,
+            plain_joints(evidence),
+            shapes,
+            self.shared,
+        )
 
         def price(j: int, subset: frozenset[str]) -> float:
             known_there = max(prices.reference * known.earned(j, subset), known.repeated(j, subset))
@@ -139,13 +152,13 @@ class Search:
         scatter = np.ones(self.case.machine.num_joints)
         tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)
         wide = None
-        if repaired and around.is_needed(evidence, repaired, _promised(tables, chosen)):
+        if repaired and nonadditive_refit.is_needed(evidence, repaired, _promised(tables, chosen)):
             wide, tables, chosen, repaired = self._around(evidence, grown, chosen, repaired, price)
             grown = wide[1]
         self.tell("frames", 0.8)
         after = repaired.after if repaired else evidence.base
-        changes, error = frames.Changes(evidence), evidence.error_of(after)
-        late = frames.search(changes, error, nulls[:FEW], self.kinds, prices.joint, prices.name)
+        changes, error = timing.Changes(evidence), evidence.error_of(after)
+        late = timing.search(changes, error, nulls[:FEW], self.kinds, prices.joint, prices.name)
         if late:  # from here on errors scatter after each change of a command
             chancy = replace(evidence, late=changes.spread(error))
             shapes = [
@@ -161,13 +174,17 @@ class Search:
             if (
                 late
             ):  # what delays change depends on when commands act, and so on what else delays them
-                evidence = frames.expected(evidence, late, repaired.effects() if repaired else [])
-                wide = around.simulated(evidence, grown, repaired) if wide and repaired else None
+                evidence = timing.expected(evidence, late, repaired.effects() if repaired else [])
+                wide = (
+                    nonadditive_refit.simulated(evidence, grown, repaired)
+                    if wide and repaired
+                    else None
+                )
             z, grown, shapes = wide or (None, grown, shapes)
             tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter, z)
         self.tell("what is left", 0.92)
         others = [*on_sensors, *on_tool.found, *([late] if late else [])]
-        beside = remainder.repaired(evidence, repaired)
+        beside = residual_model.repaired(evidence, repaired)
         left, left_null = self._left(beside)
         return Findings(
             evidence, tables, grown, price, chosen, repaired, others, left, left_null,
@@ -177,7 +194,7 @@ class Search:
     @property
     def shared(self) -> frozenset[str]:
         """Effects with one cause for all joints."""
-        return library.shared(self.kinds)
+        return effect_library.shared(self.kinds)
 
     def _simulated(
         self, evidence: Evidence, tracked: bool
@@ -210,7 +227,7 @@ class Search:
             tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint
         )
         if z is None and (common := chosen.names & self.shared):
-            grown, shapes = tied(common, tables, grown, shapes)
+            grown, shapes = bind_shared_sizes(common, tables, grown, shapes)
             tables = self._tables(evidence, grown, shapes, scatter, z)
             chosen = choose(
                 tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint
@@ -218,7 +235,7 @@ class Search:
         repaired = self._repaired(evidence, grown, tables, chosen)
         if (
             repaired
-            and (kept := holding.kept(evidence, chosen, repaired, price, scatter, self.shared))
+            and (kept := refine.kept(evidence, chosen, repaired, price, scatter, self.shared))
             != chosen.subsets
         ):
             chosen = Chosen(kept, chosen.worth)
@@ -267,30 +284,35 @@ class Search:
         chosen: Chosen,
         repaired: Repair,
         price: Price,
-    ) -> tuple[around.Around, list[Table], Chosen, Repair | None]:
+    ) -> tuple[nonadditive_refit.Around, list[Table], Chosen, Repair | None]:
         """Goes on from a set whose effects do not add up: simulates all others in its company, fits sizes together."""
         tried, scatter = [repaired], np.ones(self.case.machine.num_joints)
-        wide = around.simulated(evidence, grown, repaired)
+        wide = nonadditive_refit.simulated(evidence, grown, repaired)
         for turn in range(TURNS):
             self.tell("simulating around what was found", 0.72 + 0.04 * turn)
             before = chosen
             tables, chosen, now = self._round(evidence, *wide[1:], price, scatter, wide[0])
             tried += [now] if now else []
-            more = now and around.grown(evidence, wide[1], tables, chosen, now, self.prices.joint)
+            more = now and nonadditive_refit.grown(
+                evidence, wide[1], tables, chosen, now, self.prices.joint
+            )
             tried += [more] if more else []
             if now is None or (more is None and chosen.subsets == before.subsets):
                 break
-            wide = around.simulated(evidence, grown, more or now)
-        best = around.best(evidence, wide[1], tried, price)
+            wide = nonadditive_refit.simulated(evidence, grown, more or now)
+        best = nonadditive_refit.best(evidence, wide[1], tried, price)
         if best is None:
             return wide, tables, Chosen((frozenset(),) * len(tables), 0.0), None
         for drops in (True, False):
-            wide, subsets = around.simulated(evidence, grown, best), around.subsets_of(best)
+            wide, subsets = (
+                nonadditive_refit.simulated(evidence, grown, best),
+                refine.subsets_of(best),
+            )
             tables = self._tables(evidence, *wide[1:], scatter, wide[0])
-            paying = around.paying(tables, subsets, price, self.prices.name)
+            paying = nonadditive_refit.paying(tables, subsets, price, self.prices.name)
             if not drops or paying == subsets or not any(paying):
                 break
-            best = around.without(evidence, wide[1], best, paying)
+            best = refine.without(evidence, wide[1], best, paying)
         worth = sum(
             table.score(s).total - price(j, s)
             for j, (table, s) in enumerate(zip(tables, subsets, strict=True))
@@ -315,16 +337,18 @@ class Search:
         """Returns what clues earn on what is left and, at most, on reference recordings, both `(clues, J)`."""
         nulls = [one.evidence for one in self.base.nulls]
         earned, on_nulls = (
-            remainder.predictable(beside, beside.z),
-            [remainder.predictable(one, one.z) for one in nulls],
+            residual_model.predictable(beside, beside.z),
+            [residual_model.predictable(one, one.z) for one in nulls],
         )
-        return earned, remainder.beyond(
+        return earned, residual_model.beyond(
             earned, on_nulls, [beside.z.shape[1] / one.z.shape[1] for one in nulls]
         )
 
     def _strays(self, beside: Evidence) -> np.ndarray:
-        own = remainder.strayed(beside, beside.error)
-        nulls = [remainder.strayed(one.evidence, one.evidence.error) for one in self.base.nulls]
+        own = residual_model.strayed(beside, beside.error)
+        nulls = [
+            residual_model.strayed(one.evidence, one.evidence.error) for one in self.base.nulls
+        ]
         return np.sqrt(own / np.maximum(np.mean(nulls, 0), 1e-9)) if nulls else np.ones_like(own)
 
 

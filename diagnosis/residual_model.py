@@ -1,15 +1,11 @@
-"""Whether a flexible model still predicts what is left, and from what: then something is there, and the library has no name for it.
+"""Regressions of a simulator's residuals on its own motion: on the reference, and after the repair.
 
-What is left is judged against the simulator with the effects that were found, and by its motion: a
-joint that a dead band makes slow wanders by a part of that slow speed, not of the fast one that the
-simulator had before.
-Each clue is a small ridge regression of increments on one thing that a machine could depend on:
-where it stands, the other joints, the time it has run, the work it did just before. Small models
-find what a large one drowns. `FORMS` come first, and the others
-explain what they leave: in starts and stops, and in how speed follows commands, real forms of known
-effects differ from the library's as well. Like an effect, a clue earns the logarithm of a Bayes
-factor, and is judged by what it earns on the reference.
-Axes: `W` windows, `I` increments, `J` joints, `E` entries, `F` features.
+On the reference they give the discrepancy: errors that a tidy simulator makes wherever the machine
+goes, such as a wavy flow curve or oil that warms up. It is taken off in the field before any effect
+is tried (Kennedy and O'Hagan's discrepancy, linear), as far as one part of the reference predicts
+another. After the repair they give clues: small ridge regressions, each on one thing that a machine
+could depend on. A clue that still predicts the residuals shows a cause outside the library.
+Axes: `W` windows, `I` increments, `J` joints, `E` entries (whitened increments), `F` features.
 """
 
 from __future__ import annotations
@@ -21,12 +17,133 @@ from functools import cached_property
 import numpy as np
 from scipy.signal import lfilter
 
-from diagnosis.discrepancy import WARM_S, ridge
-from diagnosis.evidence import Evidence
-from diagnosis.noise import SPAN, increments, loss, weight
-from diagnosis.repair import Repair
+from diagnosis.refine import Repair
+from diagnosis.residuals import SPAN, Evidence, robust_loss, robust_weight, to_increments
+from diagnosis.responses import fitted
 
-RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+RIDGES = (10.0, 100.0, 1000.0)
+"""Pulls towards no discrepancy, in features of unit size over the noise; that which predicts best
+is used."""
+TURNS = 2
+"""Increments before and after whose changes of speed may matter."""
+LEVELS = (0.0, 0.25, 0.5, 0.75)
+"""Speeds, of full speed, about which errors may differ."""
+ORDERS = (1, 2, 3, 4)
+"""Chebyshev polynomials of the position within the travel."""
+WIDEST = 5.0
+"""Faults are no larger than so many times the usual."""
+TOLD = 0.5
+"""Variance of an estimate, over that of its prior, up to which recordings tell anything about a
+fault."""
+WARM_S = 900.0
+"""Time in which oil warms up."""
+
+
+def features(evidence: Evidence, j: int) -> np.ndarray:
+    """Returns what an error of joint `j` could depend on, in the simulator's own motion, `(W, I, F)`."""
+    way, machine = evidence.way, evidence.candidates.machine
+    full = machine.max_speed * machine.period_s * SPAN
+    own, speed = way[..., j], way / full
+    middle, half = (machine.upper + machine.lower)[j] / 2, (machine.upper - machine.lower)[j] / 2
+    place = np.clip((evidence.start[:, None, j] + np.cumsum(own, 1) - middle) / half, -1.0, 1.0)
+    size, out = np.abs(speed[..., j]), (own > 0).astype(float)
+    sides, turn = (out, 1.0 - out), np.diff(own, axis=1, prepend=own[:, :1])
+    warm = 1.0 - np.exp(-evidence.candidates.running_s / WARM_S)[:, None]
+    columns = [own * side for side in sides] + [np.full_like(own, 0.1 * full[j]), own * warm]
+    columns += [
+        own * np.maximum(1.0 - np.abs(size - level) / 0.25, 0.0) * side
+        for level in LEVELS
+        for side in sides
+    ]
+    columns += [own * np.cos(order * np.arccos(place)) * side for order in ORDERS for side in sides]
+    columns += [
+        np.roll(turn, shift, 1) * side for shift in range(-TURNS, TURNS + 1) for side in sides
+    ]
+    columns += [np.abs(turn), np.abs(np.roll(turn, 1, 1)), np.sign(own) * (size < 0.1) * full[j]]
+    for k in range(way.shape[2]):
+        if k != j:
+            other = speed[..., k]
+            columns += [own * np.abs(other), full[j] * other, full[j] * np.abs(other)]
+    return np.stack(columns, -1)
+
+
+def ridge(x: np.ndarray, z: np.ndarray, pull: float) -> np.ndarray:
+    """Returns coefficients `(F,)` of a robust ridge regression of `z` `(E,)` on features `(E, F)` of about unit size."""
+    beta = np.zeros(x.shape[1])
+    for _ in range(3):
+        weighted = x * robust_weight(z - x @ beta)[:, None]
+        beta = np.linalg.solve(weighted.T @ x + pull * np.eye(x.shape[1]), weighted.T @ z)
+    return beta
+
+
+def learned(parts: Sequence[Evidence], field: Evidence) -> tuple[list[np.ndarray], np.ndarray]:
+    """Returns the discrepancy of each part, learned on the others, and of the field, learned on all, each `(W, I, J)`.
+
+    Joints of which no part predicts the others have none.
+
+    Args:
+        parts: The simulator against parts of the reference that it was not fitted to, with their
+            noise.
+        field: The simulator against the field.
+    """
+    found, of_field = [np.zeros_like(part.way) for part in parts], np.zeros_like(field.way)
+    if len(parts) < 2:
+        return found, of_field
+    for j in range(of_field.shape[2]):
+        raw = [features(part, j) for part in parts]
+        white = [part.whitened_joint(columns, j) for part, columns in zip(parts, raw, strict=True)]
+        size = np.sqrt(np.mean(np.square(np.concatenate(white)), 0))
+        by = np.where(size > 1e-9, 1.0 / np.maximum(size, 1e-9), 0.0)
+        x, z = [one * by for one in white], [part.z[j] for part in parts]
+        others = [[k for k in range(len(parts)) if k != out] for out in range(len(parts))]
+        best, lowest = None, sum(float(robust_loss(one)) for one in z)
+        for pull in RIDGES:
+            betas = [
+                ridge(
+                    np.concatenate([x[k] for k in rest]), np.concatenate([z[k] for k in rest]), pull
+                )
+                for rest in others
+            ]
+            total = sum(
+                float(robust_loss(one - columns @ beta))
+                for one, columns, beta in zip(z, x, betas, strict=True)
+            )
+            if total < lowest:
+                best, lowest = (pull, betas), total
+        if best is None:
+            continue
+        pull, betas = best
+        for bias, columns, beta in zip(found, raw, betas, strict=True):
+            bias[..., j] = columns @ (beta * by)
+        of_field[..., j] = features(field, j) @ (
+            ridge(np.concatenate(x), np.concatenate(z), pull) * by
+        )
+    return found, of_field
+
+
+def widths(parts: Sequence[Evidence]) -> np.ndarray:
+    """Returns how far the simulator's own numbers are off on parts of the reference, over what is usual, `(P,)`, 1 at least.
+
+    All joints and parts together, less what chance alone does to an estimate.
+    """
+    squares, chance = [], []
+    for part in parts:
+        for z, faults in zip(part.z, part.faults, strict=True):
+            lines = WIDEST * faults
+            found = fitted(z, [], faults=lines)
+            slack = np.diag(
+                np.linalg.inv(
+                    (lines * robust_weight(z - found @ lines)) @ lines.T + np.eye(len(lines))
+                )
+            )
+            squares.append(np.where(slack < TOLD, np.square(found), np.nan))
+            chance.append(np.where(slack < TOLD, slack, np.nan))
+    told = np.isfinite(squares)
+    excess = (np.nansum(squares, 0) - np.nansum(chance, 0)) / np.maximum(told.sum(0), 1)
+    return np.clip(WIDEST * np.sqrt(np.maximum(excess, 0.0)), 1.0, WIDEST)
+
+
+CLUE_RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """Pulls towards nothing, in features of unit size over the noise; that which makes the errors most
 likely is used."""
 PAST_S = (2.0, 4.0, 8.0, 16.0)
@@ -53,7 +170,7 @@ class Motion:
     def slip(self) -> np.ndarray:
         """What increments lose where motion comes a sample late."""
         q, start = self.evidence.base[..., self.j], self.evidence.start[:, None, self.j]
-        return increments(np.diff(q, axis=1, prepend=start)[..., None], np.zeros((len(q), 1)))[
+        return to_increments(np.diff(q, axis=1, prepend=start)[..., None], np.zeros((len(q), 1)))[
             ..., 0
         ]
 
@@ -263,12 +380,12 @@ def strayed(evidence: Evidence, error: np.ndarray) -> np.ndarray:
 def _earned(x: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
     """Returns by how much features `(E, F)` make errors `(E,)` more likely, by Laplace's approximation, and what they leave."""
     best, least = 0.0, z
-    for pull in RIDGES:
+    for pull in CLUE_RIDGES:
         beta = ridge(x, z, pull)
         left = z - x @ beta
-        told = (x * weight(left)[:, None]).T @ x / pull + np.eye(x.shape[1])
+        told = (x * robust_weight(left)[:, None]).T @ x / pull + np.eye(x.shape[1])
         gain = (
-            float(loss(z) - loss(left))
+            float(robust_loss(z) - robust_loss(left))
             - 0.5 * pull * float(beta @ beta)
             - 0.5 * float(np.linalg.slogdet(told)[1])
         )

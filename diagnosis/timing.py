@@ -18,13 +18,10 @@ import numpy as np
 from scipy import stats
 
 from diagnosis.answer import Estimate
-from diagnosis.candidates import Values
-from diagnosis.evidence import Evidence
-from diagnosis.found import Found, interval
-from diagnosis.library import Kind
-from diagnosis.noise import increments
-from diagnosis.sizes import fitted
-from diagnosis.tied import median
+from diagnosis.effect_library import Found, Kind, Values, fit_interval
+from diagnosis.residuals import Evidence, to_increments
+from diagnosis.responses import fitted
+from diagnosis.search import weighted_median
 
 CHANGE = 0.06
 """Smaller changes of a command tell nothing about when it arrived."""
@@ -137,7 +134,7 @@ class Changes:
             self.evidence.candidates, cut=many, running_s=self.evidence.candidates.running_s[rows]
         )
         paths = candidates.paths([])[0].reshape(count, windows, *self.evidence.base.shape[1:])
-        return increments(paths, self.evidence.start) - self.evidence.way
+        return to_increments(paths, self.evidence.start) - self.evidence.way
 
     @cached_property
     def _told(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -280,7 +277,7 @@ def search(
     best = max(kinds, key=lambda kind: worth[kind.name])
     if worth[best.name] <= 0:
         return None
-    ends = np.array(interval(SIZES, gains[best.name]))
+    ends = np.array(fit_interval(SIZES, gains[best.name]))
     machine = changes.evidence.candidates.machine
     parameters = {}
     for name in best.fitted:
@@ -326,7 +323,7 @@ def expected(evidence: Evidence, found: Found, steady: Sequence[tuple[Kind, Valu
     later = replace(evidence.candidates, cut=late).paths([])[0] - evidence.base
     known = replace(evidence, mean=mean)
     moved, usual = (
-        known.whitened(increments(one, np.zeros_like(evidence.start))[None])[:, 0]
+        known.whitened(to_increments(one, np.zeros_like(evidence.start))[None])[:, 0]
         for one in (later, mean)
     )
     shares = [
@@ -334,8 +331,8 @@ def expected(evidence: Evidence, found: Found, steady: Sequence[tuple[Kind, Valu
         for z, faults, line in zip(known.z, known.faults, moved, strict=True)
     ]
     told = np.square(moved).sum(1)
-    own = median((moved * usual).sum(1) / np.maximum(told, 1e-9), told)
-    more = median(np.array(shares), told)
+    own = weighted_median((moved * usual).sum(1) / np.maximum(told, 1e-9), told)
+    more = weighted_median(np.array(shares), told)
     return replace(evidence, mean=mean + more * later) if abs(more) <= BEYOND * abs(own) else known
 
 
@@ -349,7 +346,7 @@ def _drawn(changes: Changes, kind: Kind) -> list[np.ndarray]:
             kind.clipped(name, kind.numbers[name].none + sizes * kind.size(name)), joints, 1
         )
     paths = evidence.candidates.paths([(kind, values)], len(sizes))
-    moved = increments(paths, evidence.start) - evidence.way
+    moved = to_increments(paths, evidence.start) - evidence.way
     found = [changes.delays(one).value for one in moved]
     return [np.concatenate(found[start : start + DRAWN]) for start in range(0, len(found), DRAWN)]
 

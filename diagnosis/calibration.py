@@ -16,8 +16,8 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.spec import spec
-from diagnosis.engine import Findings
-from diagnosis.remainder import CLUES, CURVE, FORMS, LATER, STARTS, TIME
+from diagnosis.detection import Findings
+from diagnosis.residual_model import CLUES, CURVE, FORMS, LATER, STARTS, TIME
 
 OUTSIDE = ("constant", "clue", "form", "curve", "scatter", "strays", "tool")
 RIGHT = ("constant", "margin", "adds", "size", "names", "outside")

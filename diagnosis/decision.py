@@ -1,21 +1,125 @@
-"""From what the search found to what is said: classes that cannot be told apart, probabilities, numbers, a verdict."""
+"""From detected effects to an answer: rivals, probabilities, numbers with intervals, a verdict.
+
+The weights of the choice are recorded as plain JSON, enough to choose again at other penalties
+without a simulation.
+Axes: `J` joints, `E` entries, `B` blocks of entries that hang together.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 
 from brokk_rl.machine import Machine
-from diagnosis import certainty
+from diagnosis import calibration
 from diagnosis.answer import Estimate, Ranked, Selected
-from diagnosis.around import without
-from diagnosis.certainty import Certainty
-from diagnosis.engine import Findings, Prices
-from diagnosis.found import Found
-from diagnosis.library import Kind
-from diagnosis.search import Chosen
+from diagnosis.calibration import Certainty
+from diagnosis.detection import Findings, Prices
+from diagnosis.effect_library import Found, Kind, shared
+from diagnosis.refine import without
+from diagnosis.residuals import Evidence
+from diagnosis.responses import plain
+from diagnosis.search import Chosen, Scored, Subset, Table, choose, promising
+
+
+def record_weights(findings: Findings, prices: Prices) -> dict[str, Any]:
+    """Returns what was weighed."""
+    joints, common = [], shared(ways[0].kind for ways in findings.rays.values() if ways)
+    for j, table in enumerate(findings.tables):
+        priced = {*promising(table, prices.joint, prices.share, common)}
+        rows = []
+        for subset in sorted(table.scored, key=sorted):
+            if subset in priced:
+                null = findings.price(j, subset) - prices.joint * len(subset - common)
+                rows.append(
+                    _row(table, subset) | {"null": round(null / max(prices.reference, 1e-9), 2)}
+                )
+            elif subset and (len(subset) < 3 or any(subset < larger for larger in priced)):
+                rows.append(_row(table, subset) | {"gain": round(table.scored[subset].total, 2)})
+        joints.append({"felt": sorted(table.shapes), "subsets": rows})
+    return {
+        "joints": joints,
+        "others": [{"effect": one.kind.name, "joints": one.joints.tolist(), "worth": one.worth, "gain": one.gain,
+                    "rivals": dict(one.rivals)} for one in findings.others],
+        "left": findings.left.tolist(), "left_null": findings.left_null.tolist(), "scatter": findings.scatter.tolist(),
+        "strays": findings.strays.tolist(), "tool_left": findings.tool_left, "entries": findings.evidence.z.shape[1],
+        "blocks": int(findings.evidence.block.max()) + 1,
+        "prices": {"joint": prices.joint, "name": prices.name},
+    }  # fmt: skip
+
+
+def _row(table: Table, subset: Subset) -> dict[str, Any]:
+    scored = table.scored[subset]
+    sizes = {name: [round(float(v), 3) for v in size] for name, size in scored.sizes.items()}
+    gain = np.bincount(table.block, scored.gain)
+    return {"effects": sorted(subset), "gain": [round(float(v), 2) for v in gain], "sizes": sizes}
+
+
+def restore_result(told: Mapping[str, Any], prices: Prices, kinds: Sequence[Kind]) -> Findings:
+    """Returns the findings at other prices; evidence, repair and rays are those that choosing and saying need, no more."""
+    tables, nulls, count = [], [], told["blocks"]
+    for joint in told["joints"]:
+        table = Table(
+            plain(np.zeros(count), []), {name: [] for name in joint["felt"]}, np.arange(count)
+        )
+        for row in joint["subsets"]:
+            sizes = {name: np.array(size) for name, size in row["sizes"].items()}
+            gain = np.array(row["gain"]) if "null" in row else np.full(count, row["gain"] / count)
+            table.scored[frozenset(row["effects"])] = Scored(gain, sizes)
+        tables.append(table)
+        nulls.append(
+            {frozenset(row["effects"]): row["null"] for row in joint["subsets"] if "null" in row}
+        )
+
+    def price(j: int, subset: Subset) -> float:
+        return prices.joint * len(subset - shared(kinds)) + prices.reference * nulls[j].get(
+            subset, 0.0
+        )
+
+    chosen = chosen_of(tables, price, prices, kinds)
+    by_name = {kind.name: kind for kind in kinds}
+    others = []
+    for one in told["others"]:
+        mask, was = np.array(one["joints"]), told["prices"]
+        more = (was["joint"] - prices.joint) * (
+            1 if by_name[one["effect"]].target.stochastic else mask.sum()
+        )
+        worth = one["worth"] + more + was["name"] - prices.name
+        if worth > 0:
+            others.append(
+                Found(by_name[one["effect"]], mask, {}, worth, one["gain"], 0.0, one["rivals"])
+            )
+    evidence = cast(Evidence, SimpleNamespace(z=np.zeros((len(tables), told["entries"]))))
+    left, left_null, scatter, strays = (
+        np.array(told[name]) for name in ("left", "left_null", "scatter", "strays")
+    )
+    rays = {name: [] for joint in told["joints"] for name in joint["felt"]}
+    return Findings(
+        evidence,
+        tables,
+        rays,
+        price,
+        chosen,
+        None,
+        others,
+        left,
+        left_null,
+        scatter,
+        strays,
+        told["tool_left"],
+    )
+
+
+def chosen_of(tables: Sequence[Table], price: Any, prices: Prices, kinds: Sequence[Kind]) -> Chosen:
+    """Returns the set that is worth most at these prices."""
+    return choose(
+        tables, price, prices.name, prices.share, shared(kinds), prices.partial, prices.joint
+    )
+
 
 SAME = 0.9
 """An effect that earns so much of what another earns in its place cannot be told from it."""
@@ -129,16 +233,16 @@ def named_signs(
     whole = sum(table.score(subset).total for table, subset in places)
     size = max(float(np.abs(table.score(subset).sizes[name]).max()) for table, subset in places)
     adds = own_gain(findings, name) / max(whole, 1e-9)
-    outside = certainty.odds(weights.outside, certainty.outside(findings))
-    return certainty.right(
+    outside = calibration.odds(weights.outside, calibration.outside(findings))
+    return calibration.right(
         margin(findings, prices, name, swaps, like), adds, size, len(findings.names), outside
     )
 
 
 def other_signs(findings: Findings, weights: Certainty, found: Found) -> dict[str, float]:
     """Returns the same of an effect that sensors, frames or tool points show."""
-    outside = certainty.odds(weights.outside, certainty.outside(findings))
-    return certainty.right(found.worth, 1.0, 1.0, len(findings.names), outside)
+    outside = calibration.odds(weights.outside, calibration.outside(findings))
+    return calibration.right(found.worth, 1.0, 1.0, len(findings.names), outside)
 
 
 def none_signs(findings: Findings, prices: Prices, weights: Certainty) -> dict[str, float]:
@@ -146,7 +250,9 @@ def none_signs(findings: Findings, prices: Prices, weights: Certainty) -> dict[s
     nearest = max(
         (_alone(findings, prices, name)[0] for name in findings.rays), default=-prices.name
     )
-    return certainty.none(nearest, certainty.odds(weights.outside, certainty.outside(findings)))
+    return calibration.none(
+        nearest, calibration.odds(weights.outside, calibration.outside(findings))
+    )
 
 
 def numbers(
@@ -164,7 +270,7 @@ def numbers(
         for name in (ray.name,) if ray.name else kind.fitted:
             number, unit = kind.numbers[name], kind.size(name)
             for j in np.flatnonzero(mask):
-                ends = number.none + unit * certainty.widened(
+                ends = number.none + unit * calibration.widened(
                     size[j] + np.array([-1.96, 0.0, 1.96]) * deviation[j], form
                 )
                 low, mean, high = (float(v) for v in np.sort(np.clip(ends, *number.bounds)))
@@ -190,14 +296,14 @@ def chosen_kinds(findings: Findings, kinds: Mapping[str, Kind]) -> list[Kind]:
 def unexplained(findings: Findings) -> np.ndarray:
     """Returns which joints have something left, `(J,)` bool: predicted by a flexible model, or scattered too much."""
     late = any(one.kind.stage == "timing" for one in findings.others)
-    return (certainty.predicted(findings).max(0) > LEFT) | (
+    return (calibration.predicted(findings).max(0) > LEFT) | (
         (findings.scatter > SCATTERED) & (not late)
     )
 
 
 def unknown_chance(findings: Findings, prices: Prices, weights: Certainty) -> float:
     """Returns the probability that the cause lies outside the library."""
-    found = certainty.chance(weights.outside, certainty.outside(findings))
+    found = calibration.chance(weights.outside, calibration.outside(findings))
     seen = any(one.kind.stage in ("kinematics", "sensing") for one in findings.others)
     return max(found, TOLD) if findings.tool_left > prices.tool and not seen else found
 
@@ -205,7 +311,7 @@ def unknown_chance(findings: Findings, prices: Prices, weights: Certainty) -> fl
 def named_chances(findings: Findings, prices: Prices, weights: Certainty) -> dict[str, float]:
     """Returns the probability of each effect that was found."""
     found = {
-        one.kind.name: certainty.chance(weights.right, other_signs(findings, weights, one))
+        one.kind.name: calibration.chance(weights.right, other_signs(findings, weights, one))
         for one in findings.others
     }
     for name in findings.chosen.names:
@@ -213,7 +319,7 @@ def named_chances(findings: Findings, prices: Prices, weights: Certainty) -> dic
         signs = named_signs(
             findings, prices, weights, name, swaps, same_as(swaps, own_gain(findings, name))
         )
-        found[name] = certainty.chance(weights.right, signs)
+        found[name] = calibration.chance(weights.right, signs)
     return found
 
 
@@ -229,7 +335,7 @@ def is_unknown(findings: Findings, prices: Prices, weights: Certainty) -> bool:
     chances, least = list(named.values()), SAID
     if not chances:
         chances, least = (
-            [certainty.chance(weights.none, none_signs(findings, prices, weights))],
+            [calibration.chance(weights.none, none_signs(findings, prices, weights))],
             0.5,
         )
     return unknown_chance(findings, prices, weights) > min(least, max(chances))
@@ -284,7 +390,7 @@ def other(findings: Findings, found: Found, weights: Certainty, machine: Machine
         joints=tuple(
             name for name, has in zip(machine.joint_names, found.joints, strict=True) if has
         ),
-        probability=certainty.chance(weights.right, other_signs(findings, weights, found)),
+        probability=calibration.chance(weights.right, other_signs(findings, weights, found)),
         parameters=parameters,
         gap_closed=Estimate(found.closed, (found.closed, found.closed)),
         same_as=like,
@@ -293,7 +399,7 @@ def other(findings: Findings, found: Found, weights: Certainty, machine: Machine
 
 def _widened(one: Estimate, none: float, form: float) -> Estimate:
     low, value, high = (
-        certainty.widened(np.array([one.ci95[0], one.mean, one.ci95[1]]) - none, form) + none
+        calibration.widened(np.array([one.ci95[0], one.mean, one.ci95[1]]) - none, form) + none
     )
     return Estimate(float(value), (float(low), float(high)))
 
@@ -318,7 +424,7 @@ def ranking(
             joints = tuple(machine.joint_names[j] for j in places)
             named[name] = Ranked(name, joints, min(float(1.0 / (1.0 + np.exp(-odds))), most))
     chances = [one.probability for one in selected]
-    nothing = certainty.chance(weights.none, none_signs(findings, prices, weights))
+    nothing = calibration.chance(weights.none, none_signs(findings, prices, weights))
     least = 1.0 - max([*chances, unknown if unknown > 0.5 else 0.0])
     none = min(nothing, least, most if is_told else 1.0)
     rows = [*named.values(), Ranked("none", (), none), Ranked("unknown", (), unknown)]

@@ -1,7 +1,11 @@
-"""Errors of a simulator on some recordings, and what effects would change about them, divided by the simulator's own noise.
+"""Errors of a simulator on recordings, divided by the standard deviation that they have anyway.
 
-Axes: `C` candidates, `W` windows, `I` increments in a window, `J` joints, `E` entries (increments
-of all windows, `W` times `I`).
+Errors are compared as increments over `SPAN` samples. Their covariance has three parts: the sensor's
+(each increment by itself), one at changes of speed, and a speed that wanders by a few percent over
+some seconds. Whitening divides by the root of that covariance, so that all increments count alike
+and independently: a wandering speed is then no evidence for another gain.
+Axes: `C` candidates, `W` windows, `I` increments in a window, `J` joints, `B` blocks of `S`
+increments in a row, `E` entries (increments of all windows, `W` times `I`).
 """
 
 from __future__ import annotations
@@ -14,10 +18,109 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.optimize import minimize
 
-from diagnosis.candidates import Candidates
-from diagnosis.library import Kind
-from diagnosis.noise import LONGEST, Noise, increments
+from diagnosis.effect_library import Candidates, Kind
+
+SPAN = 5
+"""Samples in an increment: a quarter of a second at 20 Hz."""
+FREEDOM = 5.0
+"""Degrees of freedom of the t distribution that whitened errors are taken to have."""
+LONGEST = 80
+"""Increments in a block."""
+STILL = 0.1
+"""Smallest typical error, over the root of the mean square."""
+
+
+def to_increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Returns the ways in `SPAN` samples each of positions `(…, W, K, J)` that begin at `start` `(W, J)`: `(…, W, I, J)`."""
+    count = paths.shape[-2] // SPAN
+    ends = paths[..., SPAN - 1 : count * SPAN : SPAN, :]
+    first = np.broadcast_to(start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
+    return np.diff(ends, axis=-2, prepend=first)
+
+
+def robust_loss(z: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Returns the negative log likelihood of whitened errors, up to a constant, summed."""
+    return 0.5 * (FREEDOM + 1.0) * np.log1p(np.square(z) / FREEDOM).sum(axis)
+
+
+def robust_weight(z: np.ndarray) -> np.ndarray:
+    """Returns the weights that turn squares of `z` into `loss` (iteratively reweighted least squares)."""
+    return (FREEDOM + 1.0) / (FREEDOM + np.square(z))
+
+
+@dataclass(frozen=True)
+class ErrorCovariance:
+    """Covariance of the increments of one joint's error, as a function of the simulated motion.
+
+    Attributes:
+        sensor: Standard deviation of each increment, rad or m.
+        change: The same over the change of speed between neighbouring increments.
+        wander: Relative standard deviation of the speed.
+        memory: Increments over which a wandering speed forgets.
+        reading: Standard deviation of each position as it is read, rad or m: what one increment
+            gains the next one loses.
+    """
+
+    sensor: float
+    change: float
+    wander: float
+    memory: float
+    reading: float = 0.0
+
+    def covariance(self, way: np.ndarray) -> np.ndarray:
+        """Returns the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `way` `(B, S)`."""
+        lag = np.abs(np.subtract.outer(np.arange(way.shape[1]), np.arange(way.shape[1])))
+        kept = np.exp(-lag / self.memory)
+        turn = np.abs(np.diff(way, axis=1, prepend=way[:, :1])) + np.abs(
+            np.diff(way, axis=1, append=way[:, -1:])
+        )
+        single = self.sensor**2 + (self.change * turn) ** 2
+        read = self.reading**2 * np.clip(2.0 - 3.0 * lag, -1.0, 2.0) * (lag <= 1)
+        return (
+            self.wander**2 * way[:, :, None] * way[:, None, :] * kept
+            + single[:, :, None] * np.eye(way.shape[1])
+            + read
+        )
+
+    def strayed(self, way: np.ndarray) -> np.ndarray:
+        """Returns the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
+        return np.diagonal(self.covariance(way).cumsum(1).cumsum(2), axis1=1, axis2=2)
+
+    def whitener(self, way: np.ndarray) -> np.ndarray:
+        """Returns the inverse Cholesky factors of the covariance, `(B, S, S)`."""
+        return np.linalg.inv(np.linalg.cholesky(self.covariance(way)))
+
+
+def fit_noise(error: np.ndarray, way: np.ndarray) -> ErrorCovariance:
+    """Returns the noise of one joint: maximum likelihood on errors and simulated increments, `(W, I)`, with outliers cut."""
+    # a joint that stands still most of the time, read by a coarse sensor, has a median error of 0
+    typical = max(1.4826 * np.median(np.abs(error)), STILL * np.sqrt(np.mean(error**2))) + 1e-9
+    size = np.sqrt(np.mean(way**2)) + 1e-9
+    error = np.clip(error, -12.0 * typical - 0.3 * np.abs(way), 12.0 * typical + 0.3 * np.abs(way))
+
+    def minus_log(x: np.ndarray) -> float:
+        noise = ErrorCovariance(*np.exp(x))
+        factor = np.linalg.cholesky(noise.covariance(way) + 1e-18 * np.eye(way.shape[1]))
+        z = np.linalg.solve(factor, error[..., None])[..., 0]
+        log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
+        return float(robust_loss(z) + log_size + 0.02 * np.square(x[3] - np.log(10.0)) * 10)
+
+    start = np.log([typical, 0.05, max(0.01, 0.5 * np.sqrt(np.mean(error**2)) / size), 10.0])
+    low, high = (
+        np.log([typical / 10, 1e-4, 1e-4, 1.0]),
+        np.log([10 * typical + 1e-6, 1.0, 0.5, 200.0]),
+    )
+    found = minimize(
+        minus_log,
+        start,
+        method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": 40},
+    )
+    return ErrorCovariance(*np.exp(found.x))
+
 
 GRID = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
 """Sizes, over the typical one, at which an effect is simulated; in between its doing is
@@ -105,7 +208,7 @@ class Evidence:
     """
 
     candidates: Candidates
-    noise: Sequence[Noise] | None
+    noise: Sequence[ErrorCovariance] | None
     claims: np.ndarray
     mean: np.ndarray | None = None
     bias: np.ndarray | None = None
@@ -126,7 +229,7 @@ class Evidence:
     @cached_property
     def way(self) -> np.ndarray:
         """Increments that the simulator makes, `(W, I, J)`."""
-        return increments(self.base, self.start)
+        return to_increments(self.base, self.start)
 
     @cached_property
     def error(self) -> np.ndarray:
@@ -136,11 +239,11 @@ class Evidence:
     def error_of(self, paths: np.ndarray) -> np.ndarray:
         """Returns measured less simulated increments, `(…, W, I, J)`, of free runs `(…, W, K, J)`."""
         still = np.zeros_like(self.start)
-        known = 0.0 if self.mean is None else increments(self.mean, still)
+        known = 0.0 if self.mean is None else to_increments(self.mean, still)
         known = known if self.bias is None else known + self.bias
         return (
-            increments(self.candidates.cut.measured, self.start)
-            - increments(paths, self.start)
+            to_increments(self.candidates.cut.measured, self.start)
+            - to_increments(paths, self.start)
             - known
         )
 
@@ -239,7 +342,7 @@ class Evidence:
         for name, value in (getattr(model, "parameters", None) or {}).items():
             by = FAULT_S if name.endswith("_s") else FAULT
             moved = (
-                increments(candidates.paths([], 1, {name: value.numpy() + by})[0], self.start)
+                to_increments(candidates.paths([], 1, {name: value.numpy() + by})[0], self.start)
                 - self.way
             )
             found.append(self.whitened(moved[None]))
@@ -247,7 +350,7 @@ class Evidence:
         lines = lines if self.widths is None else lines * self.widths[:, None]
         if self.mean is None:
             return lines
-        known = increments(self.mean, np.zeros_like(self.start))
+        known = to_increments(self.mean, np.zeros_like(self.start))
         return np.concatenate([lines, self.whitened(UNSURE * known[None])], 1)
 
     def response(self, ray: Ray) -> np.ndarray:
@@ -258,5 +361,5 @@ class Evidence:
             [(ray.kind, ray.values(np.repeat(sizes[:, None], joints, 1)))], len(sizes)
         )
         changed = np.zeros((len(ray.sizes), *self.way.shape))
-        changed[ray.sizes != 0.0] = increments(paths, self.start) - self.way
+        changed[ray.sizes != 0.0] = to_increments(paths, self.start) - self.way
         return self.whitened(changed)

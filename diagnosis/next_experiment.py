@@ -18,9 +18,8 @@ from brokk_rl.contracts.actuator import Actuator, Excitation
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from diagnosis.answer import NextExperiment
-from diagnosis.candidates import Candidates, Values
-from diagnosis.library import Kind
-from diagnosis.noise import LONGEST, Noise, increments
+from diagnosis.effect_library import Candidates, Kind, Values
+from diagnosis.residuals import LONGEST, ErrorCovariance, to_increments
 
 SECONDS = 30.0
 ENOUGH = 8.0
@@ -40,7 +39,7 @@ class Rival:
 
 def best(
     actuator: Actuator,
-    noises: Sequence[Noise],
+    noises: Sequence[ErrorCovariance],
     rivals: Sequence[Rival],
     excitations: Mapping[str, Excitation],
     machine: Machine,
@@ -78,14 +77,14 @@ def best(
 
 
 def _apart(
-    candidates: Candidates, noises: Sequence[Noise], rivals: Sequence[Rival]
+    candidates: Candidates, noises: Sequence[ErrorCovariance], rivals: Sequence[Rival]
 ) -> dict[tuple[str, str], np.ndarray]:
     """Returns the expected difference in log likelihood of each pair of rivals in each window, `(W,)`."""
     cut = candidates.cut
     at, count = cut.q[:, cut.num_before - 1], len(cut.q)
-    base = increments(candidates.paths([])[0], at)
+    base = to_increments(candidates.paths([])[0], at)
     ways = {
-        rival.kind.name: increments(candidates.paths([(rival.kind, rival.values)])[0], at)
+        rival.kind.name: to_increments(candidates.paths([(rival.kind, rival.values)])[0], at)
         for rival in rivals
     }
     found = {pair: np.zeros(count) for pair in combinations(ways, 2)}

@@ -1,26 +1,30 @@
-"""The whole way from a case to an outcome."""
+"""The whole way from a case to an outcome, and `effects.yaml` for a training on the machine as it is."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from brokk_rl.contracts.actuator import Excitation
+from brokk_rl.errors import StorageError
 from brokk_rl.inspection import Thresholds
-from diagnosis import certainty, engine, separation, verdict, weighing
+from brokk_rl.session import write_text
+from diagnosis import calibration, decision, detection, next_experiment
 from diagnosis.answer import Answer, Estimate, NextExperiment, Outcome, Ranked, Selected, Where
+from diagnosis.baseline import Base
+from diagnosis.calibration import Certainty
 from diagnosis.case import Case
-from diagnosis.certainty import Certainty
-from diagnosis.engine import Findings, Prices, Tell
+from diagnosis.detection import Findings, Prices, Tell
+from diagnosis.effect_library import Kind
 from diagnosis.free_runs import FreeRuns
-from diagnosis.library import Kind
-from diagnosis.reach import Reach, apart
-from diagnosis.remainder import CLUES
-from diagnosis.repair import Repair
-from diagnosis.simulator import Base
+from diagnosis.gap import Reach, apart
+from diagnosis.refine import Repair
+from diagnosis.residual_model import CLUES
 from diagnosis.stages import survey_gap
 
 NEAR = 0.6
@@ -55,7 +59,7 @@ class Diagnosis:
     base: Base
     kinds: Sequence[Kind]
     prices: Prices
-    certainty: Certainty
+    calibration: Certainty
     thresholds: Thresholds
     excitations: Mapping[str, Excitation]
     generator: np.random.Generator
@@ -64,15 +68,15 @@ class Diagnosis:
         """Returns the outcome; `tell` is told what is being done and how much of the whole is done."""
         if doubts := self.case.doubts():
             return self._cannot_tell("; ".join(doubts))
-        search = engine.Search(self.case, self.base, self.kinds, self.prices, tell)
+        search = detection.Search(self.case, self.base, self.kinds, self.prices, tell)
         return self._outcome(search.run())
 
     def _outcome(self, findings: Findings) -> Outcome:
-        weighed = weighing.weighed(findings, self.prices)
-        findings = verdict.likely(findings, self.prices, self.certainty)
+        weighed = decision.record_weights(findings, self.prices)
+        findings = decision.likely(findings, self.prices, self.certainty)
         field, evidence = self.base.field, findings.evidence
         before, floor = field.runs(field.evidence.base), self._floor()
-        unknown = verdict.is_unknown(findings, self.prices, self.certainty)
+        unknown = decision.is_unknown(findings, self.prices, self.certainty)
         repaired = None if unknown else findings.repair
         found = [] if unknown else findings.others
         mean = 0.0 if evidence.mean is None else evidence.mean
@@ -84,7 +88,7 @@ class Diagnosis:
         )
         foretold = reach.foretold()
         selected = [
-            verdict.other(findings, one, self.certainty, self.case.machine) for one in found
+            decision.other(findings, one, self.certainty, self.case.machine) for one in found
         ]
         selected += self._selected(findings, reach) if repaired else []
         selected.sort(key=lambda one: -one.probability)
@@ -95,12 +99,12 @@ class Diagnosis:
             before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
         )
         remainder = self._remainder(findings, reach) if selected else None
-        chance = verdict.unknown_chance(findings, self.prices, self.certainty)
+        chance = decision.unknown_chance(findings, self.prices, self.certainty)
         answer = Answer(
             verdict=told,
             selected=tuple(selected),
             ranking=tuple(
-                verdict.ranking(findings, selected, self.prices, self.certainty, machine, chance)
+                decision.ranking(findings, selected, self.prices, self.certainty, machine, chance)
             ),
             where=seen.where(),
             gap=reach.gap(),
@@ -115,14 +119,14 @@ class Diagnosis:
 
     def _selected(self, findings: Findings, reach: Reach) -> list[Selected]:
         kinds = {kind.name: kind for kind in self.kinds}
-        chosen = verdict.chosen_kinds(findings, kinds)
+        chosen = decision.chosen_kinds(findings, kinds)
         shares = reach.by_effect(findings, [kind.name for kind in chosen])
         assert findings.repair is not None, "what is selected has been simulated"
         found = []
         for kind in chosen:
-            swaps = verdict.rivals(findings, kind.name)
-            like = verdict.same_as(swaps, verdict.own_gain(findings, kind.name))
-            signs = verdict.named_signs(
+            swaps = decision.rivals(findings, kind.name)
+            like = decision.same_as(swaps, decision.own_gain(findings, kind.name))
+            signs = decision.named_signs(
                 findings, self.prices, self.certainty, kind.name, swaps, like
             )
             joints = findings.repair.joints_of(kind)
@@ -138,8 +142,8 @@ class Diagnosis:
                         for name, has in zip(self.case.machine.joint_names, joints, strict=True)
                         if has
                     ),
-                    probability=certainty.chance(self.certainty.right, signs),
-                    parameters=verdict.numbers(
+                    probability=calibration.chance(self.certainty.right, signs),
+                    parameters=decision.numbers(
                         findings, kind, self.case.machine, self.certainty.form[kind.stage]
                     ),
                     gap_closed=shares[kind.name],
@@ -151,7 +155,7 @@ class Diagnosis:
 
     def _remainder(self, findings: Findings, reach: Reach) -> dict[str, Any] | None:
         """Returns what is left beside the effects that were named and has no name; `None` where that is nothing."""
-        predictable = verdict.unexplained(findings)
+        predictable = decision.unexplained(findings)
         names = self.case.machine.joint_names
         beyond = reach.beyond()
         joints = [
@@ -178,28 +182,28 @@ class Diagnosis:
             swaps = (
                 []
                 if one.effect not in findings.chosen.names
-                else verdict.rivals(findings, one.effect)
+                else decision.rivals(findings, one.effect)
             )
             near = {swap.name: max(0.0, swap.share) for swap in swaps[:3] if swap.share > NEAR}
             if near and (undecided is None or one is undecided):
                 rivals = [
-                    separation.Rival(
+                    next_experiment.Rival(
                         kinds[one.effect],
-                        verdict.values(findings, one.effect, one.effect),
+                        decision.values(findings, one.effect, one.effect),
                         one.probability,
                     )
                 ]
                 rivals += [
-                    separation.Rival(
+                    next_experiment.Rival(
                         kinds[name],
-                        verdict.values(findings, one.effect, name),
+                        decision.values(findings, one.effect, name),
                         share * one.probability,
                     )
                     for name, share in near.items()
                 ]
                 break
         noises = self.base.field.evidence.noise or []
-        found = separation.best(
+        found = next_experiment.best(
             self.base.actuator, noises, rivals, self.excitations, self.case.machine, self.generator
         )
         if found is None and undecided and undecided.decided_by:
@@ -292,13 +296,13 @@ class Diagnosis:
                 f"; an unknown remainder on {', '.join(remainder['joints'])}" if remainder else ""
             )
         if told == "unknown":
-            joints = np.flatnonzero(verdict.unexplained(findings))
+            joints = np.flatnonzero(decision.unexplained(findings))
             where = ", ".join(self.case.machine.joint_names[j] for j in joints) or "some joints"
-            best = certainty.predicted(findings).max(1)
+            best = calibration.predicted(findings).max(1)
             clues = [
                 clue
                 for clue, earned in zip(CLUES, best, strict=True)
-                if earned > max(verdict.LEFT, 0.5 * best.max())
+                if earned > max(decision.LEFT, 0.5 * best.max())
             ]
             if not clues:
                 return f"the gap of {where} is real, and no effect of the library explains it"
@@ -316,3 +320,51 @@ class Diagnosis:
             next_experiment=None, reason=f"cannot tell, because {why}",
         )  # fmt: skip
         return Outcome(answer, runs, None, floor)
+
+
+EFFECTS_FILE = "effects.yaml"
+
+
+def write_effects(answer: Answer, kinds: Sequence[Kind], path: Path) -> None:
+    """Writes the selected effects, the one nearest to the machine first; a note alone where nothing was selected.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    by_name = {kind.name: kind for kind in kinds}
+    chosen = sorted(answer.selected, key=lambda one: by_name[one.effect].order)
+    lines = [
+        "# @package effect",
+        f"# {answer.verdict}: {answer.reason}",
+        "# taken by effect=@<this file>",
+    ]
+    text = (
+        yaml.safe_dump(
+            {one.effect: _node(one, by_name[one.effect]) for one in chosen}, sort_keys=False
+        )
+        if chosen
+        else ""
+    )
+    try:
+        write_text(path, "\n".join(lines) + "\n" + text)
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _node(one: Selected, kind: Kind) -> dict:
+    target = kind.target
+    node: dict = {"_target_": f"{target.__module__}.{target.__name__}"}
+    if "joints" in target.__annotations__:
+        node["joints"] = list(one.joints) or "all"
+    for name, number in kind.numbers.items():
+        values = {
+            joint: float(f"{value.mean:.6g}")
+            for joint, value in one.parameters.get(name, {}).items()
+        }
+        if not values:
+            node[name] = number.typical if number.none is None else number.none
+        elif number.per_joint:
+            node[name] = values | {"other": number.typical if number.none is None else number.none}
+        else:
+            node[name] = next(iter(values.values()))
+    return node

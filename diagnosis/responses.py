@@ -1,22 +1,21 @@
-"""Which sizes of some effects explain a joint's errors best, and how much more likely that makes the recordings.
+"""Responses of the whitened residuals to effects, and the sizes that explain the residuals best.
 
-What a set of effects earns is the logarithm of its Bayes factor against the simulator alone, by
-Laplace's approximation: the likelihood at the best sizes, less what large sizes and large faults of
-the simulator are unlikely, less the price of fitting them.
-
-What an effect does at a size is interpolated between the sizes at which it was simulated, and
-effects are added up: both are near enough for choosing, and what is chosen is simulated again.
-Axes: `E` entries (whitened increments), `S` sizes of a ray.
+The score of a set of effects is the logarithm of its Bayes factor against the simulator alone, by
+Laplace's approximation: the likelihood at the best sizes, less the priors of sizes and of faults of
+the simulator, less Occam's factor. The response at a size is interpolated between simulated sizes,
+and effects are added up. Both are near enough to choose by; the chosen set is simulated again.
+Axes: `E` entries (whitened increments), `S` sizes of a growth path, `J` joints.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.noise import FREEDOM, loss, weight
+from diagnosis.effect_library import Kind, shared
+from diagnosis.residuals import FREEDOM, GRID, Evidence, Ray, rays, robust_loss, robust_weight
 
 PARTS = (0.25, 0.5, 0.75)
 """Of the way between two simulated sizes: a fit also begins there."""
@@ -104,7 +103,7 @@ def fitted(
     now, damping = total(left, size), 1e-3
     for _ in range(STEPS):
         slope = _slopes(shapes, lines, size)
-        weighted = slope * (weight(left) * used)
+        weighted = slope * (robust_weight(left) * used)
         normal, gradient = (
             weighted @ slope.T + np.diag(precision),
             weighted @ left - precision * size,
@@ -170,7 +169,7 @@ def plain(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray) -> Plain:
     lines = np.reshape(np.asarray(faults, dtype=float), (-1, len(z)))
     whole = fitted(z, [], faults=lines)
     left = z - whole @ lines
-    return Plain(z, lines, loss(left[:, None], axis=1), _price(left, [], lines, whole))
+    return Plain(z, lines, robust_loss(left[:, None], axis=1), _price(left, [], lines, whole))
 
 
 def earned(
@@ -188,14 +187,14 @@ def earned(
         - (predicted(shapes, whole[:count]) if shapes else 0.0)
     )
     saved = joint.price - _price(left, shapes, joint.faults, whole)
-    return joint.loss - loss(left[:, None], axis=1) + saved / len(left), whole[:count]
+    return joint.loss - robust_loss(left[:, None], axis=1) + saved / len(left), whole[:count]
 
 
 def _price(left: np.ndarray, shapes: Sequence[Shape], lines: np.ndarray, size: np.ndarray) -> float:
     """Returns the loss of sizes and faults under their priors, and Occam's factor: how much narrower the recordings make them."""
     slope = _slopes(shapes, lines, size)
     precision = np.concatenate([np.full(len(shapes), PRIOR**-2.0), np.ones(len(lines))])
-    told = (slope * weight(left)) @ slope.T / precision + np.eye(len(size))
+    told = (slope * robust_weight(left)) @ slope.T / precision + np.eye(len(size))
     return 0.5 * float(precision @ np.square(size)) + 0.5 * float(np.linalg.slogdet(told)[1])
 
 
@@ -209,3 +208,86 @@ def crossed(z: np.ndarray, shapes: Sequence[Shape], fold: np.ndarray) -> np.ndar
                 other
             ]
     return change
+
+
+SHAPES = (0.35, 0.5, 0.7, 1.4, 2.0)
+"""Values of a number that only shapes an effect that are tried beside the typical one, over it."""
+FINE = tuple(np.geomspace(GRID[0], GRID[-1], 20).round(3).tolist())
+"""Sizes at which an effect is simulated that rings: between those of `GRID` it would be out of
+step, and only a dull one fits."""
+SMALL = GRID[:4]
+"""Sizes at which effects are simulated on the reference: small ones of the field's, as many effects
+begin at a threshold."""
+FELT = 1e-3
+"""An effect that changes errors over the noise by less does nothing to a joint."""
+
+
+def rays_of(kind: Kind, grid: Sequence[float] = GRID) -> list[Ray]:
+    """Returns the ways in which an effect can grow, at sizes as close as it has to be simulated; none beyond those of `grid`."""
+    fine = [size for size in FINE if size <= grid[-1]]
+    return rays(kind, fine if kind.shaping and not shared([kind]) else grid)
+
+
+def add(
+    shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray], evidence: Evidence
+) -> list[Ray]:
+    """Adds the shapes of an effect to the joints that it does something to.
+
+    Numbers that only shape the effect are tried at several values; each joint keeps the best, and
+    the rays remember them.
+    """
+    kind = ways[0].kind
+    trials: list[dict[str, float]] = [{}]
+    if not ways[0].shape:
+        trials += [{number: part} for number in kind.shaping for part in SHAPES]
+    shaped = [
+        [replace(ray, shape=_all(trial, len(shapes))) if trial else ray for ray in ways]
+        for trial in trials
+    ]
+    responses = [[evidence.response(ray) for ray in one] for one in shaped]
+    best = np.zeros(len(shapes), dtype=int)
+    for j, mine in enumerate(shapes):
+        if max(np.abs(response[j]).max() for response in responses[0]) < FELT:
+            continue
+        made = [
+            [Shape(ray.sizes, r[j]) for ray, r in zip(ways, response, strict=True)]
+            for response in responses
+        ]
+        if len(made) > 1:
+            best[j] = int(
+                np.argmin(
+                    [
+                        robust_loss(evidence.z[j] - predicted(one, fitted(evidence.z[j], one)))
+                        for one in made
+                    ]
+                )
+            )
+        mine[name] = made[best[j]]
+    if len(trials) == 1:
+        return list(ways)
+    shape = {
+        number: np.array([trials[b].get(number, 1.0) for b in best]) for number in kind.shaping
+    }
+    return [replace(ray, shape=shape) for ray in ways]
+
+
+def plain_joints(
+    evidence: Evidence, scatter: np.ndarray | None = None, z: np.ndarray | None = None
+) -> list[Plain]:
+    """Returns the errors of each joint with small faults of the simulator, in units of `scatter` times the noise.
+
+    Args:
+        evidence: Errors over the noise.
+        scatter: Mean square error over what the noise says, `(J,)`.
+        z: Errors to explain in place of those of the evidence, `(J, E)`.
+    """
+    by = np.ones(len(evidence.z)) if scatter is None else 1.0 / np.sqrt(scatter)
+    z = evidence.z if z is None else z
+    return [
+        plain(one * part, lines * part)
+        for one, lines, part in zip(z, evidence.faults, by, strict=True)
+    ]
+
+
+def _all(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:
+    return {name: np.full(joints, part) for name, part in trial.items()}
