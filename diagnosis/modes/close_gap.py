@@ -19,10 +19,10 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
 from brokk_rl.modes.train import Train
-from brokk_rl.rl.policy import CONTRACT, Trained
-from brokk_rl.rl.runner import Training
+from brokk_rl.rl.policy import CONTRACT, TrainedPolicy
+from brokk_rl.rl.runner import TrainingConfig
 from brokk_rl.rl.tracking import Tracking
-from brokk_rl.rl.vec_env import Plant
+from brokk_rl.rl.vec_env import ControlLoopConfig
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from diagnosis import retraining
@@ -81,10 +81,10 @@ class CloseGap:
     randomisation: dict[str, Effect]
     stand_in: StandIn
     follower: Follower
-    policy: Trained
+    policy: TrainedPolicy
     panel: dict[str, PolicySpec]
     warm: bool
-    rl: Training
+    rl: TrainingConfig
     tracking: Tracking
     evaluation: Evaluation
     resume: str | None
@@ -117,7 +117,7 @@ class CloseGap:
         folder = self.session.folder
         policies: dict[str, PolicySpec] = {
             retraining.BEFORE: self.policy,
-            retraining.AFTER: Trained(folder=str(self._retrained())),
+            retraining.AFTER: TrainedPolicy(folder=str(self._retrained())),
             **self.panel,
         }
         plants = self._plants()
@@ -141,8 +141,8 @@ class CloseGap:
         _show(found, folder)
         return float(found["achieved"]["mean"])
 
-    def _plants(self) -> dict[str, Plant]:
-        known = Plant(
+    def _plants(self) -> dict[str, ControlLoopConfig]:
+        known = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
             task=self.task,
@@ -158,7 +158,7 @@ class CloseGap:
             ),
         }
 
-    def _training_plant(self) -> Plant:
+    def _training_plant(self) -> ControlLoopConfig:
         known = self._plants()["repaired"]
         return replace(known, effects=self.effect | self.randomisation | self.found)
 
@@ -179,7 +179,7 @@ class CloseGap:
         return place
 
     def _evaluated(
-        self, name: str, plant: Plant, policies: dict[str, PolicySpec]
+        self, name: str, plant: ControlLoopConfig, policies: dict[str, PolicySpec]
     ) -> dict[str, Any]:
         """Returns `evaluation.json` on a plant; one that an interrupted run has written is kept."""
         place = self.session.folder / name
@@ -192,7 +192,7 @@ class CloseGap:
         )[0]
 
 
-def _describe_plant(plant: Plant) -> str:
+def _describe_plant(plant: ControlLoopConfig) -> str:
     return " + ".join([type(plant.actuator).__name__.lower(), *plant.effects])
 
 

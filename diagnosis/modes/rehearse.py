@@ -25,7 +25,7 @@ from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError, list_choices
 from brokk_rl.modes.evaluate import Evaluation
 from brokk_rl.report import Cell, Report, Tone
-from brokk_rl.rl.runner import Training
+from brokk_rl.rl.runner import TrainingConfig
 from brokk_rl.session import RESOLVED, Session, read_record, write_text
 from brokk_rl.spec import spec
 from diagnosis import answer, plots, report, retraining
@@ -296,7 +296,7 @@ class Rehearse:
     session: Session
     sim: Simulator
     task: Task
-    rl: Training
+    rl: TrainingConfig
     evaluation: Evaluation
     withheld: dict[str, Effect]
     stages: dict[str, StoryStage]

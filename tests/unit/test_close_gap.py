@@ -16,8 +16,7 @@ from training import CPU, plant, small, train
 
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.rl.policy import make_actor, write_bundle
-from brokk_rl.rl.warm_start import begin_with
+from brokk_rl.rl.policy import load_initial_weights, make_actor, write_bundle
 from diagnosis import retraining
 
 EPISODES = 200
@@ -132,7 +131,7 @@ def test_training_that_begins_with_a_policy_has_its_network_and_its_own_explorat
     config = training.runner_config()
     loop = plant(machine).build(CPU, 16, 64, 0)
     actor = make_actor(config["actor"], config["obs_groups"], loop)
-    begin_with(actor, str(tmp_path / "old"), machine)
+    load_initial_weights(actor, str(tmp_path / "old"), machine)
     groups = loop.get_observations()
     np.testing.assert_array_equal(actor(groups).detach(), old(groups).detach())
     shipped = option("rl", "ppo").runner["actor"]["distribution_cfg"]["init_std"]
@@ -140,7 +139,7 @@ def test_training_that_begins_with_a_policy_has_its_network_and_its_own_explorat
 
     other = make_actor(config["actor"] | {"hidden_dims": [8]}, config["obs_groups"], loop)
     with pytest.raises(CheckpointError, match="start_from"):
-        begin_with(other, str(tmp_path / "old"), machine)
+        load_initial_weights(other, str(tmp_path / "old"), machine)
 
 
 def test_without_an_effect_there_is_nothing_to_retrain_with(brokk: Callable[..., Done]) -> None:

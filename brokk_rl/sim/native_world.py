@@ -5,48 +5,10 @@ from __future__ import annotations
 import torch
 from mujoco.batch import Batch, SimulationError
 
-from brokk_rl.errors import ConfigError, DeviceError
 from brokk_rl.machine import Machine
-from brokk_rl.sim.drive import Drive
-from brokk_rl.sim.model import compile_model, contact_sensors
-from brokk_rl.sim.scene import Placement, nominal
-from brokk_rl.spec import spec
-
-
-@spec
-class Native:
-    """MuJoCo C on threads: many worlds on the cores of this computer.
-
-    Attributes:
-        num_worlds: Worlds, unless the caller of `build` asks for another number.
-        substeps: Physics steps per control period.
-        num_threads: Threads; 0 takes all cores.
-    """
-
-    num_worlds: int
-    substeps: int
-    num_threads: int
-
-    def check(self) -> None:
-        if self.num_worlds < 1 or self.substeps < 1 or self.num_threads < 0:
-            raise ConfigError(
-                f"sim: expected num_worlds and substeps of 1 or more and num_threads of 0 or more, got {self.num_worlds}, "
-                f"{self.substeps} and {self.num_threads}"
-            )
-
-    def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
-    ) -> NativeWorld:
-        """Returns the worlds; `num_worlds` overrides the number in the config.
-
-        Raises:
-            DeviceError: `device` is not the CPU.
-        """
-        if torch.device(device).type != "cpu":
-            raise DeviceError(
-                f"sim=native runs on the CPU, but device '{device}' was asked for; choose sim=warp, or the CPU"
-            )
-        return NativeWorld(machine, num_worlds or self.num_worlds, self.substeps, self.num_threads)
+from brokk_rl.sim.drive import DriveReferences
+from brokk_rl.sim.model import compile_model, mask_contact_sensors
+from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
 
 class NativeWorld:
@@ -80,18 +42,18 @@ class NativeWorld:
         self._geom_size, self._geom_pos = (
             torch.from_numpy(self._batch.expand(name)) for name in ("geom_size", "geom_pos")
         )
-        self._placement = Placement(self.model, self.device, torch.float64)
-        self._drive = Drive(self.model, machine, num_worlds, self.device, torch.float64)
+        self._placement = ScenePlacement(self.model, self.device, torch.float64)
+        self._drive = DriveReferences(self.model, machine, num_worlds, self.device, torch.float64)
         # touch sensors measure in every substep; recording them all catches a peak between two
         # control steps
         self._recorded = self._batch.rollout(substeps, record=("sensordata",))
         self._sensors = torch.from_numpy(self._recorded["sensordata"])
-        self._is_touch = torch.from_numpy(contact_sensors(self.model))
+        self._is_touch = torch.from_numpy(mask_contact_sensors(self.model))
         self.q = torch.zeros(num_worlds, machine.num_joints)
         self.contact_force_n = torch.zeros(num_worlds)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool)
         home = torch.tensor(machine.home, dtype=torch.float32).expand(num_worlds, -1)
-        self.reset(~self.faults, home, nominal(num_worlds))
+        self.reset(~self.faults, home, make_nominal_scenes(num_worlds))
 
     def step(self, increment: torch.Tensor) -> None:
         """Advances one control period; see `brokk_rl.contracts.world.World`."""

@@ -1,4 +1,4 @@
-"""Capturing a step in a CUDA graph, and compiling it."""
+"""Execution of control steps: CUDA graphs, `torch.compile`, and threads on a CPU."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WARM_UP = 3
 recorded."""
 
 
-def capture(
+def capture_graph(
     step: Callable[[], None], device: torch.device, gradients: bool = False
 ) -> torch.cuda.CUDAGraph:
     """Returns a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses.
@@ -41,7 +41,7 @@ def capture(
 
 
 @contextlib.contextmanager
-def compiling() -> Iterator[None]:
+def report_compile_errors() -> Iterator[None]:
     """Says what to do where `torch.compile` finds nothing to compile with.
 
     Raises:
@@ -54,3 +54,22 @@ def compiling() -> Iterator[None]:
             f"rl.fuse: cannot compile the control step ({str(error).splitlines()[0]}); install a C++ compiler (g++), or give "
             "rl.fuse=false"
         ) from error
+
+
+@contextlib.contextmanager
+def limit_to_one_thread(device: torch.device | str) -> Iterator[None]:
+    """Keeps torch to one thread meanwhile; nothing changes where `device` is a GPU.
+
+    The tensors of a control step are too small to share. Torch's other threads would only wait for
+    the next one, and they wait spinning, on the cores on which the physics runs; where the computer
+    has other work too, all stand still for the slowest.
+    """
+    before = torch.get_num_threads()
+    if torch.device(device).type != "cpu" or before == 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 @spec
-class Measured:
+class MeasuredNoise:
     """Noise of the target by the table of `benchmarks/perception`, and by the calibration of the camera.
 
     Attributes:
@@ -42,7 +42,7 @@ class Measured:
             stays: a camera at rest looks at the same face with the same matcher.
         unmeasured_bias_m: Longest bias where there is no table yet.
         unmeasured_sample_m: Half width of the error of a sample there.
-        filter: As in `tasks.tool_pose.Noise`, like all that follows.
+        filter: As in `tasks.control.ObservationNoise`, like all that follows.
         q_scale: Scale error of all measured positions (±).
         u_scale: Scale error of all recorded commands (±).
     """
@@ -99,11 +99,11 @@ class Measured:
 
     def _laws(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Returns longest bias and half width of a sample as laws `a + b distance^2`, `None` where nothing was measured."""
-        return _laws(self.table, self.perception, self.conditions, self.frame_share)
+        return _fit_laws(self.table, self.perception, self.conditions, self.frame_share)
 
 
 @cache
-def _laws(
+def _fit_laws(
     table: str, perception: str, conditions: tuple[str, ...], frame_share: float
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
     path = next((path for path in (Path(table), ROOT / table) if path.is_file()), None)
@@ -115,7 +115,7 @@ def _laws(
         return None
     rows = [
         row
-        for row in _rows(path)
+        for row in _read_rows(path)
         if row["perception"] == perception and row["condition"] in conditions
     ]
     rows = [row for row in rows if all(row.get(name) is not None for name in FIGURES)]
@@ -135,10 +135,10 @@ def _laws(
             for row in here
         )
         sample.append(frame_share * math.sqrt(3.0) * std_m)
-    return _law(distances, bias), _law(distances, sample)
+    return _fit_law(distances, bias), _fit_law(distances, sample)
 
 
-def _law(distance_m: list[float], size_m: list[float]) -> tuple[float, float]:
+def _fit_law(distance_m: list[float], size_m: list[float]) -> tuple[float, float]:
     """Returns `a` and `b` of `a + b distance^2`, neither below 0, so that no measured point lies above it by much.
 
     Errors of stereo grow with the square of the distance. Relative least squares, since a tenth of
@@ -163,7 +163,7 @@ def _law(distance_m: list[float], size_m: list[float]) -> tuple[float, float]:
     return best
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
+def _read_rows(path: Path) -> list[dict[str, Any]]:
     try:
         told = json.loads(path.read_text())
         return [row for row in told if {"perception", "condition", "distance_m"} <= row.keys()]

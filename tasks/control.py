@@ -12,11 +12,11 @@ import torch
 
 from brokk_rl.machine import mask_exclusive_joints
 from brokk_rl.spec import spec
-from tasks.classical import Guidance
+from tasks.classical import ControllerGuidance
 
 
 @spec
-class Noise:
+class ObservationNoise:
     """What the policy is told is wrong by; drawn anew each episode unless said otherwise.
 
     Attributes:
@@ -48,7 +48,7 @@ class Noise:
 
 
 @spec
-class Switch:
+class PhaseSwitch:
     """When only the exclusive joints move (paper, section III-B).
 
     Attributes:
@@ -67,7 +67,7 @@ class Switch:
     reach_m: tuple[float, float]
     height_m: float
 
-    def positioning(self, guidance: Guidance) -> torch.Tensor:
+    def positioning(self, guidance: ControllerGuidance) -> torch.Tensor:
         """Returns which environments are positioning, `(N,)` bool."""
         near, far = self.reach_m
         distance = guidance.reach_m if self.rule == "planar" else guidance.reach_3d_m
@@ -78,7 +78,7 @@ class Switch:
 
 
 @spec
-class Action:
+class ActionMapping:
     """How the policy's output becomes valve commands.
 
     Attributes:
