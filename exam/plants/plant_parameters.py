@@ -1,4 +1,4 @@
-"""The numbers of one machine of an exam, drawn from a seed: no two are built alike."""
+"""Parameters of one plant, drawn from a seed: no two machines are alike."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from brokk_rl.machine import Machine
 MAKES = ("chambers", "compensated", "throttled")
 """How the power stage of a machine works; see the module of each name."""
 
-Anatomy = dict[str, np.ndarray]
+PlantParameters = dict[str, np.ndarray]
 """Number by name, `(J,)` each."""
 
 RANGES = {
@@ -46,7 +46,7 @@ NUISANCES = {
 """The same for what no tidy model has; all but times scale with the roughness."""
 
 
-def drawn(machine: Machine, seed: int, roughness: float) -> tuple[str, Anatomy]:
+def draw_plant(machine: Machine, seed: int, roughness: float) -> tuple[str, PlantParameters]:
     """Returns make and numbers of the machine with this seed.
 
     Args:
@@ -58,7 +58,7 @@ def drawn(machine: Machine, seed: int, roughness: float) -> tuple[str, Anatomy]:
     make = MAKES[int(generator.integers(len(MAKES)))]
     count = machine.num_joints
 
-    def each(ranges: dict[str, tuple[float, float]]) -> Anatomy:
+    def each(ranges: dict[str, tuple[float, float]]) -> PlantParameters:
         return {name: generator.uniform(low, high, count) for name, (low, high) in ranges.items()}
 
     found = each(RANGES)
@@ -73,18 +73,18 @@ def drawn(machine: Machine, seed: int, roughness: float) -> tuple[str, Anatomy]:
         found[name] = value if name.endswith("_s") else value * roughness
     found["droop"] = np.full(count, found["droop"][0])  # one pump
     found["warm_up"] = np.full(count, found["warm_up"][0])  # one tank
-    found |= {name: np.zeros(count) for name in FAULTLESS}
-    found |= {name: np.full(count, value) for name, value in WHOLE.items()}
+    found |= {name: np.zeros(count) for name in ZERO_WITHOUT_FAULT}
+    found |= {name: np.full(count, value) for name, value in NEUTRAL_WITHOUT_FAULT.items()}
     return make, found
 
 
-TAU_HZ = 2.0 * np.pi
+RAD_PER_CYCLE = 2.0 * np.pi
 """Radians a second for one hertz."""
-FAULTLESS = (
+ZERO_WITHOUT_FAULT = (
     "jitter_s", "loss", "pilot_s", "stroke_s", "leak", "breakaway", "gap_rad", "soft_s", "soft_damping", "drift", "stamp_s",
     "step_rad", "bias_rad", "extra_m", "roll_rad", "pitch_rad", "extra_noise_rad", "stranger",
 )  # fmt: skip
 """Numbers that are 0 in a machine without faults."""
-WHOLE = {"stop": 1.0, "extend": 1.0, "retract": 1.0, "scale": 1.0, "drift_s": 600.0}
+NEUTRAL_WITHOUT_FAULT = {"stop": 1.0, "extend": 1.0, "retract": 1.0, "scale": 1.0, "drift_s": 600.0}
 """Numbers of a machine without faults that are not 0: travel of the spool, port areas, scale of the
 encoder."""

@@ -1,19 +1,19 @@
-"""Ailments outside any library: what a diagnosis can only call unknown.
+"""Faults outside the library, which a diagnosis can only call unknown.
 
-Each has a severity by joint, 1 for a machine that plainly has it and 0 where it has not.
+Each has a severity by joint: 1 for a clear fault, 0 for none.
 
-    warm_delay           commands come later and later as the machine runs
-    stop_delay           stops come later than starts
-    pose_friction        a sector of the travel in which the joint goes slowly
-    bouc_wen             hysteresis of the pilot stage that is no play
-    joystick_curve       an exponent on the command
-    intermittent_sticking   bouts of a second or two in which a joint hardly moves
-    interlock            commands are ignored for some seconds while two certain joints are both
-    wanted fast dial_error           the encoder's disc sits off its centre: an error that comes and
-    goes with the angle end_cushion          the last part of the travel is slow
-    cross_talk           the commands of the others open the valve a little
-    fading               the pump tires after some seconds of work and recovers in pauses
-    flow_boost           above a command a second pump joins
+warm_delay              commands come later and later as the machine runs
+stop_delay              stops come later than starts
+pose_friction           a sector of the travel in which the joint goes slowly
+bouc_wen                hysteresis of the pilot stage that is no play
+joystick_curve          an exponent on the command
+intermittent_sticking   bouts of a second or two in which a joint hardly moves
+interlock               commands are ignored for seconds while certain two joints go fast
+dial_error              the encoder's disc is off centre: a periodic error over the angle
+end_cushion             the last part of the travel is slow
+cross_talk              the commands of the others open the valve a little
+fading                  the pump tires after some seconds of work and recovers in pauses
+flow_boost              above a command a second pump joins
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.anatomy import TAU_HZ
+from exam.plants.plant_parameters import RAD_PER_CYCLE
 
 KINDS = (
     "warm_delay", "stop_delay", "pose_friction", "bouc_wen", "joystick_curve", "intermittent_sticking", "interlock",
@@ -29,7 +29,7 @@ KINDS = (
 )  # fmt: skip
 
 
-class Strangers:
+class OutOfLibraryFaults:
     """All of them at work, each in the runs that have it.
 
     Args:
@@ -112,4 +112,4 @@ class Strangers:
     def shown(self, q: np.ndarray) -> np.ndarray:
         """Returns the angles that the encoders' discs show at `q`, `(N, J)`."""
         size = self._of.get("dial_error")
-        return q if size is None else q + 0.05 * size * np.sin(TAU_HZ * q / 0.7)
+        return q if size is None else q + 0.05 * size * np.sin(RAD_PER_CYCLE * q / 0.7)

@@ -1,4 +1,4 @@
-"""Sitting an exam: each case goes to a process of its own, which finds a copy of the case and nothing else of the exam."""
+"""Answers of a candidate to all cases: one process a case, which sees a copy of that case only."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_json
 from brokk_rl.spec import spec
-from diagnosis.answer import FILE
+from diagnosis.answer import ANSWER_FILE
 
 log = logging.getLogger(__name__)
 
-NOTE = "sitting.json"
+NOTE_FILE = "sitting.json"
 LAST_CHARACTERS = 2000
 
 
@@ -40,7 +40,7 @@ class Candidate(Protocol):
 
 
 @spec
-class Command:
+class CommandCandidate:
     """A program that diagnoses one case, started anew for each, without a way to the labels.
 
     Attributes:
@@ -96,7 +96,7 @@ class Command:
             )
 
 
-def sit(
+def answer_cases(
     candidate: Candidate,
     cases: Sequence[Path],
     folder: Path,
@@ -118,12 +118,16 @@ def sit(
         workers: Cases answered at once.
         advance: Told when a case is done.
     """
-    todo = [case for case in cases if not (folder / case.name / FILE).is_file()]
+    todo = [case for case in cases if not (folder / case.name / ANSWER_FILE).is_file()]
     for _ in range(len(cases) - len(todo)):
         advance()
-    is_alone = workers == 1 or isinstance(candidate, Command)  # a program has processes of its own
+    is_alone = workers == 1 or isinstance(
+        candidate, CommandCandidate
+    )  # a program has processes of its own
     with ThreadPoolExecutor(workers) if is_alone else ProcessPoolExecutor(workers) as pool:
-        pending = [pool.submit(_one, candidate, case, folder / case.name, machine) for case in todo]
+        pending = [
+            pool.submit(_answer_case, candidate, case, folder / case.name, machine) for case in todo
+        ]
         try:
             for done in as_completed(pending):
                 done.result()
@@ -132,10 +136,10 @@ def sit(
             for job in pending:
                 job.cancel()  # those that run are waited for; the rest is for the next time
             raise
-    return sum(not (folder / case.name / FILE).is_file() for case in cases)
+    return sum(not (folder / case.name / ANSWER_FILE).is_file() for case in cases)
 
 
-def _one(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
+def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
     """Answers one case from a copy under a neutral name: no path leads from there to the labels."""
     begun, error = time.monotonic(), None
     with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
@@ -143,8 +147,8 @@ def _one(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
         shutil.copytree(case, copy)
         try:
             candidate.answer(copy, place, machine)
-            if not (place / FILE).is_file():
-                error = f"it left no {FILE}"
+            if not (place / ANSWER_FILE).is_file():
+                error = f"it left no {ANSWER_FILE}"
         except Exception as failure:  # whoever answers may break in any way: that is an answer missed, and no end of the exam
             error = str(failure) or repr(failure)
         seconds = time.monotonic() - begun
@@ -153,18 +157,18 @@ def _one(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
         else:
             out.mkdir(parents=True, exist_ok=True)
             log.warning("case %s: no answer: %s", case.name, error.splitlines()[-1])
-    write_json(out / NOTE, {"seconds": round(seconds, 2), "error": error})
+    write_json(out / NOTE_FILE, {"seconds": round(seconds, 2), "error": error})
 
 
 def is_begun(answer: Path) -> bool:
     """Says whether anybody answered the case, or tried to, whose answer belongs into a folder."""
-    return (answer / NOTE).is_file() or (answer / FILE).is_file()
+    return (answer / NOTE_FILE).is_file() or (answer / ANSWER_FILE).is_file()
 
 
-def seconds(answer: Path) -> float | None:
+def read_seconds(answer: Path) -> float | None:
     """Returns how long the answer in a folder took, `None` where there is none."""
     try:
-        note = json.loads((answer / NOTE).read_text())
+        note = json.loads((answer / NOTE_FILE).read_text())
     except (OSError, ValueError):
         return None
     return None if note["error"] else float(note["seconds"])

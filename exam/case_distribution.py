@@ -1,18 +1,80 @@
-"""Which cases an exam has: kinds, effects, joints and sizes, drawn from a seed."""
+"""Distribution of the cases of an exam: kinds, effects, joints and sizes, drawn from a seed.
+
+`PlantFamily` is the seam to the plants: the configuration puts a family into the exam.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
 
 import numpy as np
 
+from brokk_rl.contracts.link import Link
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from exam.specimen import Ailment
+
+
+@dataclass(frozen=True)
+class UnknownFault:
+    """Something outside the library that a machine has.
+
+    Attributes:
+        kind: Its name in the family.
+        severity: By joint, `(J,)`: 0 not at all, 1 plainly.
+    """
+
+    kind: str
+    severity: np.ndarray
+
+
+@dataclass(frozen=True)
+class PlantRun:
+    """One run of one machine.
+
+    Attributes:
+        seed: The machine: same seed, same machine.
+        roughness: Name of how much of the machine no tidy model has (`mild`, `strong`).
+        chance: Seed of the run's own chance.
+        elapsed_s: Time the machine has run before.
+        faults: Effects it has, by name: parameters in the library's words, `(J,)` each.
+        ailment: What it has besides that no library knows.
+        tracked: Whether its tool point is measured.
+    """
+
+    seed: int
+    roughness: str
+    chance: int
+    elapsed_s: float
+    faults: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    ailment: UnknownFault | None = None
+    tracked: bool = False
+
+
+class PlantFamily(Protocol):
+    """A spec in `conf/exam_plants`: machines of many makes, none of which shares equations with what is examined."""
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that its plants can have."""
+        ...
+
+    @property
+    def ailments(self) -> tuple[str, ...]:
+        """Names of what its plants can have that no library knows."""
+        ...
+
+    def makes(self, machine: Machine, specimens: Sequence[PlantRun]) -> list[str]:
+        """Returns the make of each specimen; those of one make can run side by side."""
+        ...
+
+    def build(self, machine: Machine, specimens: Sequence[PlantRun], run_s: float) -> Link:
+        """Returns a link to specimens of one make, side by side, that runs for `run_s`, with what else is measured as `extra()`."""
+        ...
+
 
 KINDS = ("none", "faint", "one", "several", "outside")
 """No gap; an effect too small to be seen; one effect; two or three; something that no library
@@ -20,7 +82,7 @@ has."""
 
 
 @spec
-class Trouble:
+class EffectDistribution:
     """How an effect is drawn.
 
     Attributes:
@@ -43,7 +105,7 @@ class Trouble:
 
 
 @dataclass(frozen=True)
-class Fault:
+class CaseFault:
     """One effect of a case.
 
     Attributes:
@@ -63,7 +125,7 @@ class Fault:
 
 
 @dataclass(frozen=True)
-class Question:
+class CaseDesign:
     """One case before it is recorded.
 
     Attributes:
@@ -80,15 +142,15 @@ class Question:
     kind: str
     machine_seed: int
     chance: int
-    faults: tuple[Fault, ...] = ()
-    ailment: Ailment | None = None
+    faults: tuple[CaseFault, ...] = ()
+    ailment: UnknownFault | None = None
     size: float | None = None
     tracked: bool = False
     joints: tuple[str, ...] = ()
 
 
 @spec
-class Mix:
+class CaseDistribution:
     """Kinds of cases and how effects are drawn.
 
     Attributes:
@@ -110,7 +172,7 @@ class Mix:
     tracked_share: float
     second_joint: float
     classes: tuple[tuple[str, ...], ...]
-    troubles: dict[str, Trouble]
+    troubles: dict[str, EffectDistribution]
 
     def check(self) -> None:
         if set(self.shares) != set(KINDS) or not math.isclose(
@@ -124,12 +186,12 @@ class Mix:
 
     def questions(
         self, machine: Machine, ailments: Sequence[str], generator: np.random.Generator
-    ) -> list[Question]:
+    ) -> list[CaseDesign]:
         """Returns the cases in random order; each effect, and each ailment, occurs about as often as any other."""
         kinds = [kind for kind, count in self._counts().items() for _ in range(count)]
         effects, strange = (
-            _rounds(list(self.troubles), generator),
-            _rounds(list(ailments), generator),
+            _cycle_shuffled(list(self.troubles), generator),
+            _cycle_shuffled(list(ailments), generator),
         )
         found = []
         for kind in kinds:
@@ -157,14 +219,16 @@ class Mix:
                 chosen = self._some(
                     np.flatnonzero(~machine.is_exclusive), generator
                 )  # much of it shows in company only
-                ailment = Ailment(
+                ailment = UnknownFault(
                     next(strange), size * np.isin(np.arange(machine.num_joints), chosen)
                 )
                 joints = tuple(machine.joint_names[j] for j in chosen)
             tracked = tracked or any(self.troubles[fault.effect].needs_tool for fault in faults)
             machine_seed, chance = generator.integers(2**62, size=2).tolist()
             found.append(
-                Question(kind, machine_seed, chance, tuple(faults), ailment, size, tracked, joints)
+                CaseDesign(
+                    kind, machine_seed, chance, tuple(faults), ailment, size, tracked, joints
+                )
             )
         return [found[i] for i in generator.permutation(len(found))]
 
@@ -199,7 +263,7 @@ class Mix:
         machine: Machine,
         sizes: tuple[float, float],
         generator: np.random.Generator,
-    ) -> Fault:
+    ) -> CaseFault:
         trouble, size = self.troubles[name], float(generator.uniform(*sizes))
         able = np.flatnonzero([joint not in trouble.not_on for joint in machine.joint_names])
         chosen = able if trouble.joints == "all" else self._some(able, generator)
@@ -219,10 +283,12 @@ class Mix:
                 has & (key in drawn), none + sign * size * (typical - none), away
             )
         nothing = {key: trouble.numbers[key][0] for key in drawn}
-        return Fault(name, tuple(machine.joint_names[j] for j in chosen), size, parameters, nothing)
+        return CaseFault(
+            name, tuple(machine.joint_names[j] for j in chosen), size, parameters, nothing
+        )
 
 
-def _rounds(names: list[str], generator: np.random.Generator) -> Iterator[str]:
+def _cycle_shuffled(names: list[str], generator: np.random.Generator) -> Iterator[str]:
     """Yields all names in random order, again and again."""
     while True:
         for i in generator.permutation(len(names)):

@@ -1,8 +1,8 @@
-"""One answer against one label: what was right about it.
+"""Score of one answer against one label.
 
 An answer names an effect rightly, over classes, when it names the true one, one of its class (see
-`Mix.classes`), or has the true one in its `same_as`; strictly, when it names the true one. A case
-whose effect is below the noise counts as one without a gap.
+`CaseDistribution.classes`), or has the true one in its `same_as`; strictly, when it names the true
+one. A case whose effect is below the noise counts as one without a gap.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import Any
 
 from diagnosis.answer import Answer, Selected
 
-QUIET = ("none", "faint")
+QUIET_KINDS = ("none", "faint")
 """Kinds of cases in which nothing can be seen."""
-TO_90 = 1.6449 / 1.9600
+CI90_OVER_CI95 = 1.6449 / 1.9600
 """From half a 95 % interval to half a 90 % interval of a normal distribution."""
 
 
 @dataclass(frozen=True)
-class Number:
+class ParameterScore:
     """A parameter of an effect that was rightly named, on a joint that has it.
 
     Attributes:
@@ -52,7 +52,7 @@ class Claim:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mark:
+class CaseScore:
     """What is right and wrong about one answer.
 
     Attributes:
@@ -91,7 +91,7 @@ class Mark:
     joints_right: tuple[bool, ...]
     unknown: float
     claims: tuple[Claim, ...]
-    numbers: tuple[Number, ...]
+    numbers: tuple[ParameterScore, ...]
     size: float
     moved_rad: float
     closed: float | None
@@ -101,14 +101,14 @@ class Mark:
     outside: str | None
 
 
-def mark(
+def score_answer(
     label: Mapping[str, Any],
     answer: Answer | None,
     classes: Sequence[Sequence[str]],
     of_machine: Sequence[str],
     seconds: float | None = None,
     oracle: float | None = None,
-) -> Mark:
+) -> CaseScore:
     """Returns the mark of `answer`, `None` where there is none.
 
     Args:
@@ -120,30 +120,30 @@ def mark(
         oracle: Share of the gap that the true effects close.
     """
     kind = label["kind"]
-    true = {one["effect"]: one for one in label["effects"]} if kind not in QUIET else {}
+    true = {one["effect"]: one for one in label["effects"]} if kind not in QUIET_KINDS else {}
     chosen = (
         sorted(answer.selected, key=lambda one: -one.probability)
         if answer and answer.verdict == "effects"
         else []
     )
-    pairs = _pairs(list(true), chosen, classes)
+    pairs = _match_effects(list(true), chosen, classes)
     stands_for = {id(one): effect for effect, one in pairs}
     verdict = answer.verdict if answer else "failed"
     top = chosen[0] if chosen else None
-    unknown = _probability(answer, "unknown")
+    unknown = _get_probability(answer, "unknown")
     claims = [Claim(one.probability, id(one) in stands_for) for one in chosen]
     if verdict in ("none", "unknown"):
         claims.append(
             Claim(
-                _probability(answer, verdict),
-                kind in QUIET if verdict == "none" else kind == "outside",
+                _get_probability(answer, verdict),
+                kind in QUIET_KINDS if verdict == "none" else kind == "outside",
             )
         )
     outside = label["outside"]
     sizes = [one["size"] for one in label["effects"]] + ([outside["size"]] if outside else [])
     gap = answer.gap if answer else None
     predicted = answer.more.get("predicted_closed") if answer else None
-    return Mark(
+    return CaseScore(
         case=label["case"],
         kind=kind,
         truth=tuple(true),
@@ -163,7 +163,7 @@ def mark(
             number
             for effect, one in pairs
             if effect == one.effect
-            for number in _numbers(true[effect], one)
+            for number in _score_parameters(true[effect], one)
         ),
         size=max(sizes, default=0.0),
         moved_rad=max(label["moved_rad"].values()),
@@ -175,12 +175,12 @@ def mark(
     )
 
 
-def _pairs(
+def _match_effects(
     true: Sequence[str], chosen: Sequence[Selected], classes: Sequence[Sequence[str]]
 ) -> list[tuple[str, Selected]]:
     """Returns each true effect with the name that stands for it; the true name itself before others of its class."""
     found, left = [], list(chosen)
-    for stands in (_is_it, lambda effect, one: _is_like_it(effect, one, classes)):
+    for stands in (_is_same, lambda effect, one: _is_equivalent(effect, one, classes)):
         for effect in true:
             match = next((one for one in left if stands(effect, one)), None)
             if match is not None and effect not in [other for other, _ in found]:
@@ -189,17 +189,17 @@ def _pairs(
     return found
 
 
-def _is_it(effect: str, one: Selected) -> bool:
+def _is_same(effect: str, one: Selected) -> bool:
     return one.effect == effect
 
 
-def _is_like_it(effect: str, one: Selected, classes: Sequence[Sequence[str]]) -> bool:
+def _is_equivalent(effect: str, one: Selected, classes: Sequence[Sequence[str]]) -> bool:
     return effect in one.same_as or any(
         effect in group and one.effect in group for group in classes
     )
 
 
-def _probability(answer: Answer | None, name: str) -> float:
+def _get_probability(answer: Answer | None, name: str) -> float:
     """Returns the probability of `none` or `unknown`; where it is not ranked, 1 or 0 by the verdict."""
     if answer is None:
         return 0.0
@@ -207,7 +207,7 @@ def _probability(answer: Answer | None, name: str) -> float:
     return ranked[0] if ranked else float(answer.verdict == name)
 
 
-def _numbers(true: Mapping[str, Any], one: Selected) -> list[Number]:
+def _score_parameters(true: Mapping[str, Any], one: Selected) -> list[ParameterScore]:
     """Returns the marks of all parameters of an effect on the joints that have it and are named."""
     found = []
     for name, by_joint in true["parameters"].items():
@@ -226,8 +226,10 @@ def _numbers(true: Mapping[str, Any], one: Selected) -> list[Number]:
                 continue
             estimate, nothing = said[joint], true["nothing"][name]
             size, (low, high) = max(abs(value - nothing), 1e-9), estimate.ci95
-            short, long = (estimate.mean + TO_90 * (end - estimate.mean) for end in (low, high))
-            number = Number(
+            short, long = (
+                estimate.mean + CI90_OVER_CI95 * (end - estimate.mean) for end in (low, high)
+            )
+            number = ParameterScore(
                 effect=one.effect,
                 parameter=name,
                 error=abs(estimate.mean - value) / size,

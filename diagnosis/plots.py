@@ -1,7 +1,7 @@
-"""Pictures of a diagnosis, fit to be printed: the gap, where it lies, measured against simulated, how it grows, who caused it.
+"""Figures of a diagnosis: size of the gap, location, paths, growth, rivals and tip error.
 
-Black is what was measured, orange the simulator as it was, blue with the effects that were found,
-grey the floor.
+Black is the measurement, red the simulator as it was, blue the simulator with the effects, grey the
+floor.
 """
 
 from __future__ import annotations
@@ -16,25 +16,23 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, NullFormatter
 
 from brokk_rl.machine import Machine
-from brokk_rl.plot import BLUE, GREY, RED, clean, legend, panels
+from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_joint_panels, remove_frame
 from brokk_rl.split import COMMANDED
-from diagnosis import wording
-from diagnosis.answer import Answer
+from diagnosis.answer import Answer, Outcome, format_error
+from diagnosis.error_growth import READINGS, compute_rmse_curve
 from diagnosis.free_runs import FreeRuns
-from diagnosis.growth import READINGS, curve
-from diagnosis.outcome import Outcome
-from diagnosis.sanity import name_of
+from diagnosis.sanity import name_recording
 
 BEFORE, AFTER, FLOOR = RED, BLUE, GREY
 HEAT = LinearSegmentedColormap.from_list("heat", ["#ffffff", "#fde3c8", "#f4a36b", RED, "#7a2e00"])
 IDLE = "#c3cbd3"
-SHOWN = 3
+MAX_JOINTS = 3
 """Joints whose paths are drawn."""
-AGES = 16
+NUM_AGES = 16
 """Columns of the picture over time."""
 
 
-def ladder(answer: Answer) -> Figure | None:
+def draw_gap_bars(answer: Answer) -> Figure | None:
     """Draws the error before and after over the floor; `None` where there is none to draw."""
     gap = answer.gap
     if gap is None or not max(gap.before, gap.floor or 0.0):
@@ -57,7 +55,7 @@ def ladder(answer: Answer) -> Figure | None:
     scale = 100.0 if gap.unit == "travel" else 1e3
     for place, (_, width, colour) in enumerate(rows):
         axis.barh(place, scale * width, color=colour, height=0.62)
-        told = wording.size(width, gap.unit)
+        told = format_error(width, gap.unit)
         axis.annotate(told, (scale * width, place), (6, 0), textcoords="offset points", va="center")
     axis.set_yticks(range(len(rows)), [row[0] for row in rows])
     axis.invert_yaxis()
@@ -66,11 +64,11 @@ def ladder(answer: Answer) -> Figure | None:
     axis.set_xlim(0.0, scale * max(width for _, width, _ in rows) * 1.16)
     unit = "% of travel" if gap.unit == "travel" else f"m{gap.unit}"
     axis.set_xlabel(f"error over 5 s free runs, all joints, RMS [{unit}]")
-    clean(axis)
+    remove_frame(axis)
     return figure
 
 
-def heat(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
+def draw_gap_map(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
     """Draws which joint and regime the gap lies in, and how large the error of each joint is over the running time."""
     location = answer.more["location"]
     parts = location["parts"]["regime"]
@@ -79,7 +77,7 @@ def heat(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
         list(dict.fromkeys(part["category"] for part in parts)),
     )
     share = np.array(
-        [[_part(parts, joint, regime)["gap"] for regime in regimes] for joint in joints]
+        [[_find_part(parts, joint, regime)["gap"] for regime in regimes] for joint in joints]
     )
     figure = Figure(figsize=(12.0, 1.5 + 0.52 * len(joints)), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
@@ -88,7 +86,7 @@ def heat(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
     )
     for y, joint in enumerate(joints):
         for x, regime in enumerate(regimes):
-            part = _part(parts, joint, regime)
+            part = _find_part(parts, joint, regime)
             if share[y, x] >= 0.005 or part["is_sure"]:
                 text = f"{100 * share[y, x]:.0f} %" + (" ●" if part["is_sure"] else "")
                 dark = share[y, x] > 0.6 * max(0.3, share.max())
@@ -109,7 +107,7 @@ def heat(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
     )
     left.set_yticks(range(len(joints)), joints)
     left.set_title("part of the gap by joint and regime (● beyond chance)", loc="left", fontsize=10)
-    _over_time(right, before, machine)
+    _draw_error_over_time(right, before, machine)
     for axis in (left, right):
         axis.tick_params(length=0)
         axis.tick_params(which="minor", length=0)
@@ -117,13 +115,13 @@ def heat(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
     return figure
 
 
-def paths(outcome: Outcome, machine: Machine) -> Figure:
+def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
     """Draws measured against simulated positions of the joints with the largest gaps: a whole recording, and the worst windows."""
     before = outcome.before
     error = np.sqrt(np.nanmean(before.error**2, 1))  # (W, J)
     located = outcome.answer.where.joints
     foremost = [-located[name].share if name in located else 0.0 for name in machine.joint_names]
-    shown = np.argsort(foremost, kind="stable")[: min(SHOWN, machine.num_joints)]
+    shown = np.argsort(foremost, kind="stable")[: min(MAX_JOINTS, machine.num_joints)]
     height = 2.6 * len(shown) + 0.6
     figure = Figure(figsize=(12.0, height))
     rows = figure.add_gridspec(
@@ -147,9 +145,9 @@ def paths(outcome: Outcome, machine: Machine) -> Figure:
             grid = rows[line, column].subgridspec(2, 1, height_ratios=[3.2, 1.0], hspace=0.1)
             above = figure.add_subplot(grid[0])
             below = figure.add_subplot(grid[1], sharex=above)
-            _path(above, below, outcome, windows, int(joint), machine)
+            _draw_path(above, below, outcome, windows, int(joint), machine)
             above.set_title(
-                f"{title}: {name_of(before.recordings[int(before.source[windows[0]])])}",
+                f"{title}: {name_recording(before.recordings[int(before.source[windows[0]])])}",
                 fontsize=8.5,
                 loc="left",
             )
@@ -158,20 +156,22 @@ def paths(outcome: Outcome, machine: Machine) -> Figure:
                 below.set_ylabel("u", rotation=0, va="center")
             if line == len(shown) - 1:
                 below.set_xlabel("time [s]")
-    legend(figure, figure.axes[0])
+    add_legend(figure, figure.axes[0])
     return figure
 
 
-def growth(outcome: Outcome, machine: Machine) -> Figure:
+def draw_growth(outcome: Outcome, machine: Machine) -> Figure:
     """Draws the error over the time of a free run, one panel a joint, with what its shape says."""
-    figure, axes = panels(machine, "xy")
+    figure, axes = make_joint_panels(machine, "xy")
     curves = {"before": outcome.before, "after": outcome.after, "floor": outcome.floor}
     t_s = machine.period_s * np.arange(1, outcome.before.simulated.shape[1] + 1)
     told = outcome.answer.more["location"]["growth"]
     for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
         for (name, runs), colour in zip(curves.items(), (BEFORE, AFTER, FLOOR), strict=True):
             if runs is not None:
-                rmse = 100.0 * curve(runs)[:, j] / (machine.upper[j] - machine.lower[j])
+                rmse = (
+                    100.0 * compute_rmse_curve(runs)[:, j] / (machine.upper[j] - machine.lower[j])
+                )
                 axis.plot(
                     t_s[: len(rmse)], np.maximum(rmse, 1e-4), color=colour, lw=1.8, label=name
                 )
@@ -185,14 +185,14 @@ def growth(outcome: Outcome, machine: Machine) -> Figure:
         axis.grid(alpha=0.3)
         reading = READINGS[told[joint.name]["reading"]].split(":")[0]
         axis.set_title(f"{joint.name}: {reading}", loc="left", fontsize=9)
-        clean(axis)
+        remove_frame(axis)
     figure.supxlabel("time of the free run [s]", fontsize=10)
     figure.supylabel("RMSE [% of travel]", fontsize=10)
-    legend(figure, axes[0])
+    add_legend(figure, axes[0])
     return figure
 
 
-def rivals(evidence: Mapping[str, Any]) -> Figure | None:
+def draw_rivals(evidence: Mapping[str, Any]) -> Figure | None:
     """Draws what each rival earned, those that were chosen in blue, and what chance alone earns.
 
     Args:
@@ -228,11 +228,11 @@ def rivals(evidence: Mapping[str, Any]) -> Figure | None:
     axis.set_xlabel(evidence.get("unit", "what it earns on recordings that it was not fitted to"))
     if axis.get_legend_handles_labels()[0]:
         axis.legend(frameon=False, loc="lower right", fontsize=9)
-    clean(axis)
+    remove_frame(axis)
     return figure
 
 
-def waterfall(budget: Mapping[str, Any]) -> Figure:
+def draw_tip_budget(budget: Mapping[str, Any]) -> Figure:
     """Draws how the joints' errors add up to the mean squared error of the tip, and what is left after the effects."""
     before, after, floor = (budget[name] for name in ("before", "after", "floor"))
     parts = sorted(before["joint_part"].items(), key=lambda pair: -pair[1])
@@ -288,15 +288,15 @@ def waterfall(budget: Mapping[str, Any]) -> Figure:
     axis.set_ylim(
         0.0, 1.15 * max(whole, *(one["tip_rms_mm"] for _, one, _ in totals if one is not None))
     )
-    clean(axis)
+    remove_frame(axis)
     return figure
 
 
-def _over_time(axis: Axes, before: FreeRuns, machine: Machine) -> None:
+def _draw_error_over_time(axis: Axes, before: FreeRuns, machine: Machine) -> None:
     """Fills the axis with the error of each joint over running time, in parts of its travel."""
     square = np.nanmean(before.error**2, 1) / (machine.upper - machine.lower) ** 2
     order = np.lexsort((before.row, before.source))
-    groups = np.array_split(order, min(AGES * 2, len(order)))
+    groups = np.array_split(order, min(NUM_AGES * 2, len(order)))
     shade = 100.0 * np.sqrt(np.array([square[group].mean(0) for group in groups]).T)
     image = axis.imshow(shade, cmap=HEAT, vmin=0.0, aspect="auto")
     cuts = [
@@ -307,7 +307,7 @@ def _over_time(axis: Axes, before: FreeRuns, machine: Machine) -> None:
     for place in cuts:
         axis.axvline(place - 0.5, color="black", lw=0.8)
     starts = [0, *cuts]
-    labels = [name_of(before.recordings[int(before.source[groups[i][0]])]) for i in starts]
+    labels = [name_recording(before.recordings[int(before.source[groups[i][0]])]) for i in starts]
     axis.set_xticks(
         starts, labels if len(labels) <= 6 else [""] * len(labels), fontsize=8, ha="left"
     )
@@ -318,7 +318,7 @@ def _over_time(axis: Axes, before: FreeRuns, machine: Machine) -> None:
     axis.figure.colorbar(image, ax=axis, pad=0.01, fraction=0.04).outline.set_visible(False)  # type: ignore[union-attr]
 
 
-def _path(
+def _draw_path(
     above: Axes,
     below: Axes,
     outcome: Outcome,
@@ -373,8 +373,8 @@ def _path(
     if high - low < 0.02 * span:
         above.set_ylim((low + high - 0.02 * span) / 2.0, (low + high + 0.02 * span) / 2.0)
     for axis in (above, below):
-        clean(axis)
+        remove_frame(axis)
 
 
-def _part(parts: Sequence[Mapping[str, Any]], joint: str, category: str) -> Mapping[str, Any]:
+def _find_part(parts: Sequence[Mapping[str, Any]], joint: str, category: str) -> Mapping[str, Any]:
     return next(part for part in parts if part["joint"] == joint and part["category"] == category)

@@ -1,7 +1,8 @@
-"""What an exam showed: one page with the table of all candidates, who is confused with whom, and how far probabilities hold."""
+"""The report of an exam: table of all candidates, confusion, reliability, detection; and the ledger."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,57 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from brokk_rl.report import DPI, MISSING, Cell, Page
-from brokk_rl.session import write_text
+from brokk_rl.errors import StorageError
+from brokk_rl.report import DPI, MISSING, Cell, Report
+from brokk_rl.session import describe_commit, write_text
 
-PAGE = "exam.html"
-TABLE = "exam.md"
+HEADLINES = (
+    "top1", "top1_strictly", "macro_f1", "joints", "exact_set", "set_f1", "false_alarms", "unknown_recall", "unknown_auroc",
+    "ece", "parameter_error", "cover_90", "closed_of_oracle", "predicted_off",
+)  # fmt: skip
+
+
+def append_to_ledger(
+    path: Path, when: str, exam: dict[str, Any], name: str, table: dict[str, Any]
+) -> None:
+    """Appends one candidate's headlines.
+
+    Args:
+        path: The ledger.
+        when: Time, ISO 8601.
+        exam: Seed, whether sealed, roughness, number of cases, hash of the labels.
+        name: The candidate.
+        table: Its figures; see `tally`.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    figures = {key: table[key]["value"] for key in HEADLINES} | {
+        "seconds": table["seconds"]["median"],
+        "sat": table["sat"]["value"],
+        "failed": table["failed"],
+    }
+    line = {
+        "when": when,
+        "commit": describe_commit(),
+        "candidate": name,
+        **exam,
+        **{key: _round_float(value) for key, value in figures.items()},
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+    except OSError as error:
+        raise StorageError(f"cannot append to the ledger {path}: {error.strerror}") from error
+
+
+def _round_float(value: Any) -> Any:
+    return round(value, 4) if isinstance(value, float) else value
+
+
+REPORT_FILE = "exam.html"
+TABLE_FILE = "exam.md"
 ROWS = {
     "top1": ("one effect: named first, over classes", True),
     "top1_strictly": ("one effect: named first, strictly", True),
@@ -38,7 +85,7 @@ ROWS = {
 """Figure, its words, and whether more of it is better."""
 
 
-def rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
+def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
     """Returns the lines of the table of all candidates."""
     found: list[list[str | Cell]] = []
     for key, (words, more_is_better) in ROWS.items():
@@ -63,7 +110,7 @@ def rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
     found.append(
         [
             "seconds a case, median (most)",
-            *(_seconds(table["seconds"]) for table in tables.values()),
+            *(_format_seconds(table["seconds"]) for table in tables.values()),
         ]
     )
     found.append(
@@ -79,10 +126,10 @@ def rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
     return found
 
 
-def markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
+def format_markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
     """Returns the table of all candidates as Markdown, to be pasted where figures stand."""
     lines = [["", *tables], ["---"] * (1 + len(tables))]
-    for words, *cells in rows(tables):
+    for words, *cells in build_rows(tables):
         told = (cell if isinstance(cell, Cell) else Cell(cell) for cell in cells)
         lines.append(
             [
@@ -93,58 +140,60 @@ def markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def write(folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]) -> None:
+def write_report(
+    folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]
+) -> None:
     """Writes `exam.html`, its table `exam.md`, pictures of each candidate: `confusion_<name>.png`, `reliability_…`, `size_…`."""
     first = next(iter(tables.values()))
     kinds = ", ".join(f"{count} {kind}" for kind, count in first["cases"].items() if count)
-    page = Page(
+    page = Report(
         f"Exam of {', '.join(tables)}",
         f"{exam['num_cases']} cases ({kinds}), roughness {exam['roughness']}, seed {exam['seed']}.",
     )
     for name, table in tables.items():
         if table["sat"]["value"] < table["sat"]["of"]:
-            page.text(
+            page.add_text(
                 f"{name} sat {table['sat']['value']} of {table['sat']['of']} cases; the others are left out.",
                 "warn",
             )
     if not exam["sealed"]:
-        page.text(
+        page.add_text(
             "A development seed: its cases may have been looked at while the candidates were made.",
             "warn",
         )
-    page.heading("Marks")
-    page.table(
+    page.add_heading("Marks")
+    page.add_table(
         ["", *tables],
-        rows(tables),
+        build_rows(tables),
         "Rates with 95 % Wilson intervals, other figures with bootstrap intervals over cases",
     )
     for name, table in tables.items():
-        page.heading(name)
+        page.add_heading(name)
         drawings = {
-            "confusion": confusion(table),
-            "reliability": reliability(table),
-            "size": sizes(table),
+            "confusion": draw_confusion(table),
+            "reliability": draw_reliability(table),
+            "size": draw_detection(table),
         }
         for stem, figure in drawings.items():
             if figure is not None:
                 figure.savefig(folder / f"{stem}_{name}.png", dpi=DPI)
-                page.picture(folder / f"{stem}_{name}.png", CAPTIONS[stem])
-        with page.details("By effect, all cases"):
+                page.add_picture(folder / f"{stem}_{name}.png", CAPTIONS[stem])
+        with page.add_details("By effect, all cases"):
             columns = ["right", "wrong", "missed", "precision", "recall", "f1", "parameter_error"]
             lines = [
                 [effect, *(figures[column] for column in columns)]
                 for effect, figures in table["by_effect"].items()
             ]
-            page.table(["effect", *(column.replace("_", " ") for column in columns)], lines)
-        with page.details("What lies outside the library, and what was said"):
+            page.add_table(["effect", *(column.replace("_", " ") for column in columns)], lines)
+        with page.add_details("What lies outside the library, and what was said"):
             said = [
                 [kind, ", ".join(f"{count} {answer}" for answer, count in row.items())]
                 for kind, row in table["outside"].items()
             ]
-            page.table(["outside", "said"], said)
-    page.facts({"labels, SHA-256": exam["labels_sha256"]})
-    page.write(folder / PAGE)
-    write_text(folder / TABLE, markdown(tables))
+            page.add_table(["outside", "said"], said)
+    page.add_facts({"labels, SHA-256": exam["labels_sha256"]})
+    page.write(folder / REPORT_FILE)
+    write_text(folder / TABLE_FILE, format_markdown(tables))
 
 
 CAPTIONS = {
@@ -154,7 +203,7 @@ CAPTIONS = {
 }
 
 
-def confusion(table: Mapping[str, Any]) -> Figure | None:
+def draw_confusion(table: Mapping[str, Any]) -> Figure | None:
     """Draws who is taken for whom."""
     found = table["confusion"]
     if not found:
@@ -191,7 +240,7 @@ def confusion(table: Mapping[str, Any]) -> Figure | None:
     return figure
 
 
-def reliability(table: Mapping[str, Any]) -> Figure | None:
+def draw_reliability(table: Mapping[str, Any]) -> Figure | None:
     """Draws true against stated frequency."""
     bins = table["reliability"]
     if not bins:
@@ -217,7 +266,7 @@ def reliability(table: Mapping[str, Any]) -> Figure | None:
     return figure
 
 
-def sizes(table: Mapping[str, Any]) -> Figure | None:
+def draw_detection(table: Mapping[str, Any]) -> Figure | None:
     """Draws how detection grows with size."""
     if not table["by_size"]:
         return None
@@ -256,7 +305,7 @@ def sizes(table: Mapping[str, Any]) -> Figure | None:
     return figure
 
 
-def _seconds(found: Mapping[str, float | None]) -> Cell:
+def _format_seconds(found: Mapping[str, float | None]) -> Cell:
     if found["median"] is None or found["most"] is None:
         return Cell(MISSING)
     return Cell(f"{found['median']:.0f} ({found['most']:.0f})")

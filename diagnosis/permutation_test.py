@@ -1,8 +1,8 @@
-"""Whether the machine errs more than the simulator's own floor: permutation tests over blocks, with a bound on false discoveries.
+"""Permutation tests of the field's error against the reference's, with a bound on false discoveries.
 
-Samples of one recording hang together, so whole recordings change sides, never samples. Where there
-are too few of them for a small p, recordings are cut into parts of `PART_S`, whose dependence
-(pose, oil) is small against that within a window.
+Samples of one recording are dependent, so whole recordings change sides, never samples. With too
+few recordings for a small p, recordings are cut into parts of `PART_S`; their dependence (pose, oil)
+is small against that within a window.
 Axes: `W` windows, `B` blocks, `C` cells.
 """
 
@@ -16,16 +16,16 @@ from scipy.stats import false_discovery_control
 
 from diagnosis.free_runs import FreeRuns
 
-FEWEST_PERMUTATIONS = 1000
+MIN_PERMUTATIONS = 1000
 """Below so many ways to distribute recordings over two sides, no cell of some forty could be told
 from chance."""
 PART_S = 30.0
-DRAWN = 2000
-FALSE_DISCOVERIES = 0.05
+NUM_PERMUTATIONS = 2000
+FALSE_DISCOVERY_RATE = 0.05
 
 
 @dataclass(frozen=True)
-class Blocks:
+class ExchangeBlocks:
     """Which windows change sides together.
 
     Attributes:
@@ -39,19 +39,19 @@ class Blocks:
     unit: str
 
 
-def blocks(field: FreeRuns, reference: FreeRuns) -> Blocks:
+def assign_blocks(field: FreeRuns, reference: FreeRuns) -> ExchangeBlocks:
     """Returns recordings as blocks, or parts of them where recordings are too few."""
     sides = [np.unique(side.source, return_inverse=True)[1] for side in (field, reference)]
-    few = comb(len(set(sides[0])) + len(set(sides[1])), len(set(sides[0]))) < FEWEST_PERMUTATIONS
+    few = comb(len(set(sides[0])) + len(set(sides[1])), len(set(sides[0]))) < MIN_PERMUTATIONS
     if not few:
-        return Blocks(sides[0], sides[1], "recordings")
-    cut = [parts(side) for side in (field, reference)]
-    return Blocks(
+        return ExchangeBlocks(sides[0], sides[1], "recordings")
+    cut = [number_parts(side) for side in (field, reference)]
+    return ExchangeBlocks(
         cut[0], cut[1], f"parts of recordings of {PART_S:g} s each (whole ones are too few)"
     )
 
 
-def parts(runs: FreeRuns) -> np.ndarray:
+def number_parts(runs: FreeRuns) -> np.ndarray:
     """Returns the number of the part of `PART_S` of a recording that each window lies in, `(W,)`."""
     begin_s = np.array(
         [
@@ -64,14 +64,14 @@ def parts(runs: FreeRuns) -> np.ndarray:
     ].ravel()
 
 
-def summed(values: np.ndarray, block: np.ndarray) -> np.ndarray:
+def sum_by_block(values: np.ndarray, block: np.ndarray) -> np.ndarray:
     """Returns sums over the windows of each block, `(B, …)`, of `values`, `(W, …)`."""
     found = np.zeros((int(block.max()) + 1, *values.shape[1:]))
     np.add.at(found, block, values)
     return found
 
 
-def excess_p(
+def compute_excess_p(
     field: tuple[np.ndarray, np.ndarray],
     reference: tuple[np.ndarray, np.ndarray],
     generator: np.random.Generator,
@@ -89,10 +89,11 @@ def excess_p(
     """
     sums, counts = (np.concatenate(pair) for pair in zip(field, reference, strict=True))
     num_field, total = len(field[0]), len(sums)
-    sides = np.zeros((DRAWN, total))
-    sides[np.arange(DRAWN)[:, None], generator.random((DRAWN, total)).argsort(1)[:, :num_field]] = (
-        1.0
-    )
+    sides = np.zeros((NUM_PERMUTATIONS, total))
+    sides[
+        np.arange(NUM_PERMUTATIONS)[:, None],
+        generator.random((NUM_PERMUTATIONS, total)).argsort(1)[:, :num_field],
+    ] = 1.0
     sides = np.concatenate(
         [np.arange(total)[None] < num_field, sides]
     )  # the first is what was seen
@@ -107,7 +108,7 @@ def excess_p(
     return np.where(np.isfinite(seen), larger.mean(0), np.nan)
 
 
-def standard_error(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def estimate_standard_error(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Returns the standard error of the ratio of totals, `(C,)`, from how blocks differ; NaN for fewer than two blocks.
 
     Source: the ratio estimator's, Cochran 1977, section 2.11.
@@ -123,7 +124,7 @@ def standard_error(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return np.sqrt(len(sums) / (len(sums) - 1) * (off**2).sum(0)) / total
 
 
-def adjusted(p: np.ndarray) -> np.ndarray:
+def adjust_p_values(p: np.ndarray) -> np.ndarray:
     """Returns p so that those up to `FALSE_DISCOVERIES` hold but for that part of them; NaN stays NaN.
 
     Source: Benjamini and Hochberg 1995.

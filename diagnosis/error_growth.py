@@ -1,9 +1,8 @@
-"""How the error grows over the time of a free run, and what that says about where it comes from.
+"""Growth of the error over the time of a free run, and the kind of cause that its slope suggests.
 
-A sensor's error does not grow; play and an offset are there at once and then stay; a wrong gain or
-dead band adds up with the way;
-a load that is not modelled adds up faster still. Commands go to and fro, so growth is slower than
-for one step: bounds are wide.
+A sensor's error does not grow. Play and an offset are there at once and then stay. A wrong gain or
+dead band adds up with the distance, an unmodelled load faster. Commands go to and fro, so growth is
+slower than for one step; the bounds are wide.
 Axes: `W` windows, `K` steps, `J` joints.
 """
 
@@ -28,12 +27,12 @@ READINGS = {
 }
 FLAT, STEP, LINEAR, QUADRATIC = 0.2, 0.35, 0.65, 1.3
 """Bounds of the slope of log(error) over log(time)."""
-SIZEABLE = 1.2
+MIN_EXCESS_RATIO = 1.2
 """Error over floor from which there is a growth to read."""
 
 
 @dataclass(frozen=True)
-class Growth:
+class ErrorGrowth:
     """Error of one joint over the time of a free run.
 
     Attributes:
@@ -65,9 +64,9 @@ class Growth:
         return plain | {"meaning": READINGS[self.reading]}
 
 
-def growth(
+def measure_growth(
     runs: FreeRuns, reference: FreeRuns | None, machine: Machine, whole: FreeRuns | None
-) -> dict[str, Growth]:
+) -> dict[str, ErrorGrowth]:
     """Returns the growth of each joint's error."""
     steps = runs.simulated.shape[1]
     at = [
@@ -75,40 +74,40 @@ def growth(
         for h in HORIZONS_S
         if round(h / machine.period_s) <= steps
     ]
-    rmse = curve(runs)[at]
-    floor = curve(reference)[at] if reference else None
+    rmse = compute_rmse_curve(runs)[at]
+    floor = compute_rmse_curve(reference)[at] if reference else None
     overall = None if whole is None else np.sqrt(np.nanmean(whole.error**2, (0, 1)))
     found = {}
     for j, name in enumerate(machine.joint_names):
         beyond = np.sqrt(
             np.maximum(rmse[:, j] ** 2 - (0.0 if floor is None else floor[:, j] ** 2), 0.0)
         )
-        is_sizeable = floor is None or rmse[-1, j] > SIZEABLE * floor[-1, j]
+        is_sizeable = floor is None or rmse[-1, j] > MIN_EXCESS_RATIO * floor[-1, j]
         early, late = (
-            slopes(np.array([(k + 1) * machine.period_s for k in at]), beyond)
+            fit_log_slopes(np.array([(k + 1) * machine.period_s for k in at]), beyond)
             if is_sizeable
             else (None, None)
         )
-        found[name] = Growth(
+        found[name] = ErrorGrowth(
             tuple((k + 1) * machine.period_s for k in at),
             tuple(map(float, rmse[:, j])),
             None if floor is None else tuple(map(float, floor[:, j])),
             early,
             late,
-            reading(early, late),
+            classify_growth(early, late),
             None if overall is None else float(overall[j]),
         )
     return found
 
 
-def curve(runs: FreeRuns) -> np.ndarray:
+def compute_rmse_curve(runs: FreeRuns) -> np.ndarray:
     """Returns the root mean square error after each step, `(K, J)`, over the windows that go so far; NaN where none does."""
     given = np.isfinite(runs.error)
     with np.errstate(invalid="ignore"):
         return np.sqrt((np.where(given, runs.error, 0.0) ** 2).sum(0) / given.sum(0))
 
 
-def slopes(horizon_s: np.ndarray, beyond: np.ndarray) -> tuple[float | None, float | None]:
+def fit_log_slopes(horizon_s: np.ndarray, beyond: np.ndarray) -> tuple[float | None, float | None]:
     """Returns the slope of log(error) over log(time) from the first horizon to the second, and from the second to the last."""
     if len(horizon_s) < 3 or not np.isfinite(beyond[1:]).all() or beyond[1] <= 0 or beyond[-1] <= 0:
         return None, None
@@ -119,7 +118,7 @@ def slopes(horizon_s: np.ndarray, beyond: np.ndarray) -> tuple[float | None, flo
     )
 
 
-def reading(early: float | None, late: float | None) -> str:
+def classify_growth(early: float | None, late: float | None) -> str:
     """Returns what a pair of slopes says, one of `READINGS`."""
     if early is None or late is None:
         return "none"

@@ -1,4 +1,4 @@
-"""From questions to recordings: a plan for each run, machines of one make side by side, files that tell only what was measured."""
+"""Recordings of cases: a plan for each run, machines of one make side by side, files of measurements."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
-from exam.mix import Question
-from exam.specimen import PlantFamily, Specimen
+from exam.case_distribution import CaseDesign, PlantFamily, PlantRun
 
 SIDE_BY_SIDE = 240
 """Runs simulated at once; their random numbers lie in memory."""
@@ -39,7 +38,7 @@ EPOCH_S = FIRST_DAY.timestamp()
 
 
 @spec
-class Half:
+class HalfPlan:
     """How one half of a case, `reference` or `field`, is recorded.
 
     Attributes:
@@ -60,7 +59,7 @@ class Half:
 
 
 @dataclass(frozen=True)
-class Made:
+class RecordedHalf:
     """What was recorded of one half of all cases.
 
     Attributes:
@@ -76,7 +75,7 @@ class Made:
 
 
 @contextmanager
-def _without_warnings() -> Iterator[None]:
+def _silence_runner() -> Iterator[None]:
     """Leaves out what the runner says of ways to start poses that took too long: an ailing machine may well be slow."""
     logger = logging.getLogger(Runner.__module__)
     before = logger.level
@@ -87,7 +86,7 @@ def _without_warnings() -> Iterator[None]:
         logger.setLevel(before)
 
 
-class Job:
+class RecordingJob:
     """One file of one case.
 
     Attributes:
@@ -104,7 +103,7 @@ class Job:
     plan: Plan
 
     def __init__(
-        self, question: Question, case: int, number: int, half: Half, is_field: bool
+        self, question: CaseDesign, case: int, number: int, half: HalfPlan, is_field: bool
     ) -> None:
         self.question, self.case, self.number, self.half, self.is_field = (
             question,
@@ -129,7 +128,7 @@ class Job:
         )
 
 
-class Workshop:
+class CaseRecorder:
     """Records cases.
 
     Args:
@@ -152,14 +151,16 @@ class Workshop:
         self._excitations, self._approach = excitations, approach
         self._guards = Guards(max_command=1.0, max_tool_speed_m_s=None)
 
-    def planned(self, questions: Sequence[Question], half: Half, is_field: bool) -> list[Job]:
+    def planned(
+        self, questions: Sequence[CaseDesign], half: HalfPlan, is_field: bool
+    ) -> list[RecordingJob]:
         """Returns the files of one half of all cases with their plans, before anything is recorded.
 
         Raises:
             ConfigError: an excitation is unknown, or finds no room in a file.
         """
         jobs = [
-            Job(question, n, k, half, is_field)
+            RecordingJob(question, n, k, half, is_field)
             for n, question in enumerate(questions)
             for k in range(len(half.programs))
         ]
@@ -169,11 +170,11 @@ class Workshop:
 
     def record(
         self,
-        jobs: Sequence[Job],
+        jobs: Sequence[RecordingJob],
         folders: Sequence[Path],
         workers: int,
         advance: Callable[[int], None],
-    ) -> list[Made]:
+    ) -> list[RecordedHalf]:
         """Writes the files of one half of each case into its folder; returns what is in them, by case.
 
         Args:
@@ -188,7 +189,7 @@ class Workshop:
         for make in sorted(set(makes)):
             mine = [i for i, other in enumerate(makes) if other == make]
             batches += [mine[begin : begin + size] for begin in range(0, len(mine), size)]
-        found: dict[int, Made] = {}
+        found: dict[int, RecordedHalf] = {}
         with ExitStack() as stack:
             run = map if workers == 1 else stack.enter_context(ProcessPoolExecutor(workers)).map
             parts = (
@@ -199,18 +200,18 @@ class Workshop:
             ):
                 found |= dict(zip(batch, made, strict=True))
                 advance(len(batch))
-        done = [Made([], [], []) for _ in folders]
+        done = [RecordedHalf([], [], []) for _ in folders]
         for i, job in enumerate(jobs):  # a case's files are in order
             for name in ("u", "q", "without_q"):
                 getattr(done[job.case], name).extend(getattr(found[i], name))
         return done
 
-    def _specimen(self, job: Job) -> Specimen:
+    def _specimen(self, job: RecordingJob) -> PlantRun:
         question = job.question
         faults = (
             {fault.effect: fault.parameters for fault in question.faults} if job.is_field else {}
         )
-        return Specimen(
+        return PlantRun(
             seed=question.machine_seed,
             roughness=self._roughness,
             chance=int(job.stream("chance").integers(2**62)),
@@ -220,7 +221,7 @@ class Workshop:
             tracked=question.tracked,
         )
 
-    def _plan(self, job: Job) -> Plan:
+    def _plan(self, job: RecordingJob) -> Plan:
         names = job.half.programs[job.number]
         for name in names:
             if name not in self._excitations:
@@ -239,8 +240,8 @@ class Workshop:
                 tried += 1
 
     def _batch(
-        self, jobs: Sequence[Job], specimens: Sequence[Specimen], folders: Sequence[Path]
-    ) -> list[Made]:
+        self, jobs: Sequence[RecordingJob], specimens: Sequence[PlantRun], folders: Sequence[Path]
+    ) -> list[RecordedHalf]:
         """Records files of one half, of machines of one make; returns what is in each."""
         half, is_field = jobs[0].half, jobs[0].is_field
         machine = self._machine
@@ -251,7 +252,7 @@ class Workshop:
         )
         link = self._plants.build(machine, specimens, half.file_s)
         runner = Runner(plan, machine, self._approach, self._guards)
-        with link as opened, _without_warnings():
+        with link as opened, _silence_runner():
             samples = list(drive(opened, runner, machine, len(jobs), half.file_s))
         track = Track(samples)
         extra = {
@@ -282,9 +283,9 @@ class Workshop:
             )
             record.write(recording, path)
             os.utime(path, (EPOCH_S, EPOCH_S))
-        return [Made([u[:, n]], [q[:, n]], [without[:, n]]) for n in range(len(jobs))]
+        return [RecordedHalf([u[:, n]], [q[:, n]], [without[:, n]]) for n in range(len(jobs))]
 
-    def _without(self, specimens: Sequence[Specimen], u: np.ndarray, half: Half) -> np.ndarray:
+    def _without(self, specimens: Sequence[PlantRun], u: np.ndarray, half: HalfPlan) -> np.ndarray:
         """Returns the positions of the same machines without faults, under the same commands and chance, `(T, N, J)`."""
         healthy = [
             replace(specimen, faults={}, ailment=None, tracked=False) for specimen in specimens
