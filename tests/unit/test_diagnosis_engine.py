@@ -125,7 +125,7 @@ def diagnosed(
     )
     outcome = work.run(lambda doing, done: None)
     outcome.save(folder)
-    return answer.read(folder / answer.FILE)
+    return answer.read_answer(folder / answer.ANSWER_FILE)
 
 
 def test_a_speed_that_changed_is_found_on_a_single_axis_without_geometry(
@@ -261,10 +261,10 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
     }
     assert found["where"]["joints"]["q3"] == {"rmse_rad": 0.03, "floor_rad": 0.002, "share": 1.0}
     assert found["gap"]["before"] == {"rmse_rad": 0.03}
-    assert answer.read(path) == said()
+    assert answer.read_answer(path) == said()
     path.write_text(json.dumps(found | {"schema": 2}))
     with pytest.raises(RecordingError, match="schema 2"):
-        answer.read(path)
+        answer.read_answer(path)
 
 
 def test_training_takes_the_found_effects_as_they_are(

@@ -10,7 +10,7 @@ from composed import option
 
 from brokk_rl.contracts.vision import HolePose
 from brokk_rl.errors import ConfigError
-from perception.calibrate import rigid
+from perception.calibrate import transforms
 
 
 def seen(center: tuple[float, float, float], std_m: float = 0.002, t_s: float = 0.0) -> HolePose:
@@ -55,7 +55,7 @@ def test_a_camera_that_may_stand_elsewhere_makes_the_target_as_uncertain_however
     pose, generator = inside.moved(camera, cov), np.random.default_rng(0)
     steps = generator.multivariate_normal(np.zeros(6), cov, 20_000)
     moved = [
-        inside.moved(rigid.moved(camera, step)) for step in steps
+        inside.moved(transforms.apply_motion(camera, step)) for step in steps
     ]  # as if the camera really stood there
     spread, turned = (
         np.cov(np.array([getattr(one, name) for one in moved]).T) for name in ("center_m", "axis")
