@@ -11,8 +11,7 @@ import pytest
 import torch
 from composed import names, option
 
-from actuators.effects.effect import EffectSpec, Wrapped
-from actuators.effects.library import LibraryModel
+from actuators.effects.effect import EffectChain, EffectSpec
 from brokk_rl.checks import NUM_ENVS, check_actuator_model
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -406,7 +405,7 @@ def test_all_effects_can_be_captured_in_a_cuda_graph(those: list[str], machine: 
         model = shipped("actuator", "lag").build(machine, num, device)
         for name in those:
             model = shipped("effect", name).wrap(model, machine, num, device)
-        assert isinstance(model, (Wrapped, LibraryModel))
+        assert isinstance(model, EffectChain)
         shape = (num, machine.num_history, machine.num_joints)
         history = History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
         command, seen = torch.zeros(num, 5, device=device), torch.zeros(num, 8, device=device)
