@@ -1,4 +1,4 @@
-"""Several effects at once: drawn per episode (`Library`), or around an actuator with its sensors."""
+"""Several effects at once: drawn per episode, or around an actuator with its sensors."""
 
 import zlib
 

@@ -1,4 +1,4 @@
-"""Effects around an actuator model: the base class of their specs, and the one model of all of them.
+"""Effects around an actuator model: the base class of their specs, and the one model of all.
 
 An effect of a package of your own is a spec that derives from `EffectSpec`, sets `side` and
 `numbers`, and overrides the method of its side. `EffectChain` does the rest: parameters per
@@ -32,7 +32,7 @@ SALT_STEP = 2_654_435_761
 
 
 class MachineTensors:
-    """Constants of the machine as tensors: way at full speed in one period, limits, weight, geometry.
+    """Constants of the machine as tensors: full step, limits, weight, geometry.
 
     Weight and geometry are built when an effect first asks for them. Most effects do not ask, and
     so they also work on machines of which only the joints are known. A captured step can hold the
@@ -72,7 +72,7 @@ class MachineTensors:
         return Gravity(self._machine, self._device)
 
     def weight(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the gravity load in the positive direction at `q`, over the yield force, `(N, J)`."""
+        """Return gravity load over yield force at `q`, positive direction, `(N, J)`."""
         return self.gravity.load(q) / self.yield_force
 
     @cached_property
@@ -171,7 +171,7 @@ class EffectSpec:
         return {}
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """Return the commands that the inner model sees, `(N, H, J)`, and the memory; command side."""
+        """Return the commands for the inner model, `(N, H, J)`, and the memory."""
         return now.history.u, {}
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
@@ -185,7 +185,7 @@ class EffectSpec:
         return q
 
     def truth(self, q: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Return the likeliest true positions for readings `q`, `(N, J)` or `(N, H, J)`; measurement side."""
+        """Return likely true positions for readings `q`, `(N, J)` or `(N, H, J)`."""
         return q
 
     def tool(
@@ -195,7 +195,7 @@ class EffectSpec:
         value: dict[str, torch.Tensor],
         plant: MachineTensors,
     ) -> torch.Tensor:
-        """Return the true place of the tool that the model has at `point_m`, `(N, 3)`; kinematics."""
+        """Return the true place of the tool that the model has at `point_m`, `(N, 3)`."""
         return point_m
 
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -288,7 +288,7 @@ class EffectChain:
         return own | getattr(self.inner, "sides", frozenset())
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Forget in the environments of `mask`, `(N,)` bool, and draw parameters; cuts gradients."""
+        """Forget in the environments of `mask`, `(N,)`; draw parameters; cut gradients."""
         self.inner.reset(mask)
         for value in self._memory.values():
             if value.requires_grad:
@@ -314,7 +314,7 @@ class EffectChain:
         return q
 
     def measure(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the readings at the true positions `q`, `(N, J)`; call it once a control period."""
+        """Return the readings at true positions `q`, `(N, J)`; once a control period."""
         q = getattr(self.inner, "measure", _keep_unchanged)(q)
         if not self._measured:
             return q
@@ -330,7 +330,7 @@ class EffectChain:
         return getattr(self.inner, "truth", _keep_unchanged)(q)
 
     def tool(self, point_m: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Return where an outside instrument finds the tool that the model has at `point_m`, `(N, 3)`."""
+        """Return the true place of the tool that the model has at `point_m`, `(N, 3)`."""
         point_m = getattr(self.inner, "tool", _keep_unchanged)(point_m, q)
         for name, effect in self._placed.items():
             point_m = effect.tool(point_m, q, self._get_values(name), self._plant)
@@ -410,7 +410,7 @@ class EffectChain:
         counter: torch.Tensor | None,
         weight: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Return the result of one effect and store its memory; after a reset the memory begins anew."""
+        """Return the result of one effect and store its memory."""
         effect = self._effects[name]
         now = StepInputs(
             self._get_values(name),

@@ -1,4 +1,9 @@
-"""Speeds as a function of commands: what recordings say about valve curves, pose and pump for given dead times, play and lags.
+"""Fit of `actuators.models.valve` in seconds, by linear least squares on increments.
+
+Positions hardly feed back into the speed, so the speed is fitted as a function of commands. The
+model is driven by recorded commands and, for the pose, recorded positions. Increments of `WIDTH`
+samples are compared. For given dead time, play and lags the curves are a linear least-squares
+problem; pose and pump follow in a few sweeps.
 
 Axes: `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments, `P` widths of the
 play.
@@ -84,7 +89,10 @@ class SpeedData:
     def features(
         self, j: int, dynamics: np.ndarray, known: Sequence[np.ndarray] | None = None
     ) -> np.ndarray:
-        """Returns increments per unit of the curve at each knot, `(I, 2 (K - 1))`, with factors `known` on the speed or none."""
+        """Return increments per unit of the curve at each knot, `(I, 2 (K - 1))`.
+
+        `known`: factors on the speed, or none.
+        """
         parts = []
         for n in range(len(self._u)):
             basis = self._basis(self._spool(n, j, dynamics), j)
@@ -93,7 +101,7 @@ class SpeedData:
         return np.concatenate(parts)
 
     def factors(self, found: StaticFit, dynamics: np.ndarray) -> list[list[np.ndarray]]:
-        """Returns the factor on the speed from pose and pump, by joint and recording, each `(T,)`."""
+        """Return the speed factor from pose and pump, by joint and recording, each `(T,)`."""
         joints, half = range(self.machine.num_joints), len(self._knots) - 1
         full = np.maximum(np.abs(found.curve[:, [half - 1, 2 * half - 1]]), 1e-3)
         unit = self.machine.max_speed * self._period_s
@@ -124,7 +132,7 @@ class SpeedData:
         noise: float | None = None,
         free: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Returns the curve that explains `way` `(I,)`, by ridge regression toward straight lines."""
+        """Return the curve that explains `way` `(I,)`: ridge regression to straight lines."""
         noise = 1e-3 * float(np.mean(way**2)) if noise is None else noise
         weighted = features if free is None else features * free[:, None]
         normal = weighted.T @ features + noise / STIFFNESS**2 * self._bend
@@ -134,7 +142,10 @@ class SpeedData:
     def statics(
         self, dynamics: np.ndarray, sweeps: int, demand: np.ndarray | None = None
     ) -> StaticFit:
-        """Returns curves, pose and demands for given dynamics `(J, 4)`, beginning at `demand` where it is known."""
+        """Return curves, pose and demands for given dynamics `(J, 4)`.
+
+        `demand`: where to begin, if known.
+        """
         joints, count, half = self.machine.num_joints, len(self._u), len(self._knots) - 1
         spool = [
             np.stack([self._spool(n, j, dynamics[j]) for j in range(joints)], 1)
@@ -218,7 +229,7 @@ class SpeedData:
         noise: np.ndarray,
         free: np.ndarray,
     ) -> np.ndarray:
-        """Returns the demands on the pump that explain best how joints slow each other."""
+        """Return the demands on the pump that explain best how joints slow each other."""
         joints = self.machine.num_joints
         weight = np.sqrt(free / noise[:, None])
         if all((o > 0.05).sum(1).max() < 2 for o in opening):
@@ -260,7 +271,7 @@ class SpeedData:
         )
 
     def _basis(self, spool: np.ndarray, j: int) -> np.ndarray:
-        """Returns hat functions of the spool times the way in a period at full speed, signed, `(T, 2 (K - 1))`."""
+        """Return signed hat functions of the spool times full step, `(T, 2 (K - 1))`."""
         knots, half, size = self._knots, len(self._knots) - 1, np.minimum(np.abs(spool), 1.0)
         cell = np.clip(np.searchsorted(knots, size, side="right") - 1, 0, half - 1)
         part = (size - knots[cell]) / (knots[cell + 1] - knots[cell])
@@ -272,19 +283,19 @@ class SpeedData:
         return out * (np.sign(spool) * self.machine.max_speed[j] * self._period_s)[:, None]
 
     def _increments(self, steps: np.ndarray) -> np.ndarray:
-        """Sums steps `(T, …)` over `WIDTH` samples each, without the beginning, `(I, …)`."""
+        """Sum steps `(T, …)` over `WIDTH` samples each, without the beginning, `(I, …)`."""
         count = len(steps) // WIDTH
         return steps[: count * WIDTH].reshape(count, WIDTH, *steps.shape[1:]).sum(1)[self._skip :]
 
     def _at_stop(self, q: np.ndarray) -> np.ndarray:
-        """Returns 1 for increments away from both stops, else 0, `(I, J)`."""
+        """Return 1 for increments away from both stops, else 0, `(I, J)`."""
         margin = 0.005 * (self.machine.upper - self.machine.lower)
         inside = (q > self.machine.lower + margin) & (q < self.machine.upper - margin)
         return (self._increments(inside.astype(np.float64)) > WIDTH - 0.5).astype(np.float64)
 
 
 def delay_signal(u: np.ndarray, periods: float) -> np.ndarray:
-    """Returns `u` `(T,)` later by a fractional number of samples, its mean over each period."""
+    """Return `u` `(T,)` later by a fractional number of samples, its mean over each period."""
     whole = int(np.floor(periods + 5e-7))
     part = periods - whole
     known = np.pad(u, (whole + 1, 0), mode="edge")
@@ -292,7 +303,7 @@ def delay_signal(u: np.ndarray, periods: float) -> np.ndarray:
 
 
 def lag_signal(u: np.ndarray, time_constant_s: float, period_s: float) -> np.ndarray:
-    """Returns a first-order lag of `u` `(T, …)`, as it stands at the end of each period."""
+    """Return a first-order lag of `u` `(T, …)`, as it stands at the end of each period."""
     if time_constant_s < 1e-4:
         return u
     kept = np.exp(-period_s / time_constant_s)
@@ -300,7 +311,7 @@ def lag_signal(u: np.ndarray, time_constant_s: float, period_s: float) -> np.nda
 
 
 def _apply_plays(u: np.ndarray) -> np.ndarray:
-    """Returns the play operator of each of `PLAYS` on `u` `(T, J)`, `(P, T, J)`."""
+    """Return the play operator of each of `PLAYS` on `u` `(T, J)`, `(P, T, J)`."""
     out, now, half = (
         np.empty((len(PLAYS), *u.shape)),
         np.repeat(u[:1], len(PLAYS), 0),
@@ -317,7 +328,7 @@ def _compute_pump_share(demand: np.ndarray, opening: np.ndarray) -> np.ndarray:
 
 
 def _build_bend_penalty(knots: np.ndarray) -> np.ndarray:
-    """Returns the quadratic form of the changes of slope of both curves, each change over the root of its stroke."""
+    """Return the quadratic form of slope changes, each over the root of its stroke."""
     half, rows = len(knots) - 1, []
     for first in (0, half):
         for k in range(1, half):
@@ -367,7 +378,7 @@ class ValveFit:
         seed: int,
         device: torch.device,
     ) -> ValveActuator:
-        """Fits to all recordings (nothing is chosen by validation) and writes `<name>.yaml` into `folder`.
+        """Fit to all recordings and write `<name>.yaml` into `folder`; validation chooses nothing.
 
         Raises:
             RecordingError: a joint never moves.
@@ -405,7 +416,7 @@ class ValveFit:
     def refit(
         self, fitted: ValveActuator, machine: Machine, recordings: Sequence[Recording]
     ) -> ValveActuator:
-        """Returns `fitted` with curves, pose and pump fitted to other recordings; dead times, play and lags stay."""
+        """Return `fitted` with curves, pose and pump refitted; the dynamics stay."""
         columns = [getattr(fitted, name) for name in ("dead_time_s", "play", "spool_s", "speed_s")]
         dynamics = np.array([[column[name] for column in columns] for name in machine.joint_names])
         assert isinstance(fitted.demand, dict), "a fitted actuator has numbers by joint"
@@ -417,7 +428,7 @@ class ValveFit:
     def _dynamics(
         self, data: SpeedData, j: int, known: Sequence[np.ndarray] | None, start: np.ndarray | None
     ) -> np.ndarray:
-        """Returns dead time, play, spool lag and speed lag of joint `j` that explain its increments best.
+        """Return the dead time, play, spool lag and speed lag that explain joint `j` best.
 
         Args:
             data: The recordings.
@@ -494,7 +505,7 @@ class ValveFit:
 
 
 def _convert_to_plain(value: object) -> object:
-    """Returns tuples as lists, for YAML."""
+    """Return tuples as lists, for YAML."""
     if isinstance(value, dict):
         return {key: _convert_to_plain(inner) for key, inner in value.items()}
     return [_convert_to_plain(inner) for inner in value] if isinstance(value, tuple) else value
