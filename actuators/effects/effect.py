@@ -224,6 +224,7 @@ class EffectChain:
             history, at each step anew.
 
     Attributes:
+        effects: The effects by name.
         inner: The model inside.
         parameters: Numbers by name, `(N, J)` or `(N, 1)`. Write in place or replace an entry to
             simulate `N` candidates side by side. Gradients flow to an entry that requires them
@@ -243,7 +244,7 @@ class EffectChain:
         shares: Mapping[str, float] = MappingProxyType({}),
         num_recent: int | None = None,
     ) -> None:
-        self.inner, self._effects, self._num_recent = inner, effects, num_recent
+        self.inner, self.effects, self._num_recent = inner, dict(effects), num_recent
         given: dict[str, Value] = {}
         numbers: dict[str, EffectNumber] = {}
         joints: dict[str, Joints] = {}
@@ -284,7 +285,7 @@ class EffectChain:
     @property
     def sides(self) -> frozenset[str]:
         """Sides of all effects, of the models inside too."""
-        own = frozenset(effect.side for effect in self._effects.values())
+        own = frozenset(effect.side for effect in self.effects.values())
         return own | getattr(self.inner, "sides", frozenset())
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -411,7 +412,7 @@ class EffectChain:
         weight: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Return the result of one effect and store its memory."""
-        effect = self._effects[name]
+        effect = self.effects[name]
         now = StepInputs(
             self._get_values(name),
             {},
@@ -449,7 +450,7 @@ class EffectChain:
 
     def _get_values(self, name: str) -> dict[str, torch.Tensor]:
         """Return the parameters of one effect, by their own names."""
-        return {key: self.parameters[_join(name, key)] for key in self._effects[name].numbers}
+        return {key: self.parameters[_join(name, key)] for key in self.effects[name].numbers}
 
     def _salt_counter(self, name: str, counter: torch.Tensor | None) -> torch.Tensor | None:
         """Return the counter of one effect's draws; `None` for an effect that draws none."""

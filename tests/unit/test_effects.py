@@ -148,7 +148,7 @@ def test_the_typical_value_changes_something(name: str, machine: Machine) -> Non
         (places(model, path[-1]) - 1.0).abs().amax(),
     ]
     acting = {"command": 0, "speed": 0, "joints": 0, "measurement": 1, "kinematics": 2}[
-        model.effect.side
+        model.effects[""].side
     ]
     assert [float(size) > 1e-5 for size in moved] == [place == acting for place in range(3)]
 
@@ -160,7 +160,7 @@ def test_only_the_named_joints_have_it(name: str, machine: Machine) -> None:
     model = effect(name, joints=["q3"]).wrap(
         shipped("actuator", "ideal").build(machine, 3, CPU), machine, 3, CPU
     )
-    for key, number in model.effect.numbers.items():
+    for key, number in model.effects[""].numbers.items():
         expected = torch.full(
             (3, machine.num_joints), number.typical if number.none is None else number.none
         )
