@@ -1,18 +1,21 @@
-# Everything a person needs, on a machine with Python 3.11, git and make. uv comes into .venv when there is none.
+# Needs Python 3.11, git and make. uv is installed into .venv if it is missing.
 PYTHON ?= $(shell command -v python3.11 || echo python3)
 BIN := .venv/bin
 UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
 SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact --compile-bytecode
 
-.PHONY: train test test-all check setup clean
+.PHONY: help train test test-all check setup clean
 
-train: setup            ## train the main job on whatever is there and leave a run folder
+help:                   ## show these targets
+	@grep -hE '^[a-z.-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+
+train: setup            ## install, train the main task and leave a run folder
 	$(BIN)/brokk mode=train
 
-test: setup             ## the tests that run without a GPU, but for the slow ones
+test: setup             ## the tests that need no GPU, without the slow ones
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile -m "not gpu and not slow"
 
-test-all: setup         ## the slow ones too
+test-all: setup         ## the slow tests too
 	$(BIN)/python -m pytest -q -m "not gpu"
 
 check: setup            ## format, lint, types
@@ -25,9 +28,9 @@ setup: .venv/.synced    ## the environment of uv.lock in .venv
 .venv/.synced: uv.lock pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	command -v $(UV) >/dev/null || $(BIN)/python -m pip install --quiet uv
-	$(SYNC) || UV_SYSTEM_CERTS=1 $(SYNC)  # behind a company's proxy only the system knows the certificates
+	$(SYNC) || UV_SYSTEM_CERTS=1 $(SYNC)  # behind a proxy only the system has the certificates
 	touch $@
 
-clean:                  ## everything that can be made again; runs and recordings stay
+clean:                  ## remove what can be made again; runs and recordings stay
 	rm -rf .venv dist .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -14,7 +14,7 @@ import torch
 from actuators.identify.dataset import Windows
 from actuators.models.network import JointNetworks
 from brokk_rl.machine import Machine
-from brokk_rl.rl.graph import capture
+from brokk_rl.rl.execution import capture_graph
 
 
 class Descent:
@@ -78,7 +78,7 @@ class Descent:
         if self._device.type != "cuda":
             return update
         before = {name: value.clone() for name, value in self.state().items()}
-        graph = capture(update, self._device, gradients=True)
+        graph = capture_graph(update, self._device, gradients=True)
         for name, value in self.state().items():
             value.copy_(before[name])
         return graph.replay

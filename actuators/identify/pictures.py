@@ -14,7 +14,7 @@ from actuators.identify.dead_time import Delay
 from actuators.identify.regimes import REGIMES
 from actuators.identify.scores import TAILS, Scores
 from brokk_rl.machine import Machine
-from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, clean, legend, panels
+from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, add_legend, make_joint_panels, remove_frame
 from brokk_rl.split import COMMANDED
 
 COLOURS = {"hold": GREY, "arx": ORANGE}
@@ -93,15 +93,15 @@ def prediction(scores: Scores, model: str) -> Figure:
             if j == machine.num_joints - 1:
                 below.set_xlabel("time of the free run [s]")
             for axis in (above, below):
-                clean(axis)
-    legend(figure, figure.axes[0])
+                remove_frame(axis)
+    add_legend(figure, figure.axes[0])
     return figure
 
 
 def error_over_horizon(scores: Scores, model: str) -> Figure:
     """Draws the error of all models over the time of the free run, one panel a joint, with 95 % bands."""
     machine = scores.machine
-    figure, axes = panels(machine, "xy")
+    figure, axes = make_joint_panels(machine, "xy")
     colour = colours(list(scores.predicted), model)
     t_s = machine.period_s * np.arange(1, scores.cut.measured.shape[1] + 1)
     for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
@@ -126,16 +126,16 @@ def error_over_horizon(scores: Scores, model: str) -> Figure:
         axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
         axis.set_xlim(t_s[0], t_s[-1])
         axis.grid(which="major", alpha=0.3)
-        clean(axis)
+        remove_frame(axis)
     figure.supxlabel("time of the free run [s]; the left end is the one-step error", fontsize=10)
     figure.supylabel("RMSE [% of travel]", fontsize=10)
-    legend(figure, axes[0])
+    add_legend(figure, axes[0])
     return figure
 
 
 def regimes(table: Mapping[str, Any], machine: Machine, model: str, names: Sequence[str]) -> Figure:
     """Draws how fast each model drifts in each regime, one panel a joint."""
-    figure, axes = panels(machine, "x")
+    figure, axes = make_joint_panels(machine, "x")
     colour = colours(names, model)
     travel = machine.upper - machine.lower
     for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
@@ -175,22 +175,22 @@ def regimes(table: Mapping[str, Any], machine: Machine, model: str, names: Seque
         axis.set_ylim(len(REGIMES) - 0.5, -0.5)
         axis.grid(axis="x", which="major", alpha=0.3)
         axis.set_title(joint.name, loc="left", fontsize=10)
-        clean(axis)
+        remove_frame(axis)
     figure.supxlabel(
         "drift: RMS of the error added within a second [% of travel]; in brackets the part of the time",
         fontsize=10,
     )
-    legend(figure, axes[0])
+    add_legend(figure, axes[0])
     return figure
 
 
 def dead_times(delays: Mapping[str, Delay | None], machine: Machine) -> Figure:
     """Draws what each delay leaves unexplained, one panel a joint; the band is the interval of the best one."""
-    figure, axes = panels(machine, "xy")
+    figure, axes = make_joint_panels(machine, "xy")
     history_s = machine.num_history * machine.period_s
     for axis, (joint, delay) in zip(axes, delays.items(), strict=True):
         axis.set_title(joint, loc="left", fontsize=10)
-        clean(axis)
+        remove_frame(axis)
         if delay is None:
             axis.text(0.5, 0.5, "hardly commanded", transform=axis.transAxes, ha="center")
             continue
@@ -219,7 +219,7 @@ def dead_times(delays: Mapping[str, Delay | None], machine: Machine) -> Figure:
     figure.supylabel("variance of the motion left unexplained [%]", fontsize=10)
     drawn = [axis for axis, delay in zip(axes, delays.values(), strict=True) if delay is not None]
     if drawn:
-        legend(figure, drawn[0])
+        add_legend(figure, drawn[0])
     return figure
 
 

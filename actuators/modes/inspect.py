@@ -22,7 +22,7 @@ from brokk_rl.inspection import KINDS, Inspection, Thresholds, inspect
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.recording_validation import Breach
-from brokk_rl.report import Page
+from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 
@@ -258,7 +258,7 @@ class Inspect:
 
     def _page(
         self, result: dict[str, Any], inspected: Sequence[Inspected], pictures: dict[str, Path]
-    ) -> Page:
+    ) -> Report:
         broken = sum(bool(one.breaches) for one in inspected)
         minutes = (
             sum((one.inspection.timing["duration_s"] or 0.0) for one in inspected if one.inspection)
@@ -272,27 +272,27 @@ class Inspect:
             or "nothing that wants an explanation"
         )
         summary = f"{len(inspected)} recordings, {minutes:.1f} minutes; {broken} break the format. Found: {told}."
-        page = Page(f"Recordings of {self.machine.name}", summary, "bad" if broken else "plain")
-        page.heading("Joints")
-        page.table(
+        page = Report(f"Recordings of {self.machine.name}", summary, "bad" if broken else "plain")
+        page.add_heading("Joints")
+        page.add_table(
             *self._figures(result),
             "Shares are of the time; noise and step in the unit of the joint.",
         )
-        page.heading("Findings")
-        page.table(*self._counts(result))
-        page.items([f"{kind}: {meaning}" for kind, meaning in KINDS.items()])
-        page.heading("Recordings")
-        page.table(FILES, [_file_row(one) for one in inspected])
+        page.add_heading("Findings")
+        page.add_table(*self._counts(result))
+        page.add_list([f"{kind}: {meaning}" for kind, meaning in KINDS.items()])
+        page.add_heading("Recordings")
+        page.add_table(FILES, [_file_row(one) for one in inspected])
         if result["remarks"]:
-            page.items(result["remarks"])
+            page.add_list(result["remarks"])
         for name, path in pictures.items():
             lines = "" if name == "overview" else ", breaches of the format are vertical lines"
-            page.picture(path, f"{name}: findings are shaded{lines}")
+            page.add_picture(path, f"{name}: findings are shaded{lines}")
         for one in inspected:
             if one.num_remarks:
-                page.heading(one.path.name, 3)
+                page.add_heading(one.path.name, 3)
             if one.breaches:
-                page.items([str(breach) for breach in one.breaches])
+                page.add_list([str(breach) for breach in one.breaches])
             if one.inspection and one.inspection.findings:
                 rows = [
                     [
@@ -306,8 +306,10 @@ class Inspect:
                     ]
                     for f in one.inspection.findings
                 ]
-                with page.details(f"{len(rows)} findings"):
-                    page.table(["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows)
+                with page.add_details(f"{len(rows)} findings"):
+                    page.add_table(
+                        ["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows
+                    )
         return page
 
 

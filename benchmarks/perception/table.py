@@ -35,10 +35,10 @@ from rich.table import Table
 from brokk_rl.contracts.vision import FrameDetections, Overlay
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from perception.benchmark.cells import Tally, judge
+from perception.benchmark.scoring import FinderScore, score_frame
 from perception.finder import StagedFinder
-from perception.render.drawing import compose
-from perception.render.studio import Studio
+from perception.render.frame_renderer import FrameRenderer
+from perception.render.scene_sampler import compose_scene
 
 CONDITIONS = ("clean", "haze", "dark", "hidden", "decoy", "empty")
 SHOWN = (
@@ -151,7 +151,7 @@ def look(task: Task) -> list[dict[str, Any]]:
     """Returns what each option makes of one scene."""
     studio = renderer(task.condition, task.distance_m)
     generator = scenes(task.seed).generator(f"scene/{task.number}")
-    shot = studio.shot(compose(studio.scene, studio.rig, generator), generator)
+    shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
     frame = Frame(
         color=shot.color, depth_m=shot.depth_m, camera_matrix=studio.rig.left.matrix, base_from_camera=studio.rig.base_from_camera,
         t_s=0.0, right=shot.right, baseline_m=studio.rig.baseline_m,
@@ -159,7 +159,7 @@ def look(task: Task) -> list[dict[str, Any]]:
     lines = []
     for option in task.options:
         finder = build_finder(option)
-        tally, found = judge(finder, frame, shot.truth)
+        tally, found = score_frame(finder, frame, shot.truth)
         place = {
             "condition": task.condition,
             "distance_m": task.distance_m,
@@ -189,7 +189,7 @@ def show_failure(
 
 
 @functools.cache
-def renderer(condition: str, distance_m: float) -> Studio:
+def renderer(condition: str, distance_m: float) -> FrameRenderer:
     return composed(
         "studio",
         "mode=render",
@@ -233,10 +233,12 @@ def read(path: Path) -> Iterator[dict[str, Any]]:
 
 def rows(path: Path, options: list[str]) -> list[dict[str, Any]]:
     """Returns the rows of the table, each with how many times smaller its median error is than that of the baseline."""
-    tallies: dict[tuple, Tally] = defaultdict(Tally)
+    tallies: dict[tuple, FinderScore] = defaultdict(FinderScore)
     for line in read(path):
         if line["option"] in options:
-            tallies[line["option"], line["condition"], line["distance_m"]] += Tally(**line["tally"])
+            tallies[line["option"], line["condition"], line["distance_m"]] += FinderScore(
+                **line["tally"]
+            )
     order = {name: number for number, name in enumerate((*options, *CONDITIONS))}
     found = []
     for option, condition, distance_m in sorted(

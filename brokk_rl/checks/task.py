@@ -39,9 +39,7 @@ def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu")
             f"reasons: expected different names, got {process.reasons}",
         )
         json.dumps(process.describe())
-        start = {
-            name: value.to(device) for name, value in _checked_starts(process, machine).items()
-        }
+        start = {name: value.to(device) for name, value in _check_starts(process, machine).items()}
         everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=device)
         history = rest_history(machine, device, start["q"])
         require_rows(process.state, "state")
@@ -61,7 +59,7 @@ def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu")
         require("policy" in groups, f"observe: no group 'policy' among {', '.join(groups)}")
         size = process.describe()["size"]
         own = [
-            observation.size(machine, pitch, proposals)
+            observation.compute_size(machine, pitch, proposals)
             for proposals in (False, True)
             for pitch in (False, True)
         ]
@@ -101,7 +99,7 @@ def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu")
             )
 
 
-def _checked_starts(process: TaskProcess, machine: Machine) -> dict[str, torch.Tensor]:
+def _check_starts(process: TaskProcess, machine: Machine) -> dict[str, torch.Tensor]:
     start, again, other = (
         process.starts(NUM_ENVS, 1),
         process.starts(NUM_ENVS, 1),

@@ -49,7 +49,7 @@ def check_world(
     require(bool(torch.allclose(world.q, home, atol=1e-4)), "reset: q is not where the arm was put")
     require(not bool(world.faults.any()), "reset: faults at rest at home")
     stored = world.state_dict()
-    first = _push(world, steps)
+    first = _push_joints(world, steps)
     require(bool(first.isfinite().all()), "step: q is not finite")
     require(bool((first[-1] != home).any()), "step: the arm does not move")
     seen = {"q": world.q, "contact_force_n": world.contact_force_n, "faults": world.faults}
@@ -59,14 +59,14 @@ def check_world(
     )  # the order of additions on a GPU is not fixed
     world.load_state_dict(stored)
     require(
-        same(_push(world, steps), first, tolerance),
+        same(_push_joints(world, steps), first, tolerance),
         "load_state_dict: the same steps from the same state lead elsewhere",
     )
     world.load_state_dict(stored)
     altered = steps.clone()
     altered[0] = 0.0
     require(
-        same(_push(world, altered)[:, 1:], first[:, 1:], tolerance),
+        same(_push_joints(world, altered)[:, 1:], first[:, 1:], tolerance),
         "step: what happens in world 0 changes the others",
     )
     before, some = world.q.clone(), everywhere.clone()
@@ -79,7 +79,7 @@ def check_world(
     )
 
 
-def _push(world: World, steps: torch.Tensor) -> torch.Tensor:
+def _push_joints(world: World, steps: torch.Tensor) -> torch.Tensor:
     """Returns the positions over some control periods in which every joint advances, `(T, N, J)`."""
     found = []
     for _ in range(5):

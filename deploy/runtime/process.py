@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 log = logging.getLogger(__name__)
 
-_ENTRY = "from deploy.runtime.process import enter; enter()"
+_ENTRY = "from deploy.runtime.process import enter_child; enter_child()"
 _DIE_WITH_PARENT, _LOCK_ALL, _ON_USE = (
     1,
     3,

@@ -26,7 +26,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
-from brokk_rl.sim.link import Simulated
+from brokk_rl.sim.link import SimulatedMachines
 
 SMALL = (
     "collect.num_runs=2",
@@ -297,10 +297,11 @@ def test_a_simulated_machine_is_its_actuator_model_with_noise(
     )
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     quiet, noisy = (
-        Simulated(actuator=plant, noise=noise).build(machine, 2, session) for noise in (0.0, 0.01)
+        SimulatedMachines(actuator=plant, noise=noise).build(machine, 2, session)
+        for noise in (0.0, 0.01)
     )
     model = option("actuator", "lag").build(machine, 2, torch.device("cpu"))
-    neutral = Simulated(
+    neutral = SimulatedMachines(
         actuator=Affected(actuator=option("actuator", "lag"), effects={}), noise=0.0
     ).build(machine, 2, session)
     home = torch.as_tensor(machine.home, dtype=torch.float32).repeat(2, 1)

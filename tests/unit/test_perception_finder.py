@@ -12,7 +12,7 @@ from drawn import AXIS, CENTER, drawn
 
 from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, SizePrior
 from perception import dataset, search
-from perception.benchmark.cells import Tally, compare, judge
+from perception.benchmark.scoring import FinderScore, match_holes, score_frame
 from perception.finder import StagedFinder, rectify
 
 
@@ -89,8 +89,8 @@ def test_figures_are_counted_as_by_hand() -> None:
     truth = dataset.SceneTruth(
         "test", {}, (circle(0.0, 0.3), circle(0.5, 0.3)), (circle(1.0, 0.0),), {}
     )
-    tally = Tally()
-    compare([pose(0.0, 2.003), pose(1.01), pose(3.0)], truth, drawn()[0], tally)
+    tally = FinderScore()
+    match_holes([pose(0.0, 2.003), pose(1.01), pose(3.0)], truth, drawn()[0], tally)
     assert (tally.true, tally.found, tally.decoys, tally.fooled, tally.false) == (2, 1, 1, 1, 1)
     assert tally.position_m == pytest.approx([0.003])
     assert tally.along_sigmas == pytest.approx([3.0])
@@ -104,10 +104,12 @@ def test_a_frame_that_is_refused_counts_as_one_in_which_nothing_was_found() -> N
         tuple(CENTER), tuple(AXIS), tuple(CENTER), tuple(AXIS), 0.05, 0.3, 0.0, True
     )
     truth = dataset.SceneTruth("test", {}, (hole,), (), {})
-    seen, _ = judge(finder_with(masks), frame, truth)
+    seen, _ = score_frame(finder_with(masks), frame, truth)
     assert seen.is_perfect and seen.row()["position_mm_median"] < 2.0
     blind = option("perception", "plane_conic").build()
-    missed, found = judge(blind, replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), truth)
+    missed, found = score_frame(
+        blind, replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), truth
+    )
     assert (missed.refused, missed.true, missed.found, missed.is_perfect) == (1, 1, 0, False)
     assert not found.holes
 

@@ -10,7 +10,7 @@ from composed import option
 
 from brokk_rl.contracts.vision import HolePose
 from brokk_rl.errors import ConfigError
-from perception.calibrate import rigid
+from perception.calibrate import transforms
 
 FUSION = option("perception/tracker", "fusion")
 UP = np.array([0.0, 0.0, 1.0])
@@ -112,7 +112,7 @@ def test_the_shared_covariance_is_what_a_displaced_camera_does() -> None:
     pose, generator = inside.moved(camera, cov), np.random.default_rng(0)
     steps = generator.multivariate_normal(np.zeros(6), cov, 20_000)
     # as if the camera really stood there
-    moved = [inside.moved(rigid.moved(camera, step)) for step in steps]
+    moved = [inside.moved(transforms.apply_motion(camera, step)) for step in steps]
     spread, turned = (
         np.cov(np.array([getattr(one, name) for one in moved]).T) for name in ("center_m", "axis")
     )
