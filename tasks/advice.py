@@ -8,7 +8,7 @@ first of it arrives. With them the dead times of machine and person are one.
 import torch
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.follower import moved_levers
+from brokk_rl.follower import select_levers
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -94,7 +94,7 @@ class LeverAdviser:
         # `hold_s`
         lately = ((proposed == 0).float().flip(1).cumsum(1) < 0.5).sum(1)
         kept = (lately > 0) & (lately < self._hold) & (shown != 0)
-        return torch.where(moved_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
+        return torch.where(select_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
 
     def _shown(self, command: torch.Tensor) -> torch.Tensor:
         """Returns the deflection that commands `command`."""

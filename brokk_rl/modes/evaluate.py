@@ -18,7 +18,7 @@ from brokk_rl.rl.evaluation import RecordedEpisode, evaluate_policy
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.video import render_video
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 
 log = logging.getLogger(__name__)
 
@@ -139,8 +139,8 @@ def evaluate_policies(
     results = {
         **table[first],
         "seed": evaluation.seed,
-        "actuator": type(plant.actuator).__name__.lower(),
-        "follower": type(plant.follower).__name__.lower(),
+        "actuator": name_spec(plant.actuator),
+        "follower": name_spec(plant.follower),
         "policy": first,
         "policies": table,
     }

@@ -143,7 +143,7 @@ def build_calibration(
     return {
         "schema": SCHEMA,
         "kind": kind,
-        "created": record.now(),
+        "created": record.format_now(),
         "machine": machine.name,
         "T_base_cam": round_to_lists(base_from_camera),
         "covariance": round_to_lists(
