@@ -137,7 +137,7 @@ class Benchmark:
         for num_envs in self.bench.num_envs:
             self.session.seed_all()
             loop = plant.build(device, num_envs, self.rl.num_starts, self.session.stream("starts"))
-            rows.append(_sum_over_ranks(group.all(self._measure(loop, device, group))))
+            rows.append(_sum_over_ranks(group.gather(self._measure(loop, device, group))))
             log.info(
                 "%d environments: %s",
                 num_envs,

@@ -70,7 +70,7 @@ class TrainingGroup:
         if self.together:
             dist.barrier()
 
-    def from_first(self, value: Any) -> Any:
+    def broadcast_first(self, value: Any) -> Any:
         """Returns the first process's `value`: where a clock decides, one clock must decide for all."""
         if not self.together:
             return value
@@ -78,7 +78,7 @@ class TrainingGroup:
         dist.broadcast_object_list(box, src=0)
         return box[0]
 
-    def all(self, value: Any) -> list[Any]:
+    def gather(self, value: Any) -> list[Any]:
         """Returns everyone's `value` (plain numbers and text), in the order of ranks."""
         if not self.together:
             return [value]
@@ -86,7 +86,7 @@ class TrainingGroup:
         dist.all_gather_object(found, value)
         return found
 
-    def gathered(self, state: Any) -> list[Any]:
+    def gather_on_first(self, state: Any) -> list[Any]:
         """Returns everyone's `state` (mappings of tensors, on the host) to the first process, to the others an empty list."""
         if not self.together:
             return [state]
@@ -94,13 +94,13 @@ class TrainingGroup:
         dist.gather_object(_copy_to_host(state), found if self.rank.first else None, dst=0)
         return found if self.rank.first else []
 
-    def pooled(self, figures: Mapping[str, float]) -> dict[str, float]:
+    def pool_statistics(self, figures: Mapping[str, float]) -> dict[str, float]:
         """Returns the figures of all environments of all processes; see `ControlLoop.statistics`.
 
         Means over episodes weigh by the number of episodes; the fault rate by control steps, which
         are as many everywhere.
         """
-        parts = self.all(dict(figures))
+        parts = self.gather(dict(figures))
         episodes = sum(part["episodes"] for part in parts)
         pooled = {
             name: sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes)
@@ -119,7 +119,7 @@ class TrainingGroup:
         """
         if not self.together:
             return
-        found = self.all(hash_tensors(state))
+        found = self.gather(hash_tensors(state))
         other = [index for index, value in enumerate(found) if value != found[0]]
         if other:
             raise DistributedError(

@@ -151,9 +151,9 @@ class TrainingRunner(OnPolicyRunner):
         book: TrainingLogger = self.logger  # type: ignore[assignment]
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
-        while rounds := self.group.from_first(self._rounds(book, steps)):
+        while rounds := self.group.broadcast_first(self._rounds(book, steps)):
             if self.current_learning_iteration % ITERATIONS_PER_ROUND == 0:
-                share = self.group.from_first(
+                share = self.group.broadcast_first(
                     self.training.budget.share_spent(book.env_steps, book.seconds)
                 )
                 self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
@@ -164,7 +164,7 @@ class TrainingRunner(OnPolicyRunner):
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
-            over = self.group.from_first(self._rounds(book, steps)) == 0
+            over = self.group.broadcast_first(self._rounds(book, steps)) == 0
             if over or self.current_learning_iteration % self.training.save_interval == 0:
                 self.group.check_same(self._policy_state())
                 self.checkpoint()
@@ -224,7 +224,7 @@ class TrainingRunner(OnPolicyRunner):
                 untouched.
         """
         own = {"env": self.env.state_dict(), "random": get_random_state(self.device)}
-        parts = self.group.gathered(own)
+        parts = self.group.gather_on_first(own)
         if not self.group.rank.first:
             return
         book: TrainingLogger = self.logger  # type: ignore[assignment]

@@ -11,8 +11,8 @@ from brokk_rl.sim import scene
 from brokk_rl.spec import spec
 from tasks.advice import AdviceConfig
 from tasks.classical import ClassicalConfig
-from tasks.control import ActionMapping, ObservationNoise, PhaseSwitch
-from tasks.noise import MeasuredNoise
+from tasks.control import ActionMapping, PhaseSwitch
+from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.process import ToolPoseOptions, ToolPoseProcess
 from tasks.reward import RewardTerm
 from tasks.starts import ArmStarts, CandidateTargets, Uniform, draw_starts

@@ -10,7 +10,8 @@ from brokk_rl.sim import scene
 from brokk_rl.spec import spec
 from tasks.advice import AdviceConfig
 from tasks.classical import ClassicalConfig
-from tasks.control import ActionMapping, ObservationNoise, PhaseSwitch
+from tasks.control import ActionMapping, PhaseSwitch
+from tasks.noise import ObservationNoise
 from tasks.process import ToolPoseOptions, ToolPoseProcess
 from tasks.reward import RewardTerm
 from tasks.starts import ArmStarts, CandidateTargets, Uniform, draw_starts
