@@ -14,12 +14,12 @@ import numpy as np
 from brokk_rl.spec import spec
 from diagnosis import (
     effect_library,
+    geometry,
     nonadditive_refit,
     refine,
     residual_model,
     sensors,
     timing,
-    tool,
 )
 from diagnosis.baseline import Base
 from diagnosis.case import Case
@@ -128,11 +128,11 @@ class Search:
         """Returns what is found."""
         prices, nulls = self.prices, [one.evidence for one in self.base.nulls]
         self.tell("sensors", 0.32)
-        on_sensors = sensors.search(self.case, self.kinds, prices.joint, prices.name)
-        on_tool = tool.search(self.case, self.kinds, prices.joint, prices.name)
+        on_sensors = sensors.find_sensor_effects(self.case, self.kinds, prices.joint, prices.name)
+        on_tool = geometry.find_geometry_errors(self.case, self.kinds, prices.joint, prices.name)
         evidence = _adjusted(self.base.field.evidence, self.case, [*on_sensors, *on_tool.found])
         grown, shapes = self._simulated(
-            evidence, tool.is_tracked(self.case.field, self.case.machine)
+            evidence, geometry.is_tracked(self.case.field, self.case.machine)
         )
         small = {name: rays_of(ways[0].kind, SMALL) for name, ways in grown.items()}
         known = Nulls(
@@ -377,7 +377,9 @@ def _adjusted(evidence: Evidence, case: Case, found: Sequence[Found]) -> Evidenc
     if not rough:
         return evidence
     assert evidence.noise is not None, "noise is known by now"
-    reading = sensors.readings(case.field, case.reference, case.machine) * np.any(rough, 0)
+    reading = sensors.measure_excess_scatter(case.field, case.reference, case.machine) * np.any(
+        rough, 0
+    )
     noise = [
         replace(one, reading=float(more)) for one, more in zip(evidence.noise, reading, strict=True)
     ]

@@ -12,10 +12,10 @@ import yaml
 
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import StorageError
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.session import write_text
 from diagnosis import calibration, decision, detection, next_experiment
-from diagnosis.answer import Answer, Estimate, NextExperiment, Ranked, Selected, Where
+from diagnosis.answer import Answer, Estimate, NextExperiment, Outcome, Ranked, Selected, Where
 from diagnosis.baseline import Base
 from diagnosis.calibration import Certainty
 from diagnosis.case import Case
@@ -23,10 +23,9 @@ from diagnosis.detection import Findings, Prices, Tell
 from diagnosis.effect_library import Kind
 from diagnosis.free_runs import FreeRuns
 from diagnosis.gap import Reach, apart
-from diagnosis.outcome import Outcome
 from diagnosis.refine import Repair
 from diagnosis.residual_model import CLUES
-from diagnosis.survey import survey
+from diagnosis.stages import survey_gap
 
 NEAR = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
@@ -61,7 +60,7 @@ class Diagnosis:
     kinds: Sequence[Kind]
     prices: Prices
     calibration: Certainty
-    thresholds: Thresholds
+    thresholds: InspectionThresholds
     excitations: Mapping[str, Excitation]
     generator: np.random.Generator
 
@@ -96,7 +95,7 @@ class Diagnosis:
         told = "unknown" if unknown else "effects" if selected else "none"
         after = field.runs(paths) if selected else None
         machine = self.case.machine
-        seen = survey(
+        seen = survey_gap(
             before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
         )
         remainder = self._remainder(findings, reach) if selected else None

@@ -11,14 +11,14 @@ import torch
 from brokk_rl import observation
 from brokk_rl.checks.exercise import (
     NUM_ENVS,
-    copies,
-    in_place,
-    own_randomness,
-    places,
+    build_rest_history,
+    copy_tensors,
+    is_in_place,
+    is_same,
+    isolate_randomness,
     require,
     require_rows,
-    rest_history,
-    same,
+    view_tensors,
 )
 from brokk_rl.contracts.task import (
     FAULT,
@@ -47,20 +47,21 @@ def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu")
         AssertionError: A promise is broken; the message names it.
     """
     device = torch.device(device)
-    with own_randomness():
+    with isolate_randomness():
         process = task.build(machine, NUM_ENVS, device)
         _check_attributes(process)
         drawn = _check_starts(process, machine)
         start = {name: value.to(device) for name, value in drawn.items()}
-        history = rest_history(machine, device, start["q"])
-        state_places, episode_places = places(process.state), places(process.episode)
+        history = build_rest_history(machine, device, start["q"])
+        state_places, episode_places = view_tensors(process.state), view_tensors(process.episode)
 
         groups = _check_observation(process, history, start)
         _check_commands(process, machine, device)
         _check_optional(process, groups, machine)
         _check_episode(process, history, device)
         require(
-            in_place(process.state, state_places) and in_place(process.episode, episode_places),
+            is_in_place(process.state, state_places)
+            and is_in_place(process.episode, episode_places),
             "state, episode: a tensor moved or changed its shape; write it in place",
         )
         _check_reset_mask(process, start, device)
@@ -100,8 +101,8 @@ def _check_starts(process: TaskProcess, machine: Machine) -> dict[str, torch.Ten
             len(value) == NUM_ENVS and bool(value.isfinite().all()),
             f"starts: '{name}' is not finite for each of {NUM_ENVS} starts",
         )
-        require(same(value, again[name]), f"starts: '{name}' differs for the same seed")
-    require(not same(start["q"], other["q"]), "starts: another seed gives the same arms")
+        require(is_same(value, again[name]), f"starts: '{name}' differs for the same seed")
+    require(not is_same(start["q"], other["q"]), "starts: another seed gives the same arms")
     q = start["q"].cpu().numpy()
     require(
         bool(((q >= machine.lower) & (q <= machine.upper)).all()),
@@ -117,12 +118,12 @@ def _check_observation(
     everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=start["q"].device)
     torch.manual_seed(0)
     process.reset(everywhere, start)
-    groups = copies(process.observe(history))
+    groups = copy_tensors(process.observe(history))
     torch.manual_seed(0)
     process.reset(everywhere, start)
     again = process.observe(history)
     require(
-        all(same(again[name], value) for name, value in groups.items()),
+        all(is_same(again[name], value) for name, value in groups.items()),
         "reset, observe: the same seed gives another observation",
     )
     require("policy" in groups, f"observe: no group 'policy' among {', '.join(groups)}")
@@ -210,7 +211,10 @@ def _check_episode(process: TaskProcess, history: History, device: torch.device)
         contact_force_n=torch.zeros(NUM_ENVS, device=device),
         faults=torch.zeros(NUM_ENVS, dtype=torch.bool, device=device),
     )
-    kept, timed_out = copies(vars(history)), torch.zeros(NUM_ENVS, dtype=torch.bool, device=device)
+    kept, timed_out = (
+        copy_tensors(vars(history)),
+        torch.zeros(NUM_ENVS, dtype=torch.bool, device=device),
+    )
     terminated = timed_out.clone()
     for _ in range(process.max_episode_steps):
         step = process.step(history, world)
@@ -243,7 +247,7 @@ def _check_episode(process: TaskProcess, history: History, device: torch.device)
         f"step: no time-out after max_episode_steps = {process.max_episode_steps}",
     )
     require(
-        all(same(value, kept[name]) for name, value in vars(history).items()),
+        all(is_same(value, kept[name]) for name, value in vars(history).items()),
         "step, observe: changed the history",
     )
 
@@ -252,11 +256,11 @@ def _check_reset_mask(
     process: TaskProcess, start: dict[str, torch.Tensor], device: torch.device
 ) -> None:
     """Check that a reset of environment 0 leaves the state of the others alone."""
-    before = copies(process.state)
+    before = copy_tensors(process.state)
     only_first = torch.arange(NUM_ENVS, device=device) == 0
     process.reset(only_first, start)
     for name, value in process.state.items():
         require(
-            same(value[1:], before[name][1:]),
+            is_same(value[1:], before[name][1:]),
             f"reset: state '{name}' changed in environments outside the mask",
         )

@@ -18,7 +18,7 @@ from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.video import render_video
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 
 log = logging.getLogger(__name__)
 
@@ -138,8 +138,8 @@ def evaluate_policies(
     results = {
         **table[first],
         "seed": evaluation.seed,
-        "actuator": type(config.actuator).__name__.lower(),
-        "follower": type(config.follower).__name__.lower(),
+        "actuator": name_spec(config.actuator),
+        "follower": name_spec(config.follower),
         "policy": first,
         "policies": table,
     }

@@ -66,12 +66,12 @@ class TrainingGroup:
             ) from error
 
     def wait(self) -> None:
-        """Waits until all have come here."""
+        """Wait until all have come here."""
         if self.together:
             dist.barrier()
 
     def broadcast_first(self, value: Any) -> Any:
-        """Returns the first process's `value`: where a clock decides, one clock must decide for all."""
+        """Return the first process's `value`: where a clock decides, one clock must decide for all."""
         if not self.together:
             return value
         box = [value]
@@ -79,7 +79,7 @@ class TrainingGroup:
         return box[0]
 
     def gather(self, value: Any) -> list[Any]:
-        """Returns everyone's `value` (plain numbers and text), in the order of ranks."""
+        """Return everyone's `value` (plain numbers and text), in the order of ranks."""
         if not self.together:
             return [value]
         found: list[Any] = [None] * self.rank.count
@@ -87,7 +87,7 @@ class TrainingGroup:
         return found
 
     def gather_on_first(self, state: Any) -> list[Any]:
-        """Returns everyone's `state` (mappings of tensors, on the host) to the first process, to the others an empty list."""
+        """Return everyone's `state` (mappings of tensors, on the host) to the first process, to the others an empty list."""
         if not self.together:
             return [state]
         found: list[Any] = [None] * self.rank.count
@@ -95,7 +95,7 @@ class TrainingGroup:
         return found if self.rank.first else []
 
     def pool_statistics(self, figures: Mapping[str, float]) -> dict[str, float]:
-        """Returns the figures of all environments of all processes; see `ControlLoop.statistics`.
+        """Return the figures of all environments of all processes; see `ControlLoop.statistics`.
 
         Means over episodes weigh by the number of episodes; the fault rate by control steps, which
         are as many everywhere.
@@ -112,7 +112,7 @@ class TrainingGroup:
         }
 
     def check_same(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Proves that all processes hold the same numbers, bit for bit.
+        """Prove that all processes hold the same numbers, bit for bit.
 
         Raises:
             DistributedError: They do not; the message says which ranks differ from the first.
@@ -129,7 +129,7 @@ class TrainingGroup:
 
 
 def hash_tensors(state: Mapping[str, torch.Tensor]) -> str:
-    """Returns the SHA-256 of names and bytes of tensors."""
+    """Return the SHA-256 of names and bytes of tensors."""
     digest = hashlib.sha256()
     for name, value in state.items():
         digest.update(name.encode())
