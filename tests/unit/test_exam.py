@@ -118,7 +118,7 @@ def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: M
         assert set(pq.read_schema(file).metadata) == {
             b"brokk.schema", b"brokk.machine", b"brokk.rate_hz", b"brokk.created", b"brokk.fingerprint"
         }  # fmt: skip
-        found = record.read(file, machine)
+        found = record.read_recording(file, machine)
         moving = np.abs(found.u) > 0
         exclusive = machine.is_exclusive
         assert not (moving[:, exclusive].any(1) & moving[:, ~exclusive].any(1)).any()
