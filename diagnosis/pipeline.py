@@ -12,7 +12,7 @@ import yaml
 
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import StorageError
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.session import write_text
 from diagnosis import calibration, decision, detection, next_experiment
 from diagnosis.answer import Answer, Estimate, NextExperiment, Outcome, Ranked, Selected, Where
@@ -60,7 +60,7 @@ class Diagnosis:
     kinds: Sequence[Kind]
     prices: Prices
     calibration: Certainty
-    thresholds: Thresholds
+    thresholds: InspectionThresholds
     excitations: Mapping[str, Excitation]
     generator: np.random.Generator
 

@@ -15,10 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from brokk_rl.inspection import Finding, Thresholds, inspect
+from brokk_rl.inspection import InspectionThresholds, RecordingFinding, inspect_recording
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
-from brokk_rl.recording_validation import runs
+from brokk_rl.record import Recording, find_stretches
 
 MIN_STRETCHES = 5
 """Ignored stretches below which a condition that they share may be a coincidence."""
@@ -49,10 +48,10 @@ class Interlock:
 
 
 def find_interlock(
-    inspected: Sequence[tuple[Recording, Sequence[Finding]]],
+    inspected: Sequence[tuple[Recording, Sequence[RecordingFinding]]],
     machine: Machine,
     joint: int,
-    thresholds: Thresholds,
+    thresholds: InspectionThresholds,
 ) -> Interlock | None:
     """Returns the one condition that tells ignored commands of a joint from obeyed ones, `None` where no simple one does.
 
@@ -69,7 +68,7 @@ def find_interlock(
         ]
         for finding in mine:
             mask[finding.row : finding.row + finding.num_rows] = True
-        for row, count in runs(np.abs(recording.u[:, joint]) > thresholds.driving):
+        for row, count in find_stretches(np.abs(recording.u[:, joint]) > thresholds.driving):
             held[row + lead : row + count] = True
         speed = (
             (
@@ -117,7 +116,7 @@ def _measure_agreement(
     condition: np.ndarray,
     ignores: np.ndarray,
     obeys: np.ndarray,
-    thresholds: Thresholds,
+    thresholds: InspectionThresholds,
     machine: Machine,
 ) -> tuple[float, float]:
     """Returns the parts of the ignored and of the obeyed time in which a condition holds, where it has not just changed."""
@@ -131,7 +130,7 @@ def _measure_agreement(
 
 
 def _list_conditions(
-    u: np.ndarray, q: np.ndarray, machine: Machine, joint: int, thresholds: Thresholds
+    u: np.ndarray, q: np.ndarray, machine: Machine, joint: int, thresholds: InspectionThresholds
 ) -> Iterator[tuple[str, np.ndarray]]:
     commanded = np.abs(u) > thresholds.commanded
     others = np.delete(commanded, joint, axis=1)
@@ -250,7 +249,7 @@ TEXTS: dict[str, tuple[Severity, str, str]] = {
     ),
     "clock rate": (
         "note",
-        "the clock runs faster or slower than the stated rate",
+        "the clock find_stretches faster or slower than the stated rate",
         "state the true rate, or discipline the clock",
     ),
     "saturated sensor": (
@@ -261,7 +260,7 @@ TEXTS: dict[str, tuple[Severity, str, str]] = {
     "joint at rest": (
         "note",
         "hardly commanded here: nothing can be said about this joint",
-        "record runs that move it",
+        "record find_stretches that move it",
     ),
 }
 """Severity, meaning and advice of each remark."""
@@ -277,11 +276,12 @@ FINDING_NAMES = {
 
 
 def examine_recordings(
-    recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds
+    recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
 ) -> list[RecordingRemark]:
     """Returns what is to be said about recordings of `machine`, the gravest first."""
     inspected = [
-        (recording, inspect(recording, machine, thresholds).findings) for recording in recordings
+        (recording, inspect_recording(recording, machine, thresholds).findings)
+        for recording in recordings
     ]
     locks = list(
         filter(
@@ -340,10 +340,12 @@ def _make_remark(
     )
 
 
-def _group_findings(recording: Recording, findings: Sequence[Finding]) -> Iterator[RecordingRemark]:
+def _group_findings(
+    recording: Recording, findings: Sequence[RecordingFinding]
+) -> Iterator[RecordingRemark]:
     """Yields one remark for all stretches of one kind and joint."""
 
-    def key(finding: Finding) -> tuple[str, str]:
+    def key(finding: RecordingFinding) -> tuple[str, str]:
         return finding.kind, finding.joint or ""
 
     for (kind, joint), group in groupby(sorted(findings, key=key), key):
@@ -400,7 +402,7 @@ def _check_clock(recording: Recording) -> Iterator[RecordingRemark]:
 
 
 def _check_saturation(
-    recording: Recording, machine: Machine, thresholds: Thresholds
+    recording: Recording, machine: Machine, thresholds: InspectionThresholds
 ) -> Iterator[RecordingRemark]:
     margin, back = (
         thresholds.at_limit * (machine.upper - machine.lower),
@@ -415,7 +417,11 @@ def _check_saturation(
             if abs(stop - extreme) < margin[j]:
                 continue
             driven = outward * acting > thresholds.driving
-            stuck = [run for run in runs((q == extreme) & driven) if run[1] >= MIN_SATURATED_ROWS]
+            stuck = [
+                run
+                for run in find_stretches((q == extreme) & driven)
+                if run[1] >= MIN_SATURATED_ROWS
+            ]
             if stuck:
                 rows = sum(count for _, count in stuck)
                 span_s = recording.t_s[stuck[0][0]], recording.t_s[sum(stuck[-1]) - 1]
@@ -424,7 +430,7 @@ def _check_saturation(
 
 
 def _check_excitation(
-    recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds
+    recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
 ) -> Iterator[RecordingRemark]:
     if not recordings:
         return

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -376,7 +376,7 @@ def survey_gap(
     floor: FreeRuns | None,
     after: FreeRuns | None,
     machine: Machine,
-    thresholds: Thresholds,
+    thresholds: InspectionThresholds,
     dead_time_s: np.ndarray,
     generator: np.random.Generator,
     whole: FreeRuns | None = None,

@@ -13,11 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from actuators.excite.plan.account import Track
-from actuators.excite.plan.drive import drive
-from actuators.excite.plan.guard import Guards
-from actuators.excite.plan.runner import Runner
-from actuators.excite.plan.schedule import Approach, Plan, schedule
+from actuators.excite.plan_report import PlanTrack
+from actuators.excite.player import CommandGuards, PlanPlayer, drive
+from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import ConfigError, list_choices
@@ -77,7 +75,7 @@ class RecordedHalf:
 @contextmanager
 def _silence_runner() -> Iterator[None]:
     """Leaves out what the runner says of ways to start poses that took too long: an ailing machine may well be slow."""
-    logger = logging.getLogger(Runner.__module__)
+    logger = logging.getLogger(PlanPlayer.__module__)
     before = logger.level
     logger.setLevel(logging.ERROR)
     try:
@@ -100,7 +98,7 @@ class RecordingJob:
         plan: What is played.
     """
 
-    plan: Plan
+    plan: ExcitationPlan
 
     def __init__(
         self, question: CaseDesign, case: int, number: int, half: HalfPlan, is_field: bool
@@ -117,7 +115,7 @@ class RecordingJob:
         self.elapsed_s = low_s + share * (
             high_s - low_s
         )  # files follow one another through the day
-        self.created = record.later(
+        self.created = record.add_seconds(
             FIRST_DAY.isoformat(timespec="milliseconds"), self.elapsed_s + 86400.0 * is_field
         )
 
@@ -149,7 +147,7 @@ class CaseRecorder:
     ) -> None:
         self._machine, self._plants, self._roughness = machine, plants, roughness
         self._excitations, self._approach = excitations, approach
-        self._guards = Guards(max_command=1.0, max_tool_speed_m_s=None)
+        self._guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
 
     def planned(
         self, questions: Sequence[CaseDesign], half: HalfPlan, is_field: bool
@@ -221,7 +219,7 @@ class CaseRecorder:
             tracked=question.tracked,
         )
 
-    def _plan(self, job: RecordingJob) -> Plan:
+    def _plan(self, job: RecordingJob) -> ExcitationPlan:
         names = job.half.programs[job.number]
         for name in names:
             if name not in self._excitations:
@@ -233,7 +231,7 @@ class CaseRecorder:
         tried = 1
         while True:
             try:
-                return schedule(chosen, self._machine, self._approach, 1, job.half.file_s, stream)
+                return plan_runs(chosen, self._machine, self._approach, 1, job.half.file_s, stream)
             except ConfigError:
                 if tried == NUM_PLANS:
                     raise
@@ -245,16 +243,16 @@ class CaseRecorder:
         """Records files of one half, of machines of one make; returns what is in each."""
         half, is_field = jobs[0].half, jobs[0].is_field
         machine = self._machine
-        plan = Plan(
+        plan = ExcitationPlan(
             runs=tuple(job.plan.runs[0] for job in jobs),
             run_s=half.file_s,
             names=tuple(self._excitations),
         )
         link = self._plants.build(machine, specimens, half.file_s)
-        runner = Runner(plan, machine, self._approach, self._guards)
+        runner = PlanPlayer(plan, machine, self._approach, self._guards)
         with link as opened, _silence_runner():
             samples = list(drive(opened, runner, machine, len(jobs), half.file_s))
-        track = Track(samples)
+        track = PlanTrack(samples)
         extra = {
             name: np.stack([sample.extra[name] for sample in samples], 1)
             for name in samples[0].extra
@@ -274,14 +272,17 @@ class CaseRecorder:
                 u=u[:, n],
                 q=q[:, n],
                 extra=columns,
-                metadata={"created": job.created, "fingerprint": record.stamp(machine)},
+                metadata={
+                    "created": job.created,
+                    "fingerprint": record.format_fingerprint(machine),
+                },
             )
             path = (
                 folders[job.case]
                 / ("field" if is_field else "reference")
                 / f"{job.number:02d}.parquet"
             )
-            record.write(recording, path)
+            record.write_recording(recording, path)
             os.utime(path, (EPOCH_S, EPOCH_S))
         return [RecordedHalf([u[:, n]], [q[:, n]], [without[:, n]]) for n in range(len(jobs))]
 

@@ -42,7 +42,8 @@ TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 def extract_features(case: Path, machine: Machine) -> np.ndarray:
     """Returns the features of each joint of a case, `(J, F)`."""
     reference, field = (
-        record.read_all(str(case / half / "*.parquet"), machine) for half in ("reference", "field")
+        record.read_recordings(str(case / half / "*.parquet"), machine)
+        for half in ("reference", "field")
     )
     rows = []
     for joint in range(machine.num_joints):

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from actuators.identify.regimes import REGIMES
-from actuators.identify.verdict import HOLD, LINEAR, Finding
+from actuators.identify.results import HOLD, LINEAR, VerdictSentence
+from actuators.identify.scores import REGIMES
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.report import DPI, Cell, Report
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 PAGE = "identification.html"
 
 
-def write(
+def write_page(
     folder: Path,
     result: Mapping[str, Any],
-    findings: Sequence[Finding],
+    findings: Sequence[VerdictSentence],
     drawings: Mapping[str, Figure],
     machine: Machine,
 ) -> None:
@@ -42,7 +42,7 @@ def write(
     )
     for finding in findings[1:]:
         page.add_text(finding.text, finding.tone)
-    _use(page, result, machine)
+    _add_usage(page, result, machine)
     page.add_heading("Measured and predicted")
     caption = (
         "Free runs on runs the model has not seen: it is given the recorded commands (grey, below) and its own predictions. "
@@ -50,15 +50,15 @@ def write(
         "the largest error. Red dots: end of travel."
     )
     page.add_picture(folder / "prediction.png", caption)
-    _errors(page, result, folder, machine)
-    _against(page, result)
-    _regimes(page, result, folder)
-    _dead_time(page, result, folder, machine)
-    _data(page, result)
+    _add_errors(page, result, folder, machine)
+    _add_comparisons(page, result)
+    _add_regimes(page, result, folder)
+    _add_dead_times(page, result, folder, machine)
+    _add_data(page, result)
     page.write(folder / PAGE)
 
 
-def _use(page: Report, result: Mapping[str, Any], machine: Machine) -> None:
+def _add_usage(page: Report, result: Mapping[str, Any], machine: Machine) -> None:
     page.add_heading("Use it")
     if not result["use"]:
         page.add_text(
@@ -75,7 +75,7 @@ def _use(page: Report, result: Mapping[str, Any], machine: Machine) -> None:
     )
 
 
-def _errors(page: Report, result: Mapping[str, Any], folder: Path, machine: Machine) -> None:
+def _add_errors(page: Report, result: Mapping[str, Any], folder: Path, machine: Machine) -> None:
     page.add_heading("Error of free runs")
     horizons = list(result["overall"][result["model"]])
     rows = []
@@ -83,15 +83,17 @@ def _errors(page: Report, result: Mapping[str, Any], folder: Path, machine: Mach
         unit = machine.joints[machine.joint_names.index(joint)].unit
         for number, (name, figures) in enumerate(models.items()):
             first = result["one_step"][joint]
-            cells = [_percent(first[name], [row["percent"] for row in first.values()], unit)]
+            cells = [_format_percent(first[name], [row["percent"] for row in first.values()], unit)]
             cells += [
-                _percent(figures[h], [row[h]["percent"] for row in models.values() if row[h]], unit)
+                _format_percent(
+                    figures[h], [row[h]["percent"] for row in models.values() if row[h]], unit
+                )
                 for h in horizons
             ]
             rows.append([joint if number == 0 else "", name, *cells])
     for number, (name, figures) in enumerate(result["overall"].items()):
         cells = [
-            _percent(
+            _format_percent(
                 figures[h], [row[h]["percent"] for row in result["overall"].values() if row[h]], ""
             )
             for h in horizons
@@ -125,7 +127,7 @@ def _errors(page: Report, result: Mapping[str, Any], folder: Path, machine: Mach
         )
 
 
-def _against(page: Report, result: Mapping[str, Any]) -> None:
+def _add_comparisons(page: Report, result: Mapping[str, Any]) -> None:
     model, rivals = result["model"], result["against"]
     page.add_heading("Is it really better?")
     page.add_text(
@@ -140,8 +142,8 @@ def _against(page: Report, result: Mapping[str, Any]) -> None:
                     row
                     and Cell(
                         f"{row['reduction_percent']:.0f}",
-                        _range(row["reduction_ci95"], ".0f"),
-                        _surely_better(row),
+                        _format_range(row["reduction_ci95"], ".0f"),
+                        _is_surely_better(row),
                     )
                     for row in figures.values()
                 ),
@@ -153,7 +155,7 @@ def _against(page: Report, result: Mapping[str, Any]) -> None:
             page.add_table(columns, rows)
 
 
-def _regimes(page: Report, result: Mapping[str, Any], folder: Path) -> None:
+def _add_regimes(page: Report, result: Mapping[str, Any], folder: Path) -> None:
     page.add_heading("Where it fails")
     text = (
         "Free runs cut into seconds, by the commands that were acting (those of a dead time before) and by where the joint was. A "
@@ -172,7 +174,7 @@ def _regimes(page: Report, result: Mapping[str, Any], folder: Path) -> None:
                     joint if number == 0 else "",
                     regime,
                     *shares,
-                    Cell(f"{figure['drift_per_s']:.5f}", _range(figure["ci95"], ".5f")),
+                    Cell(f"{figure['drift_per_s']:.5f}", _format_range(figure["ci95"], ".5f")),
                 ]
             )
     with page.add_details(f"The same for {model} in figures"):
@@ -183,7 +185,9 @@ def _regimes(page: Report, result: Mapping[str, Any], folder: Path) -> None:
         )
 
 
-def _dead_time(page: Report, result: Mapping[str, Any], folder: Path, machine: Machine) -> None:
+def _add_dead_times(
+    page: Report, result: Mapping[str, Any], folder: Path, machine: Machine
+) -> None:
     page.add_heading("Dead time")
     caption = (
         "What is left of the motion's variance when a static curve of the command, delayed by so much, has explained its part. The "
@@ -192,7 +196,7 @@ def _dead_time(page: Report, result: Mapping[str, Any], folder: Path, machine: M
     page.add_picture(folder / "dead_time.png", caption)
     rows = [
         [joint, None, None] if delay is None else
-        [joint, Cell(f"{delay['value']:.2f}", _range(delay["ci95"], ".3f")), f"{100 * delay['explained']:.1f}"]
+        [joint, Cell(f"{delay['value']:.2f}", _format_range(delay["ci95"], ".3f")), f"{100 * delay['explained']:.1f}"]
         for joint, delay in result["delay_s"].items()
     ]  # fmt: skip
     page.add_table(
@@ -202,7 +206,7 @@ def _dead_time(page: Report, result: Mapping[str, Any], folder: Path, machine: M
     )
 
 
-def _data(page: Report, result: Mapping[str, Any]) -> None:
+def _add_data(page: Report, result: Mapping[str, Any]) -> None:
     page.add_heading("Data and fit")
     data = result["data"]
     rows = [
@@ -252,16 +256,18 @@ def _data(page: Report, result: Mapping[str, Any]) -> None:
                 page.add_text(f"{label}: {', '.join(stage[part]) or 'none'}")
 
 
-def _percent(row: Mapping[str, Any] | None, among: Sequence[float], unit: str) -> Cell | None:
+def _format_percent(
+    row: Mapping[str, Any] | None, among: Sequence[float], unit: str
+) -> Cell | None:
     if row is None:
         return None
     note = f"{row['rmse']:.4f} {unit}" if unit else ""
     return Cell(f"{row['percent']:.3f}", note, row["percent"] <= min(among))
 
 
-def _range(bounds: Sequence[float] | None, style: str) -> str:
+def _format_range(bounds: Sequence[float] | None, style: str) -> str:
     return "" if bounds is None else f"{bounds[0]:{style}} to {bounds[1]:{style}}"
 
 
-def _surely_better(row: Mapping[str, Any]) -> bool:
+def _is_surely_better(row: Mapping[str, Any]) -> bool:
     return row["ci95"] is not None and row["ci95"][1] < 0

@@ -24,7 +24,7 @@ from brokk_rl.rl.runner import TrainingConfig
 from brokk_rl.rl.tracking import Tracking
 from brokk_rl.rl.vec_env import ControlLoopConfig
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 from diagnosis import retraining
 
 log = logging.getLogger(__name__)
@@ -193,7 +193,7 @@ class CloseGap:
 
 
 def _describe_plant(plant: ControlLoopConfig) -> str:
-    return " + ".join([type(plant.actuator).__name__.lower(), *plant.effects])
+    return " + ".join([name_spec(plant.actuator), *plant.effects])
 
 
 def _show(found: dict[str, Any], folder: Path) -> None:

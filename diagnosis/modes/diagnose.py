@@ -14,7 +14,7 @@ from rich.table import Table
 
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
@@ -78,7 +78,7 @@ class Diagnose:
     machine: Machine
     fit: ActuatorFit
     actuator: Actuator | None
-    thresholds: Thresholds
+    thresholds: InspectionThresholds
     excitation: dict[str, Excitation]
     diagnosis: Subject
 

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from actuators.excite.plan.schedule import Approach
+from actuators.excite.schedule import Approach
 from brokk_rl import record
 from brokk_rl.contracts.actuator import ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
@@ -361,7 +361,9 @@ class Exam:
         report.write_report(self.session.folder, facts, tables)
         if self.exam.ledger is not None:
             for name, table in tables.items():
-                report.append_to_ledger(Path(self.exam.ledger), record.now(), facts, name, table)
+                report.append_to_ledger(
+                    Path(self.exam.ledger), record.format_now(), facts, name, table
+                )
         _show(tables)
         log.info("report: %s", self.session.folder / report.REPORT_FILE)
 

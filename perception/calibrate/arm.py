@@ -116,7 +116,7 @@ def read_joint_positions(path: Path, machine: Machine) -> JointTrajectory:
         RecordingError: the recording breaks the format.
     """
     if path.suffix == ".parquet":
-        recording = record.read(path, machine)
+        recording = record.read_recording(path, machine)
         t_s, q = np.asarray(recording.t_s, float), np.asarray(recording.q, float)
         return JointTrajectory(t_s, q, None)
     try:

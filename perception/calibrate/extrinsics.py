@@ -157,7 +157,7 @@ def build_calibration(
     return {
         "schema": SCHEMA,
         "kind": kind,
-        "created": record.now(),
+        "created": record.format_now(),
         "machine": machine.name,
         "T_base_cam": round_to_lists(base_from_camera),
         # of a small motion of the camera in its own frame: x y z in m, then turns in rad

@@ -13,7 +13,7 @@ from composed import option
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import Windows
+from brokk_rl.open_loop import FreeRunWindows
 from diagnosis import calibration, decision, residual_model
 from diagnosis.calibration import Certainty
 from diagnosis.detection import Findings, Prices
@@ -122,7 +122,7 @@ def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> 
     steady = np.repeat(0.05 * random.standard_normal((windows, 20, joints)), residual_model.SPAN, 1)
     measured = 0.5 * np.cumsum(way * (1.0 + steady), 1)
     q = np.concatenate([start[:, None], measured], 1)
-    cut = Windows(np.zeros((windows, 100, joints)), q, np.repeat("one", windows), 1, 1)
+    cut = FreeRunWindows(np.zeros((windows, 100, joints)), q, np.repeat("one", windows), 1, 1)
     candidates = Candidates(cast(Actuator, None), machine, cut, np.zeros(windows), 0)
     evidence = Evidence(
         candidates, [noise] * joints, np.ones((windows, joints), dtype=bool), runs=before

@@ -13,10 +13,10 @@ import pytest
 import torch
 from composed import option
 
-from actuators.effects.affected import Affected
 from actuators.effects.command import DeadBand
+from actuators.effects.composition import Affected
 from actuators.effects.speed import Compliance, FlowGain
-from actuators.models.lag import Lag
+from actuators.models.lag import FirstOrderLag
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Effect
 from brokk_rl.errors import RecordingError
@@ -40,7 +40,7 @@ from diagnosis.detection import Prices
 from diagnosis.pipeline import Diagnosis
 
 CPU = torch.device("cpu")
-PLANT = Lag(
+PLANT = FirstOrderLag(
     dead_time_s=0.31,
     dead_band_extend=0.07,
     dead_band_retract=0.1,
@@ -214,8 +214,8 @@ def test_recordings_of_another_machine_are_refused(tmp_path: Path, machine: Mach
     )
     for part in ("reference", "field"):
         one = driven(other, {}, 1, 10.0, 3)[0]
-        record.write(
-            dataclasses.replace(one, metadata={"fingerprint": record.stamp(other)}),
+        record.write_recording(
+            dataclasses.replace(one, metadata={"fingerprint": record.format_fingerprint(other)}),
             tmp_path / part / "a.parquet",
         )
     with pytest.raises(RecordingError, match="limits differ"):

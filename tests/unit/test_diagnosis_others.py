@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from actuators.models.lag import Lag
+from actuators.models.lag import FirstOrderLag
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -21,7 +21,7 @@ from diagnosis.residuals import Evidence, rays
 from diagnosis.responses import Shape, fitted
 
 CPU = torch.device("cpu")
-PLANT = Lag(
+PLANT = FirstOrderLag(
     dead_time_s=0.3,
     dead_band_extend=0.05,
     dead_band_retract=0.05,

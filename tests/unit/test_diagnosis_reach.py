@@ -12,9 +12,9 @@ import pytest
 import torch
 from composed import option
 
-from actuators.effects.affected import Affected
 from actuators.effects.command import DeadBand, Saturation
-from actuators.models.lag import Lag
+from actuators.effects.composition import Affected
+from actuators.models.lag import FirstOrderLag
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -24,7 +24,7 @@ from diagnosis.gap import Reach
 from diagnosis.residuals import ErrorCovariance, rays
 
 CPU = torch.device("cpu")
-LINEAR = Lag(
+LINEAR = FirstOrderLag(
     dead_time_s=0.0,
     dead_band_extend=0.0,
     dead_band_retract=0.0,

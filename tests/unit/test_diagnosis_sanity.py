@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.sanity import TEXTS, RecordingRemark, examine_recordings
@@ -19,7 +19,7 @@ NOISE = 0.0003
 
 
 @pytest.fixture(scope="module")
-def thresholds() -> Thresholds:
+def thresholds() -> InspectionThresholds:
     return option("thresholds", "default")
 
 
@@ -53,14 +53,14 @@ def named(remarks: list[RecordingRemark]) -> dict[str, RecordingRemark]:
 
 
 def test_a_sound_recording_says_only_which_joint_rested(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     (remark,) = examine_recordings([recording(machine)], machine, thresholds)
     assert (remark.name, remark.joint, remark.severity) == ("joint at rest", "q2", "note")
 
 
 def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
     found = named(
@@ -76,7 +76,7 @@ def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
 
 
 def test_a_joint_locked_in_a_pose_is_an_interlock_and_says_where(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
     limit = float(np.quantile(sound.q[:, 0], 0.5))
@@ -89,7 +89,7 @@ def test_a_joint_locked_in_a_pose_is_an_interlock_and_says_where(
 
 
 def test_a_lock_without_a_common_condition_stays_unexplained(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     ignored = np.zeros(4800, dtype=bool)
     for begin in np.random.default_rng(3).integers(0, 4700, 12):
@@ -109,7 +109,7 @@ def test_a_lock_without_a_common_condition_stays_unexplained(
     ],
 )
 def test_what_is_wrong_with_a_clock_is_told_apart(
-    machine: Machine, thresholds: Thresholds, change, name: str | None
+    machine: Machine, thresholds: InspectionThresholds, change, name: str | None
 ) -> None:
     sound = recording(machine)
     found = named(examine_recordings([replace(sound, t_s=change(sound.t_s))], machine, thresholds))
@@ -121,7 +121,7 @@ def test_what_is_wrong_with_a_clock_is_told_apart(
 
 
 def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_not(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
     middle = float(sound.q[:, 2].min() + 0.7 * np.ptp(sound.q[:, 2]))
@@ -140,7 +140,7 @@ def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_no
 
 
 def test_lost_frames_and_broken_rules_are_one_remark_each(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
     q, u = sound.q.copy(), sound.u.copy()
@@ -153,7 +153,7 @@ def test_lost_frames_and_broken_rules_are_one_remark_each(
 
 
 def test_the_gravest_comes_first_and_all_of_it_is_plain(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
     remarks = examine_recordings(

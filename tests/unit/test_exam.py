@@ -118,7 +118,7 @@ def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: M
         assert set(pq.read_schema(file).metadata) == {
             b"brokk.schema", b"brokk.machine", b"brokk.rate_hz", b"brokk.created", b"brokk.fingerprint"
         }  # fmt: skip
-        found = record.read(file, machine)
+        found = record.read_recording(file, machine)
         moving = np.abs(found.u) > 0
         exclusive = machine.is_exclusive
         assert not (moving[:, exclusive].any(1) & moving[:, ~exclusive].any(1)).any()
@@ -164,7 +164,7 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(
         *about,
         "exam.do=score",
         f"+exam.answers.none={answers}",
-        f"exam.report={ledger}",
+        f"exam.ledger={ledger}",
         f"session.out={marks}",
     )
     assert done.code == 0, done.err

@@ -355,7 +355,7 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
         u=np.zeros_like(q),
         q=q,
     )
-    record.write(recording, tmp_path / "run.parquet")
+    record.write_recording(recording, tmp_path / "run.parquet")
     frame_s, late_s, chance = np.arange(0.5, 11.5, 0.3), 0.12, np.random.default_rng(0)
     dataset.write_camera(tmp_path, board.MATRIX, None, None)
     there = np.stack([np.interp(frame_s + late_s, t_s, column) for column in q.T], 1)

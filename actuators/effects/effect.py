@@ -8,8 +8,8 @@ from typing import ClassVar, Literal
 
 import torch
 
-from actuators.effects.ranges import CHANCE, Joints, Number, Ranges
-from actuators.models import draw
+from actuators.effects.ranges import CHANCE, EffectNumber, Joints, ParameterRanges
+from actuators.models import random_draws
 from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
@@ -20,7 +20,7 @@ Memory = dict[str, torch.Tensor]
 Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
 
 
-class Plant:
+class MachineTensors:
     """What effects need of the machine: `full_step` (way at full speed in one period) and the like, `(J,)`; weight; geometry.
 
     Weight and geometry are made when an effect asks for them: most do not, and work on machines
@@ -71,7 +71,7 @@ class Plant:
 
 
 @dataclass(frozen=True)
-class Moment:
+class StepInputs:
     """What an effect looks at in one control period.
 
     Attributes:
@@ -87,7 +87,7 @@ class Moment:
     value: dict[str, torch.Tensor]
     memory: Memory
     history: History
-    plant: Plant
+    plant: MachineTensors
     moved: torch.Tensor
     counter: torch.Tensor | None
     weight: torch.Tensor | None = None
@@ -96,7 +96,7 @@ class Moment:
     def chance(self) -> torch.Tensor:
         """A number in [0, 1) for each environment, the same for all joints: they share frames. `(N, 1)`."""
         assert self.counter is not None, "only a stochastic effect has chances"
-        return draw.uniform(self.counter, CHANCE, 1)
+        return random_draws.draw_uniform(self.counter, CHANCE, 1)
 
 
 class EffectSpec:
@@ -121,7 +121,7 @@ class EffectSpec:
     stage: ClassVar[Literal["actuation", "sensing", "kinematics", "timing", "perception"]] = (
         "actuation"
     )
-    numbers: ClassVar[dict[str, Number]]
+    numbers: ClassVar[dict[str, EffectNumber]]
     stochastic: ClassVar[bool] = False
     smooth: ClassVar[bool] = True
     delays: ClassVar[bool] = False
@@ -144,15 +144,15 @@ class EffectSpec:
         """
         return Wrapped(self, model, machine, num_envs, device)
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """Returns the memory with which the effect begins at `now`, at rest or in the middle of a recording."""
         return {}
 
-    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """Returns the commands that the inner model sees, `(N, H, J)`, and the memory; command side."""
         return now.history.u, {}
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """Returns how much further than `now.moved` the joints move, `(N, J)`, and the memory; speed side."""
         return torch.zeros_like(now.moved), {}
 
@@ -167,7 +167,11 @@ class EffectSpec:
         return q
 
     def tool(
-        self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant
+        self,
+        point_m: torch.Tensor,
+        q: torch.Tensor,
+        value: dict[str, torch.Tensor],
+        plant: MachineTensors,
     ) -> torch.Tensor:
         """Returns where the tool point is that the model has at `point_m`, `(N, 3)`; kinematics."""
         return point_m
@@ -202,11 +206,11 @@ class Wrapped:
         joints: Joints = given.pop("joints", "all")
         salt = zlib.crc32(name.encode()) + len(inner.state)
         where = f"effect.{name}"
-        self._ranges = Ranges(
+        self._ranges = ParameterRanges(
             given, effect.numbers, joints, machine, num_envs, device, effect.stochastic, salt, where
         )
         self.parameters = self._ranges.value
-        self.plant = Plant(
+        self.plant = MachineTensors(
             machine, device, weighed=effect.weighed, placed=effect.side == "kinematics"
         )
         rest = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
@@ -252,7 +256,7 @@ class Wrapped:
         now = self._moment(history, self._ranges.advance() if self.effect.stochastic else None)
         begun, fresh = self._begin(now), self._fresh.clone()
         memory = {
-            key: torch.where(per_row(fresh, value), begun[key], value)
+            key: torch.where(broadcast_rows(fresh, value), begun[key], value)
             for key, value in self._memory.items()
         }
         now = replace(now, memory=memory)
@@ -264,7 +268,7 @@ class Wrapped:
 
     def measure(self, q: torch.Tensor) -> torch.Tensor:
         """Returns what the sensors say at the true positions `q`, `(N, J)`; to be called once a control period."""
-        q = getattr(self.inner, "measure", _unchanged)(q)
+        q = getattr(self.inner, "measure", _keep_unchanged)(q)
         if self.effect.side != "measurement":
             return q
         return self.effect.measured(
@@ -274,16 +278,16 @@ class Wrapped:
     def truth(self, q: torch.Tensor) -> torch.Tensor:
         """Returns the likeliest true positions where the sensors say `q`, `(N, J)` or `(N, H, J)`."""
         q = self.effect.truth(q, self.parameters)
-        return getattr(self.inner, "truth", _unchanged)(q)
+        return getattr(self.inner, "truth", _keep_unchanged)(q)
 
     def tool(self, point_m: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Returns where an outside instrument finds the tool that the model has at `point_m`, `(N, 3)` in the base frame."""
-        point_m = getattr(self.inner, "tool", _unchanged)(point_m, q)
+        point_m = getattr(self.inner, "tool", _keep_unchanged)(point_m, q)
         return self.effect.tool(point_m, q, self.parameters, self.plant)
 
     def target(self, point_m: torch.Tensor) -> torch.Tensor:
         """Returns where the camera sees a point, `(N, 3)` in the base frame."""
-        point_m = getattr(self.inner, "target", _unchanged)(point_m)
+        point_m = getattr(self.inner, "target", _keep_unchanged)(point_m)
         return self.effect.target(point_m, self.parameters)
 
     def misplacement(self, q: torch.Tensor) -> torch.Tensor:
@@ -296,12 +300,12 @@ class Wrapped:
         tip_m = self.plant.kinematics.pose(q).tip_in_base_m
         return self.target(self.tool(tip_m, q)) - tip_m
 
-    def _moment(self, history: History, counter: torch.Tensor | None) -> Moment:
-        return Moment(
+    def _moment(self, history: History, counter: torch.Tensor | None) -> StepInputs:
+        return StepInputs(
             self.parameters, {}, history, self.plant, torch.zeros_like(history.q[:, -1]), counter
         )
 
-    def _begin(self, now: Moment) -> Memory:
+    def _begin(self, now: StepInputs) -> Memory:
         begun = self.effect.begin(now)
         return begun | (
             {"shift": torch.zeros_like(now.history.q)}
@@ -309,11 +313,11 @@ class Wrapped:
             else {}
         )
 
-    def _commanded(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def _commanded(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         u, memory = self.effect.commands(now)
         return self.inner.step(History(q=now.history.q, u=u)), memory
 
-    def _moved(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def _moved(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """Steps the inner model on positions from which past doings of the effect are taken out.
 
         A learned model goes on from the increments that it sees; a gain on them would compound from
@@ -335,10 +339,10 @@ class Wrapped:
         }
 
 
-def _unchanged(value: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+def _keep_unchanged(value: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
     return value
 
 
-def per_row(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+def broadcast_rows(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
     """Returns `mask`, `(N,)`, so that it broadcasts over rows of `like`."""
     return mask.reshape(-1, *[1] * (like.dim() - 1))

@@ -64,7 +64,7 @@ class Approach:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ExcitationPlan:
     """What each run plays.
 
     Attributes:
@@ -78,14 +78,14 @@ class Plan:
     names: tuple[str, ...]
 
 
-def schedule(
+def plan_runs(
     excitations: Mapping[str, Excitation],
     machine: Machine,
     approach: Approach,
     num_runs: int,
     run_s: float,
     generator: np.random.Generator,
-) -> Plan:
+) -> ExcitationPlan:
     """Returns a plan in which each run plays all excitations in order, with draws of its own, within `run_s`.
 
     Raises:
@@ -107,17 +107,17 @@ def schedule(
     for seed in generator.integers(2**63, size=num_runs):
         programs_s, tries = run_s, []
         for _ in range(NUM_TRIES):
-            segments = _segments(excitations, parts, machine, programs_s, int(seed))
-            needed_s = _needed_s(segments, machine, approach)
+            segments = _collect_segments(excitations, parts, machine, programs_s, int(seed))
+            needed_s = _estimate_duration_s(segments, machine, approach)
             tries.append(
                 (needed_s if needed_s <= run_s else run_s - needed_s, len(tries), tuple(segments))
             )
             programs_s *= run_s / needed_s
         runs.append(max(tries)[-1])
-    return Plan(runs=tuple(runs), run_s=run_s, names=tuple(excitations))
+    return ExcitationPlan(runs=tuple(runs), run_s=run_s, names=tuple(excitations))
 
 
-def _segments(
+def _collect_segments(
     excitations: Mapping[str, Excitation],
     parts: Mapping[str, float],
     machine: Machine,
@@ -131,7 +131,7 @@ def _segments(
     return found
 
 
-def _needed_s(segments: list[Segment], machine: Machine, approach: Approach) -> float:
+def _estimate_duration_s(segments: list[Segment], machine: Machine, approach: Approach) -> float:
     """Returns the time that programs and approaches should take, from home on; motion within a segment is left out."""
     at = np.stack([machine.home, *(segment.start for segment in segments[:-1])])
     ways_s = approach.duration_s(machine, at, np.stack([segment.start for segment in segments]))

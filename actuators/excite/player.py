@@ -1,26 +1,90 @@
-"""Plays a plan on `N` machines at once: approaches in closed loop, programs in open loop, both within the guards.
-
-    approach --arrived or given up--> rest --over--> play --program over--> approach of the next
-    segment … done
-                                                      |  ^
-                                        near a stop   v  | program passes zero     (segments that go
-                                        `home` at the stops)
-                                                    return --arrived--> wait
-
-A program runs on by the clock while its joint is brought home, so a segment always lasts as long as
-its program. A segment that
-repeats another plays the commands that were really sent then, turns at the stops included: only so
-are the two comparable.
-"""
+"""Guards of a collection: bounds that no program can exceed. They do not replace the machine's own guard."""
 
 import logging
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
-from actuators.excite.plan.guard import Guards, ToolSpeed
-from actuators.excite.plan.schedule import Approach, Plan
-from brokk_rl.errors import ConfigError
+from actuators.excite.schedule import Approach, ExcitationPlan
+from brokk_rl.contracts.link import Link
+from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine, mask_exclusive_joints
+from brokk_rl.session import Session
+from brokk_rl.signals import Command, JointState
+from brokk_rl.spec import spec
+
+
+@spec
+class CommandGuards:
+    """What commands may do at most.
+
+    Attributes:
+        max_command: Largest command.
+        max_tool_speed_m_s: Largest speed of the tool point, predicted from the machine's nominal
+            speeds; commands that would
+            exceed it are scaled down together. `null`: no bound. Needs a machine whose geometry is
+                known.
+    """
+
+    max_command: float
+    max_tool_speed_m_s: float | None
+
+    def check(self) -> None:
+        if not 0 < self.max_command <= 1:
+            raise ConfigError(
+                f"collect.guards.max_command: expected (0, 1], got {self.max_command}"
+            )
+        if self.max_tool_speed_m_s is not None and self.max_tool_speed_m_s <= 0:
+            raise ConfigError(
+                f"collect.guards.max_tool_speed_m_s: expected more than 0 or null, got {self.max_tool_speed_m_s}"
+            )
+
+
+class ToolSpeed:
+    """Speed of the tool point; needs torch, as all kinematics does.
+
+    Raises:
+        ConfigError: the machine's geometry is not known, or torch is not installed.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        if not machine.has_bodies:
+            raise ConfigError(
+                f"collect.guards.max_tool_speed_m_s: the geometry of machine '{machine.name}' is not known; give null, or bodies "
+                "and tool_m in its file"
+            )
+        try:
+            import torch
+
+            from brokk_rl.kinematics import Kinematics
+        except ImportError as error:
+            raise ConfigError(
+                "collect.guards.max_tool_speed_m_s: needs torch, which is not installed; give null, or a max_command"
+            ) from error
+        self._kinematics, self._tensor = Kinematics(machine), torch.as_tensor
+
+    def of(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Returns the speed of the tool point in m/s, `(N,)`, for joints at `q` that move with `speed`, each `(N, J)`."""
+        tip = self._kinematics.jacobian(self._tensor(q.astype(np.float32))).tip.numpy()
+        return np.linalg.norm((tip @ speed[..., None])[..., 0], axis=-1)
+
+
+def predict_tool_speed(machine: Machine, q: np.ndarray) -> np.ndarray | None:
+    """Returns the speed of the tool point in m/s along a path `q`, `(T, J)`: `(T,)`; `None` where geometry or torch are missing."""
+    if not machine.has_bodies:
+        return None
+    try:
+        import torch
+
+        from brokk_rl.kinematics import Kinematics
+    except ImportError:
+        return None
+    tip_m = Kinematics(machine).pose(torch.as_tensor(q.astype(np.float32))).tip_in_base_m.numpy()
+    return np.linalg.norm(np.gradient(tip_m, axis=0), axis=-1) / machine.period_s
+
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +104,7 @@ INSIDE = np.array([False, False, True, True, True, False])
 """By phase: the clock of the program runs."""
 
 
-class Runner:
+class PlanPlayer:
     """The state machine, over all runs at once.
 
     Attributes:
@@ -48,7 +112,9 @@ class Runner:
         segment: Number of the segment of each run, `(N,)`.
     """
 
-    def __init__(self, plan: Plan, machine: Machine, approach: Approach, guards: Guards) -> None:
+    def __init__(
+        self, plan: ExcitationPlan, machine: Machine, approach: Approach, guards: CommandGuards
+    ) -> None:
         self._plan, self._machine, self._approach, self._guards = plan, machine, approach, guards
         self._tool_speed = None if guards.max_tool_speed_m_s is None else ToolSpeed(machine)
         count = len(plan.runs)
@@ -239,3 +305,140 @@ class Runner:
                     self._original[n, i] = names.index(segment.repeat_of)
                     margin = margin * REPEAT_MARGIN
                 self._low[n, i], self._high[n, i] = machine.lower + margin, machine.upper - margin
+
+
+DUE = 0.9
+"""Part of a control period after which a new state counts as due: states that come at the machine's
+own rate jitter."""
+SILENCE_S = 1.0
+"""Time without a new state after which a link counts as lost."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One control period of all runs.
+
+    Attributes:
+        t_s: Time on the link's clock.
+        q: Measured positions, `(N, J)`.
+        u: Commands really sent, in force from `t_s` on, `(N, J)`.
+        phase: What each run is doing, `(N,)`; see `runner`.
+        segment: Number of its segment, `(N,)`.
+        played: Control periods since the program of that segment began, `(N,)`.
+        extra: What the link measures besides, each `(N,)`.
+    """
+
+    t_s: float
+    q: np.ndarray
+    u: np.ndarray
+    phase: np.ndarray
+    segment: np.ndarray
+    played: np.ndarray
+    extra: Mapping[str, np.ndarray]
+
+
+def drive(
+    link: Link, runner: PlanPlayer, machine: Machine, num_runs: int, run_s: float
+) -> Iterator[Sample]:
+    """Plays the runner's plan over an open link, one sample a control period, until it is done or `run_s` is over.
+
+    What is not needed at once belongs between two samples: the loop sleeps only until the next
+    control period is due.
+
+    Raises:
+        LinkError: the link fell silent, or said something that makes no sense.
+    """
+    extra, before = getattr(link, "extra", dict), -np.inf
+    shape = (num_runs, machine.num_joints)
+    for _ in range(round(run_s / machine.period_s)):
+        if runner.done:
+            return
+        state = _wait_for_state(link, before + DUE * machine.period_s)
+        before, form = state.t_s, np.shape(state.q)
+        q = np.asarray(state.q, dtype=np.float64)
+        if q.size != np.prod(shape) or not np.isfinite(q).all():
+            raise LinkError(
+                f"link: expected {shape} finite positions at {state.t_s:.2f} s, got {q}"
+            )
+        q = q.reshape(shape)
+        u = runner.command(q)
+        phase, segment, played = runner.phase.copy(), runner.segment.copy(), runner.played
+        sent = np.array(link.send(Command(u.reshape(form))).u, dtype=np.float64).reshape(shape)
+        runner.took(sent)
+        columns = {
+            name: np.array(np.broadcast_to(value, (num_runs,)), dtype=np.float64)
+            for name, value in extra().items()
+        }
+        yield Sample(
+            t_s=state.t_s,
+            q=q.copy(),
+            u=sent,
+            phase=phase,
+            segment=segment,
+            played=played,
+            extra=columns,
+        )
+
+
+def _wait_for_state(link: Link, due_s: float) -> JointState:
+    """Returns the first state at or after `due_s`, sleeping until then; a simulated machine is always due."""
+    given_up = time.monotonic() + SILENCE_S
+    while (state := link.read()).t_s < due_s:
+        if time.monotonic() > given_up:
+            raise LinkError(
+                f"link: no state after {state.t_s:.2f} s for {SILENCE_S:g} s; is the machine on, and the bus connected?"
+            )
+        time.sleep(min(max(due_s - state.t_s, 1e-3), SILENCE_S / 10.0))
+    return state
+
+
+@spec
+class NominalMachine:
+    """A machine as its file has it: dead time and full speed times command. Needs neither simulator nor torch."""
+
+    @property
+    def source(self) -> str:
+        """That it is none."""
+        return "nominal machine"
+
+    def build(self, machine: Machine, num_runs: int, session: Session) -> Link:
+        """Returns a link to `num_runs` of them."""
+        return NominalLink(machine, num_runs, alone=num_runs == 1)
+
+
+class NominalLink:
+    """A machine as its file has it: dead time, full speed times command, stops; `N` of them, or one alone without that axis."""
+
+    def __init__(self, machine: Machine, num_runs: int, alone: bool = False) -> None:
+        self._machine, self._t_s, self._form = (
+            machine,
+            0.0,
+            (machine.num_joints,) if alone else (num_runs, machine.num_joints),
+        )
+        self._q = np.tile(machine.home, (num_runs, 1))
+        self._in_flight = np.zeros(
+            (round(machine.dead_time_s / machine.period_s) + 1, *self._q.shape)
+        )
+
+    def read(self) -> JointState:
+        """Returns the true positions."""
+        return JointState(self._t_s, self._q.reshape(self._form))
+
+    def send(self, command: Command) -> Command:
+        """Moves on by one control period."""
+        machine = self._machine
+        u = np.nan_to_num(np.asarray(command.u, dtype=float), nan=0.0, posinf=0.0, neginf=0.0).clip(
+            -1.0, 1.0
+        )
+        self._in_flight = np.concatenate([self._in_flight[1:], u.reshape(1, *self._q.shape)])
+        self._q = (self._q + self._in_flight[0] * machine.max_speed * machine.period_s).clip(
+            machine.lower, machine.upper
+        )
+        self._t_s += machine.period_s
+        return Command(u)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        pass

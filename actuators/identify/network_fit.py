@@ -1,10 +1,17 @@
-"""Fits the actuator networks to recordings, all joints in one batch."""
+"""One update of a fit, with everything it changes: on a GPU captured in a CUDA graph, on the CPU the same code called step by step.
 
+A free run of 60 steps is some thousand tiny kernels forth and back; launched one by one they take
+far longer than they run.
+"""
+
+from __future__ import annotations
+
+import copy
 import dataclasses
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -12,19 +19,132 @@ import numpy as np
 import torch
 from rich.progress import Progress, TaskID
 
-from actuators.identify import survey
-from actuators.identify.dataset import Windows
-from actuators.identify.descent import Descent
-from actuators.identify.interruption import Interruption, digest
+from actuators.identify import training_data
+from actuators.identify.training_data import TrainingWindows
 from actuators.models import checkpoint
-from actuators.models.coupled import Coupled
-from actuators.models.mlp import Mlp
-from actuators.models.network import JointNetworks
+from actuators.models.checkpoint import ResumeFile, hash_recordings
+from actuators.models.network import Coupled, JointNetworks, Mlp
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.rl.execution import capture_graph
 from brokk_rl.spec import spec
 from brokk_rl.split import COMMANDED
+
+
+class FreeRunOptimizer:
+    """Adam on free runs, with a running average of the weights.
+
+    The windows of an update are named by a counter (`Windows.draw`), so that there is no generator
+    with a state to keep. Rates are tensors that the host fills before an update, so that a captured
+    update can be steered.
+
+    Args:
+        networks: What is fitted, on its device.
+        machine: Gives the ends of travel.
+        seed: Of the draws.
+
+    Attributes:
+        networks: The networks at work.
+        averaged: The running average of their weights, which is what is validated and kept.
+    """
+
+    def __init__(self, networks: JointNetworks, machine: Machine, seed: int) -> None:
+        self.networks, self.averaged = networks, copy.deepcopy(networks).requires_grad_(False)
+        self._device = networks.quiet.device
+        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=self._device)
+        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=self._device)
+        self._seed = seed % 2**31
+        self._key = torch.zeros((), dtype=torch.int64, device=self._device)
+        self._rate = torch.zeros((), device=self._device)
+        self._share_of_new = torch.zeros((), device=self._device)
+        self._parameters = list(networks.parameters())
+        on_gpu = self._device.type == "cuda"
+        self._adam = torch.optim.Adam(
+            self._parameters, lr=self._rate, fused=True, capturable=on_gpu
+        )
+        self._begin_adam()
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Returns all that an update changes, by name; the tensors themselves, to be copied from and into."""
+        found = {
+            f"networks.{name}": value.detach() for name, value in self.networks.named_parameters()
+        }
+        found |= {f"averaged.{name}": value for name, value in self.averaged.named_parameters()}
+        for number, parameter in enumerate(self._parameters):
+            found |= {
+                f"adam.{number}.{name}": value
+                for name, value in self._adam.state[parameter].items()
+            }
+        return found
+
+    def updater(
+        self, windows: TrainingWindows, batch: int, still_share: float, busy_share: float
+    ) -> Callable[[], None]:
+        """Returns one update on `batch` windows a joint as a function; capturing it, on a GPU, leaves the state as it was."""
+
+        def update() -> None:
+            self._update(
+                *windows.draw(
+                    batch, still_share, busy_share, self._key, together=self.networks.coupled
+                )
+            )
+
+        if self._device.type != "cuda":
+            return update
+        before = {name: value.clone() for name, value in self.state().items()}
+        graph = capture_graph(update, self._device, gradients=True)
+        for name, value in self.state().items():
+            value.copy_(before[name])
+        return graph.replay
+
+    def steer(self, number: int, rate: float, average: float) -> None:
+        """Sets number, learning rate and decay of the average of the update to come, without waiting for the device."""
+        self._key.fill_(self._seed * 2**20 + number)
+        self._rate.fill_(rate)
+        self._share_of_new.fill_(1.0 - average)
+
+    @torch.no_grad()
+    def run(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+        """Returns the free runs of the averaged networks through windows `(J, B, H + K)`, shape `(J, B, K)`."""
+        return self.averaged.roll_out(
+            u[..., :-1], q[..., : self.averaged.num_history], self._lower, self._upper
+        )
+
+    def _update(self, u: torch.Tensor, q: torch.Tensor) -> None:
+        networks, size = self.networks, self.networks.num_history
+        scale = networks.increment_scale[:, None, None]
+        horizon = q.shape[2] - size
+        if horizon == 1:
+            # before the dead zone, whose gradient is zero where it acts
+            output = networks(networks.inputs(u[..., :size], q[..., :size]))
+            loss = (
+                (output - (q[..., size] - q[..., size - 1]) / scale[..., 0]).square().mean(1).sum()
+            )
+        else:
+            path = networks.roll_out(u[..., :-1], q[..., :size], self._lower, self._upper)
+            ahead = torch.arange(1, horizon + 1, device=q.device)
+            # an error that grows with the square root of time counts the same early and late
+            loss = (((path - q[..., size:]) / scale).square() / ahead).mean((1, 2)).sum()
+        gradients = torch.autograd.grad(loss, self._parameters)
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            # joints are fitted independently: each has its own bound
+            norm = gradient.flatten(1).norm(dim=1).clamp(min=1.0)
+            parameter.grad = gradient / norm.view(-1, 1, 1)
+        self._adam.step()
+        with torch.no_grad():
+            for mean, value in zip(self.averaged.parameters(), self._parameters, strict=True):
+                mean.lerp_(value, self._share_of_new)
+
+    def _begin_adam(self) -> None:
+        """Makes Adam's state exist, with fixed addresses, before anything is captured: a step of rate and gradient zero."""
+        for parameter in self._parameters:
+            parameter.grad = torch.zeros_like(parameter)
+        self._adam.step()
+        for parameter in self._parameters:
+            for value in self._adam.state[parameter].values():
+                value.zero_()
+
 
 log = logging.getLogger(__name__)
 
@@ -112,15 +232,15 @@ class NetworkFit:
             CheckpointError: `folder` holds an interrupted fit with other settings or data.
             StorageError: a file could not be written.
         """
-        survey.check_enough(train, machine)
+        training_data.check_enough(train, machine)
         if self.network == "coupled":
-            survey.check_together(train)
+            training_data.check_together(train)
         stamp = {
             "fit": {**dataclasses.asdict(self), "save_every_s": None}, "machine": machine.fingerprint(), "seed": seed,
-            "device": device.type, "train": digest(train), "validation": digest(validation),
+            "device": device.type, "train": hash_recordings(train), "validation": hash_recordings(validation),
         }  # fmt: skip
-        interruption = Interruption(folder / f"{self.name}.partial.safetensors", stamp)
-        fitting = _Fitting(self, machine, train, validation, seed, device)
+        interruption = ResumeFile(folder / f"{self.name}.partial.safetensors", stamp)
+        fitting = _NetworkFitting(self, machine, train, validation, seed, device)
         seconds = fitting.run(interruption)
         tensors, errors = fitting.result
         facts = {
@@ -131,7 +251,9 @@ class NetworkFit:
                 "commanded_minutes": dict(
                     zip(
                         machine.joint_names,
-                        (survey.commanded_s(train).sum(0) / 60.0).round(1).tolist(),
+                        (training_data.measure_commanded_each_way_s(train).sum(0) / 60.0)
+                        .round(1)
+                        .tolist(),
                         strict=True,
                     )
                 ),
@@ -149,13 +271,13 @@ class NetworkFit:
             },
         }
         path = folder / f"{self.name}.safetensors"
-        checkpoint.write(path, self.network, machine, tensors, facts)
+        checkpoint.write_checkpoint(path, self.network, machine, tensors, facts)
         interruption.remove()
         return (Coupled if self.network == "coupled" else Mlp)(checkpoint=str(path))
 
 
 @dataclasses.dataclass
-class _Place:
+class _FitProgress:
     """Where a fit is: stage, updates done in it, validations without improvement, and the time spent so far."""
 
     stage: int = 0
@@ -165,7 +287,7 @@ class _Place:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Stage:
+class _HorizonStage:
     """Updates with one horizon."""
 
     horizon_s: float
@@ -173,7 +295,7 @@ class _Stage:
     batch: int
 
 
-class _Fitting:
+class _NetworkFitting:
     """One fit at work."""
 
     def __init__(
@@ -190,12 +312,12 @@ class _Fitting:
         coupled, joints = config.network == "coupled", machine.num_joints
         networks = JointNetworks(joints, machine.num_history, config.width, coupled, generator)
         self._normalise(networks)
-        self._descent = Descent(networks.to(device), machine, seed)
+        self._descent = FreeRunOptimizer(networks.to(device), machine, seed)
         self._kept = {
             name: value.clone() for name, value in self._descent.averaged.named_parameters()
         }
         self._best = torch.full((joints,), math.inf, device=device)
-        held = Windows(
+        held = TrainingWindows(
             validation,
             machine,
             self._steps(config.validation_s),
@@ -210,18 +332,19 @@ class _Fitting:
             torch.zeros((), dtype=torch.int64, device=device),
             together=coupled,
         )
-        self._stages = [_Stage(0.0, config.one_step_updates, config.one_step_batch)]
+        self._stages = [_HorizonStage(0.0, config.one_step_updates, config.one_step_batch)]
         if config.loss == "rollout":
             self._stages += [
-                _Stage(horizon_s, config.updates, config.batch) for horizon_s in config.horizons_s
+                _HorizonStage(horizon_s, config.updates, config.batch)
+                for horizon_s in config.horizons_s
             ]
 
-    def run(self, interruption: Interruption) -> float:
+    def run(self, interruption: ResumeFile) -> float:
         """Fits, going on from `interruption` if there is one; returns the time it took in all, s."""
         found = interruption.load(self._state())
         if found:
             log.info("going on with the fit that was interrupted after %.0f s", found["seconds"])
-        place = _Place(**(found or {}))
+        place = _FitProgress(**(found or {}))
         with Progress(transient=True) as progress:
             task = progress.add_task("fit", total=sum(stage.updates for stage in self._stages))
             while place.stage < len(self._stages):
@@ -235,11 +358,11 @@ class _Fitting:
         return {**self._descent.averaged.state_dict(), **self._kept}, self._best.tolist()
 
     def _run_stage(
-        self, place: _Place, interruption: Interruption, progress: Progress, task: TaskID
+        self, place: _FitProgress, interruption: ResumeFile, progress: Progress, task: TaskID
     ) -> None:
         """Runs what is left of the stage at `place`."""
         config, stage = self._config, self._stages[place.stage]
-        windows = Windows(
+        windows = TrainingWindows(
             self._train, self._machine, max(1, self._steps(stage.horizon_s)), self._device
         )
         update = self._descent.updater(windows, stage.batch, config.still_share, config.busy_share)
@@ -315,7 +438,9 @@ class _Fitting:
         networks.position_center.copy_((lower + upper) / 2.0)
         networks.position_scale.copy_((upper - lower) / 2.0)
         if self._config.quiet is None:
-            networks.quiet.copy_(torch.as_tensor(survey.resting_noise(self._train, self._machine)))
+            networks.quiet.copy_(
+                torch.as_tensor(training_data.estimate_resting_noise(self._train, self._machine))
+            )
         else:
             networks.quiet.fill_(self._config.quiet)
 

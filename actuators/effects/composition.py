@@ -54,7 +54,7 @@ class AffectedModel:
             model = self.effects[name] = effect.wrap(model, machine, num_envs, device)
         self._model = model
         self._truth, self._measure = (
-            getattr(model, name, _unchanged) for name in ("truth", "measure")
+            getattr(model, name, _keep_unchanged) for name in ("truth", "measure")
         )
         self._q = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
@@ -82,5 +82,5 @@ class AffectedModel:
         return self._measure(q)
 
 
-def _unchanged(q: torch.Tensor) -> torch.Tensor:
+def _keep_unchanged(q: torch.Tensor) -> torch.Tensor:
     return q
