@@ -22,7 +22,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from perception import dataset
 from perception.calibrate import arm, clock_offset, hand_eye, touched_points, transforms
-from perception.calibrate import hand_eye as start
 from perception.calibrate.extrinsics import compute_point_std_m
 from perception.sources.folder import FrameFolder
 
