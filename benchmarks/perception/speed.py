@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     given = parser.parse_args()
     cv2.setNumThreads(given.threads)
-    observer = configured(
+    finder = configured(
         "perception", "mode=perceive", "perceive.input=.", f"perception={given.option}"
     ).build()
     shortest = []
@@ -54,7 +54,7 @@ def main() -> None:
         looks = []
         for _ in range(TIMES):
             start, busy = time.perf_counter(), time.process_time()
-            ms = observer.look(frame).ms
+            ms = finder.find(frame).ms
             total, spent = time.perf_counter() - start, time.process_time() - busy
             looks.append(
                 [ms.get(stage, 0.0) for stage in STAGES[:-2]] + [1000.0 * total, 1000.0 * spent]

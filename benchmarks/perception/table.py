@@ -32,10 +32,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from brokk_rl.contracts.vision import FrameDetections, Observer, Overlay
+from brokk_rl.contracts.vision import FrameDetections, Overlay
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from perception.benchmark.scoring import FinderScore, score_frame
+from perception.finder import StagedFinder
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_sampler import compose_scene
 
@@ -157,8 +158,8 @@ def look(task: Task) -> list[dict[str, Any]]:
     )  # fmt: skip
     lines = []
     for option in task.options:
-        seer = observer(option)
-        tally, sighting = score_frame(seer, frame, shot.truth)
+        finder = build_finder(option)
+        tally, found = score_frame(finder, frame, shot.truth)
         place = {
             "condition": task.condition,
             "distance_m": task.distance_m,
@@ -168,22 +169,22 @@ def look(task: Task) -> list[dict[str, Any]]:
         lines.append({**place, "tally": asdict(tally)})
         if not tally.is_perfect and option == task.shown:
             name = f"{option.replace(' ', '_').replace('/', '-')}_{task.condition}_{task.distance_m:g}m"
-            show_failure(task, name, frame, sighting, seer)
+            show_failure(task, name, frame, found, finder)
     return lines
 
 
 def show_failure(
-    task: Task, name: str, frame: Frame, sighting: FrameDetections, seer: Observer
+    task: Task, name: str, frame: Frame, found: FrameDetections, finder: StagedFinder
 ) -> None:
     """Writes the picture of what went wrong and why, unless there are enough of its kind."""
     task.failures.mkdir(parents=True, exist_ok=True)
     if len(list(task.failures.glob(f"{name}_*.png"))) < task.pictures:
-        drawing().write(task.failures / f"{name}_{task.number:04d}.png", frame, sighting)
+        drawing().write(task.failures / f"{name}_{task.number:04d}.png", frame, found)
         told = [
             f"score {hole.score:.2f}, radius {hole.radius_m:.4f} m at {hole.center_m.round(4).tolist()}"
-            for hole in sighting.holes
+            for hole in found.holes
         ]
-        told += [seer.explain(one) for one in sighting.rejected]
+        told += [finder.explain(one) for one in found.rejected]
         (task.failures / f"{name}_{task.number:04d}.txt").write_text("\n".join(told) + "\n")
 
 
@@ -198,7 +199,7 @@ def renderer(condition: str, distance_m: float) -> FrameRenderer:
 
 
 @functools.cache
-def observer(option: str) -> Observer:
+def build_finder(option: str) -> StagedFinder:
     name, *overrides = option.split()
     return composed(
         "perception", "mode=perceive", f"perception={name}", "perceive.input=.", *overrides

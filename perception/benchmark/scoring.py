@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.contracts.vision import FrameDetections, HolePose, Observer
+from brokk_rl.contracts.vision import BoreholeFinder, FrameDetections, HolePose
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
@@ -113,20 +113,20 @@ class FinderScore:
 
 
 def score_frame(
-    observer: Observer, frame: Frame, truth: dataset.SceneTruth
+    finder: BoreholeFinder, frame: Frame, truth: dataset.SceneTruth
 ) -> tuple[FinderScore, FrameDetections]:
     """Returns what was counted on one frame, and what the finder saw in it: nothing where it refused the frame as a whole."""
     tally = FinderScore(frames=1)
     start = time.perf_counter()
     try:
-        sighting = observer.look(frame)
+        found = finder.find(frame)
     except FrameError:
         tally.refused = 1
-        sighting = FrameDetections([], [], [], None)
-    for stage, value in {**sighting.ms, "total": 1000 * (time.perf_counter() - start)}.items():
+        found = FrameDetections([])
+    for stage, value in {**found.ms, "total": 1000 * (time.perf_counter() - start)}.items():
         tally.ms[stage] = [value]
-    match_holes(sighting.holes, truth, frame, tally)
-    return tally, sighting
+    match_holes(found.holes, truth, frame, tally)
+    return tally, found
 
 
 def match_holes(
