@@ -2,8 +2,8 @@
 
 One control period, for a proposal `p` that is shown during it:
 
-    attention    looks at the display every `attention_s` and goes on with what was seen last
-    reaction     what was seen acts `delay_s` later; within the period where it changes, to the
+    attention    looks at the display every `attention_s` and keeps the last proposal seen
+    reaction     a seen proposal acts `delay_s` later; within the period where it changes, to the
     fraction choice       an exclusive joint or the others, whichever is asked for more; of those
     the `joints_at_once` largest, and a lever
                  once taken is kept for `grip_s`: nobody changes hands twenty times a second
@@ -13,7 +13,7 @@ One control period, for a proposal `p` that is shown during it:
 The command of a period is the lever's mean over it, as a logger of 20 Hz would have it. Delay and
 lag are the usual range of compensatory tracking (McRuer et al., AFFDL-TR-65-15, 1965: 0.1 to 0.4 s
 and 0.1 to 0.2 s), intermittent attention is that of Loram et al. (J. Physiol. 589, 2011), tremor in
-proportion to what is done that of Harris and Wolpert (Nature 394, 1998).
+proportion to the deflection that of Harris and Wolpert (Nature 394, 1998).
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class HumanFollowerModel:
     """Persons at the levers; fulfils `brokk_rl.contracts.actuator.FollowerModel`.
 
     Attributes:
-        state: What each person has seen and holds, who it is, and where its draws stand.
+        state: Proposals seen, levers held, personal parameters and draw counters.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """Inspection of a recording: rates, ranges, noise, and stretches that no model could explain.
 
-Axes: `T` time, `J` joints. Recordings may be broken: what is missing is NaN and takes no part.
+Axes: `T` time, `J` joints. Recordings may be broken: missing values are NaN and take no part.
 """
 
 import warnings
@@ -80,7 +80,7 @@ class RecordingFinding:
         num_rows: Rows on end.
         t_s: Time of the first row.
         duration_s: From the first row to the last.
-        text: What is there, with its size.
+        text: Description with its size.
     """
 
     kind: Kind

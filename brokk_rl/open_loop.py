@@ -1,6 +1,6 @@
 """Free runs: a model gets recorded commands and its own predictions, no recorded positions.
 
-One-step errors hardly separate models (a machine at 20 Hz moves little in a step); what counts is
+One-step errors hardly separate models (a machine at 20 Hz moves little in a step); the measure is
 where a free run ends up.
 Axes: `W` windows, `K` steps, `J` joints, `L` samples before the free run, of which `H` are the
 first history.

@@ -32,7 +32,7 @@ class Breach:
     """A place where a recording breaks a rule of the format.
 
     Attributes:
-        text: What was expected and what is there.
+        text: The expected and the found content.
         column: Column concerned, `None` where it is the file as a whole.
         row: First row concerned, `None` where it is the column or the file as a whole.
         num_rows: Number of rows on end that break the same rule.
@@ -246,7 +246,7 @@ def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, l
     """Read as much as possible of the recording at `path`.
 
     Returns:
-        The recording, with NaN in place of what is missing and the machine's rate where none is
+        The recording, with NaN for missing values and the machine's rate where none is
         stated, `None` where nothing can be read; and every place where it breaks a rule of the
         format.
     """

@@ -96,7 +96,7 @@ def check_commanded(
 ) -> None:
     """Raise a `RecordingError` for a joint commanded in fewer than `needed` runs.
 
-    `why` says for which purpose; the message says what to record.
+    `why` says for which purpose; the message advises on recordings.
     """
     moving = {name: measure_commanded_s(recordings) > 0 for name, recordings in runs.items()}
     minutes = (

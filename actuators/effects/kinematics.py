@@ -91,10 +91,10 @@ class Extrinsics(EffectSpec):
     """The camera pose is wrong: seen points are rotated about the base and displaced.
 
     Attributes:
-        x_m: Displacement of what is seen, forward.
+        x_m: Displacement of seen points, forward.
         y_m: To the left.
         z_m: Up.
-        roll_rad: Turn of what is seen about x.
+        roll_rad: Rotation of seen points about x.
         pitch_rad: About y.
         yaw_rad: About z.
     """

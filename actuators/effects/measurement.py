@@ -68,7 +68,7 @@ class EncoderBias(EffectSpec):
 
     Attributes:
         joints: Joints it acts on, or `all`.
-        bias_rad: What the encoder shows too much (m for a sliding joint).
+        bias_rad: Excess of the reading over the true position (m for a sliding joint).
     """
 
     joints: Joints

@@ -50,12 +50,12 @@ class ParameterRanges:
 
     Attributes:
         value: `(N, J)` or `(N, 1)` by name. An entry may be written in place or replaced, by one
-            that wants gradients for example; what was replaced is not drawn again.
+            that wants gradients for example; a replaced entry is not drawn again.
         state: Counter and drawn values; empty where nothing is random.
 
     Args:
         fields: Numbers as configured, by name; those of several effects as `effect.number`.
-        numbers: What is known about them.
+        numbers: Unit, neutral value and bounds of each.
         joints: Joints that are acted on; elsewhere each number is at its `none`.
         machine: The machine.
         num_envs: Number of environments, `N`.
@@ -64,7 +64,7 @@ class ParameterRanges:
         salt: Keeps the draws of several effects apart.
         where: Config node named in messages.
         shares: Part of the environments that have an effect, by effect; all have those not named.
-            The others have its numbers at their `none`. Who has what is drawn at each reset.
+            The others have its numbers at their `none`. Each reset draws anew who has the effect.
 
     Raises:
         ConfigError: a number is out of bounds, a range upside down, or a joint unknown.

@@ -335,10 +335,10 @@ class Sample:
         t_s: Time on the link's clock.
         q: Measured positions, `(N, J)`.
         u: Commands really sent, in force from `t_s` on, `(N, J)`.
-        phase: What each run is doing, `(N,)`; see `runner`.
+        phase: Phase of each run, `(N,)`: `APPROACH`, `REST`, …
         segment: Number of its segment, `(N,)`.
         played: Control periods since the program of that segment began, `(N,)`.
-        extra: What the link measures besides, each `(N,)`.
+        extra: Further measurements of the link, each `(N,)`.
     """
 
     t_s: float
@@ -355,7 +355,7 @@ def drive(
 ) -> Iterator[Sample]:
     """Play the plan over an open link, one sample a control period, until it or `run_s` ends.
 
-    What is not needed at once belongs between two samples: the loop sleeps only until the next
+    Slow work belongs between two samples: the loop sleeps only until the next
     control period is due.
 
     Raises:

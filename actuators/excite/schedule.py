@@ -27,7 +27,7 @@ class Approach:
         tolerance: A joint this close, as a part of its travel, has arrived.
         rest_s: Rest before the program begins; longer than the dead time, so that each program
             begins at rest.
-        patience: An approach is given up after this many times what it should take.
+        patience: An approach is given up after this many times its nominal duration.
     """
 
     level: float

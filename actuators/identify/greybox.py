@@ -142,7 +142,7 @@ class GreyBoxFit:
     """Fits physical parameters by free runs: search over ranges, then Gauss-Newton steps.
 
     Attributes:
-        name: Name of the model in tables and of what it leaves: `<name>.yaml`, an option for
+        name: Name of the model in tables and of its files: `<name>.yaml`, an option for
             `actuator=@…`, and `<name>.json`.
         actuator: The model; numbers that are not free keep the values they have here.
         free: Lower and upper bound of each number that is fitted, joint by joint, by name.
@@ -215,7 +215,7 @@ class GreyBoxFit:
 
         The files are `<name>.yaml` and `<name>.json`.
 
-        Goes on exactly from what an interrupted fit with the same settings and recordings left
+        Resumes exactly where an interrupted fit with the same settings and recordings stopped
         there.
 
         Raises:

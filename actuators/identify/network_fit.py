@@ -40,13 +40,13 @@ class FreeRunOptimizer:
     update can be steered.
 
     Args:
-        networks: What is fitted, on its device.
+        networks: The fitted networks, on their device.
         machine: Gives the ends of travel.
         seed: Of the draws.
 
     Attributes:
         networks: The networks at work.
-        averaged: The running average of their weights, which is what is validated and kept.
+        averaged: The running average of their weights, which is validated and kept.
     """
 
     def __init__(self, networks: JointNetworks, machine: Machine, seed: int) -> None:
@@ -183,7 +183,7 @@ class NetworkFit:
         busy_share: Part of the windows drawn from the tenth of all times in which most is commanded
             at once: joints hinder each other rarely, and where recordings of single joints abound
                 hardly ever.
-        average: Decay of the running average of the weights, which is what is validated and kept.
+        average: Decay of the running average of the weights, which is validated and kept.
         validate_every: Updates between two validations.
         validation_s: Horizon of the free run on which the weights are chosen.
         patience: Validations without improvement after which a horizon is given up.

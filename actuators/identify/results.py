@@ -254,10 +254,10 @@ class IdentificationRun:
 
     Attributes:
         machine: The machine.
-        model: Name of the model that is kept; the others are what it is compared with.
+        model: Name of the model that is kept; the others are compared with it.
         stages: Fits in their order; the last one made the model that is kept.
         cuts: Windows of each stage, `None` where it judges nothing.
-        done: What each stage's fits left, by model.
+        done: Results of each stage's fits, by model.
         horizons_s: Horizons that fit into the recordings judged by.
         wanted_s: Horizons that were wanted.
     """
@@ -277,7 +277,7 @@ def build_results(
     """Return `identification.json`, the verdict, and the pictures by file stem.
 
     Args:
-        identified: What was fitted.
+        identified: All fits.
         resampling: Draws the resamples of the errors.
         delaying: Draws those of the dead times.
 

@@ -36,7 +36,7 @@ class FitStage:
     """Recordings by run for one fit, and the folder of its results.
 
     Attributes:
-        name: What to call it in the log.
+        name: Name in the log.
         folder: Where the fitted model goes; rivals have folders of their own within it.
         seed: Of the fit.
         train: To fit to.

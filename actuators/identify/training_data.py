@@ -22,7 +22,7 @@ class TrainingWindows:
         machine: Gives joints and history.
         horizon: Steps to predict, `K`.
         device: Where the tensors live.
-        purpose: What they are for, in error messages.
+        purpose: Their purpose, in error messages.
 
     Attributes:
         u: Commands of all recordings, `(J, T)`.

@@ -10,6 +10,7 @@ play.
 """
 
 import dataclasses
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -72,11 +73,10 @@ class SpeedData:
         pose = PoseFeatures(machine, torch.device("cpu"))
         self._pose = [pose.features(torch.as_tensor(r.q)).numpy().astype(np.float64) for r in used]
         self.num_pose = pose.size
-        way = [
-            self._increments(np.diff(r.q.astype(np.float64), axis=0, append=r.q[-1:])) for r in used
-        ]
+        q = [r.q.astype(np.float64) for r in used]
+        way = [self._increments(np.diff(part, axis=0, append=part[-1:])) for part in q]
         self.way = np.concatenate(way).T  # (J, I)
-        self._free = np.concatenate([self._at_stop(r.q.astype(np.float64)) for r in used]).T
+        self._free = np.concatenate([self._at_stop(part) for part in q]).T
         self.scale = np.maximum(np.mean(self.way**2, 1), 1e-12)
         if (still := np.flatnonzero(self.scale < 1e-10)).size:
             names = ", ".join(machine.joint_names[j] for j in still)
@@ -105,10 +105,7 @@ class SpeedData:
         joints, half = range(self.machine.num_joints), len(self._knots) - 1
         full = np.maximum(np.abs(found.curve[:, [half - 1, 2 * half - 1]]), 1e-3)
         unit = self.machine.max_speed * self._period_s
-        spool = [
-            np.stack([self._spool(n, j, dynamics[j]) for j in joints], 1)
-            for n in range(len(self._u))
-        ]
+        spool = self._stack_spools(dynamics)
         plain = [
             np.stack([self._basis(s[:, j], j) @ found.curve[j] for j in joints], 1) / unit
             for s in spool
@@ -147,10 +144,7 @@ class SpeedData:
         `demand`: where to begin, if known.
         """
         joints, count, half = self.machine.num_joints, len(self._u), len(self._knots) - 1
-        spool = [
-            np.stack([self._spool(n, j, dynamics[j]) for j in range(joints)], 1)
-            for n in range(count)
-        ]
+        spool = self._stack_spools(dynamics)
         basis = [[self._basis(spool[n][:, j], j) for j in range(joints)] for n in range(count)]
         found = StaticFit(
             np.zeros((joints, 2 * half)),
@@ -174,9 +168,8 @@ class SpeedData:
             for j in range(joints):
                 out = [s[:, j] > 0 for s in spool]
                 factor = [self._factor(n, j, out[n], found.pose) for n in range(count)]
-                features = collect(
-                    [basis[n][j] * (factor[n] * share[n])[:, None] for n in range(count)], j
-                )
+                scaled = [basis[n][j] * (factor[n] * share[n])[:, None] for n in range(count)]
+                features = collect(scaled, j)
                 found.curve[j] = self.curve(features, self.way[j], noise[j], free[j])
                 plain = [basis[n][j] @ found.curve[j] for n in range(count)]
                 parts = [(plain[n] * share[n])[:, None] * self._pose[n][:, j] for n in range(count)]
@@ -207,16 +200,10 @@ class SpeedData:
                 np.abs(p) / unit / np.where(s > 0, full[:, 0], full[:, 1])
                 for p, s in zip(plain, spool, strict=True)
             ]
-            posed = [
-                np.stack(
-                    [
-                        plain[n][:, j] * self._factor(n, j, spool[n][:, j] > 0, found.pose)
-                        for j in range(joints)
-                    ],
-                    1,
-                )
-                for n in range(count)
-            ]
+            posed = []
+            for n, moved in enumerate(plain):
+                factor = [self._factor(n, j, spool[n][:, j] > 0, found.pose) for j in range(joints)]
+                posed.append(moved * np.stack(factor, 1))
             found.demand = self._demand(found.demand, posed, opening, dynamics, noise, free)
         return found
 
@@ -269,6 +256,14 @@ class SpeedData:
         return lag_signal(
             delay_signal(played, dead_time_s / self._period_s), spool_s, self._period_s
         )
+
+    def _stack_spools(self, dynamics: np.ndarray) -> list[np.ndarray]:
+        """Return the spool strokes of each recording, `(T, J)`, for dynamics `(J, 4)`."""
+        joints = range(self.machine.num_joints)
+        return [
+            np.stack([self._spool(n, j, dynamics[j]) for j in joints], 1)
+            for n in range(len(self._u))
+        ]
 
     def _basis(self, spool: np.ndarray, j: int) -> np.ndarray:
         """Return signed hat functions of the spool times full step, `(T, 2 (K - 1))`."""
@@ -397,7 +392,8 @@ class ValveFit:
                     data, j, known[j] if known else None, dynamics[j] if turn else None
                 )
         fitted = self._spec(data, dynamics)
-        facts = {key: _convert_to_plain(value) for key, value in dataclasses.asdict(fitted).items()}  # pyright: ignore[reportArgumentType]
+        # through JSON, which makes lists of tuples as YAML wants them
+        facts = json.loads(json.dumps(dataclasses.asdict(fitted)))  # pyright: ignore[reportArgumentType]
         try:
             folder.mkdir(parents=True, exist_ok=True)
             text = yaml.safe_dump(
@@ -502,10 +498,3 @@ class ValveFit:
             pose_extend=rows(found.pose[:, 0]),
             pose_retract=rows(found.pose[:, 1]),
         )
-
-
-def _convert_to_plain(value: object) -> object:
-    """Return tuples as lists, for YAML."""
-    if isinstance(value, dict):
-        return {key: _convert_to_plain(inner) for key, inner in value.items()}
-    return [_convert_to_plain(inner) for inner in value] if isinstance(value, tuple) else value

@@ -71,7 +71,7 @@ class Hydraulic:
         thermal_gain: Relative change of speed and spool frequency per kelvin.
         substep_s: Own time step; the control period is divided into the nearest whole number of
             them.
-        spread: Relative half width, by field name, of what is drawn per environment and joint at
+        spread: Relative half width, by field name, of draws per environment and joint at
             reset.
     """
 

@@ -65,7 +65,7 @@ class FirstOrderLag:
         dead_band_retract: The same for the negative direction.
         gain: Speed at full command over the machine's `max_speed`.
         time_constant_s: Time constant with which the speed follows the command; 0 for none.
-        spread: Relative half width, by field name, of what is drawn per environment and joint at
+        spread: Relative half width, by field name, of draws per environment and joint at
             reset.
     """
 

@@ -53,7 +53,7 @@ class ValveActuator:
         pose_extend: Relative change of the speed per feature of the pose, positive direction, by
             joint; empty for none.
         pose_retract: The same for the negative direction.
-        spread: Relative half width, by field name, of what is drawn per environment and joint at
+        spread: Relative half width, by field name, of draws per environment and joint at
             reset.
     """
 

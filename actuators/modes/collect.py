@@ -85,7 +85,7 @@ class Collect:
 
         Raises:
             ConfigError: the plan finds no room in a run.
-            LinkError: the link to the machine failed; what was recorded until then is kept.
+            LinkError: the link to the machine failed; the recording until then is kept.
             StorageError: a file could not be written.
         """
         self.session.seed_all()

@@ -86,9 +86,9 @@ class Identify:
         session: Folder, seed, device.
         machine: The machine that was recorded.
         fit: The model that is kept.
-        baselines: What it is compared with, by name: `hold`, `arx`, and any more
+        baselines: Models to compare with, by name: `hold`, `arx`, and any more
             (`+fit@baselines.<name>=<fit>`).
-        identify: What to fit to and what to judge by.
+        identify: Recordings to fit to and to judge by.
         resume: Run folder of an interrupted identification to go on with; the same as
             `session.out`.
     """

@@ -30,7 +30,7 @@ class OverviewRow:
 
     Attributes:
         duration_s: Its length.
-        findings: What was found in it.
+        findings: Its findings.
         num_breaches: How often it breaks the format.
     """
 

@@ -104,7 +104,7 @@ def require_memory_in_state(
     Args:
         model: After the run that led to `first`.
         begin: Copies of its state before that run.
-        first: What came of it, `(T, N, …)`.
+        first: Its results, `(T, N, …)`.
         run: Does it again; told whether to treat environment 0 otherwise.
     """
     end = copy_tensors(model.state)

@@ -87,18 +87,18 @@ class Segment:
     """A pose and the commands that are played from it. Pure data for one machine.
 
     Attributes:
-        name: What it is, different from all others of its plan, e.g. `ramps_q3_02`.
+        name: Its name, unique in its plan, e.g. `ramps_q3_02`.
         start: Joint positions from which it is played, `(J,)`, rad or m.
         u: The program, `(T, J)` in [-1, 1]; row `k` is in force in control period `k`. Exclusive
             joints never together with others.
-        stops: What happens when a joint is about to come to rest closer to its stop than
+        stops: Reaction when a joint is about to come to rest closer to its stop than
             `stop_margin`. `home`: everything goes
             back to `start` and waits until the program, which runs on by the clock, next passes
                 zero. `inward`: this joint is
             driven the other way until its program next passes zero.
         stop_margin: Distance from the stops, as a part of the joint's travel.
-        repeat_of: Name of an earlier segment of the same length, of which this one repeats what was
-            really sent.
+        repeat_of: Name of an earlier segment of the same length, of which this one repeats the commands
+            that were really sent.
     """
 
     name: str
@@ -195,8 +195,8 @@ class FollowerModel(Protocol):
     def step(self, proposed: torch.Tensor) -> torch.Tensor:
         """Return the given command of the coming control period, `(N, J)` in [-1, 1].
 
-        `proposed`, `(N, J)`, is what the policy shows from now on. Where no proposal moves an
-        exclusive joint together with others, what is given does not either.
+        `proposed`, `(N, J)`, is the proposal from now on. Where no proposal moves an
+        exclusive joint together with others, the given command does not either.
         """
         ...
 
