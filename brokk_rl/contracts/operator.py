@@ -62,7 +62,7 @@ class OperatorModel(Protocol):
     """Simulated operators at the levers of `N` machines, in numpy; one control period a call."""
 
     def step(self, view: OperatorView) -> np.ndarray:
-        """Returns the commands given during the coming period, `(N, J)` in [-1, 1]; exclusive joints never together with others."""
+        """Return the commands given during the coming period, `(N, J)` in [-1, 1]; exclusive joints never together with others."""
         ...
 
 
@@ -70,7 +70,7 @@ class Operator(Protocol):
     """A spec in `conf/operator`: a kind of simulated operator."""
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
-        """Returns operators at work; `persons`, `(N,)`, numbers them: the same number and seed is the same person."""
+        """Return operators at work; `persons`, `(N,)`, numbers them: the same number and seed is the same person."""
         ...
 
 
@@ -80,5 +80,5 @@ class TrialGround(Protocol):
     def run(
         self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
     ) -> list[Recording]:
-        """Does the trials; returns a recording of each, in order, with advice where it was shown."""
+        """Do the trials; returns a recording of each, in order, with advice where it was shown."""
         ...

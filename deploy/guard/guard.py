@@ -144,7 +144,7 @@ class Guard:
     def decide(
         self, now_s: float, armed: bool, seen: GuardInput, request: CommandRequest | None
     ) -> GuardDecision:
-        """Returns what to send in this cycle.
+        """Return what to send in this cycle.
 
         Args:
             now_s: Monotonic time.
@@ -183,13 +183,13 @@ class Guard:
         return self._say(self._limited(request.u, seen.q, elapsed_s), GuardTrip.NONE)
 
     def stops(self, seen: GuardInput) -> bool:
-        """Says whether what is seen now ends a motion: then the caller decides at once, not in its next cycle."""
+        """Return whether what is seen now ends a motion: then the caller decides at once, not in its next cycle."""
         return self._state is GuardState.ACTIVE and (
             not seen.deadman or self._health(seen, 0.0) is not GuardTrip.NONE
         )
 
     def _health(self, seen: GuardInput, elapsed_s: float) -> GuardTrip:
-        """Returns the first thing that is wrong, whatever is asked for."""
+        """Return the first thing that is wrong, whatever is asked for."""
         limits = self._limits
         checks = (
             (seen.bus_up, GuardTrip.BUS_DOWN),
@@ -206,7 +206,7 @@ class Guard:
         return next((trip for fine, trip in checks if not fine), GuardTrip.NONE)
 
     def _objection(self, request: CommandRequest | None) -> GuardTrip:
-        """Returns what is wrong with a request."""
+        """Return what is wrong with a request."""
         if request is None or not request.age_s <= self._limits.request_s:
             return GuardTrip.REQUEST_STALE
         full = 1.0 + self._limits.overrun
@@ -225,7 +225,7 @@ class Guard:
         return GuardTrip.NONE
 
     def _limited(self, u: Numbers, q: Numbers, elapsed_s: float) -> Numbers:
-        """Returns the command within magnitude, growth and joint limits."""
+        """Return the command within magnitude, growth and joint limits."""
         limits, body = self._limits, self._body
         most = limits.max_rate_1_s * elapsed_s
         values = []

@@ -107,7 +107,7 @@ def build_joint_bounds(
     max_speed: Sequence[float],
     exclusive: Sequence[bool],
 ) -> JointBounds:
-    """Returns the machine as the guard knows it, from arrays of length `J`."""
+    """Return the machine as the guard knows it, from arrays of length `J`."""
     return JointBounds(
         tuple(map(float, lower)),
         tuple(map(float, upper)),

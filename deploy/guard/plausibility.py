@@ -24,7 +24,7 @@ class PlausibilityFilter:
         return max(self._jumps) < self._limits.num_jumps
 
     def accept(self, joint: int, now_s: float, position: float) -> bool:
-        """Says whether to use a new position of `joint`; a rejected one is judged against the last that was used.
+        """Return whether to use a new position of `joint`; a rejected one is judged against the last that was used.
 
         Where the joint stays at its new place, it is believed again as soon as the machine could
         have got there.

@@ -73,7 +73,7 @@ class PolicyBundle:
         self._check_golden(_read(place / GOLDEN, folder), folder)
 
     def command(self, observation: np.ndarray) -> np.ndarray:
-        """Returns masked commands, `(B, J)`, for observation vectors, `(B, O)`."""
+        """Return masked commands, `(B, J)`, for observation vectors, `(B, O)`."""
         return np.asarray(
             self._session.run(None, {"observation": observation.astype(np.float32)})[0]
         )
@@ -116,7 +116,7 @@ def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> 
 
 
 def _is_different(mine: Any, other: Any) -> bool:
-    """Says whether two pieces of plain data differ by more than rounding."""
+    """Return whether two pieces of plain data differ by more than rounding."""
     if isinstance(mine, dict):
         return (
             not isinstance(other, dict)

@@ -72,7 +72,7 @@ class CaptureConfig:
 
 
 def run(stop: Stop, capture: CaptureConfig, memory: LoopMemory) -> None:
-    """Runs until it is asked to stop, then takes what is there: those who write may go on without being recorded.
+    """Run until it is asked to stop, then takes what is there: those who write may go on without being recorded.
 
     Raises:
         StorageError: the disk is full, or the files cannot be written; what was written stays
@@ -100,7 +100,7 @@ class DurableBlfWriter(BLFWriter):
     """A BLF whose header is true at any time, not only after it was closed."""
 
     def flush(self) -> None:
-        """Writes what is buffered, and the header."""
+        """Write what is buffered, and the header."""
         self._flush()
         end = self.file.tell()
         self.file.seek(0)
@@ -139,7 +139,7 @@ class CaptureWriter:
         self._flushed_s = time.monotonic()
 
     def add(self, data: bytes) -> None:
-        """Takes one record of a pipe."""
+        """Take one record of a pipe."""
         if data[:1] == FRAMES:
             for t_s, frame_id, sent, payload in _iterate_frames(data[1:]):
                 self._add_frame(t_s, frame_id, sent, payload)
@@ -148,7 +148,7 @@ class CaptureWriter:
             self._write(values.pop("topic"), values.pop("t_s"), values)
 
     def add_picture(self, t_s: float, data: bytes) -> None:
-        """Takes a JPEG of the camera."""
+        """Take a JPEG of the camera."""
         wall_ns = int(t_s * 1e9) + self._offset_ns
         stamp = {"sec": wall_ns // 10**9, "nsec": wall_ns % 10**9}
         values = {
@@ -160,14 +160,14 @@ class CaptureWriter:
         self._write(PICTURES, t_s, values)
 
     def flush_when_due(self) -> None:
-        """Puts everything on the disk, twice a second."""
+        """Put everything on the disk, twice a second."""
         now_s = time.monotonic()
         if now_s - self._flushed_s >= FLUSH_S:
             self._flushed_s = now_s
             self.flush()
 
     def flush(self) -> None:
-        """Puts everything on the disk."""
+        """Put everything on the disk."""
         self._mcap.flush()
         self._blf.flush()
         os.fsync(self._mcap_file.fileno())
@@ -254,7 +254,7 @@ class PictureSampler:
         self._apart_s, self._taken, self._next_s = 1.0 / rate_hz if rate_hz else 0.0, 0, 0.0
 
     def due(self) -> tuple[float, bytes] | None:
-        """Returns when the newest picture was taken, and it as a JPEG, if it is its turn."""
+        """Return when the newest picture was taken, and it as a JPEG, if it is its turn."""
         now_s = time.monotonic()
         if self._slot is None or now_s < self._next_s or self._slot.number == self._taken:
             return None

@@ -39,7 +39,7 @@ class CaptureLogReader:
     shortest_s: float
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
-        """Returns the pieces of the capture at `path`; see `actuators.modes.convert.LogReader`.
+        """Return the pieces of the capture at `path`; see `actuators.modes.convert.LogReader`.
 
         Raises:
             RecordingError: it cannot be read, was made on another machine, or holds no piece that
@@ -57,7 +57,7 @@ class CaptureLogReader:
         return found
 
     def between(self, path: Path, machine: Machine, begin_s: float, end_s: float) -> Recording:
-        """Returns what was captured between two times of the monotonic clock.
+        """Return what was captured between two times of the monotonic clock.
 
         Raises:
             RecordingError: it cannot be read, was made on another machine, or has a gap there.
@@ -75,7 +75,7 @@ class CaptureLogReader:
     def _series(
         self, path: Path, machine: Machine
     ) -> tuple[CaptureContents, dict[str, Series], dict[str, Series]]:
-        """Returns the capture, positions, and what the valves got, by joint."""
+        """Return the capture, positions, and what the valves got, by joint."""
         contents = capture_reader.read_capture(path)
         try:
             machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
@@ -122,7 +122,7 @@ class CaptureLogReader:
 
 
 def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:
-    """Returns times and values of a signal, whatever message it came in; of what was called invalid nothing."""
+    """Return times and values of a signal, whatever message it came in; of what was called invalid nothing."""
     joint, positions = signal.partition("_")[2], signal.startswith("Position_")
     for messages in contents.messages.values():
         if signal in messages.names:
@@ -139,7 +139,7 @@ def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:
 
 
 def _split_at_gaps(series: Sequence[Series], longest_gap_s: float) -> list[tuple[float, float]]:
-    """Returns the times, begin and end, in which none of the series has a gap."""
+    """Return the times, begin and end, in which none of the series has a gap."""
     begin_s, end_s = max(t_s[0] for t_s, _ in series), min(t_s[-1] for t_s, _ in series)
     gaps = sorted(
         (float(t_s[row]), float(t_s[row + 1]))
@@ -157,7 +157,7 @@ def _split_at_gaps(series: Sequence[Series], longest_gap_s: float) -> list[tuple
 
 
 def _average_over_periods(series: Series, grid_s: np.ndarray, period_s: float) -> np.ndarray:
-    """Returns the means over the period after each grid time of a value that holds until its next message."""
+    """Return the means over the period after each grid time of a value that holds until its next message."""
     t_s, values = series
     # integral of the staircase up to any time, linear in between
     integral = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(t_s))])
@@ -167,7 +167,7 @@ def _average_over_periods(series: Series, grid_s: np.ndarray, period_s: float) -
 def _build_extra_columns(
     contents: CaptureContents, grid_s: np.ndarray, machine: Machine
 ) -> dict[str, np.ndarray]:
-    """Returns the oil's temperature and the advice shown, where there was any; NaN where not."""
+    """Return the oil's temperature and the advice shown, where there was any; NaN where not."""
     extra: dict[str, np.ndarray] = {}
     for messages in contents.messages.values():
         if "OilTemperature" in messages.names:

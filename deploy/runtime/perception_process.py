@@ -100,7 +100,7 @@ def run(stop: Stop, camera: CameraConfig, exchange: LoopMemory) -> None:
                 known.take(_look(finder, frame), now_s)
                 known.write(exchange.holes, now_s)
                 text = {"topic": "holes", "t_s": now_s, "holes": known.plain()}
-                exchange.sight_log.put(TEXT + json.dumps(text).encode())
+                exchange.vision_log.put(TEXT + json.dumps(text).encode())
             time.sleep(max(0.0, began_s + 1.0 / camera.rate_hz - time.monotonic()))
 
 

@@ -42,7 +42,7 @@ class TwinBench:
             )
 
     def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
-        """Returns the processes to run beside the loop."""
+        """Return the processes to run beside the loop."""
         found = [
             CompanionProcess(
                 "twin",

@@ -66,7 +66,7 @@ class ActiveFaults:
     _place: tuple[list[float], list[float]] | None = None
 
     def request(self, text: bytes, now_s: float) -> None:
-        """Takes a request; see the module.
+        """Take a request; see the module.
 
         Raises:
             ConfigError: it is none.
@@ -97,20 +97,20 @@ class ActiveFaults:
             self._since_s[fault] = now_s
 
     def take_place(self) -> tuple[list[float], list[float]] | None:
-        """Returns where machine and block are to be put, once: joint positions and the centre of the rim."""
+        """Return where machine and block are to be put, once: joint positions and the centre of the rim."""
         place, self._place = self._place, None
         return place
 
     def on(self, fault: str, message: str, now_s: float) -> bool:
-        """Says whether a fault is on for a message."""
+        """Return whether a fault is on for a message."""
         return any(self.until_s.get((fault, name), -1.0) > now_s for name in (message, ""))
 
     def since_s(self, fault: str, now_s: float) -> float:
-        """Returns how long ago a fault was asked for."""
+        """Return how long ago a fault was asked for."""
         return now_s - self._since_s.get(fault, now_s)
 
     def pass_on(self, layout: MessageLayout, frame: CanFrame, now_s: float) -> list[CanFrame]:
-        """Returns what is to be sent now in place of `frame`."""
+        """Return what is to be sent now in place of `frame`."""
         name = layout.name
 
         def on(fault: str) -> bool:
@@ -140,7 +140,7 @@ class ActiveFaults:
         return [frame, frame] if on("duplicate") else [frame]
 
     def due(self, now_s: float) -> list[CanFrame]:
-        """Returns the frames that were held up until now."""
+        """Return the frames that were held up until now."""
         ripe = [frame for at_s, frame in self._late if at_s <= now_s]
         self._late = [(at_s, frame) for at_s, frame in self._late if at_s > now_s]
         return ripe
@@ -161,7 +161,7 @@ class FaultPort:
             self._socket.setblocking(False)
 
     def poll(self, faults: ActiveFaults) -> str | None:
-        """Takes a request that has come in, if any, and answers it; returns its text."""
+        """Take a request that has come in, if any, and answers it; returns its text."""
         if self._socket is None:
             return None
         try:
@@ -185,7 +185,7 @@ class FaultPort:
 
 
 def request_fault(port: int, request: dict[str, object], timeout_s: float = 1.0) -> str:
-    """Sends a request to a twin on this computer and returns its answer."""
+    """Send a request to a twin on this computer and returns its answer."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         asking.settimeout(timeout_s)
         asking.sendto(json.dumps(request).encode(), ("127.0.0.1", port))

@@ -68,7 +68,7 @@ class Gateway:
         self.estop, self.heard_s = False, np.inf
 
     def take(self, frame: CanFrame, now_s: float) -> None:
-        """Takes in a frame of PC or remote."""
+        """Take in a frame of PC or remote."""
         layout = self._description.by_id.get(frame.frame_id)
         if layout is None or layout.name not in self._channels:
             return
@@ -96,7 +96,7 @@ class Gateway:
         self._u_s = now_s
 
     def flow(self, now_s: float) -> tuple[np.ndarray, int, GatewayState]:
-        """Returns what the valves get, `(J,)`, from whom, and the gateway's state."""
+        """Return what the valves get, `(J,)`, from whom, and the gateway's state."""
         nothing = np.zeros(self._machine.num_joints)
         remote = self._on and now_s - self._remote_s <= REMOTE_S and self._trusts(self._remote.name)
         if self.estop or not remote:
@@ -129,5 +129,5 @@ class Gateway:
 
 
 def find_axis_full_rad(machine: Machine) -> np.ndarray:
-    """Returns the angle of each of the four axes at full deflection, `(4,)`; 1 where no joint hangs on it."""
+    """Return the angle of each of the four axes at full deflection, `(4,)`; 1 where no joint hangs on it."""
     return np.array(find_full_angles_rad(machine.levers))

@@ -41,7 +41,7 @@ class RadioRemote:
         self._counter = 0
 
     def frame(self, frozen: int | None = None) -> CanFrame:
-        """Returns the next message; `frozen` is a counter that stands still, a fault."""
+        """Return the next message; `frozen` is a counter that stands still, a fault."""
         values: dict[str, float] = {
             f"Lever_{axis}": value for axis, value in zip(LEVER_AXES, self.levers, strict=True)
         }
@@ -64,7 +64,7 @@ def run_operator(
     seed: int,
     memory: LoopMemory,
 ) -> None:
-    """Runs a simulated operator: reads the outlet as a person reads the page, and moves the levers as `follower` says.
+    """Run a simulated operator: reads the outlet as a person reads the page, and moves the levers as `follower` says.
 
     He lets go of the levers where the advice is stale or none.
     """
@@ -96,7 +96,7 @@ def run_operator(
 
 
 def _read_displayed_command(memory: LoopMemory, levers: LeverMap) -> np.ndarray:
-    """Returns the commands that the shown lever positions stand for."""
+    """Return the commands that the shown lever positions stand for."""
     advice: Any = memory.advice.read()
     if advice is None or time.monotonic() - float(advice["t_s"]) > 0.5:
         return np.zeros(len(levers.full_rad))

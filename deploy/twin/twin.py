@@ -75,7 +75,7 @@ class Twin:
             raise ConfigError(f"twin.again_s: expected more than 0, or null, got {self.again_s}")
 
     def run(self, stop: Stop, machine: Machine, plant: Connection, session: Session) -> None:
-        """Runs until told to stop, or the time is over; leaves `gateway.h`, the bus for the firmware of a real gateway.
+        """Run until told to stop, or the time is over; leaves `gateway.h`, the bus for the firmware of a real gateway.
 
         Raises:
             LinkError: the bus cannot be opened.
@@ -100,7 +100,7 @@ def run(
     session: Session,
     memory: Any = None,
 ) -> None:
-    """Runs a twin as a child process."""
+    """Run a twin as a child process."""
     twin.run(stop, machine, plant, session)
 
 
@@ -108,11 +108,11 @@ class FrameBus(Protocol):
     """Where a twin's messages go: an open wire, or whatever stands in for one."""
 
     def recv(self, timeout_s: float) -> CanFrame | None:
-        """Returns the next frame, `None` when none came in time."""
+        """Return the next frame, `None` when none came in time."""
         ...
 
     def send(self, frame: CanFrame) -> None:
-        """Sends a frame."""
+        """Send a frame."""
         ...
 
 
@@ -155,7 +155,7 @@ class RunningTwin:
         self._own = {remote.frame_id} if twin.remote else set()
 
     def run(self, stop: Stop) -> None:
-        """Runs in real time until told to stop, or until its time is over."""
+        """Run in real time until told to stop, or until its time is over."""
         end_s = np.inf if self._twin.seconds is None else time.monotonic() + self._twin.seconds
         while not stop() and time.monotonic() < end_s:
             try:
@@ -170,13 +170,13 @@ class RunningTwin:
                 self._pace.wait()
 
     def hear(self, frame: CanFrame, now_s: float) -> None:
-        """Takes in a frame of PC or remote, and acts on it if it stops the machine."""
+        """Take in a frame of PC or remote, and acts on it if it stops the machine."""
         if frame.frame_id not in self._own:
             self._gateway.take(frame, now_s)
             self._valves(now_s)
 
     def cycle(self, now_s: float) -> None:
-        """Lets `CYCLE_S` go by: valves, motion, messages."""
+        """Let `CYCLE_S` go by: valves, motion, messages."""
         if (asked := self._port.poll(self._faults)) is not None:
             log.debug("fault: %s", asked)
         if (place := self._faults.take_place()) is not None:
@@ -213,7 +213,7 @@ class RunningTwin:
                 self._bus.send(CanFrame(0x1FFF0000, bytes(8)))
 
     def _place(self, q: list[float], hole_in_base_m: list[float]) -> None:
-        """Puts machine and block elsewhere, as between two trials of a study; a plant that cannot be put stays where it is."""
+        """Put machine and block elsewhere, as between two trials of a study; a plant that cannot be put stays where it is."""
         if not hasattr(self._link, "place"):
             log.warning("this simulated machine cannot be put elsewhere; link=site can")
             return
@@ -221,7 +221,7 @@ class RunningTwin:
         self._q = self._before = np.asarray(self._link.read().q, dtype=float)
 
     def _valves(self, now_s: float) -> tuple[np.ndarray, dict[str, float]]:
-        """Returns what the valves get, `(J,)`, and what is said of it; that they get nothing any more is said at once."""
+        """Return what the valves get, `(J,)`, and what is said of it; that they get nothing any more is said at once."""
         gateway, before = self._gateway, self._flow
         self._flow, self._source, state = gateway.flow(now_s)
         said = {
@@ -258,7 +258,7 @@ class RunningTwin:
             self._bus.send(one)
 
     def _held(self, now_s: float) -> bool:
-        """Says whether the operator holds the dead-man; a PC that was not ready when it was pressed waits for it to be let go."""
+        """Return whether the operator holds the dead-man; a PC that was not ready when it was pressed waits for it to be let go."""
         heard = now_s - self._gateway.heard_s > PRESS_S
         pressed = (
             self._twin.deadman and heard and not self._faults.on("deadman_released", "", now_s)
@@ -288,7 +288,7 @@ class RunningTwin:
             self._bus.send(one)
 
     def _positions(self, now_s: float) -> dict[str, float]:
-        """Returns positions and validities as the sensors say them."""
+        """Return positions and validities as the sensors say them."""
         faults, machine = self._faults, self._machine
         part = min(1.0, max(0.0, (now_s - self._period_began_s) / machine.period_s))
         q = self._before + part * (self._q - self._before)
@@ -316,7 +316,7 @@ class RunningTwin:
 
 
 def _read_oil_c(link: Link) -> float:
-    """Returns the oil's temperature as the bus can say it, in degrees Celsius."""
+    """Return the oil's temperature as the bus can say it, in degrees Celsius."""
     extra = getattr(link, "extra", dict)()
     return (
         float(np.clip(np.round(np.asarray(extra["oil_c"]).mean()), -40, 215))
