@@ -18,7 +18,7 @@ from brokk_rl.spec import spec
 
 
 @spec
-class Scaling:
+class TargetScaling:
     """Normalisation of the target.
 
     Attributes:
@@ -33,12 +33,12 @@ class Scaling:
     pitch_rad: tuple[float, float] | None
 
 
-def size(machine: Machine, with_pitch: bool = False, with_proposals: bool = False) -> int:
+def compute_size(machine: Machine, with_pitch: bool = False, with_proposals: bool = False) -> int:
     """Returns the length of the observation vector, that of the paper or with wanted pitch and proposals behind it."""
     return 3 + (2 + with_proposals) * machine.num_history * machine.num_joints + with_pitch
 
 
-class Encoder:
+class ObservationEncoder:
     """Turns a history and a target into the policy's vector, and back.
 
     Args:
@@ -54,7 +54,7 @@ class Encoder:
     def __init__(
         self,
         machine: Machine,
-        scaling: Scaling,
+        scaling: TargetScaling,
         constant: Callable[[np.ndarray], Any] = np.asarray,
         concat: Callable[[tuple[Any, ...], int], Any] = np.concatenate,
         with_proposals: bool = False,
@@ -63,7 +63,7 @@ class Encoder:
         self._machine, self._scaling = machine, scaling
         self.has_pitch = scaling.pitch_rad is not None
         self.has_proposals = with_proposals
-        self.size = size(machine, self.has_pitch, with_proposals)
+        self.size = compute_size(machine, self.has_pitch, with_proposals)
         self._concat = concat
         self._target_mean_m = constant(np.array(scaling.target_mean_m, np.float32))
         self._target_std_m = constant(np.array(scaling.target_std_m, np.float32))

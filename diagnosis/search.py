@@ -1,21 +1,23 @@
-"""The search over sets of effects: joint by joint over subsets, then over the names that all joints share.
+"""The search over sets of effects: joint by joint over subsets, then over the names of all joints.
 
-A set is judged by what it earns on recordings that it was not fitted to, less its price: what the
-same effect earns on reference recordings, where there is nothing to find. Saturation may pay only
-together with a dead band, so sets are never grown from one
-effect alone: each joint keeps the best few of each size.
-Axes: `J` joints, `E` entries.
+A set is judged by its log-likelihood gain less its penalty, which depends on the gain of the same
+effect on reference recordings, where there is nothing to find. A saturation may be worth its
+penalty only beside a dead band, so each joint keeps the best few subsets of each number of effects.
+An effect with one cause for all joints (a clock offset, a worn pump) is first sized joint by joint;
+once it is chosen, the joints share its size within `PLAY`.
+Axes: `J` joints, `E` entries, `S` sizes of a growth path.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 
-from diagnosis.sizes import Plain, Shape, alone, earned, predicted
+from diagnosis.residuals import Evidence, Ray
+from diagnosis.responses import Plain, Shape, add, alone, earned, plain, plain_joints, predicted
 
 MOST = 4
 """Effects in a set."""
@@ -30,6 +32,10 @@ SURELY = 1.0
 """Standard errors by which a set must earn more than a simpler one."""
 TRIED = 14
 """Subsets of each joint that are tried on the reference too."""
+
+THERE = 3.0
+"""Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be
+there already."""
 
 Subset = frozenset[str]
 Price = Callable[[int, Subset], float]
@@ -290,3 +296,115 @@ def _sum(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
         max([value for subset, value in by_subset.items() if name in subset], default=0.0)
         for by_subset in worth
     )
+
+
+@dataclass
+class Nulls:
+    """What sets of effects earn on reference recordings; an effect is simulated there when it is first asked for.
+
+    Attributes:
+        parts: The simulator against parts of the reference that it was not fitted to.
+        num_entries: Entries of the field, `E`.
+        rays: Ways in which each effect grows, at small sizes.
+        grown: The same as they are simulated in the field.
+        plain: Errors of each joint in the field.
+        shapes: What each effect does to each joint in the field.
+        shared: Effects with one cause for all joints.
+        tables: Of each part and joint.
+        known: Effects that were simulated on the reference.
+    """
+
+    parts: Sequence[Evidence]
+    num_entries: int
+    rays: Mapping[str, Sequence[Ray]]
+    grown: Mapping[str, Sequence[Ray]]
+    plain: Sequence[Plain]
+    shapes: Sequence[Mapping[str, Sequence[Shape]]]
+    shared: frozenset[str]
+    tables: list[list[Table]] = field(default_factory=list)
+    known: set[str] = field(default_factory=set)
+
+    def _scored(self, j: int, subset: frozenset[str]) -> list[tuple[Scored, float]]:
+        """Returns what the subset earns on joint `j` in each part of the reference, and the length of the field over the part's."""
+        if not self.tables:
+            self.tables = [
+                [Table(joint, {}, part.block) for joint in plain_joints(part)]
+                for part in self.parts
+            ]
+        for name in subset - self.known:
+            ways = [
+                replace(ray, shape=self.grown[name][0].shape) for ray in self.rays[name]
+            ]  # shaped as they are in the field
+            for tables, part in zip(self.tables, self.parts, strict=True):
+                add([table.shapes for table in tables], name, ways, part)
+            self.known.add(name)
+        found = []
+        for mine in (tables[j] for tables in self.tables):
+            usable = frozenset(name for name in subset if name in mine.shapes)
+            found.append((mine.score(usable), self.num_entries / len(mine.joint.z)))
+        return found
+
+    def earned(self, j: int, subset: frozenset[str]) -> float:
+        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
+
+        Of a cause that all joints share the mean: its price adds up over the joints, and the most
+        of each adds up to too much.
+        """
+        found = [max(0.0, scored.total * part) for scored, part in self._scored(j, subset)]
+        return float((np.mean if subset <= self.shared else max)(found)) if found else 0.0
+
+    def repeated(self, j: int, subset: frozenset[str]) -> float:
+        """Returns what the subset earns in the field at the sizes that it has on the reference already; 0 where it has none."""
+        parts = [scored for scored, _ in self._scored(j, subset)]
+        if not parts or sum(scored.total for scored in parts) < THERE:
+            return 0.0
+        joint, change = self.plain[j], np.zeros(len(self.plain[j].z))
+        for name in subset & self.shapes[j].keys():
+            if sizes := [scored.sizes[name] for scored in parts if name in scored.sizes]:
+                change = change + predicted(self.shapes[j][name], np.mean(sizes, 0))
+        left = plain(joint.z - change, joint.faults)
+        return max(0.0, float(joint.loss.sum() - left.loss.sum()) + joint.price - left.price)
+
+
+PLAY = 0.3
+"""Sizes may differ by so much of what they have in common: an effect's form is not quite the same
+on all joints."""
+
+Rays = Mapping[str, Sequence[Ray]]
+Shapes = Sequence[Mapping[str, Sequence[Shape]]]
+
+
+def bind_shared_sizes(
+    names: Subset, tables: Sequence[Table], grown: Rays, shapes: Shapes
+) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
+    """Returns rays and shapes with those of the effects `names` bounded to about the size that the joints agree on."""
+    rays, narrow = (
+        {name: list(ways) for name, ways in grown.items()},
+        [{n: list(s) for n, s in mine.items()} for mine in shapes],
+    )
+    for name in names:
+        scored = [table.score(frozenset({name})) for table in tables if name in table.shapes]
+        for place, ray in enumerate(rays[name]):
+            size = np.array([one.sizes[name][place] for one in scored])
+            told = np.array([max(one.total, 0.0) for one in scored]) / np.maximum(
+                np.square(size), 1e-6
+            )
+            common = weighted_median(size, told)
+            if common == 0.0:
+                continue
+            ends = np.sort(common * np.array([1.0 - PLAY, 1.0, 1.0 + PLAY]))
+            rays[name][place] = replace(ray, sizes=ends, is_tied=True)
+            for mine in narrow:
+                if name in mine:
+                    shape = mine[name][place]
+                    mine[name][place] = Shape(
+                        ends, np.stack([shape.at(float(size))[0] for size in ends])
+                    )
+    return rays, narrow
+
+
+def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """Returns the weighted median: a joint that has another effect too is far off."""
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(below, 0.5 * below[-1])]) if below[-1] > 0 else 0.0

@@ -8,7 +8,7 @@ first of it arrives. With them the dead times of machine and person are one.
 import torch
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.follower import moved_levers
+from brokk_rl.follower import select_levers
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -17,7 +17,7 @@ Expected = float | tuple[float, float]
 
 
 @spec
-class Advice:
+class AdviceConfig:
     """How to propose to a person whose habits are known roughly; the middle of a range counts.
 
     Attributes:
@@ -42,28 +42,28 @@ class Advice:
 
     def check(self) -> None:
         for name in ("delay_s", "lag_s", "dead_zone"):
-            if _middle(getattr(self, name)) < 0:
+            if _take_middle(getattr(self, name)) < 0:
                 raise ConfigError(
                     f"task.advice.{name}: expected 0 or more, got {getattr(self, name)}"
                 )
 
-    def build(self, machine: Machine, device: torch.device) -> "Adviser":
+    def build(self, machine: Machine, device: torch.device) -> "LeverAdviser":
         """Returns the adviser for `machine` on `device`."""
-        return Adviser(self, machine, device)
+        return LeverAdviser(self, machine, device)
 
 
-class Adviser:
+class LeverAdviser:
     """See `Advice`; stateless, so that it can stand inside a policy."""
 
-    def __init__(self, advice: Advice, machine: Machine, device: torch.device) -> None:
-        self._dead_zone = _middle(advice.dead_zone)
+    def __init__(self, advice: AdviceConfig, machine: Machine, device: torch.device) -> None:
+        self._dead_zone = _take_middle(advice.dead_zone)
         self._exclusive = torch.as_tensor(machine.is_exclusive, device=device)
         most = advice.joints_at_once
         self._most = (
             machine.num_joints if most is None else most[0] if isinstance(most, tuple) else most
         )
         self._hold = round(advice.hold_s / machine.period_s)
-        self._future = _future(advice, machine).to(device)
+        self._future = _predict_levers(advice, machine).to(device)
 
     def coming(self, proposed: torch.Tensor, given: torch.Tensor) -> torch.Tensor:
         """Returns the commands that hands will yet give, `(N, F, J)`, if nothing more is proposed.
@@ -94,7 +94,7 @@ class Adviser:
         # `hold_s`
         lately = ((proposed == 0).float().flip(1).cumsum(1) < 0.5).sum(1)
         kept = (lately > 0) & (lately < self._hold) & (shown != 0)
-        return torch.where(moved_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
+        return torch.where(select_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
 
     def _shown(self, command: torch.Tensor) -> torch.Tensor:
         """Returns the deflection that commands `command`."""
@@ -105,11 +105,14 @@ class Adviser:
         )
 
 
-def _future(advice: Advice, machine: Machine) -> torch.Tensor:
+def _predict_levers(advice: AdviceConfig, machine: Machine) -> torch.Tensor:
     """Returns what makes levers of the coming periods, `(F, H + 1)`, of `H` proposals, oldest first, and the hand as it is."""
     num, period_s = machine.num_history, machine.period_s
-    delay, lag = _middle(advice.delay_s) / period_s, max(_middle(advice.lag_s) / period_s, 1e-6)
-    steps = round((_middle(advice.delay_s) + advice.settle_s) / period_s) + 1
+    delay, lag = (
+        _take_middle(advice.delay_s) / period_s,
+        max(_take_middle(advice.lag_s) / period_s, 1e-6),
+    )
+    steps = round((_take_middle(advice.delay_s) + advice.settle_s) / period_s) + 1
     whole = int(delay + 5e-7)
     part = max(0.0, delay - whole)
     stay = float(torch.exp(torch.tensor(-1.0 / lag)))
@@ -129,5 +132,5 @@ def _future(advice: Advice, machine: Machine) -> torch.Tensor:
     return torch.stack(rows)
 
 
-def _middle(value: Expected) -> float:
+def _take_middle(value: Expected) -> float:
     return sum(value) / 2 if isinstance(value, tuple) else value

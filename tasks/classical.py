@@ -22,7 +22,7 @@ from brokk_rl.spec import spec
 
 
 @spec
-class Classical:
+class ClassicalConfig:
     """Resolved-rate control of the tool with dead-time compensation.
 
     Attributes:
@@ -66,7 +66,7 @@ class Classical:
 
 
 @dataclass
-class Guidance:
+class ControllerGuidance:
     """What the controller makes of a history and a target; `N` environments.
 
     Attributes:
@@ -99,7 +99,7 @@ class Guidance:
 class ClassicalController:
     """See `Classical`; stateless, so that it can stand inside a policy."""
 
-    def __init__(self, config: Classical, machine: Machine, device: torch.device) -> None:
+    def __init__(self, config: ClassicalConfig, machine: Machine, device: torch.device) -> None:
         def constant(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
@@ -152,7 +152,7 @@ class ClassicalController:
         pitch_rad: torch.Tensor,
         reach_m: tuple[float, float],
         coming: torch.Tensor | None = None,
-    ) -> Guidance:
+    ) -> ControllerGuidance:
         """Returns commands and errors.
 
         Args:
@@ -195,7 +195,7 @@ class ClassicalController:
         bearing = tip[:, :2] / tip[:, :2].norm(dim=1, keepdim=True).clamp(min=1e-3)
         radial = (error[:, :2] * bearing).sum(1)
         tangential = bearing[:, 0] * error[:, 1] - bearing[:, 1] * error[:, 0]
-        return Guidance(
+        return ControllerGuidance(
             command=self.valve(share),
             error_m=torch.stack((radial, tangential, error[:, 2]), 1),
             pitch_error_rad=pitch_error,
@@ -261,10 +261,10 @@ def _solve_4(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     Own code because LAPACK calls neither export to ONNX nor fit into a captured CUDA graph.
     """
     p, q, s = a[:, :2, :2], a[:, :2, 2:], a[:, 2:, 2:]
-    p_inverse = _inverse_2(p)
+    p_inverse = _invert_2(p)
     down = multiply_small_matrices(q.transpose(1, 2), p_inverse)
     low = multiply_small_matrices(
-        _inverse_2(s - multiply_small_matrices(down, q)),
+        _invert_2(s - multiply_small_matrices(down, q)),
         b[:, 2:] - multiply_small_matrices(down, b[:, :2]),
     )
     return torch.cat(
@@ -272,6 +272,6 @@ def _solve_4(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     )
 
 
-def _inverse_2(m: torch.Tensor) -> torch.Tensor:
+def _invert_2(m: torch.Tensor) -> torch.Tensor:
     a, b, c, d = m[:, 0, 0], m[:, 0, 1], m[:, 1, 0], m[:, 1, 1]
     return torch.stack((d, -b, -c, a), 1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from tasks.classical import Guidance
+from tasks.classical import ControllerGuidance
 
 if TYPE_CHECKING:
     from tasks.process import ToolPoseProcess
 
 
-class Deployable(torch.nn.Module):
+class DeployedPolicy(torch.nn.Module):
     """The whole policy as it runs on the machine: from the observation vector `(B, O)` to masked commands `(B, J)`.
 
     Everything that training computes beside the paper's observation (guidance, phase, residual,
@@ -47,7 +47,7 @@ class Deployable(torch.nn.Module):
         positioning = options.switch.positioning(guidance)
         if options.memory < q.shape[1]:
             observation = process._encoder.encode(target_m, q, u, pitch, proposed)
-        groups = {"policy": observation, "guide": features(guidance, positioning, u[:, -1])}
+        groups = {"policy": observation, "guide": compute_features(guidance, positioning, u[:, -1])}
         command = options.action.command(
             self.network(groups),
             guidance.command,
@@ -61,7 +61,9 @@ class Deployable(torch.nn.Module):
         )
 
 
-def features(guidance: Guidance, positioning: torch.Tensor, u_last: torch.Tensor) -> torch.Tensor:
+def compute_features(
+    guidance: ControllerGuidance, positioning: torch.Tensor, u_last: torch.Tensor
+) -> torch.Tensor:
     """Returns what the default policy is told beside the paper's observation, all of it computed from that observation."""
     errors = torch.cat((guidance.error_m, guidance.goal_error_m[:, None]), 1)
     scales = (errors, (errors / 0.1).tanh(), (errors / 0.02).tanh())

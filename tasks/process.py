@@ -19,19 +19,18 @@ from brokk_rl.contracts.world import World
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.observation import Encoder, Scaling
-from tasks.advice import Advice
-from tasks.classical import Classical, ClassicalController
-from tasks.deployable import Deployable, features
-from tasks.measured import Measured
-from tasks.reward import Term
-from tasks.state import ToolState
-from tasks.tool_pose import Action, Noise, Switch
+from brokk_rl.observation import ObservationEncoder, TargetScaling
+from tasks.advice import AdviceConfig
+from tasks.classical import ClassicalConfig, ClassicalController
+from tasks.control import ActionMapping, ObservationNoise, PhaseSwitch
+from tasks.deployable import DeployedPolicy, compute_features
+from tasks.noise import MeasuredNoise
+from tasks.reward import RewardTerm, ToolState
 
 REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
 
 
-class Goal(Protocol):
+class ToolPoseGoal(Protocol):
     """What a tool-pose task must say about itself."""
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
@@ -46,8 +45,8 @@ class Goal(Protocol):
 
 
 @dataclass
-class Options:
-    """The parts of a task's configuration that the process itself uses; see `tasks.tool_pose` and the task's spec.
+class ToolPoseOptions:
+    """The parts of a task's configuration that the process itself uses; see `tasks.control` and the task's spec.
 
     The target point of the process lies `depth_m` below that of the goal.
     """
@@ -57,13 +56,13 @@ class Options:
     limit_margin: float
     depth_m: float
     memory: int
-    advice: Advice | None
-    noise: Noise | Measured
-    switch: Switch
-    action: Action
-    scaling: Scaling
-    classical: Classical
-    reward: dict[str, Term]
+    advice: AdviceConfig | None
+    noise: ObservationNoise | MeasuredNoise
+    switch: PhaseSwitch
+    action: ActionMapping
+    scaling: TargetScaling
+    classical: ClassicalConfig
+    reward: dict[str, RewardTerm]
 
     @classmethod
     def of(cls, task: object, **fixed: Any) -> Self:
@@ -82,7 +81,12 @@ class ToolPoseProcess:
     reasons: tuple[str, ...] = REASONS
 
     def __init__(
-        self, goal: Goal, options: Options, machine: Machine, num_envs: int, device: torch.device
+        self,
+        goal: ToolPoseGoal,
+        options: ToolPoseOptions,
+        machine: Machine,
+        num_envs: int,
+        device: torch.device,
     ) -> None:
         def constant(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
@@ -94,7 +98,7 @@ class ToolPoseProcess:
         self._kinematics = Kinematics(machine, device)
         self._controller: ClassicalController = options.classical.build(machine, device)
         self.adviser = options.advice.build(machine, device) if options.advice else None
-        self._encoder = Encoder(
+        self._encoder = ObservationEncoder(
             machine, options.scaling, constant, torch.cat, with_proposals=self.adviser is not None
         )
         self._exclusive = constant(machine.is_exclusive).bool()
@@ -290,7 +294,7 @@ class ToolPoseProcess:
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
         """See `TaskProcess.deployable`."""
-        return Deployable(self, network)
+        return DeployedPolicy(self, network)
 
     def remembered(self, q: torch.Tensor, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the history that the policy sees, `(N, H, J)` each; before its last `memory` samples all looks at rest."""
@@ -376,7 +380,7 @@ class ToolPoseProcess:
         state["lowest"].copy_(guidance.lowest)
         state["highest"].copy_(guidance.highest)
         state["policy"].copy_(self._encoder.encode(sample, q, u, pitch_rad, proposed))
-        state["features"].copy_(features(guidance, positioning, u[:, -1]))
+        state["features"].copy_(compute_features(guidance, positioning, u[:, -1]))
         state["privileged"].copy_(self._privileged(sample))
 
     def _privileged(self, sample: torch.Tensor) -> torch.Tensor:

@@ -17,7 +17,7 @@ from tasks.classical import ClassicalController
 
 
 @spec
-class Arms:
+class ArmStarts:
     """Where the arm may begin.
 
     Attributes:
@@ -35,7 +35,7 @@ class Arms:
 
 
 @dataclass
-class Targets:
+class CandidateTargets:
     """Candidates for what an arm shall reach; `M` of them.
 
     Attributes:
@@ -55,11 +55,11 @@ Uniform = Callable[[tuple[float, float]], torch.Tensor]
 """Draws `(M,)` numbers between two bounds."""
 
 
-def random_starts(
+def draw_starts(
     count: int,
     seed: int,
-    draw: Callable[[Uniform], Targets],
-    arms: Arms,
+    draw: Callable[[Uniform], CandidateTargets],
+    arms: ArmStarts,
     machine: Machine,
     controller: ClassicalController,
     reach_m: tuple[float, float],
@@ -88,7 +88,7 @@ def random_starts(
     drawn = []
     for _ in range(64):
         targets = draw(uniform)
-        q, free = random_arms(arms, machine, controller, targets.object_z_m, generator)
+        q, free = draw_arms(arms, machine, controller, targets.object_z_m, generator)
         rows = {
             "q": q,
             "scene": targets.scene,
@@ -97,17 +97,17 @@ def random_starts(
         }
         rows = {name: value[free] for name, value in rows.items()}
         deep = rows["target_m"] - torch.tensor([0.0, 0.0, depth_m])
-        done = reachable(
+        done = check_reachable(
             controller, machine, rows["q"], deep, rows["target_pitch_rad"], reach_m, arms.margin_rad
         )
         drawn.append({name: value[done] for name, value in rows.items()})
         if sum(len(found["q"]) for found in drawn) >= count:
             break
-    return keep(count, drawn, what)
+    return join_starts(count, drawn, what)
 
 
-def random_arms(
-    arms: Arms,
+def draw_arms(
+    arms: ArmStarts,
     machine: Machine,
     controller: ClassicalController,
     object_z_m: torch.Tensor,
@@ -127,7 +127,7 @@ def random_arms(
     return q, free
 
 
-def reachable(
+def check_reachable(
     controller: ClassicalController,
     machine: Machine,
     q: torch.Tensor,
@@ -166,7 +166,9 @@ def reachable(
     return good & near & ((pitch_rad - pose.pitch_rad).abs() < 0.03)
 
 
-def keep(count: int, drawn: list[dict[str, torch.Tensor]], what: str) -> dict[str, torch.Tensor]:
+def join_starts(
+    count: int, drawn: list[dict[str, torch.Tensor]], what: str
+) -> dict[str, torch.Tensor]:
     """Joins batches of accepted starts and cuts them to `count`.
 
     Raises:

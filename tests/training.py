@@ -13,10 +13,10 @@ from composed import option
 from kinematic import Kinematic
 
 from brokk_rl.machine import Machine
-from brokk_rl.rl.logger import Logbook
-from brokk_rl.rl.runner import Budget, Runner, Training
-from brokk_rl.rl.tracking import Off
-from brokk_rl.rl.vec_env import ControlLoop, Plant
+from brokk_rl.rl.logger import TrainingLogger
+from brokk_rl.rl.runner import TrainingBudget, TrainingConfig, TrainingRunner
+from brokk_rl.rl.tracking import NoTracking
+from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 
 CPU = torch.device("cpu")
 STEPS = 4
@@ -24,9 +24,11 @@ TIMES = ("seconds", "rate/env_steps_per_s", "rate/collect_s", "rate/learn_s")
 """Columns of `progress.csv` that differ from run to run."""
 
 
-def plant(machine: Machine, task: Any = None, sim: Any = None, follower: Any = None) -> Plant:
+def plant(
+    machine: Machine, task: Any = None, sim: Any = None, follower: Any = None
+) -> ControlLoopConfig:
     """Returns what a small control loop is made of."""
-    return Plant(
+    return ControlLoopConfig(
         machine=machine,
         sim=sim or Kinematic(),
         task=task or option("task", "borehole_insertion"),
@@ -38,7 +40,7 @@ def plant(machine: Machine, task: Any = None, sim: Any = None, follower: Any = N
 
 def small(
     max_env_steps: int | None = None, max_seconds: float | None = None, **changes: Any
-) -> Training:
+) -> TrainingConfig:
     """Returns the shipped training configuration, made small."""
     shipped = option("rl", "ppo")
     runner = copy.deepcopy(shipped.runner)
@@ -46,7 +48,7 @@ def small(
     runner["algorithm"] |= {"num_learning_epochs": 2, "num_mini_batches": 2}
     for network in ("actor", "critic"):
         runner[network]["hidden_dims"] = [16]
-    budget = Budget(max_env_steps=max_env_steps, max_seconds=max_seconds)
+    budget = TrainingBudget(max_env_steps=max_env_steps, max_seconds=max_seconds)
     return replace(
         shipped,
         **{"num_envs": 16, "num_starts": 64, "save_interval": 1, "runner": runner, "budget": budget}
@@ -55,24 +57,26 @@ def small(
 
 
 def make(
-    machine: Machine, folder: Path, training: Training, loop: ControlLoop | None = None
-) -> tuple[Runner, Logbook]:
+    machine: Machine, folder: Path, training: TrainingConfig, loop: ControlLoop | None = None
+) -> tuple[TrainingRunner, TrainingLogger]:
     """Returns a runner on a control loop of its own; every run of a test starts from the same seed."""
     folder.mkdir(exist_ok=True)
     torch.manual_seed(0)
     loop = loop or plant(machine).build(CPU, training.num_envs, training.num_starts, 0)
-    book = Logbook(
+    book = TrainingLogger(
         folder,
-        Off().open(folder, {}),
+        NoTracking().open(folder, {}),
         loop.statistics,
         STEPS * loop.num_envs,
         training.max_fault_rate,
         training.budget.share_spent,
     )
-    return Runner(loop, training, folder, CPU, book), book
+    return TrainingRunner(loop, training, folder, CPU, book), book
 
 
-def train(machine: Machine, folder: Path, training: Training, resume: Path | None = None) -> Runner:
+def train(
+    machine: Machine, folder: Path, training: TrainingConfig, resume: Path | None = None
+) -> TrainingRunner:
     """Trains until the budget is spent, from the beginning or from a checkpoint."""
     runner, book = make(machine, folder, training)
     with book:
@@ -85,7 +89,7 @@ def train(machine: Machine, folder: Path, training: Training, resume: Path | Non
     return runner
 
 
-def weights(runner: Runner) -> dict[str, torch.Tensor]:
+def weights(runner: TrainingRunner) -> dict[str, torch.Tensor]:
     """Returns all learned numbers of actor and critic."""
     return {
         f"{part}.{name}": value

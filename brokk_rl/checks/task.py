@@ -11,14 +11,14 @@ import torch
 from brokk_rl import observation
 from brokk_rl.checks.exercise import (
     NUM_ENVS,
-    copies,
-    in_place,
-    own_randomness,
-    places,
+    build_rest_history,
+    copy_tensors,
+    is_in_place,
+    is_same,
+    isolate_randomness,
     require,
     require_rows,
-    rest_history,
-    same,
+    view_tensors,
 )
 from brokk_rl.contracts.task import Task, TaskProcess
 from brokk_rl.history import History
@@ -28,7 +28,7 @@ from brokk_rl.machine import Machine
 def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu") -> None:
     """Checks what `Task.build` returns against `TaskProcess`; nothing moves while it does."""
     device = torch.device(device)
-    with own_randomness():
+    with isolate_randomness():
         process = task.build(machine, NUM_ENVS, device)
         require(
             process.num_actions > 0 and process.max_episode_steps > 0,
@@ -39,29 +39,27 @@ def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu")
             f"reasons: expected different names, got {process.reasons}",
         )
         json.dumps(process.describe())
-        start = {
-            name: value.to(device) for name, value in _checked_starts(process, machine).items()
-        }
+        start = {name: value.to(device) for name, value in _check_starts(process, machine).items()}
         everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=device)
-        history = rest_history(machine, device, start["q"])
+        history = build_rest_history(machine, device, start["q"])
         require_rows(process.state, "state")
         require_rows(process.episode, "episode")
-        place = places(process.state), places(process.episode)
+        place = view_tensors(process.state), view_tensors(process.episode)
 
         torch.manual_seed(0)
         process.reset(everywhere, start)
-        groups = copies(process.observe(history))
+        groups = copy_tensors(process.observe(history))
         torch.manual_seed(0)
         process.reset(everywhere, start)
         again = process.observe(history)
         require(
-            all(same(again[name], value) for name, value in groups.items()),
+            all(is_same(again[name], value) for name, value in groups.items()),
             "reset, observe: the same seed gives another observation",
         )
         require("policy" in groups, f"observe: no group 'policy' among {', '.join(groups)}")
         size = process.describe()["size"]
         own = [
-            observation.size(machine, pitch, proposals)
+            observation.compute_size(machine, pitch, proposals)
             for proposals in (False, True)
             for pitch in (False, True)
         ]
@@ -86,22 +84,22 @@ def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu")
 
         _check_commands(process, machine, device)
         _check_episode(process, history, device)
-        kept_place = in_place(process.state, place[0]) and in_place(process.episode, place[1])
+        kept_place = is_in_place(process.state, place[0]) and is_in_place(process.episode, place[1])
         require(
             kept_place, "state, episode: a tensor moved or changed its shape; write it in place"
         )
-        before = copies(process.state)
+        before = copy_tensors(process.state)
         some = everywhere.clone()
         some[1:] = False
         process.reset(some, start)
         for name, value in process.state.items():
             require(
-                same(value[1:], before[name][1:]),
+                is_same(value[1:], before[name][1:]),
                 f"reset: state '{name}' changed in environments outside the mask",
             )
 
 
-def _checked_starts(process: TaskProcess, machine: Machine) -> dict[str, torch.Tensor]:
+def _check_starts(process: TaskProcess, machine: Machine) -> dict[str, torch.Tensor]:
     start, again, other = (
         process.starts(NUM_ENVS, 1),
         process.starts(NUM_ENVS, 1),
@@ -114,8 +112,8 @@ def _checked_starts(process: TaskProcess, machine: Machine) -> dict[str, torch.T
             len(value) == NUM_ENVS and bool(value.isfinite().all()),
             f"starts: '{name}' is not finite for each of {NUM_ENVS} starts",
         )
-        require(same(value, again[name]), f"starts: '{name}' differs for the same seed")
-    require(not same(start["q"], other["q"]), "starts: another seed gives the same arms")
+        require(is_same(value, again[name]), f"starts: '{name}' differs for the same seed")
+    require(not is_same(start["q"], other["q"]), "starts: another seed gives the same arms")
     q = start["q"].cpu().numpy()
     require(
         bool(((q >= machine.lower) & (q <= machine.upper)).all()),
@@ -143,7 +141,10 @@ def _check_episode(process: TaskProcess, history: History, device: torch.device)
         contact_force_n=torch.zeros(NUM_ENVS, device=device),
         faults=torch.zeros(NUM_ENVS, dtype=torch.bool, device=device),
     )
-    kept, timed_out = copies(vars(history)), torch.zeros(NUM_ENVS, dtype=torch.bool, device=device)
+    kept, timed_out = (
+        copy_tensors(vars(history)),
+        torch.zeros(NUM_ENVS, dtype=torch.bool, device=device),
+    )
     over = timed_out.clone()
     for _ in range(process.max_episode_steps):
         step = process.step(history, world)
@@ -178,6 +179,6 @@ def _check_episode(process: TaskProcess, history: History, device: torch.device)
         f"step: no time-out after max_episode_steps = {process.max_episode_steps}",
     )
     require(
-        all(same(value, kept[name]) for name, value in vars(history).items()),
+        all(is_same(value, kept[name]) for name, value in vars(history).items()),
         "step, observe: changed the history",
     )

@@ -19,12 +19,12 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.rl.distributed import Group
-from brokk_rl.rl.graph import capture
-from brokk_rl.rl.logger import Logbook
-from brokk_rl.rl.runner import Runner, Training
-from brokk_rl.rl.tracking import Off
-from brokk_rl.rl.vec_env import ControlLoop, Plant
+from brokk_rl.rl.distributed import TrainingGroup
+from brokk_rl.rl.execution import capture_graph
+from brokk_rl.rl.logger import TrainingLogger
+from brokk_rl.rl.runner import TrainingConfig, TrainingRunner
+from brokk_rl.rl.tracking import NoTracking
+from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session, read_versions, write_json
 from brokk_rl.spec import spec
 
@@ -43,7 +43,7 @@ control step, training."""
 
 
 @spec
-class Sizes:
+class BenchmarkSizes:
     """What to measure.
 
     Attributes:
@@ -68,7 +68,7 @@ class Sizes:
 
 
 @spec
-class Bench:
+class Benchmark:
     """Measures rates: physics alone, the whole control step, and training, for several numbers of environments.
 
     Attributes:
@@ -90,17 +90,17 @@ class Bench:
     actuator: Actuator
     effect: dict[str, Effect]
     follower: Follower
-    rl: Training
-    bench: Sizes
+    rl: TrainingConfig
+    bench: BenchmarkSizes
 
     together: ClassVar[bool] = True
     """Several processes that `torchrun` starts measure at the same time and train together."""
 
     def run(self) -> float:
         """Measures; returns the training rate of the last row, that of all processes together."""
-        alone = _alone(self.bench)
+        alone = _read_single_process(self.bench)
         device = self.session.torch_device()
-        plant = Plant(
+        plant = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
             task=self.task,
@@ -108,9 +108,9 @@ class Bench:
             effects=self.effect,
             follower=self.follower,
         )
-        with Group(device) as group:
+        with TrainingGroup(device) as group:
             rows = [
-                _compared(row, alone.get(row["num_envs"]))
+                _add_comparisons(row, alone.get(row["num_envs"]))
                 for row in self._rows(plant, device, group)
             ]
         if group.rank.first:
@@ -130,12 +130,14 @@ class Bench:
             _print(rows)
         return float(rows[-1]["train_env_steps_per_s"])
 
-    def _rows(self, plant: Plant, device: torch.device, group: Group) -> list[dict[str, Any]]:
+    def _rows(
+        self, plant: ControlLoopConfig, device: torch.device, group: TrainingGroup
+    ) -> list[dict[str, Any]]:
         rows = []
         for num_envs in self.bench.num_envs:
             self.session.seed_all()
             loop = plant.build(device, num_envs, self.rl.num_starts, self.session.stream("starts"))
-            rows.append(_over_ranks(group.all(self._measure(loop, device, group))))
+            rows.append(_sum_over_ranks(group.all(self._measure(loop, device, group))))
             log.info(
                 "%d environments: %s",
                 num_envs,
@@ -143,12 +145,14 @@ class Bench:
             )
         return rows
 
-    def _measure(self, loop: ControlLoop, device: torch.device, group: Group) -> dict[str, Any]:
+    def _measure(
+        self, loop: ControlLoop, device: torch.device, group: TrainingGroup
+    ) -> dict[str, Any]:
         num = loop.num_envs
         still = torch.zeros(num, self.machine.num_joints, device=device)
         graphs = device.type == "cuda" and loop.world.supports_graphs
         physics = (
-            capture(lambda: loop.world.step(still), device).replay
+            capture_graph(lambda: loop.world.step(still), device).replay
             if graphs
             else lambda: loop.world.step(still)
         )
@@ -160,15 +164,15 @@ class Bench:
         group.wait()  # those of one computer share its processors and its power: measure them at the same time
         seconds = self._in_turn(steps, loop, device)
         runner_steps = int(self.rl.runner["num_steps_per_env"])
-        book = Logbook(
+        book = TrainingLogger(
             self.session.folder,
-            Off().open(self.session.folder, {}),
+            NoTracking().open(self.session.folder, {}),
             loop.statistics,
             num * runner_steps,
             1.0,
             lambda *_: 0.0,
         )
-        runner = Runner(loop, self.rl, self.session.folder, device, book, group)
+        runner = TrainingRunner(loop, self.rl, self.session.folder, device, book, group)
         runner.learn(1)
         _wait(device)
         group.wait()
@@ -213,7 +217,7 @@ class Bench:
         return {name: median(values) / CALLS for name, values in spent.items()}
 
 
-def _over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _sum_over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Returns the row of all processes: rates add up; what each of them reached stands in `per_rank`."""
     if len(rows) == 1:
         return rows[0]
@@ -226,7 +230,7 @@ def _over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
     )
 
 
-def _alone(sizes: Sizes) -> dict[int, dict[str, Any]]:
+def _read_single_process(sizes: BenchmarkSizes) -> dict[int, dict[str, Any]]:
     """Returns the rows of the one process that is compared with, by number of environments."""
     if sizes.against is None:
         return {}
@@ -246,7 +250,7 @@ def _alone(sizes: Sizes) -> dict[int, dict[str, Any]]:
     return rows
 
 
-def _compared(row: dict[str, Any], alone: dict[str, Any] | None) -> dict[str, Any]:
+def _add_comparisons(row: dict[str, Any], alone: dict[str, Any] | None) -> dict[str, Any]:
     """Returns the row with what its rates are of those of MuJoCo's own batch, and of as many times one process alone."""
     if batch := row.get("batch_env_steps_per_s"):
         row = row | {"of_batch": {name: row[name] / batch for name in RATES[1:]}}

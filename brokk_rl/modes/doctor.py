@@ -228,20 +228,20 @@ def check_cuda_graphs() -> Iterator[DoctorFinding]:
 
 def check_warp() -> Iterator[DoctorFinding]:
     """Report the version of Warp and its kernel cache, which saves minutes of compilation."""
-    cache = probe.kernel_cache()
+    cache = probe.find_kernel_cache()
     size = (
         sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
         if cache.exists()
         else 0
     )
     yield DoctorFinding(
-        "ok", f"{probe.warp_version()}, kernel cache {cache} ({size / 2**20:.1f} MiB)"
+        "ok", f"{probe.get_warp_version()}, kernel cache {cache} ({size / 2**20:.1f} MiB)"
     )
 
 
 def check_rendering() -> Iterator[DoctorFinding]:
     """Check that MuJoCo can render, which only videos need."""
-    name = probe.working_renderer()
+    name = probe.find_renderer()
     if name:
         yield DoctorFinding("ok", f"MuJoCo draws with MUJOCO_GL={name}")
     else:

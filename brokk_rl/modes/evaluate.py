@@ -14,11 +14,11 @@ from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.rl.evaluation import Episode, evaluate
-from brokk_rl.rl.vec_env import ControlLoop, Plant
+from brokk_rl.rl.evaluation import RecordedEpisode, evaluate_policy
+from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.video import render_video
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +85,7 @@ class Evaluate:
 
     def run(self) -> float:
         """Evaluates; returns the strict success of the policy."""
-        plant = Plant(
+        plant = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
             task=self.task,
@@ -93,13 +93,18 @@ class Evaluate:
             effects=self.effect,
             follower=self.follower,
         )
-        policies = {type(self.policy).__name__.lower(): self.policy} | self.rivals
+        policies = {
+            type(self.policy).__name__.removesuffix("Policy").lower(): self.policy
+        } | self.rivals
         results, _ = evaluate_policies(plant, self.evaluation, self.session, policies)
         return float(results["success_strict"]["mean"])
 
 
 def evaluate_policies(
-    plant: Plant, evaluation: Evaluation, session: Session, policies: dict[str, PolicySpec]
+    plant: ControlLoopConfig,
+    evaluation: Evaluation,
+    session: Session,
+    policies: dict[str, PolicySpec],
 ) -> tuple[dict[str, Any], torch.Tensor]:
     """Evaluates policies from the same starts with the same noise, and writes `evaluation.json` and `insertion.mp4`.
 
@@ -121,21 +126,21 @@ def evaluate_policies(
     starts = {key: value.clone() for key, value in loop.starts.items()}
     fresh = loop.state_dict()
     table: dict[str, Any] = {}
-    recorded: dict[str, list[Episode]] = {}
+    recorded: dict[str, list[RecordedEpisode]] = {}
     seen: dict[str, torch.Tensor] = {}
     for name, policy in policies.items():
         log.info("evaluating %s over %d episodes", name, evaluation.episodes)
         loop.load_state_dict(fresh)  # every policy meets the same machines and persons
         acting = policy.build(loop, session.seed)
-        table[name], recorded[name], seen[name] = evaluate(
+        table[name], recorded[name], seen[name] = evaluate_policy(
             loop, acting, starts, evaluation.seed, evaluation.num_recorded
         )
     first = next(iter(policies))
     results = {
         **table[first],
         "seed": evaluation.seed,
-        "actuator": type(plant.actuator).__name__.lower(),
-        "follower": type(plant.follower).__name__.lower(),
+        "actuator": name_spec(plant.actuator),
+        "follower": name_spec(plant.follower),
         "policy": first,
         "policies": table,
     }

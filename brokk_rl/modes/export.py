@@ -11,12 +11,12 @@ from brokk_rl.contracts.actuator import Actuator, Follower
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.machine import Machine
-from brokk_rl.modes.train import find_checkpoint, follower_of
-from brokk_rl.rl.evaluation import evaluate
+from brokk_rl.modes.train import find_checkpoint, read_follower
+from brokk_rl.rl.evaluation import evaluate_policy
 from brokk_rl.rl.export import export_onnx
-from brokk_rl.rl.policy import Network, make_actor, write_bundle
-from brokk_rl.rl.runner import Training, read_checkpoint
-from brokk_rl.rl.vec_env import Plant
+from brokk_rl.rl.policy import NetworkPolicy, make_actor, write_bundle
+from brokk_rl.rl.runner import TrainingConfig, read_checkpoint
+from brokk_rl.rl.vec_env import ControlLoopConfig
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 
@@ -45,7 +45,7 @@ class Export:
     task: Task
     actuator: Actuator
     follower: Follower
-    rl: Training
+    rl: TrainingConfig
     checkpoint: str
     num_checked: int
 
@@ -60,7 +60,7 @@ class Export:
         cpu = torch.device("cpu")
         content = read_checkpoint(path, cpu)
         self.machine.check_fingerprint(content.get("fingerprint", {}), str(path))
-        plant = Plant(
+        plant = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
             task=self.task,
@@ -72,13 +72,15 @@ class Export:
         config = self.rl.runner_config()
         actor = make_actor(config["actor"], config["obs_groups"], loop)
         actor.load_state_dict(content["actor_state_dict"])
-        _, _, observations = evaluate(loop, Network(actor, loop), loop.starts, self.session.seed, 1)
+        _, _, observations = evaluate_policy(
+            loop, NetworkPolicy(actor, loop), loop.starts, self.session.seed, 1
+        )
         facts = {
             "checkpoint": str(path),
             "env_steps": content["book"]["env_steps"],
             "seconds": content["book"]["seconds"],
         }
-        facts["follower"] = follower_of(path.parent)
+        facts["follower"] = read_follower(path.parent)
         contract = write_bundle(self.session.folder, actor, self.rl, loop, facts)
         largest = export_onnx(self.session.folder, actor, loop.task, contract, observations)
         log.info(

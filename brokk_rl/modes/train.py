@@ -16,15 +16,19 @@ from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import Evaluation, evaluate_policies
-from brokk_rl.rl.curves import draw_curves
-from brokk_rl.rl.distributed import Group
+from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.export import export_onnx
-from brokk_rl.rl.logger import PROGRESS, Logbook
-from brokk_rl.rl.policy import Classical, Trained, Untrained, write_bundle
-from brokk_rl.rl.runner import Runner, Training, checkpoints
-from brokk_rl.rl.tracking import Off, Tracking
-from brokk_rl.rl.vec_env import Plant
-from brokk_rl.rl.warm_start import begin_with
+from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves
+from brokk_rl.rl.policy import (
+    ClassicalPolicy,
+    TrainedPolicy,
+    UntrainedPolicy,
+    load_initial_weights,
+    write_bundle,
+)
+from brokk_rl.rl.runner import TrainingConfig, TrainingRunner, list_checkpoints
+from brokk_rl.rl.tracking import NoTracking, Tracking
+from brokk_rl.rl.vec_env import ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session
 from brokk_rl.spec import spec
 
@@ -58,7 +62,7 @@ class Train:
     actuator: Actuator
     effect: dict[str, Effect]
     follower: Follower
-    rl: Training
+    rl: TrainingConfig
     tracking: Tracking
     evaluation: Evaluation
     start_from: str | None
@@ -72,7 +76,7 @@ class Train:
         checkpoint = self._checkpoint()
         device, folder = self.session.torch_device(), self.session.folder
         self.session.seed_all()
-        plant = Plant(
+        plant = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
             task=self.task,
@@ -85,7 +89,7 @@ class Train:
         )
         loop.capture(self.rl.fuse)
         state = "active" if loop.graph_active else "not used (they need sim=warp on a GPU)"
-        group = Group(device)
+        group = TrainingGroup(device)
         where = (
             f"{device}, in each of {group.rank.count} processes" if group.together else str(device)
         )
@@ -99,16 +103,16 @@ class Train:
         self.session.seed_all()  # capturing has drawn random numbers
 
         steps = loop.num_envs * int(self.rl.runner["num_steps_per_env"]) * group.rank.count
-        tracking = self.tracking if group.rank.first else Off()
+        tracking = self.tracking if group.rank.first else NoTracking()
         tracker = tracking.open(
             folder, {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed}
         )
-        book = Logbook(
+        book = TrainingLogger(
             folder, tracker, lambda: group.pooled(loop.statistics()), steps, self.rl.max_fault_rate, self.rl.budget.share_spent,
             quiet=not group.rank.first,
         )  # fmt: skip
         with group, book:
-            runner = Runner(loop, self.rl, folder, device, book, group)
+            runner = TrainingRunner(loop, self.rl, folder, device, book, group)
             if checkpoint:
                 runner.load(str(checkpoint))
                 log.info(
@@ -118,7 +122,7 @@ class Train:
                     book.seconds,
                 )
             elif self.start_from:
-                begin_with(runner.alg.actor, self.start_from, self.machine)
+                load_initial_weights(runner.alg.actor, self.start_from, self.machine)
             runner.run()
         if not group.rank.first:
             return None
@@ -129,14 +133,14 @@ class Train:
             "seed": self.session.seed,
             "device": str(device),
         }
-        facts["follower"] = follower_of(folder)
+        facts["follower"] = read_follower(folder)
         actor = runner.alg.get_policy()
         contract = write_bundle(folder, actor, self.rl, loop, facts)
         draw_curves(folder / PROGRESS, folder / "learning_curves.png")
         policies = {
-            "trained": Trained(folder=str(folder)),
-            "classical": Classical(),
-            "untrained": Untrained(training=self.rl),
+            "trained": TrainedPolicy(folder=str(folder)),
+            "classical": ClassicalPolicy(),
+            "untrained": UntrainedPolicy(training=self.rl),
         }
         results, observations = evaluate_policies(plant, self.evaluation, self.session, policies)
         export_onnx(
@@ -154,14 +158,14 @@ class Train:
         if self.resume is None:
             return None
         folder = self.session.folder
-        if Path(self.resume).resolve() == folder.resolve() and not checkpoints(folder):
+        if Path(self.resume).resolve() == folder.resolve() and not list_checkpoints(folder):
             if distributed.read_rank().first:
                 (folder / PROGRESS).unlink(missing_ok=True)
             return None
         return find_checkpoint(Path(self.resume))
 
 
-def follower_of(folder: Path) -> dict[str, Any] | None:
+def read_follower(folder: Path) -> dict[str, Any] | None:
     """Returns the `follower` of the run in `folder` as it was configured; `None` where no configuration lies there."""
     resolved = folder / RESOLVED
     return yaml.safe_load(resolved.read_text()).get("follower") if resolved.exists() else None
@@ -175,7 +179,7 @@ def find_checkpoint(path: Path) -> Path:
     """
     if path.suffix == ".pt":
         return path
-    found = checkpoints(path) if path.is_dir() else []
+    found = list_checkpoints(path) if path.is_dir() else []
     if not found:
         raise CheckpointError(
             f"resume={path}: there is no checkpoint (model_<iteration>.pt) to go on from"

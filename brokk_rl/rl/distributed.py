@@ -18,7 +18,7 @@ from brokk_rl import distributed
 from brokk_rl.errors import DistributedError
 
 
-class Group:
+class TrainingGroup:
     """The processes that train together, a context manager; in a process that is alone nothing here costs anything.
 
     Args:
@@ -34,7 +34,7 @@ class Group:
         """Whether there is more than one process."""
         return self.rank.count > 1
 
-    def __enter__(self) -> Group:
+    def __enter__(self) -> TrainingGroup:
         if self.device.type == "cuda":
             torch.cuda.set_device(self.device)
         if self.together:
@@ -56,7 +56,7 @@ class Group:
         ):  # gloo's threads must end before the interpreter does, or it aborts
             dist.destroy_process_group()
         if isinstance(error, dist.DistError) or (
-            isinstance(error, RuntimeError) and _from_a_collective(str(error))
+            isinstance(error, RuntimeError) and _is_lost_connection(str(error))
         ):
             # between GPUs nothing is destroyed after an error: NCCL would wait for those that are
             # gone
@@ -91,7 +91,7 @@ class Group:
         if not self.together:
             return [state]
         found: list[Any] = [None] * self.rank.count
-        dist.gather_object(_on_host(state), found if self.rank.first else None, dst=0)
+        dist.gather_object(_copy_to_host(state), found if self.rank.first else None, dst=0)
         return found if self.rank.first else []
 
     def pooled(self, figures: Mapping[str, float]) -> dict[str, float]:
@@ -119,7 +119,7 @@ class Group:
         """
         if not self.together:
             return
-        found = self.all(fingerprint(state))
+        found = self.all(hash_tensors(state))
         other = [index for index, value in enumerate(found) if value != found[0]]
         if other:
             raise DistributedError(
@@ -128,7 +128,7 @@ class Group:
             )
 
 
-def fingerprint(state: Mapping[str, torch.Tensor]) -> str:
+def hash_tensors(state: Mapping[str, torch.Tensor]) -> str:
     """Returns the SHA-256 of names and bytes of tensors."""
     digest = hashlib.sha256()
     for name, value in state.items():
@@ -139,15 +139,15 @@ def fingerprint(state: Mapping[str, torch.Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _on_host(state: Any) -> Any:
+def _copy_to_host(state: Any) -> Any:
     if isinstance(state, torch.Tensor):
         return state.detach().cpu()
     if isinstance(state, Mapping):
-        return {name: _on_host(value) for name, value in state.items()}
+        return {name: _copy_to_host(value) for name, value in state.items()}
     return state
 
 
-def _from_a_collective(text: str) -> bool:
+def _is_lost_connection(text: str) -> bool:
     """Whether a RuntimeError is the end of a connection: gloo has no class of its own for it."""
     return any(
         word in text

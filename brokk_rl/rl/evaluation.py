@@ -14,7 +14,7 @@ from brokk_rl.rl.vec_env import ControlLoop, Starts
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """One recorded episode, `T` control steps.
 
     Attributes:
@@ -35,9 +35,9 @@ class Episode:
 
 
 @torch.no_grad()
-def evaluate(
+def evaluate_policy(
     loop: ControlLoop, policy: Policy, starts: Starts, seed: int, num_recorded: int
-) -> tuple[dict[str, Any], list[Episode], torch.Tensor]:
+) -> tuple[dict[str, Any], list[RecordedEpisode], torch.Tensor]:
     """Runs one episode from each start.
 
     Args:
@@ -79,10 +79,14 @@ def evaluate(
             )
         )
         running &= ~done
-    return _summary(figures, reason, loop), _episodes(tape, starts, figures, loop), torch.cat(seen)
+    return (
+        _summarize(figures, reason, loop),
+        _collect_episodes(tape, starts, figures, loop),
+        torch.cat(seen),
+    )
 
 
-def _summary(
+def _summarize(
     figures: dict[str, torch.Tensor], reason: torch.Tensor, loop: ControlLoop
 ) -> dict[str, Any]:
     table = {name: value.cpu().numpy() for name, value in figures.items()}
@@ -91,8 +95,8 @@ def _summary(
     endings = reason.cpu().numpy()
     return {
         "episodes": len(strict),
-        "success_strict": _share(strict),
-        "success_paper": _share(paper),
+        "success_strict": _estimate_share(strict),
+        "success_paper": _estimate_share(paper),
         "time_to_insert_s": {
             "median": float(np.median(times)) if len(times) else None,
             "p95": float(np.quantile(times, 0.95)) if len(times) else None,
@@ -106,24 +110,24 @@ def _summary(
     }
 
 
-def _share(happened: np.ndarray) -> dict[str, Any]:
+def _estimate_share(happened: np.ndarray) -> dict[str, Any]:
     low, high = compute_wilson_interval(int(happened.sum()), len(happened))
     return {"mean": float(happened.mean()), "ci95": [low, high]}
 
 
-def _episodes(
+def _collect_episodes(
     tape: list[tuple[torch.Tensor, ...]],
     starts: Starts,
     figures: dict[str, torch.Tensor],
     loop: ControlLoop,
-) -> list[Episode]:
+) -> list[RecordedEpisode]:
     q, u, force, running = (torch.stack(parts).cpu().numpy() for parts in zip(*tape, strict=True))
     episodes = []
     for row in range(q.shape[1]):
         length = max(2, int(running[:, row].sum()))
         first = starts["q"][row].cpu().numpy()[None]
         episodes.append(
-            Episode(
+            RecordedEpisode(
                 t_s=np.arange(length + 1) * loop.machine.period_s,
                 q=np.concatenate((first, q[:length, row])),
                 u=np.concatenate((np.zeros_like(first), u[:length, row])),

@@ -31,7 +31,7 @@ GOLDEN, NUM_GOLDEN = "golden.json", 16
 first."""
 
 
-class _Plain(torch.nn.Module):
+class _OnnxActor(torch.nn.Module):
     """A copy of an actor on the CPU that takes a plain dictionary of groups: ONNX does not know the TensorDict."""
 
     def __init__(self, actor: MLPModel) -> None:
@@ -72,7 +72,7 @@ def export_onnx(
     Raises:
         CheckpointError: The file says something else than the network; it is removed.
     """
-    module = task.deployable(_Plain(actor).eval()).eval()
+    module = task.deployable(_OnnxActor(actor).eval()).eval()
     example = observations[:1].cpu()
     part = folder / f".{ONNX}.part"
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()), torch.no_grad():
@@ -87,7 +87,12 @@ def export_onnx(
         expected = module(observations.cpu()).numpy()
     model = onnx.load(part)
     onnx.helper.set_model_props(
-        model, {f"brokk.{key}": _text(value) for key, value in contract.items() if key != "network"}
+        model,
+        {
+            f"brokk.{key}": _format_metadata(value)
+            for key, value in contract.items()
+            if key != "network"
+        },
     )
     onnx.save(model, part)
     session = onnxruntime.InferenceSession(part.read_bytes(), providers=["CPUExecutionProvider"])
@@ -122,5 +127,5 @@ def export_onnx(
     return largest
 
 
-def _text(value: Any) -> str:
+def _format_metadata(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)

@@ -1,7 +1,7 @@
-"""What a training run writes down and shows while it runs.
+"""Log of a training run: `progress.csv`, the progress bar and the picture of learning curves.
 
-Takes the place of rsl-rl's logger in the runner: that one reads finished episodes back to the host
-in every step, this one asks the control loop for its sums once an iteration.
+`TrainingLogger` replaces rsl-rl's logger in the runner. That one reads finished episodes back to
+the host in every step; this one asks the control loop for its sums once an iteration.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -19,19 +20,32 @@ from brokk_rl.errors import SimulationError
 from brokk_rl.rl.tracking import Tracker
 
 PROGRESS = "progress.csv"
+PANELS = (
+    (
+        "Success",
+        (("episode/success_strict", "strict"), ("episode/success_paper", "paper's criterion")),
+        (0.0, 1.0),
+    ),
+    ("Return", (("episode/return", "return per episode"),), None),
+    ("Episode length (control steps)", (("episode/length", "length"),), None),
+    ("Peak contact force (N)", (("episode/peak_force_n", "mean over episodes"),), None),
+    ("Exploration", (("policy/action_std", "standard deviation of the action"),), None),
+    ("Rate (control steps per second)", (("rate/env_steps_per_s", "training"),), None),
+)
+"""Title, (column of `progress.csv`, label) of each curve, and limits of the vertical axis."""
 
 
-class Logbook:
-    """Fulfils what `rsl_rl.runners.OnPolicyRunner` asks of its logger.
+class TrainingLogger:
+    """Logger of one training run; has the methods that `OnPolicyRunner` of rsl-rl calls.
 
     Args:
         folder: Run folder.
         tracker: Where figures go beside `progress.csv`.
-        statistics: Returns the figures of the finished episodes since it was last asked; see
+        statistics: Returns the figures of the episodes finished since its last call; see
             `ControlLoop.statistics`.
         steps_per_iteration: Control steps of all environments (and ranks) in one iteration.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world.
-        share_done: Returns how much of the run's budget is spent, 0 to 1, from control steps and
+        share_done: Returns the spent share of the run's budget, 0 to 1, from control steps and
             seconds.
         quiet: Count only, show and write nothing: of several processes the first writes for all.
     """
@@ -49,16 +63,13 @@ class Logbook:
         self.log_dir = str(folder)
         self.writer: Tracker | None = tracker
         self.env_steps, self.seconds = 0, 0.0
-        self._statistics, self._steps, self._max_fault_rate = (
-            statistics,
-            steps_per_iteration,
-            max_fault_rate,
-        )
-        self._share_done, self._quiet = share_done, quiet
+        self._statistics, self._share_done = statistics, share_done
+        self._steps, self._max_fault_rate = steps_per_iteration, max_fault_rate
+        self._quiet = quiet
         self._path = folder / PROGRESS
         self._rows: list[dict[str, Any]] = []
-        self._pending = 0
-        self._last: dict[str, float] = {}
+        self._num_unwritten = 0
+        self._last_episode: dict[str, float] = {}
         self._clock = time.perf_counter()
         columns = (
             TextColumn("{task.description}"),
@@ -68,9 +79,9 @@ class Logbook:
             TimeRemainingColumn(),
         )
         self._bar = Progress(*columns, console=Console(stderr=True), disable=quiet)
-        self._job = self._bar.add_task("training", total=1.0, figures="")
+        self._bar_task = self._bar.add_task("training", total=1.0, figures="")
 
-    def __enter__(self) -> Logbook:
+    def __enter__(self) -> TrainingLogger:
         self._bar.start()
         self._clock = time.perf_counter()
         return self
@@ -82,16 +93,16 @@ class Logbook:
             self.writer.close()
 
     def init_logging_writer(self) -> None:
-        """Nothing to do: the tracker is open before the runner exists."""
+        """Do nothing: the tracker is open before the runner exists."""
 
     def process_env_step(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing to do: the control loop adds up finished episodes on the device."""
+        """Do nothing: the control loop adds up finished episodes on the device."""
 
     def save_model(self, path: str, it: int) -> None:
-        """Checkpoints stay in the run folder."""
+        """Do nothing: checkpoints stay in the run folder."""
 
     def stop_logging_writer(self) -> None:
-        """The tracker stays open until the whole run ends."""
+        """Do nothing: the tracker stays open until the whole run ends."""
 
     def log(
         self,
@@ -102,7 +113,7 @@ class Logbook:
         loss_dict: dict[str, float],
         **rest: Any,
     ) -> None:
-        """Writes the figures of one iteration.
+        """Write the figures of one iteration.
 
         Raises:
             SimulationError: More worlds diverged or overflowed than `max_fault_rate` allows.
@@ -111,67 +122,96 @@ class Logbook:
         self.seconds += now - self._clock
         self._clock = now
         self.env_steps += self._steps
-        found = self._statistics()
-        if found["fault_rate"] > self._max_fault_rate:
+        statistics = self._statistics()
+        if statistics["fault_rate"] > self._max_fault_rate:
             raise SimulationError(
-                f"{found['fault_rate']:.2%} of the control steps of iteration {it} ended in a world that diverged, became NaN or "
-                f"overflowed its contact buffers (limit {self._max_fault_rate:.2%}). Look at the drive's stiffness, the time step "
+                f"{statistics['fault_rate']:.2%} of the control steps of iteration {it} ended in a "
+                "world that diverged, became NaN or overflowed its contact buffers (limit "
+                f"{self._max_fault_rate:.2%}). Look at the drive's stiffness, the time step "
                 "(sim.substeps) and the sizes of the buffers (sim)."
             )
-        episode = {
-            f"episode/{name}": value
-            for name, value in found.items()
-            if name not in ("episodes", "fault_rate")
-        }
         figures = {
             "env_steps": float(self.env_steps),
             "seconds": self.seconds,
             "rate/env_steps_per_s": self._steps / (collect_time + learn_time),
             "rate/collect_s": collect_time,
             "rate/learn_s": learn_time,
-            "episodes": found["episodes"],
-            "fault_rate": found["fault_rate"],
+            "episodes": statistics.pop("episodes"),
+            "fault_rate": statistics.pop("fault_rate"),
             "policy/learning_rate": float(rest["learning_rate"]),
             "policy/action_std": float(rest["action_std"].detach().mean()),
-            **{f"loss/{name}": float(value) for name, value in loss_dict.items()},
         }
-        # an iteration in which no episode ended says nothing about episodes: keep what was known
-        self._last = episode if found["episodes"] else (self._last or episode)
-        figures |= self._last
+        figures |= {f"loss/{name}": float(value) for name, value in loss_dict.items()}
+        episode = {f"episode/{name}": value for name, value in statistics.items()}
+        # an iteration without a finished episode repeats the last known figures of episodes
+        if figures["episodes"] or not self._last_episode:
+            self._last_episode = episode
+        figures |= self._last_episode
         self._rows.append({"iteration": it, **figures})
-        self._pending += 1
+        self._num_unwritten += 1
         if self.writer is not None:
             self.writer.log(figures, it)
-        text = f"{figures['rate/env_steps_per_s']:,.0f} steps/s  success {figures.get('episode/success_strict', 0.0):.2f}"
+        rate, success = figures["rate/env_steps_per_s"], figures.get("episode/success_strict", 0.0)
         self._bar.update(
-            self._job, completed=self._share_done(self.env_steps, self.seconds), figures=text
+            self._bar_task,
+            completed=self._share_done(self.env_steps, self.seconds),
+            figures=f"{rate:,.0f} steps/s  success {success:.2f}",
         )
 
     def flush(self) -> None:
-        """Appends what is new to `progress.csv`; called with every checkpoint, so that both tell the same story."""
-        if not self._pending or self._quiet:
+        """Append new rows to `progress.csv`; called with every checkpoint so that both agree."""
+        if not self._num_unwritten or self._quiet:
             return
-        rows, self._pending = self._rows[-self._pending :], 0
-        fresh = not self._path.exists()
+        rows, self._num_unwritten = self._rows[-self._num_unwritten :], 0
+        is_new = not self._path.exists()
         with self._path.open("a", newline="") as file:
             table = csv.DictWriter(file, fieldnames=list(rows[0]), extrasaction="ignore")
-            if fresh:
+            if is_new:
                 table.writeheader()
             table.writerows(rows)
 
     def state_dict(self) -> dict[str, float]:
-        """Returns what a resumed run counts on from."""
+        """Return the counts from which a resumed run goes on."""
         return {"env_steps": self.env_steps, "seconds": self.seconds}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restores what `state_dict` returned and drops rows of `progress.csv` that were written after it."""
+        """Restore the counts; drop rows of `progress.csv` that were written after them."""
         self.env_steps, self.seconds = int(state["env_steps"]), float(state["seconds"])
         if not self._path.exists() or self._quiet:
             return
         with self._path.open(newline="") as file:
-            rows = [
-                row for row in csv.DictReader(file) if float(row["env_steps"]) <= self.env_steps
-            ]
+            rows = list(csv.DictReader(file))
         self._path.unlink()
-        self._rows, self._pending = rows, len(rows)
+        self._rows = [row for row in rows if float(row["env_steps"]) <= self.env_steps]
+        self._num_unwritten = len(self._rows)
         self.flush()
+
+
+def draw_curves(progress: Path, picture: Path) -> None:
+    """Draw `progress.csv` over control steps into a PNG; an empty file gives no picture.
+
+    A curve whose column is missing is left out: a task may record fewer figures.
+    """
+    with progress.open(newline="") as file:
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    if not rows:
+        return
+    figure = Figure(figsize=(13, 6.5), layout="constrained")
+    axes = figure.subplots(2, 3)
+    steps = [row["env_steps"] / 1e6 for row in rows]
+    for axis, (title, series, limits) in zip(axes.flat, PANELS, strict=True):
+        curves = [(name, label) for name, label in series if name in rows[0]]
+        for name, label in curves:
+            axis.plot(steps, [row[name] for row in rows], label=label, linewidth=1.2)
+        axis.set_title(title, loc="left", fontsize=10)
+        axis.grid(alpha=0.3)
+        if limits:
+            axis.set_ylim(*limits)
+        if len(curves) > 1:
+            axis.legend(frameon=False, fontsize=8)
+    for axis in axes[1]:
+        axis.set_xlabel("control steps, millions")
+    minutes = rows[-1]["seconds"] / 60
+    title = f"{progress.parent.name}: {minutes:.1f} minutes of training"
+    figure.suptitle(title, x=0.01, ha="left")
+    figure.savefig(picture, dpi=130)

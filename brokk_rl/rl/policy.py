@@ -22,7 +22,7 @@ from tensordict import TensorDict
 from brokk_rl.contracts.task import Policy
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.rl.runner import Training
+from brokk_rl.rl.runner import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import write_json
 from brokk_rl.spec import spec
@@ -32,34 +32,34 @@ SCHEMA = 1
 
 
 @spec
-class Classical:
+class ClassicalPolicy:
     """Inverse kinematics with dead-time compensation under the same masks: what a user would pick instead of a learned policy."""
 
     def build(self, loop: ControlLoop, seed: int) -> Policy:
         """Returns the policy; the controller's numbers are the task's (`task.classical`)."""
-        return _Classical(loop)
+        return _ClassicalActor(loop)
 
 
 @spec
-class Untrained:
+class UntrainedPolicy:
     """A freshly initialised network, as training would start from it.
 
     Attributes:
         training: The training configuration that gives its shape.
     """
 
-    training: Training
+    training: TrainingConfig
 
     def build(self, loop: ControlLoop, seed: int) -> Policy:
         """Returns the policy with weights drawn from `seed`."""
         config = self.training.runner_config()
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            return Network(make_actor(config["actor"], config["obs_groups"], loop), loop)
+            return NetworkPolicy(make_actor(config["actor"], config["obs_groups"], loop), loop)
 
 
 @spec
-class Trained:
+class TrainedPolicy:
     """A trained policy.
 
     Attributes:
@@ -76,7 +76,7 @@ class Trained:
             CheckpointError: The bundle is missing, corrupt, holds NaN, or was made for another
                 machine or task.
         """
-        contract, weights = read_bundle(located(self.folder), loop.machine)
+        contract, weights = read_bundle(locate_bundle(self.folder), loop.machine)
         actor = make_actor(contract["network"]["actor"], contract["network"]["obs_groups"], loop)
         try:
             actor.load_state_dict(weights)
@@ -85,10 +85,10 @@ class Trained:
                 f"{self.folder}: the weights do not fit task and machine ({str(error).splitlines()[-1].strip()}); "
                 "evaluate with the task that the policy was trained for (task=…)"
             ) from error
-        return Network(actor.to(loop.device), loop)
+        return NetworkPolicy(actor.to(loop.device), loop)
 
 
-def located(folder: str) -> Path:
+def locate_bundle(folder: str) -> Path:
     """Returns the folder of a policy: a path, or `package:path` within an installed package.
 
     Raises:
@@ -105,7 +105,7 @@ def located(folder: str) -> Path:
         ) from error
 
 
-class _Classical:
+class _ClassicalActor:
     def __init__(self, loop: ControlLoop) -> None:
         self._task = loop.task
 
@@ -113,7 +113,7 @@ class _Classical:
         return self._task.classical_action(groups)
 
 
-class Network:
+class NetworkPolicy:
     """The deterministic action of an actor network."""
 
     def __init__(self, actor: MLPModel, loop: ControlLoop) -> None:
@@ -142,7 +142,11 @@ def make_actor(
 
 
 def write_bundle(
-    folder: Path, actor: MLPModel, training: Training, loop: ControlLoop, facts: dict[str, Any]
+    folder: Path,
+    actor: MLPModel,
+    training: TrainingConfig,
+    loop: ControlLoop,
+    facts: dict[str, Any],
 ) -> dict[str, Any]:
     """Writes weights and contract of a policy into `folder`; returns the contract."""
     config = training.runner_config()
@@ -193,3 +197,36 @@ def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[st
             f"the policy in {folder} holds NaN or infinite weights in {', '.join(bad[:3])}"
         )
     return contract, weights
+
+
+EXPLORATION_PREFIX = "distribution."
+"""Exploration belongs to the training that begins, not to the policy: one that has settled explores
+no more."""
+
+
+def load_initial_weights(actor: torch.nn.Module, folder: str, machine: Machine) -> None:
+    """Copies the network of the policy in `folder` into `actor`, whose exploration stays as it is.
+
+    A bundle holds no critic: the one of the training that begins starts afresh.
+
+    Args:
+        actor: The network to be trained.
+        folder: Run folder, or `package:path`; as in `policy.folder`.
+        machine: The machine.
+
+    Raises:
+        CheckpointError: The bundle cannot be used, or its network has another shape.
+    """
+    _, weights = read_bundle(locate_bundle(folder), machine)
+    kept = {
+        name: value
+        for name, value in actor.state_dict().items()
+        if name.startswith(EXPLORATION_PREFIX)
+    }
+    try:
+        actor.load_state_dict(weights | kept)
+    except RuntimeError as error:
+        raise CheckpointError(
+            f"start_from={folder}: the policy does not fit task, machine and rl.runner.actor "
+            f"({str(error).splitlines()[-1].strip()}); train with those it was made with, or start_from=null"
+        ) from error

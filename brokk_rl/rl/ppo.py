@@ -1,16 +1,17 @@
-"""rsl-rl's PPO without the host in its loops.
+"""PPO of rsl-rl, without reading back to the host inside its loops.
 
-rsl-rl reads the divergence and three losses back to the host after each mini-batch, and launches a
-few hundred small kernels for it, some seventy more in each control step; on a GPU that takes longer
-than the arithmetic. Here the learning rate and the losses stay on the device, and acting, storing
-and a mini-batch are one replay of a CUDA graph each. Where several processes train together a
-mini-batch is two graphs, and between them one sum over all processes of a single buffer: every
-gradient and the divergence.
+rsl-rl reads the divergence and three losses back to the host after each mini-batch. A mini-batch
+launches a few hundred small kernels, a control step about seventy. On a GPU that takes longer than
+the arithmetic. Here the learning rate and the losses stay on the device. Acting, storing and a
+mini-batch are one replay of a CUDA graph each.
+
+Where several processes train together a mini-batch is two graphs. Between them one sum over all
+processes takes a single buffer: every gradient and the divergence.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
@@ -21,9 +22,99 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import nn
 
-from brokk_rl.rl.graph import capture
-from brokk_rl.rl.rollout import Rollout
-from brokk_rl.rl.threads import one_thread
+from brokk_rl.rl.execution import capture_graph, limit_to_one_thread
+
+
+class CapturedRollout:
+    """Does what `act` and `process_env_step` of `rsl_rl.algorithms.PPO` do, into the algorithm's own storage.
+
+    For feed-forward networks with a Gaussian policy; all tensors keep their addresses. On a CPU the
+    same runs without graphs.
+
+    Args:
+        algorithm: Gives networks, storage and discount.
+    """
+
+    def __init__(self, algorithm: PPO) -> None:
+        self._algorithm, storage = algorithm, algorithm.storage
+        self._observations = {
+            name: torch.zeros_like(value[0])  # type: ignore[arg-type]
+            for name, value in storage.observations.items()
+        }
+        self._reward, self._done, self._timed_out = (
+            torch.zeros_like(storage.rewards[0]) for _ in range(3)
+        )
+        self._slot = torch.zeros(1, dtype=torch.int64, device=storage.rewards.device)
+        self._actions = torch.zeros_like(storage.actions[0])
+        self._values, self._log_prob = (
+            torch.zeros_like(storage.values[0]),
+            torch.zeros_like(storage.actions_log_prob[0]),
+        )
+        self._parameters = tuple(torch.zeros_like(self._actions) for _ in range(2))
+        if storage.distribution_params is None:
+            storage.distribution_params = tuple(torch.zeros_like(storage.actions) for _ in range(2))
+        self._act, self._store = self._run(self._decide), self._run(self._keep)
+
+    def act(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Returns drawn actions, `(N, A)`; the tensor is overwritten by the next call."""
+        for name, value in self._observations.items():
+            value.copy_(observations[name])
+        self._act()
+        return self._actions
+
+    def store(self, reward: torch.Tensor, done: torch.Tensor, timed_out: torch.Tensor) -> None:
+        """Stores the step that followed the last `act`; each `(N,)`.
+
+        Raises:
+            OverflowError: The storage is full.
+        """
+        storage = self._algorithm.storage
+        if storage.step >= storage.num_transitions_per_env:
+            raise OverflowError("the storage is full: update before going on")
+        for target, value in (
+            (self._reward, reward),
+            (self._done, done),
+            (self._timed_out, timed_out),
+        ):
+            target[:, 0].copy_(value)
+        self._slot.fill_(storage.step)
+        self._store()
+        storage.step += 1
+
+    def _run(self, step: Callable[[], None]) -> Callable[[], None]:
+        device = self._slot.device
+        return capture_graph(step, device).replay if device.type == "cuda" else step
+
+    @torch.no_grad()
+    def _decide(self) -> None:
+        actor, seen = self._algorithm.actor, self._observations
+        actor.distribution.update(actor.mlp(actor.get_latent(seen)))  # type: ignore[union-attr, arg-type]
+        mean, std = actor.output_mean, actor.output_std
+        # as `Normal.sample`, which asks the host whether the spread is positive and cannot be
+        # captured
+        self._actions.copy_(mean + std * torch.randn_like(mean))
+        self._log_prob[:, 0].copy_(actor.get_output_log_prob(self._actions))
+        self._values.copy_(self._algorithm.critic(seen))  # type: ignore[arg-type]
+        for kept, value in zip(self._parameters, actor.output_distribution_params, strict=True):
+            kept.copy_(value)
+
+    @torch.no_grad()
+    def _keep(self) -> None:
+        storage = self._algorithm.storage
+        reward = (
+            self._reward + self._algorithm.gamma * self._values * self._timed_out
+        )  # the end of time is not the end
+        rows = [
+            (storage.actions, self._actions),
+            (storage.rewards, reward),
+            (storage.dones, self._done.to(storage.dones.dtype)),
+        ]
+        rows += [(storage.values, self._values), (storage.actions_log_prob, self._log_prob)]
+        rows += [(storage.observations[name], value) for name, value in self._observations.items()]
+        rows += zip(storage.distribution_params or (), self._parameters, strict=True)
+        for stored, value in rows:
+            stored.index_copy_(0, self._slot, value[None])
+
 
 LOWEST_RATE, HIGHEST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
 """Bounds and step of the adaptive learning rate, as in rsl-rl."""
@@ -33,7 +124,7 @@ FIGURES = ("value", "surrogate", "entropy")
 class DevicePPO(PPO):
     """PPO for feed-forward networks; on a CPU, and with curiosity or symmetry, it is rsl-rl's own, which acts on one thread."""
 
-    _rollout: Rollout | None = None
+    _rollout: CapturedRollout | None = None
     _mini_batch: Sequence[Callable[[], None]] | None = None
     """What one step of the optimiser consists of."""
     _gathered: torch.Tensor
@@ -49,9 +140,9 @@ class DevicePPO(PPO):
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Draws actions; see `rsl_rl.algorithms.PPO.act`."""
         if not (self._on_device and isinstance(self.actor.distribution, GaussianDistribution)):
-            with one_thread(self.device):
+            with limit_to_one_thread(self.device):
                 return super().act(obs)
-        self._rollout = self._rollout or Rollout(self)
+        self._rollout = self._rollout or CapturedRollout(self)
         return self._rollout.act(obs)
 
     def process_env_step(
@@ -63,7 +154,7 @@ class DevicePPO(PPO):
     ) -> None:
         """Stores a step; see `rsl_rl.algorithms.PPO.process_env_step`."""
         if self._rollout is None:
-            with one_thread(self.device):
+            with limit_to_one_thread(self.device):
                 super().process_env_step(obs, rewards, dones, extras)
         else:
             self._rollout.store(rewards, dones, extras.get("time_outs", torch.zeros_like(rewards)))
@@ -163,12 +254,14 @@ class DevicePPO(PPO):
             self.is_multi_gpu
         ):  # the sum stays outside: it is the one part whose length others decide
             graphs = [
-                capture(part, device, gradients=True)
+                capture_graph(part, device, gradients=True)
                 for part in (self._differentiate, self._descend)
             ]
             captured = (graphs[0].replay, self._sum_up, graphs[1].replay)
         else:
-            captured = (capture(self._differentiate_and_descend, device, gradients=True).replay,)
+            captured = (
+                capture_graph(self._differentiate_and_descend, device, gradients=True).replay,
+            )
         with torch.no_grad():
             for value, before in kept + moments:
                 value.copy_(before)

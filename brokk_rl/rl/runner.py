@@ -15,20 +15,20 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl.errors import CheckpointError, ConfigError, StorageError
-from brokk_rl.rl.distributed import Group
-from brokk_rl.rl.logger import Logbook
+from brokk_rl.rl.distributed import TrainingGroup
+from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
-ROUND = 10
+ITERATIONS_PER_ROUND = 10
 """Iterations between two changes of the desired divergence; processes that train together must
 agree on it."""
 
 
 @spec
-class Budget:
+class TrainingBudget:
     """When training ends: with the first of these that is spent; `null` for no bound.
 
     Attributes:
@@ -54,7 +54,7 @@ class Budget:
 
 
 @spec
-class Training:
+class TrainingConfig:
     """How a policy is trained with rsl-rl's PPO.
 
     Attributes:
@@ -80,7 +80,7 @@ class Training:
 
     num_envs: int | None
     num_starts: int
-    budget: Budget
+    budget: TrainingBudget
     save_interval: int
     keep_checkpoints: int
     settling: float
@@ -104,13 +104,13 @@ class Training:
 
     def runner_config(self) -> dict[str, Any]:
         """Returns a copy for rsl-rl, which writes into it; keys without a value are dropped: its constructors know no `null`."""
-        return _without_nulls(copy.deepcopy(self.runner)) | {
+        return _drop_nulls(copy.deepcopy(self.runner)) | {
             "save_interval": 10**9,
             "check_for_nan": False,
         }
 
 
-class Runner(OnPolicyRunner):
+class TrainingRunner(OnPolicyRunner):
     """Trains; see `Training`.
 
     rsl-rl's own checkpoint lacks the environment, the random generators and the step count; ours
@@ -132,13 +132,13 @@ class Runner(OnPolicyRunner):
     def __init__(
         self,
         env: ControlLoop,
-        training: Training,
+        training: TrainingConfig,
         folder: Path,
         device: torch.device,
-        logbook: Logbook,
-        group: Group | None = None,
+        logbook: TrainingLogger,
+        group: TrainingGroup | None = None,
     ) -> None:
-        self.group = group or Group(device)
+        self.group = group or TrainingGroup(device)
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
             super().__init__(env, training.runner_config(), log_dir=None, device=str(device))
@@ -148,11 +148,11 @@ class Runner(OnPolicyRunner):
 
     def run(self) -> None:
         """Trains until the budget is spent, saving a checkpoint every `save_interval` iterations and at the end."""
-        book: Logbook = self.logger  # type: ignore[assignment]
+        book: TrainingLogger = self.logger  # type: ignore[assignment]
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
         while rounds := self.group.from_first(self._rounds(book, steps)):
-            if self.current_learning_iteration % ROUND == 0:
+            if self.current_learning_iteration % ITERATIONS_PER_ROUND == 0:
                 share = self.group.from_first(
                     self.training.budget.share_spent(book.env_steps, book.seconds)
                 )
@@ -169,10 +169,13 @@ class Runner(OnPolicyRunner):
                 self.group.check_same(self._policy_state())
                 self.checkpoint()
 
-    def _rounds(self, book: Logbook, steps: int) -> int:
+    def _rounds(self, book: TrainingLogger, steps: int) -> int:
         """Returns how many iterations to do until the next checkpoint or change of step, 0 when the budget is spent."""
         budget, interval = self.training.budget, self.training.save_interval
-        rounds = min(part - self.current_learning_iteration % part for part in (ROUND, interval))
+        rounds = min(
+            part - self.current_learning_iteration % part
+            for part in (ITERATIONS_PER_ROUND, interval)
+        )
         if budget.share_spent(book.env_steps, book.seconds) >= 1.0:
             return 0
         if budget.max_env_steps:
@@ -210,7 +213,7 @@ class Runner(OnPolicyRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Trains for some iterations; see `rsl_rl.runners.OnPolicyRunner`."""
-        with _tensor_cores(self.env.graph_active):
+        with _allow_tensor_cores(self.env.graph_active):
             super().learn(num_learning_iterations, init_at_random_ep_len)
 
     def checkpoint(self) -> None:
@@ -220,11 +223,11 @@ class Runner(OnPolicyRunner):
             StorageError: The disk is full or the folder cannot be written; older checkpoints are
                 untouched.
         """
-        own = {"env": self.env.state_dict(), "random": random_state(self.device)}
+        own = {"env": self.env.state_dict(), "random": get_random_state(self.device)}
         parts = self.group.gathered(own)
         if not self.group.rank.first:
             return
-        book: Logbook = self.logger  # type: ignore[assignment]
+        book: TrainingLogger = self.logger  # type: ignore[assignment]
         book.flush()
         content = self.alg.save() | {
             "iter": self.current_learning_iteration,
@@ -250,7 +253,7 @@ class Runner(OnPolicyRunner):
             raise StorageError(
                 f"cannot write the checkpoint {path}: {error}. The checkpoint before it is untouched; make room and resume."
             ) from error
-        for old in checkpoints(self.folder)[: -self.training.keep_checkpoints]:
+        for old in list_checkpoints(self.folder)[: -self.training.keep_checkpoints]:
             old.unlink()
 
     def save(self, path: str, infos: dict | None = None) -> None:
@@ -282,7 +285,7 @@ class Runner(OnPolicyRunner):
             self.alg.learning_rate = content["learning_rate"]
             self.alg.desired_kl = content["desired_kl"]
             self.current_learning_iteration = content["iter"]
-            book: Logbook = self.logger  # type: ignore[assignment]
+            book: TrainingLogger = self.logger  # type: ignore[assignment]
             book.load_state_dict(content["book"])  # last: it rewrites progress.csv
         except (KeyError, RuntimeError) as error:
             raise CheckpointError(
@@ -292,7 +295,7 @@ class Runner(OnPolicyRunner):
 
 
 @contextlib.contextmanager
-def _tensor_cores(allowed: bool) -> Iterator[None]:
+def _allow_tensor_cores(allowed: bool) -> Iterator[None]:
     """Lets matrix products use TF32 meanwhile.
 
     Only where the control step is a captured graph, whose kernels were chosen before: ten bits of
@@ -306,7 +309,7 @@ def _tensor_cores(allowed: bool) -> Iterator[None]:
         torch.set_float32_matmul_precision(before)
 
 
-def checkpoints(folder: Path) -> list[Path]:
+def list_checkpoints(folder: Path) -> list[Path]:
     """Returns the checkpoints of a run folder, oldest first."""
     return sorted(folder.glob("model_*.pt"), key=lambda path: int(path.stem.removeprefix("model_")))
 
@@ -336,7 +339,7 @@ def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
     return content
 
 
-def random_state(device: torch.device | str) -> dict[str, torch.Tensor]:
+def get_random_state(device: torch.device | str) -> dict[str, torch.Tensor]:
     """Returns the state of torch's generators on the CPU and on `device`."""
     state = {"cpu": torch.get_rng_state()}
     if torch.device(device).type == "cuda":
@@ -351,7 +354,7 @@ def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str)
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)
 
 
-def _without_nulls(value: Any) -> Any:
+def _drop_nulls(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_nulls(item) for key, item in value.items() if item is not None}
+        return {key: _drop_nulls(item) for key, item in value.items() if item is not None}
     return value

@@ -30,25 +30,25 @@ class Tracking(Protocol):
 
 
 @spec
-class Off:
+class NoTracking:
     """No tracker: `progress.csv` and the pictures of the run folder only."""
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
         """Returns a tracker that does nothing."""
-        return _Silent()
+        return _NoTracker()
 
 
 @spec
-class TensorBoard:
+class TensorBoardTracking:
     """TensorBoard event files in the run folder."""
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
         """Returns a tracker that writes `folder/tensorboard`."""
-        return _TensorBoard(folder)
+        return _TensorBoardTracker(folder)
 
 
 @spec
-class Wandb:
+class WandbTracking:
     """Weights & Biases, offline first: one run per job, synchronised later with `wandb sync` or online with wandb.mode=online.
 
     Attributes:
@@ -65,10 +65,10 @@ class Wandb:
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
         """Returns a tracker with a run of its own, named after the run folder."""
-        return _Wandb(self, folder, config)
+        return _WandbTracker(self, folder, config)
 
 
-class _Silent:
+class _NoTracker:
     def log(self, figures: dict[str, float], step: int) -> None:
         pass
 
@@ -76,7 +76,7 @@ class _Silent:
         pass
 
 
-class _TensorBoard:
+class _TensorBoardTracker:
     def __init__(self, folder: Path) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
@@ -90,8 +90,8 @@ class _TensorBoard:
         self._writer.close()
 
 
-class _Wandb:
-    def __init__(self, config: Wandb, folder: Path, run_config: dict[str, Any]) -> None:
+class _WandbTracker:
+    def __init__(self, config: WandbTracking, folder: Path, run_config: dict[str, Any]) -> None:
         os.environ.setdefault("WANDB_SILENT", "true")
         import wandb
 

@@ -23,7 +23,7 @@ Rows = list[np.ndarray]
 
 
 @spec
-class Simulated:
+class SimulatedTrials:
     """The simulated machine and block, with the policy that advises.
 
     Attributes:
@@ -60,13 +60,15 @@ class Simulated:
         model = self.actuator.build(machine, num, device)
         for effect in self.effect.values():
             model = effect.wrap(model, machine, num, device)
-        levers = Levers(operators, trials.guided)
+        levers = OperatorLevers(operators, trials.guided)
         task = self.task.build(machine, num, device)
         starts = {
             key: value[:1].expand(num, *value.shape[1:]).clone()
             for key, value in task.starts(1, 0).items()
         }
-        loop = ControlLoop(machine, world, model, levers, task, starts | _begun(machine, trials))
+        loop = ControlLoop(
+            machine, world, model, levers, task, starts | _make_starts(machine, trials)
+        )
         if task.max_episode_steps * machine.period_s < trials.limit_s:
             raise ConfigError(
                 f"ground.task.episode_s: expected at least the trials' limit of {trials.limit_s:g} s"
@@ -75,7 +77,7 @@ class Simulated:
         return self._drive(loop, levers, session, trials)
 
     def _drive(
-        self, loop: ControlLoop, levers: Levers, session: Session, trials: TrialBatch
+        self, loop: ControlLoop, levers: OperatorLevers, session: Session, trials: TrialBatch
     ) -> list[Recording]:
         machine, policy = loop.machine, self.policy.build(loop, session.seed)
         loop.begin(loop.starts)
@@ -99,7 +101,7 @@ class Simulated:
             rows["running"].append(running.copy())
             if not running.any():
                 break
-        return _recordings(
+        return _make_recordings(
             machine,
             {name: np.stack(part) for name, part in rows.items()},
             levers,
@@ -109,7 +111,7 @@ class Simulated:
         )
 
 
-class Levers(FollowerModel):
+class OperatorLevers(FollowerModel):
     """Operators in the place of a follower: they see arm, hole and proposal, and what they give is given.
 
     Args:
@@ -143,7 +145,7 @@ class Levers(FollowerModel):
         return torch.as_tensor(self.given[-1])
 
 
-def _begun(machine: Machine, trials: TrialBatch) -> dict[str, torch.Tensor]:
+def _make_starts(machine: Machine, trials: TrialBatch) -> dict[str, torch.Tensor]:
     """Returns starts of the control loop for the study's places; the block stands with its side to the machine."""
     num, rim = len(trials.q), trials.rim_in_base_m
     scene = np.column_stack((rim, np.arctan2(rim[:, 1], rim[:, 0]), np.ones(num), trials.radius_m))
@@ -156,10 +158,10 @@ def _begun(machine: Machine, trials: TrialBatch) -> dict[str, torch.Tensor]:
     return {name: torch.as_tensor(value, dtype=torch.float32) for name, value in made.items()}
 
 
-def _recordings(
+def _make_recordings(
     machine: Machine,
     rows: dict[str, np.ndarray],
-    levers: Levers,
+    levers: OperatorLevers,
     session: Session,
     trials: TrialBatch,
     noise: float,

@@ -28,14 +28,13 @@ from brokk_rl.contracts.task import Task, TaskProcess
 from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.rl.graph import capture, compiling
-from brokk_rl.rl.threads import one_thread
+from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 
 Starts = dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
-class Plant:
+class ControlLoopConfig:
     """What a control loop is made of: specs, not yet built.
 
     Attributes:
@@ -74,7 +73,7 @@ class Plant:
         process = self.task.build(self.machine, num, device)
         # with all threads, four processes on a computer of 64 cores had no starts after three
         # minutes; with one each, after seconds
-        with one_thread("cpu"):
+        with limit_to_one_thread("cpu"):
             starts = {key: value.to(device) for key, value in process.starts(pool, seed).items()}
         return ControlLoop(self.machine, world, model, follower, process, starts)
 
@@ -192,9 +191,9 @@ class ControlLoop(VecEnv):
                 setattr(
                     self, name, torch.compile(getattr(self, name), fullgraph=True, dynamic=False)
                 )
-        with compiling():
+        with report_compile_errors():
             if graphs:
-                self._graph = capture(self._advance, self.device)
+                self._graph = capture_graph(self._advance, self.device)
             elif fuse:
                 with self._always_alike():
                     self._advance()
@@ -274,7 +273,7 @@ class ControlLoop(VecEnv):
     @contextlib.contextmanager
     def _always_alike(self) -> Iterator[None]:
         """In and outside of rsl-rl's inference mode, at any number of threads: for each, torch would compile anew what is fused."""
-        with one_thread(self.device), torch.inference_mode(False), torch.no_grad():
+        with limit_to_one_thread(self.device), torch.inference_mode(False), torch.no_grad():
             yield
 
     def _advance(self) -> None:

@@ -47,7 +47,7 @@ def add_drive(spec: mujoco.MjSpec, machine: Machine, inertia: np.ndarray) -> Non
         actuator.forcerange = (-body.yield_force.value, body.yield_force.value)
 
 
-class Drive:
+class DriveReferences:
     """References of all drives of all worlds; every update is in place.
 
     Args:

@@ -31,25 +31,25 @@ def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> 
     Raises:
         ConfigError: The MJCF is missing or its joints are not those of the machine.
     """
-    spec = _read(machine)
+    spec = _read_mjcf(machine)
     _write_machine(spec, machine)
     add_block(spec, visual)
     _write_options(spec, timestep_s)
     if not visual:
-        _strip(spec)
+        _remove_visuals(spec)
     model = spec.compile()
-    add_drive(spec, machine, _inertia_seen(model, machine))
+    add_drive(spec, machine, _compute_joint_inertia(model, machine))
     return spec.compile()
 
 
-def contact_sensors(model: mujoco.MjModel) -> np.ndarray:
+def mask_contact_sensors(model: mujoco.MjModel) -> np.ndarray:
     """Returns 1 for the touch sensors among `sensordata` and 0 for all others; the touch sensors' sum is the contact force."""
     chosen = np.zeros(model.nsensordata)
     chosen[model.sensor_adr[model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH]] = 1.0
     return chosen
 
 
-def _read(machine: Machine) -> mujoco.MjSpec:
+def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
     if machine.mjcf is None:
         raise ConfigError(
             f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose another machine=…"
@@ -84,7 +84,7 @@ def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
     """Writes origins, axes, limits, masses and the tool point into `spec`."""
     drawn = spec.copy().compile()
     links = [spec.joint(name).parent for name in machine.joint_names]
-    ends = [_values(body.origin_m) for body in machine.bodies[1:]] + [machine.tip_m]
+    ends = [_read_values(body.origin_m) for body in machine.bodies[1:]] + [machine.tip_m]
     for joint, body, link, end, drawn_end in zip(
         machine.joints,
         machine.bodies,
@@ -93,9 +93,9 @@ def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
         [*(b.pos for b in links[1:]), spec.site("tip").pos],
         strict=True,
     ):
-        _stretch(link, np.array(drawn_end), end)
+        _scale_geoms(link, np.array(drawn_end), end)
         _write_inertia(link, drawn, body.mass_kg.value, body.com_m)
-        link.pos = _values(body.origin_m)
+        link.pos = _read_values(body.origin_m)
         hinge = spec.joint(joint.name)
         hinge.type = (
             mujoco.mjtJoint.mjJNT_HINGE if joint.kind == "hinge" else mujoco.mjtJoint.mjJNT_SLIDE
@@ -108,11 +108,11 @@ def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
     spec.site("tip").pos = machine.tip_m
 
 
-def _values(dimensions: tuple) -> np.ndarray:
+def _read_values(dimensions: tuple) -> np.ndarray:
     return np.array([d.value for d in dimensions])
 
 
-def _stretch(link: mujoco.MjsBody, drawn_end: np.ndarray, end: np.ndarray) -> None:
+def _scale_geoms(link: mujoco.MjsBody, drawn_end: np.ndarray, end: np.ndarray) -> None:
     """Scales the geoms of a link along it when its length differs from the one drawn in the MJCF."""
     drawn_length, length = np.linalg.norm(drawn_end), np.linalg.norm(end)
     if drawn_length < 1e-9 or abs(length - drawn_length) < 1e-9:
@@ -159,7 +159,7 @@ def _write_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
 
 
-def _strip(spec: mujoco.MjSpec) -> None:
+def _remove_visuals(spec: mujoco.MjSpec) -> None:
     """Removes what only pictures need."""
     for geom in [g for g in spec.geoms if g.group == VISUAL_GROUP]:
         spec.delete(geom)
@@ -167,7 +167,7 @@ def _strip(spec: mujoco.MjSpec) -> None:
         spec.delete(thing)
 
 
-def _inertia_seen(model: mujoco.MjModel, machine: Machine) -> np.ndarray:
+def _compute_joint_inertia(model: mujoco.MjModel, machine: Machine) -> np.ndarray:
     """Returns the diagonal of the mass matrix at home, `(J,)`."""
     data = mujoco.MjData(model)
     data.qpos[:] = machine.home

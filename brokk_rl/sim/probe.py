@@ -13,16 +13,16 @@ RENDERERS = ("egl", "osmesa", "glfw")
 """Values of MUJOCO_GL, in the order in which they are worth trying without a screen."""
 
 
-def warp_version() -> str:
+def get_warp_version() -> str:
     """Returns the version of Warp."""
     import warp as wp
 
     return str(wp.config.version)
 
 
-def kernel_cache() -> Path:
+def find_kernel_cache() -> Path:
     """Returns the folder in which Warp keeps its compiled kernels."""
-    wp = _quiet_warp()
+    wp = _start_warp_quietly()
     return Path(wp.config.kernel_cache_dir)
 
 
@@ -32,7 +32,7 @@ def capture_graph() -> str:
     Raises:
         RuntimeError: The graph cannot be captured or does not do its work.
     """
-    wp = _quiet_warp()
+    wp = _start_warp_quietly()
     source, copy = (wp.full(8, value, dtype=float, device="cuda:0") for value in (1.0, 0.0))
     with wp.ScopedCapture(device="cuda:0") as capture:
         wp.copy(copy, source)
@@ -43,14 +43,14 @@ def capture_graph() -> str:
     return str(wp.get_device("cuda:0").name)
 
 
-def working_renderer() -> str | None:
+def find_renderer() -> str | None:
     """Returns the first value of MUJOCO_GL with which a picture can be drawn here, `None` when there is none.
 
     MuJoCo settles on one library at import and a broken driver may end the process, so each try has
     a process of its own.
     """
     chosen = os.environ.get("MUJOCO_GL")
-    program = "from brokk_rl.sim.probe import render; render()"
+    program = "from brokk_rl.sim.probe import render_test_picture; render_test_picture()"
     for name in (chosen,) if chosen else RENDERERS:
         environment = os.environ | {
             "MUJOCO_GL": name,
@@ -72,7 +72,7 @@ def working_renderer() -> str | None:
     return None
 
 
-def render() -> None:
+def render_test_picture() -> None:
     """Draws a ball in a picture of 32 x 32 pixels.
 
     Raises:
@@ -91,7 +91,7 @@ def render() -> None:
             raise RuntimeError("the picture is black")
 
 
-def _quiet_warp() -> Any:
+def _start_warp_quietly() -> Any:
     """Starts Warp without its banner; what it would say about the GPU, the doctor says itself."""
     import warp as wp
 

@@ -1,10 +1,10 @@
-"""The concrete block with the borehole: what may differ from world to world, and what that means for MuJoCo's geoms.
+"""The concrete block with the borehole: scene vectors and the MuJoCo geoms that follow from them.
 
-A scene is a vector of `COLUMNS`. The block is a mocap body whose origin is the centre of the
-borehole's rim, z along the hole's
-axis out of the block. The borehole is a regular octagon around the drilled circle: four slabs whose
-inner faces make a square, four posts that cut its corners. A slab that serves as block and wall of
-the hole saves half of the geom pairs that a closed ring would need.
+A scene is a vector of `COLUMNS`. The block is a mocap body. Its origin is the centre of the
+borehole's rim; its z axis is the hole's axis, out of the block. The borehole is a regular octagon
+around the drilled circle: four slabs whose inner faces make a square, and four posts that cut its
+corners. The slabs serve as block and as wall of the hole, which halves the geom pairs of a closed
+ring of eight walls.
 """
 
 from dataclasses import dataclass
@@ -20,29 +20,38 @@ SIZE = len(COLUMNS)
 
 HALF_LENGTH_M, HALF_WIDTH_M, HEIGHT_M = 0.5, 0.4, 0.75
 """Nominal block: 1.0 x 0.8 m and 0.75 m high; it goes into the ground where the rim is lower."""
+NOMINAL_DISTANCE_M = 2.6
+"""Distance of the nominal hole from the slew axis, within the task's range of 2.3 to 3.5 m."""
 HOLE_RADIUS_M = 0.05
 """Paper: a borehole of 10 cm."""
 HOLE_DEPTH_M = 0.40
+"""Chosen by hand: deeper than the 0.14 m at which the task aims, so that the chisel does not touch
+the bottom."""
 SCALE_BOUNDS, HOLE_RADIUS_BOUNDS_M = (0.5, 1.25), (0.01, 0.08)
-"""Bounds of a scene; MuJoCo's bounding volumes are compiled for the largest geoms within them and
+"""Bounds of a scene. MuJoCo's bounding volumes are compiled for the largest geoms within them, and
 so hold every smaller one."""
 GROUND = "ground"
-"""The plane on which the chisel stops: the ground, or the bottom of a hole that goes deeper than
-the ground."""
-POST_M = 0.02
-"""Half the thickness of the posts; more than the largest radius times (sqrt(2) - 1) / 2, so that
-they reach the corners of the square."""
+"""The plane on which the chisel stops: the ground, or the bottom of a hole that is deeper than the
+ground."""
+POST_HALF_THICKNESS_M = 0.02
+"""More than the largest radius times (sqrt(2) - 1) / 2, so that the posts reach the corners of the
+square."""
+NUM_WALL_PARTS = 24
+"""Boxes of the visual wall; chosen by hand for the eye."""
+WALL_OVERLAP_M = 0.002
+"""Overlap of the visual wall with the slabs, so that no gap shows."""
+WALL_RECESS_M = 0.0003
+"""Distance of the visual wall below the rim, so that their faces do not coincide."""
 
-_TOOL, _ARM = (
-    1,
-    2,
-)  # contact bits: the chisel meets the real hole, everything else the block as if it had none
-_FRICTION = (0.4, 0.005, 0.0001)  # steel on concrete
-_DIAGONAL = float(np.sqrt(0.5))
+# contact bits: the chisel meets the real hole, all other links the block as if it had no hole
+_TOOL, _ARM = 1, 2
+_FRICTION = (0.4, 0.005, 0.0001)
+"""Sliding, torsional and rolling friction; 0.4 for steel on concrete, the others MuJoCo's
+defaults."""
 
 
 @dataclass(frozen=True)
-class Block:
+class BlockGeoms:
     """Geoms of the block in its own frame.
 
     Attributes:
@@ -58,119 +67,136 @@ class Block:
     yaw_rad: np.ndarray
 
 
-def nominal(num_worlds: int, device: torch.device | str = "cpu") -> torch.Tensor:
-    """Returns scenes with the nominal block in front of the machine, `(N, S)`."""
-    return torch.tensor([2.6, 0.0, HEIGHT_M, 0.0, 1.0, HOLE_RADIUS_M], device=device).repeat(
-        num_worlds, 1
+def make_nominal_scenes(num_worlds: int, device: torch.device | str = "cpu") -> torch.Tensor:
+    """Return scenes with the nominal block in front of the machine, `(N, S)`."""
+    scene = [NOMINAL_DISTANCE_M, 0.0, HEIGHT_M, 0.0, 1.0, HOLE_RADIUS_M]
+    return torch.tensor(scene, device=device).repeat(num_worlds, 1)
+
+
+def build_collision_geoms(scale: float, radius_m: float) -> BlockGeoms:
+    """Return the colliding boxes of a block; sizes and positions are affine in both arguments."""
+    length, width, middle = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale, -HEIGHT_M / 2
+    post = POST_HALF_THICKNESS_M
+    plug = (HEIGHT_M - HOLE_DEPTH_M) / 2
+    names: list[str] = []
+    size: list[tuple[float, float, float]] = []
+    pos: list[tuple[float, float, float]] = []
+    yaw_rad: list[float] = []
+
+    def add(
+        name: str,
+        half: tuple[float, float, float],
+        center: tuple[float, float, float],
+        angle: float = 0.0,
+    ) -> None:
+        names.append(name)
+        size.append(half)
+        pos.append(center)
+        yaw_rad.append(angle)
+
+    for sign, name in ((1, "front"), (-1, "back")):
+        half = ((length - radius_m) / 2, width, -middle)
+        add(f"slab_{name}", half, (sign * (length + radius_m) / 2, 0, middle))
+    for sign, name in ((1, "left"), (-1, "right")):
+        half = (radius_m, (width - radius_m) / 2, -middle)
+        add(f"slab_{name}", half, (0, sign * (width + radius_m) / 2, middle))
+    for i in range(4):
+        angle = np.pi / 4 + i * np.pi / 2
+        x, y = (radius_m + post) * np.cos(angle), (radius_m + post) * np.sin(angle)
+        half = (post, radius_m * np.tan(np.pi / 8) + post, -middle)
+        add(f"post_{i}", half, (x, y, middle), angle)
+    add("plug", (radius_m, radius_m, plug), (0, 0, -HOLE_DEPTH_M - plug))
+    add("block_envelope", (length, width, -middle), (0, 0, middle))
+    return BlockGeoms(
+        tuple(names), np.array(size, float), np.array(pos, float), np.array(yaw_rad, float)
     )
 
 
-def collision_block(scale: float, radius_m: float) -> Block:
-    """Returns the colliding boxes of a block; sizes and positions are affine in both arguments."""
-    length, width, middle = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale, -HEIGHT_M / 2
-    parts: list[tuple[str, tuple[float, float, float], tuple[float, float, float], float]] = []
-    for sign, name in ((1, "front"), (-1, "back")):
-        parts.append(
-            (
-                f"slab_{name}",
-                ((length - radius_m) / 2, width, -middle),
-                (sign * (length + radius_m) / 2, 0, middle),
-                0.0,
-            )
-        )
-    for sign, name in ((1, "left"), (-1, "right")):
-        parts.append(
-            (
-                f"slab_{name}",
-                (radius_m, (width - radius_m) / 2, -middle),
-                (0, sign * (width + radius_m) / 2, middle),
-                0.0,
-            )
-        )
-    for i in range(4):
-        angle = np.pi / 4 + i * np.pi / 2
-        x, y = (radius_m + POST_M) * np.cos(angle), (radius_m + POST_M) * np.sin(angle)
-        parts.append(
-            (
-                f"post_{i}",
-                (POST_M, radius_m * np.tan(np.pi / 8) + POST_M, -middle),
-                (x, y, middle),
-                angle,
-            )
-        )
-    plug = (HEIGHT_M - HOLE_DEPTH_M) / 2
-    parts.append(("plug", (radius_m, radius_m, plug), (0, 0, -HOLE_DEPTH_M - plug), 0.0))
-    parts.append(("block_envelope", (length, width, -middle), (0, 0, middle), 0.0))
-    names, size, pos, yaw = zip(*parts, strict=True)
-    return Block(names, np.array(size, float), np.array(pos, float), np.array(yaw, float))
-
-
-def drilled_wall(radius_m: float, num_parts: int = 24) -> Block:
-    """Returns thin boxes that make the octagon look like a drilled hole, ending just below its rim."""
-    half = (
-        radius_m * (np.sqrt(2.0) - 1.0) / 2 + 0.002
-    )  # out to the corners of the square between the slabs
+def build_visual_wall(radius_m: float, num_parts: int = NUM_WALL_PARTS) -> BlockGeoms:
+    """Return thin boxes that make the octagon look like a drilled hole, ending below its rim."""
+    # out to the corners of the square between the slabs
+    half = radius_m * (np.sqrt(2.0) - 1.0) / 2 + WALL_OVERLAP_M
     angles = 2 * np.pi * np.arange(num_parts) / num_parts
     width = (radius_m + 2 * half) * np.tan(np.pi / num_parts)
     depth = HOLE_DEPTH_M / 2
     size = np.tile([half, width, depth], (num_parts, 1))
-    pos = np.stack(
-        [
-            (radius_m + half) * np.cos(angles),
-            (radius_m + half) * np.sin(angles),
-            np.full(num_parts, -0.0003 - depth),
-        ],
-        1,
-    )
-    return Block(tuple(f"wall_{i}" for i in range(num_parts)), size, pos, angles)
+    x, y = (radius_m + half) * np.cos(angles), (radius_m + half) * np.sin(angles)
+    pos = np.stack([x, y, np.full(num_parts, -WALL_RECESS_M - depth)], 1)
+    return BlockGeoms(tuple(f"wall_{i}" for i in range(num_parts)), size, pos, angles)
 
 
 def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
-    """Adds the mocap body `block` with its geoms, as large as a scene may make it; `visual` adds what only the eye needs."""
-    body = spec.worldbody.add_body(name="block", mocap=True, pos=nominal(1)[0, :3].numpy())
-    block = collision_block(1.0, HOLE_RADIUS_M)
-    largest = np.max(
-        [
-            collision_block(scale, radius).size
-            for scale in SCALE_BOUNDS
-            for radius in HOLE_RADIUS_BOUNDS_M
-        ],
-        axis=0,
+    """Add the mocap body `block` with its geoms, as large as a scene may make it.
+
+    Args:
+        spec: Written.
+        visual: Add also what only pictures need.
+    """
+    body = spec.worldbody.add_body(
+        name="block", mocap=True, pos=make_nominal_scenes(1)[0, :3].numpy()
     )
+    block = build_collision_geoms(1.0, HOLE_RADIUS_M)
+    corners = [(scale, radius) for scale in SCALE_BOUNDS for radius in HOLE_RADIUS_BOUNDS_M]
+    largest = np.max([build_collision_geoms(*corner).size for corner in corners], axis=0)
     for name, size, pos, yaw in zip(block.names, largest, block.pos, block.yaw_rad, strict=True):
-        is_envelope = name == "block_envelope"
         is_shown = name.startswith("slab") or name == "plug"
         body.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn(yaw), contype=0,
-            conaffinity=_ARM if is_envelope else _TOOL, friction=_FRICTION, group=1 if is_shown else 3,
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=size,
+            pos=pos,
+            quat=_turn_about_z(yaw),
+            contype=0,
+            conaffinity=_ARM if name == "block_envelope" else _TOOL,
+            friction=_FRICTION,
+            group=1 if is_shown else 3,
             material="hole_bottom" if name == "plug" else "concrete",
-        )  # fmt: skip
-    body.add_geom(
-        name=GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1, 1, 1), pos=(0, 0, -HEIGHT_M), contype=0, conaffinity=_TOOL,
-        friction=_FRICTION, group=3,
-    )  # fmt: skip
-    if visual:
-        wall = drilled_wall(HOLE_RADIUS_M)
-        for name, size, pos, yaw in zip(wall.names, wall.size, wall.pos, wall.yaw_rad, strict=True):
-            body.add_geom(
-                name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, quat=_turn(yaw), contype=0, conaffinity=0, group=2,
-                material="concrete",
-            )  # fmt: skip
-        body.add_camera(
-            name="close",
-            pos=(-0.65, -1.05, 0.70),
-            fovy=52,
-            mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
-            targetbody="block",
         )
+    body.add_geom(
+        name=GROUND,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=(1, 1, 1),
+        pos=(0, 0, -HEIGHT_M),
+        contype=0,
+        conaffinity=_TOOL,
+        friction=_FRICTION,
+        group=3,
+    )
+    if visual:
+        _add_visuals(body)
 
 
-def _turn(yaw_rad: float) -> tuple[float, float, float, float]:
+def _add_visuals(body: mujoco.MjsBody) -> None:
+    """Add the round wall of the hole, and a camera that looks at the block."""
+    wall = build_visual_wall(HOLE_RADIUS_M)
+    for name, size, pos, yaw in zip(wall.names, wall.size, wall.pos, wall.yaw_rad, strict=True):
+        body.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=size,
+            pos=pos,
+            quat=_turn_about_z(yaw),
+            contype=0,
+            conaffinity=0,
+            group=2,
+            material="concrete",
+        )
+    body.add_camera(
+        name="close",
+        pos=(-0.65, -1.05, 0.70),
+        fovy=52,
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
+        targetbody="block",
+    )
+
+
+def _turn_about_z(yaw_rad: float) -> tuple[float, float, float, float]:
+    """Return the quaternion of a turn about z."""
     return (float(np.cos(yaw_rad / 2)), 0.0, 0.0, float(np.sin(yaw_rad / 2)))
 
 
-class Placement:
-    """Turns scenes into MuJoCo's numbers, batched in torch.
+class ScenePlacement:
+    """Map from scenes to MuJoCo's numbers, batched in torch.
 
     Args:
         model: Compiled model; gives the ids of the geoms.
@@ -181,30 +207,28 @@ class Placement:
     def __init__(
         self, model: mujoco.MjModel, device: torch.device | str, dtype: torch.dtype
     ) -> None:
-        nominal, wider, larger = (
-            collision_block(0.0, 0.0),
-            collision_block(0.0, 1.0),
-            collision_block(1.0, 0.0),
+        # sizes and positions are affine in scale and radius: three evaluations give the whole map
+        origin = build_collision_geoms(0.0, 0.0)
+        base, by_scale, by_radius = (
+            np.concatenate([block.size, block.pos], axis=1)
+            for block in (origin, build_collision_geoms(1.0, 0.0), build_collision_geoms(0.0, 1.0))
         )
-        # affine in scale and radius, hence three evaluations give the whole map
-        stack = [np.concatenate([b.size, b.pos], axis=1) for b in (nominal, larger, wider)]
-        table = np.stack([stack[0], stack[1] - stack[0], stack[2] - stack[0]])
-        table = np.concatenate(
-            [table, np.zeros((3, 1, 6))], axis=1
-        )  # the ground, set by the height of the rim
+        table = np.stack([base, by_scale - base, by_radius - base])
+        # a row of zeros for the ground, which the height of the rim sets
+        table = np.concatenate([table, np.zeros((3, 1, 6))], axis=1)
         self._table = torch.tensor(table.reshape(3, -1), dtype=dtype, device=device)
-        self.geom_ids = torch.tensor(
-            [model.geom(name).id for name in (*nominal.names, GROUND)], device=device
-        )
-        self._lower = torch.tensor(
-            [SCALE_BOUNDS[0], HOLE_RADIUS_BOUNDS_M[0]], dtype=dtype, device=device
-        )
-        self._upper = torch.tensor(
-            [SCALE_BOUNDS[1], HOLE_RADIUS_BOUNDS_M[1]], dtype=dtype, device=device
-        )
+        ids = [model.geom(name).id for name in (*origin.names, GROUND)]
+        self.geom_ids = torch.tensor(ids, device=device)
+        lower, upper = zip(SCALE_BOUNDS, HOLE_RADIUS_BOUNDS_M, strict=True)
+        self._lower = torch.tensor(lower, dtype=dtype, device=device)
+        self._upper = torch.tensor(upper, dtype=dtype, device=device)
 
     def geoms(self, scene: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns sizes and positions of the block's geoms, `(N, G, 3)` each, for scenes `(N, S)`, clamped to the bounds."""
+        """Return sizes and positions of the block's geoms, `(N, G, 3)` each.
+
+        Args:
+            scene: Scenes, `(N, S)`; clamped to the bounds.
+        """
         scene = scene.to(self._table.dtype)
         shape = torch.minimum(torch.maximum(scene[:, 4:6], self._lower), self._upper)
         both = torch.addmm(self._table[:1], shape, self._table[1:]).unflatten(1, (-1, 6))
@@ -212,9 +236,8 @@ class Placement:
         return both[..., :3], both[..., 3:]
 
     def pose(self, scene: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns position `(N, 3)` and quaternion `(N, 4)` of the block for scenes `(N, S)`."""
+        """Return position `(N, 3)` and quaternion `(N, 4)` of the block for scenes `(N, S)`."""
         half = scene[:, 3:4].to(self._table.dtype) / 2
         zero = torch.zeros_like(half)
-        return scene[:, :3].to(self._table.dtype), torch.cat(
-            (half.cos(), zero, zero, half.sin()), 1
-        )
+        quaternion = torch.cat((half.cos(), zero, zero, half.sin()), 1)
+        return scene[:, :3].to(self._table.dtype), quaternion

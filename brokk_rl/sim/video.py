@@ -1,4 +1,8 @@
-"""A video and stills of a recorded episode: MuJoCo's renderer where there is a GL library, else a drawn side and top view."""
+"""Videos and stills of a recorded episode.
+
+MuJoCo's renderer draws them where a GL library works. Elsewhere matplotlib draws a side and a top
+view.
+"""
 
 from __future__ import annotations
 
@@ -11,32 +15,55 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
+import mujoco
 import numpy as np
 import torch
 
 from brokk_rl.errors import StorageError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.sim.probe import working_renderer
+from brokk_rl.sim.model import compile_model
+from brokk_rl.sim.probe import find_renderer
+from brokk_rl.sim.scene import (
+    COLUMNS,
+    HALF_LENGTH_M,
+    HALF_WIDTH_M,
+    HOLE_DEPTH_M,
+    ScenePlacement,
+    build_visual_wall,
+)
 
 log = logging.getLogger(__name__)
 
 MAX_FRAMES = 200
-"""More frames than this are thinned out: a CPU draws some five pictures a second."""
+"""Longer episodes are thinned out to this many frames: a CPU renders about five pictures a
+second."""
 SIZE = (1200, 540)
+"""Width and height of a picture, pixels."""
 CLOSE_WIDTH = 380
 """Width of the close-up at the right, pixels."""
 FAR_M = 10.0
-"""A block farther away than this is not part of the task."""
+"""Horizontal distance beyond which a block is not part of the task (goal_pose puts it 20 m away)."""
 NUM_STILLS = 3
-_TIMEOUT_S = 600
+RENDER_TIMEOUT_S = 600
+"""Bound on the rendering process; 200 frames take about 40 s on a CPU."""
+FONT_SIZE = 18
+VIDEO_QUALITY = 7
+"""Of ffmpeg's encoder as imageio_ffmpeg scales it, 0 to 10; its default is 5."""
+SCHEMATIC_DPI = 100
+SHOWN_GROUPS = (0, 1, 2)
+"""Geom groups that pictures show; group 3 holds geoms that only collide."""
+
+DrawFrames = Callable[[Iterable[int]], Iterator[np.ndarray]]
+"""Yields one picture, `(height, width, 3)` uint8, for each of the given steps."""
 
 
-class Motion(Protocol):
-    """What is shown: an episode of `T` control steps."""
+class SimulatedEpisode(Protocol):
+    """A recorded episode of `T` control steps."""
 
     @property
     def q(self) -> np.ndarray:
@@ -59,11 +86,32 @@ class Motion(Protocol):
         ...
 
 
-def render_video(machine: Machine, motion: Motion, path: Path) -> Path:
-    """Writes an mp4 to `path` and stills beside it (`<stem>_0.png` is the start, the last one the end).
+@dataclass(frozen=True)
+class RenderJob:
+    """An episode and the file to draw it into; travels to the rendering process as a pickle.
 
-    The renderer runs in a process of its own: GL drivers can end the process, and MuJoCo settles on
-    one when it is imported.
+    Attributes:
+        machine: The machine.
+        q: Joint positions, `(T, J)`.
+        u: Commands, `(T, J)`.
+        force_n: Peak contact force of each step, `(T,)`.
+        scene: The scene, `(S,)`.
+        path: The mp4 to write.
+    """
+
+    machine: Machine
+    q: np.ndarray
+    u: np.ndarray
+    force_n: np.ndarray
+    scene: np.ndarray
+    path: Path
+
+
+def render_video(machine: Machine, episode: SimulatedEpisode, path: Path) -> Path:
+    """Write an mp4 to `path` and stills beside it.
+
+    `<stem>_0.png` shows the start, the last still the end. The renderer runs in a process of its
+    own: GL drivers can end the process, and MuJoCo chooses its GL library at import.
 
     Returns:
         `path`.
@@ -71,13 +119,18 @@ def render_video(machine: Machine, motion: Motion, path: Path) -> Path:
     Raises:
         StorageError: The files cannot be written.
     """
-    arrays = {name: np.asarray(getattr(motion, name)) for name in ("q", "u", "force_n", "scene")}
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "video.mp4"
-        if not _painted(machine, arrays, draft):
-            from brokk_rl.sim.schematic_video import frames
-
-            write(draft, frames(machine, arrays, SIZE), len(arrays["q"]), machine.period_s)
+        job = RenderJob(
+            machine=machine,
+            q=np.asarray(episode.q),
+            u=np.asarray(episode.u),
+            force_n=np.asarray(episode.force_n),
+            scene=np.asarray(episode.scene),
+            path=draft,
+        )
+        if not _render_in_subprocess(job):
+            write_video(draft, draw_schematic(job, SIZE), len(job.q), machine.period_s)
         try:
             for file in sorted(draft.parent.glob("video*.[mp][pn]*")):
                 shutil.copyfile(file, path.with_name(file.name.replace("video", path.stem, 1)))
@@ -86,32 +139,35 @@ def render_video(machine: Machine, motion: Motion, path: Path) -> Path:
     return path
 
 
-def _painted(machine: Machine, arrays: dict[str, np.ndarray], draft: Path) -> bool:
-    """Tries MuJoCo's renderer in a process of its own; returns whether it drew everything."""
-    library = working_renderer()
+def _render_in_subprocess(job: RenderJob) -> bool:
+    """Run MuJoCo's renderer in a process of its own; return whether it drew everything."""
+    library = find_renderer()
     if library is None:
         log.warning(
-            "no GL library works here, so the video is a drawing; for pictures install libegl1 (see `brokk mode=doctor`)"
+            "no GL library works here, so the video is a drawing; for rendered pictures install "
+            "libegl1 (see `brokk mode=doctor`)"
         )
         return False
-    job = draft.with_suffix(".job")
-    job.write_bytes(pickle.dumps((machine, arrays, draft)))
+    file = job.path.with_suffix(".job")
+    file.write_bytes(pickle.dumps(job))
     environment = os.environ | {
         "MUJOCO_GL": library,
         "PYTHONPATH": os.pathsep.join(part for part in sys.path if part),
     }
-    program = "import sys; from brokk_rl.sim.video import paint; paint(sys.argv[1])"
+    program = "import sys; from brokk_rl.sim.video import render_job; render_job(sys.argv[1])"
     try:
         done = subprocess.run(
-            [sys.executable, "-c", program, str(job)],
+            [sys.executable, "-c", program, str(file)],
             env=environment,
-            cwd=draft.parent,
+            cwd=file.parent,
             capture_output=True,
             text=True,
-            timeout=_TIMEOUT_S,
+            timeout=RENDER_TIMEOUT_S,
         )
     except subprocess.TimeoutExpired:
-        log.warning("MuJoCo's renderer took more than %d s, so the video is a drawing", _TIMEOUT_S)
+        log.warning(
+            "MuJoCo's renderer took more than %d s, so the video is a drawing", RENDER_TIMEOUT_S
+        )
         return False
     if done.returncode:
         log.warning(
@@ -122,92 +178,18 @@ def _painted(machine: Machine, arrays: dict[str, np.ndarray], draft: Path) -> bo
     return done.returncode == 0
 
 
-def paint(job: str) -> None:
-    """Draws the job that `render_video` has left in the file `job`; runs in a process of its own."""
-    machine, arrays, draft = pickle.loads(Path(job).read_bytes())
-    write(draft, _pictures(machine, arrays), len(arrays["q"]), machine.period_s)
+def render_job(file: str) -> None:
+    """Render the `RenderJob` that `render_video` has left in `file`; runs in its own process."""
+    job: RenderJob = pickle.loads(Path(file).read_bytes())
+    write_video(job.path, draw_rendered(job), len(job.q), job.machine.period_s)
 
 
-def _pictures(
-    machine: Machine, arrays: dict[str, np.ndarray]
-) -> Callable[[Iterable[int]], Iterator[np.ndarray]]:
-    """Returns what draws the given steps: the overview, the borehole close up, and the commands."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    from brokk_rl.sim.renderer import Painter
-
-    lines, font, (width, height) = captions(machine, arrays), ImageFont.load_default(18), SIZE
-    split = width - CLOSE_WIDTH
-
-    def draw(steps: Iterable[int]) -> Iterator[np.ndarray]:
-        with Painter(machine, width, height) as painter:
-            for step in steps:
-                painter.pose(arrays["q"][step], arrays["scene"])
-                views = (
-                    painter.picture("overview", split, height),
-                    painter.picture("close", CLOSE_WIDTH, height),
-                )
-                picture = Image.fromarray(np.concatenate(views, axis=1))
-                pen = ImageDraw.Draw(picture)
-                pen.rectangle((split - 1, 0, split + 1, height), fill="white")
-                pen.text(
-                    (16, 12),
-                    lines[step],
-                    fill="white",
-                    font=font,
-                    stroke_width=2,
-                    stroke_fill=(40, 40, 40),
-                )
-                _bars(pen, machine.joint_names, arrays["u"][step], font, height)
-                yield np.asarray(picture)
-
-    return draw
-
-
-def _bars(pen, names: tuple[str, ...], u: np.ndarray, font, height: int) -> None:
-    """Draws one bar per joint in the lower left corner, from the middle to the command."""
-    for row, (name, value) in enumerate(zip(names, u, strict=True)):
-        y = height - 20 - 24 * (len(names) - row)
-        pen.text(
-            (16, y - 4), name, fill="white", font=font, stroke_width=2, stroke_fill=(40, 40, 40)
-        )
-        pen.rectangle((60, y, 200, y + 14), fill=(60, 60, 60))
-        ends = sorted((130.0, 130.0 + 70.0 * float(np.clip(value, -1.0, 1.0))))
-        pen.rectangle((ends[0], y + 1, ends[1], y + 13), fill=(250, 170, 10))
-
-
-def captions(machine: Machine, arrays: dict[str, np.ndarray]) -> list[str]:
-    """Returns a line for each step: time, where the tip is relative to the rim (unless the block is far away), and force."""
-    tip = (
-        Kinematics(machine)
-        .pose(torch.as_tensor(arrays["q"], dtype=torch.float32))
-        .tip_in_base_m.numpy()
-        - arrays["scene"][:3]
-    )
-    concerned = float(np.hypot(*arrays["scene"][:2])) < FAR_M
-    lines = []
-    for step, ((x, y, z), force) in enumerate(zip(tip, arrays["force_n"], strict=True)):
-        side = "above" if z > 0 else "below"
-        where = (
-            f"{100 * abs(z):4.0f} cm {side} the rim, {100 * math.hypot(x, y):5.1f} cm off axis    "
-            if concerned
-            else ""
-        )
-        lines.append(f"{step * machine.period_s:5.1f} s    {where}{force:6.0f} N")
-    return lines
-
-
-def write(
-    path: Path,
-    draw: Callable[[Iterable[int]], Iterator[np.ndarray]],
-    num_steps: int,
-    period_s: float,
-) -> None:
-    """Writes an mp4 and stills.
+def write_video(path: Path, draw: DrawFrames, num_steps: int, period_s: float) -> None:
+    """Write an mp4 and stills.
 
     Args:
         path: The mp4; stills lie beside it as `<stem>_<i>.png`.
-        draw: Yields a picture `(height, width, 3)` uint8 for each of the given steps.
+        draw: Draws the pictures.
         num_steps: `T`.
         period_s: Time from step to step.
     """
@@ -216,20 +198,198 @@ def write(
 
     stride = max(1, math.ceil(num_steps / MAX_FRAMES))
     steps = sorted({*range(0, num_steps, stride), num_steps - 1})
-    chosen = {round(i * (len(steps) - 1) / (NUM_STILLS - 1)): i for i in range(NUM_STILLS)}
+    # stills at equal distances from the first frame to the last
+    stills = {round(i * (len(steps) - 1) / (NUM_STILLS - 1)): i for i in range(NUM_STILLS)}
     rate_hz = 1.0 / (period_s * stride)
     writer = imageio_ffmpeg.write_frames(
         str(path),
         SIZE,
         fps=rate_hz,  # pyright: ignore[reportArgumentType]
-        quality=7,
+        quality=VIDEO_QUALITY,
         macro_block_size=4,
     )
     writer.send(None)
     try:
         for count, picture in enumerate(draw(steps)):
             writer.send(np.ascontiguousarray(picture))
-            if count in chosen:
-                imageio.imwrite(path.with_name(f"{path.stem}_{chosen[count]}.png"), picture)
+            if count in stills:
+                imageio.imwrite(path.with_name(f"{path.stem}_{stills[count]}.png"), picture)
     finally:
         writer.close()
+
+
+def write_captions(job: RenderJob) -> list[str]:
+    """Return a line for each step: time, tip relative to the rim, contact force.
+
+    A block that is far away is left out of the line.
+    """
+    q = torch.as_tensor(job.q, dtype=torch.float32)
+    tip = Kinematics(job.machine).pose(q).tip_in_base_m.numpy() - job.scene[:3]
+    has_block = float(np.hypot(*job.scene[:2])) < FAR_M
+    lines = []
+    for step, ((x, y, z), force) in enumerate(zip(tip, job.force_n, strict=True)):
+        side = "above" if z > 0 else "below"
+        off_axis_cm = 100 * math.hypot(x, y)
+        where = f"{100 * abs(z):4.0f} cm {side} the rim, {off_axis_cm:5.1f} cm off axis    "
+        time_s = step * job.machine.period_s
+        lines.append(f"{time_s:5.1f} s    {where if has_block else ''}{force:6.0f} N")
+    return lines
+
+
+class SceneRenderer:
+    """MuJoCo's renderer for one world in any pose and scene; a context manager.
+
+    Needs a GL library: set `MUJOCO_GL` before MuJoCo is imported for the first time
+    (`sim.probe.find_renderer` returns a value that works).
+
+    Args:
+        machine: The machine.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self.model = compile_model(machine, machine.period_s, visual=True)
+        self.data = mujoco.MjData(self.model)
+        self._placement = ScenePlacement(self.model, "cpu", torch.float64)
+        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = [group in SHOWN_GROUPS for group in range(6)]
+        self._option.sitegroup[:] = 0
+
+    def __enter__(self) -> SceneRenderer:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for renderer in self._renderers.values():
+            renderer.close()
+
+    def set_pose(self, q: np.ndarray, scene: np.ndarray) -> None:
+        """Put the machine at `q`, shape `(J,)`, beside the block of `scene`, shape `(S,)`."""
+        row = torch.as_tensor(scene, dtype=torch.float64)[None]
+        size, pos = self._placement.geoms(row)
+        ids = self._placement.geom_ids.numpy()
+        self.model.geom_size[ids], self.model.geom_pos[ids] = size[0].numpy(), pos[0].numpy()
+        wall = build_visual_wall(float(scene[COLUMNS.index("hole_radius_m")]))
+        ids = [self.model.geom(name).id for name in wall.names]
+        self.model.geom_size[ids], self.model.geom_pos[ids] = wall.size, wall.pos
+        position, turn = self._placement.pose(row)
+        self.data.qpos[:] = q
+        self.data.mocap_pos[0], self.data.mocap_quat[0] = position[0].numpy(), turn[0].numpy()
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+    def render(self, camera: str, width: int, height: int) -> np.ndarray:
+        """Return the picture of `camera`, shape `(height, width, 3)` uint8."""
+        key = (height, width)
+        if key not in self._renderers:
+            self._renderers[key] = mujoco.Renderer(self.model, height, width)
+        self._renderers[key].update_scene(self.data, camera, self._option)
+        return self._renderers[key].render()
+
+
+def draw_rendered(job: RenderJob) -> DrawFrames:
+    """Return a function that renders steps: overview, close-up of the borehole, commands."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    lines, font, (width, height) = write_captions(job), ImageFont.load_default(FONT_SIZE), SIZE
+    split = width - CLOSE_WIDTH
+    outline = {"stroke_width": 2, "stroke_fill": (40, 40, 40)}
+
+    def draw(steps: Iterable[int]) -> Iterator[np.ndarray]:
+        with SceneRenderer(job.machine) as renderer:
+            for step in steps:
+                renderer.set_pose(job.q[step], job.scene)
+                views = (
+                    renderer.render("overview", split, height),
+                    renderer.render("close", CLOSE_WIDTH, height),
+                )
+                picture = Image.fromarray(np.concatenate(views, axis=1))
+                pen = ImageDraw.Draw(picture)
+                pen.rectangle((split - 1, 0, split + 1, height), fill="white")
+                pen.text((16, 12), lines[step], fill="white", font=font, **outline)
+                _draw_command_bars(pen, job.machine.joint_names, job.u[step], font, height)
+                yield np.asarray(picture)
+
+    return draw
+
+
+def _draw_command_bars(
+    pen: Any, names: tuple[str, ...], u: np.ndarray, font: Any, height: int
+) -> None:
+    """Draw one bar per joint in the lower left corner, from the middle to the command."""
+    outline = {"stroke_width": 2, "stroke_fill": (40, 40, 40)}
+    for row, (name, value) in enumerate(zip(names, u, strict=True)):
+        y = height - 20 - 24 * (len(names) - row)
+        pen.text((16, y - 4), name, fill="white", font=font, **outline)
+        pen.rectangle((60, y, 200, y + 14), fill=(60, 60, 60))
+        ends = sorted((130.0, 130.0 + 70.0 * float(np.clip(value, -1.0, 1.0))))
+        pen.rectangle((ends[0], y + 1, ends[1], y + 13), fill=(250, 170, 10))
+
+
+def draw_schematic(job: RenderJob, size: tuple[int, int]) -> DrawFrames:
+    """Return a function that draws steps with matplotlib, without a GL library.
+
+    Args:
+        job: The episode.
+        size: Width and height of a picture, pixels.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    pose = Kinematics(job.machine).pose(torch.as_tensor(job.q, dtype=torch.float32))
+    tip = pose.tip_in_base_m[:, None]
+    # points of the arm: foot, joints, tip
+    chain = torch.cat((torch.zeros_like(tip), pose.joints_in_base_m, tip), 1).numpy()
+    lines = write_captions(job)
+
+    def draw(steps: Iterable[int]) -> Iterator[np.ndarray]:
+        inches = (size[0] / SCHEMATIC_DPI, size[1] / SCHEMATIC_DPI)
+        figure = Figure(figsize=inches, dpi=SCHEMATIC_DPI, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        side, top = figure.subplots(1, 2)
+        # (second coordinate shown, line of the arm, line of the chisel) of each view
+        views = [(2, *_draw_view(side, job.scene, 2)), (1, *_draw_view(top, job.scene, 1))]
+        title = figure.suptitle("", family="monospace", fontsize=10)
+        for step in steps:
+            for up, links, chisel in views:
+                links.set_data(chain[step, :-1, 0], chain[step, :-1, up])
+                chisel.set_data(chain[step, -2:, 0], chain[step, -2:, up])
+            title.set_text(lines[step])
+            canvas.draw()
+            yield np.asarray(canvas.buffer_rgba())[..., :3]
+
+    return draw
+
+
+def _draw_view(axes: Any, scene: np.ndarray, up: int) -> tuple[Any, Any]:
+    """Draw the block, seen along y (`up` = 2) or from above (`up` = 1).
+
+    Returns:
+        The still empty lines of the arm and of the chisel.
+    """
+    x, y, rim_z, yaw, scale, radius = scene
+    length, width = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale
+    if up == 2:
+        half = abs(length * np.cos(yaw)) + abs(width * np.sin(yaw))
+        xs = [-half, -radius, -radius, radius, radius, half, half, -half]
+        zs = [0.0, 0.0, -HOLE_DEPTH_M, -HOLE_DEPTH_M, 0.0, 0.0, -rim_z, -rim_z]
+        axes.fill(x + np.array(xs), rim_z + np.array(zs), color="0.75", zorder=0)
+        axes.axhline(0.0, color="0.4", linewidth=1)
+    else:
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (length, width)
+        axes.fill(*(corners @ turn.T + (x, y)).T, color="0.75", zorder=0)
+        angles = np.linspace(0, 2 * np.pi, 60)
+        rim = (x + radius * np.cos(angles), y + radius * np.sin(angles))
+        axes.plot(*rim, color="0.2", linewidth=1)
+    axes.set(
+        xlim=(-1.0, 5.0),
+        ylim=(-0.8, 3.6) if up == 2 else (-2.6, 2.6),
+        xlabel="x / m",
+        ylabel="z / m" if up == 2 else "y / m",
+    )
+    axes.set_aspect("equal")
+    joints = {"markersize": 5, "markerfacecolor": "0.2", "markeredgecolor": "0.2"}
+    (links,) = axes.plot([], [], "-o", color="darkorange", linewidth=5, **joints)
+    (chisel,) = axes.plot([], [], color="0.15", linewidth=3)
+    return links, chisel

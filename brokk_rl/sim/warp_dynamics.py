@@ -1,30 +1,87 @@
-# pyright: reportInvalidTypeForm=false
-# (sizes of vectors and matrices are known only at run time, so that their types are values)
-"""Forces on an arm before contacts, and its step in time after them: a launch each for all Warp worlds.
+"""Forces on an arm before contacts, and its step in time after them: one Warp launch each.
 
-Before: the mass matrix M, the forces of the servos (`brokk_rl.sim.drive`) and the inertial forces
-of the present motion, from Newton's and Euler's laws of every body projected onto the joints (Kane
-and Levinson, "Dynamics: Theory and Applications", 1985):
+Before the contacts: the mass matrix M, the forces of the servos (`brokk_rl.sim.drive`) and the
+inertial forces of the present motion. They follow from Newton's and Euler's laws of every body,
+projected onto the joints (Kane and Levinson, "Dynamics: Theory and Applications", 1985):
 
     M = Σ m Jᵀ J + Wᵀ I W        bias = Σ Jᵀ (m a) + Wᵀ (I α + ω × I ω)
 
-with the Jacobians J and W of a body's centre of mass and turn, and its accelerations a and α where
-no joint accelerates. After: MuJoCo's implicit integrator (documentation, Computation,
-"implicitfast"), (M + h D) x' = M x with the damping D of the servos that are not cut off at their
+J and W are the Jacobians of a body's centre of mass and turn. a and α are its accelerations while
+no joint accelerates. After the contacts: MuJoCo's implicit integrator (documentation, Computation,
+"implicitfast"), (M + h D) x' = M x. D is the damping of the servos that are not cut off at their
 yield force.
 
-For five joints this is less arithmetic than the recursions of `mujoco_warp`, made for any tree,
-take in launches.
+For five joints this arithmetic takes less time than the launches of `mujoco_warp`'s recursions,
+which are made for any tree. Vectors and matrices of five joints stay in a thread's registers.
 """
 
 import functools
+from typing import Any, NamedTuple
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from brokk_rl.sim.warp_algebra import algebra
+MAX_DOFS = 16
+"""Up to here Warp unrolls the loops over degrees of freedom; beyond, a solver for any size is the
+better one."""
+
+
+class JointAlgebra(NamedTuple):
+    """Types and functions for one number of degrees of freedom; a kernel takes from it what it needs.
+
+    Attributes:
+        Vector: A number a degree of freedom.
+        Matrix: A square matrix.
+        inertia_at: `(elements, element, world)` -> the mass matrix of a world, from the lower half
+            that `mujoco_warp` keeps.
+        solved: `(A, b)` -> the solution of A x = b for a positive definite A, which needs no
+            pivots.
+    """
+
+    Vector: Any
+    Matrix: Any
+    inertia_at: wp.Function
+    solved: wp.Function
+
+
+@functools.cache
+def compile_algebra(num_dofs: int) -> JointAlgebra:
+    """Returns the types and functions for `num_dofs` degrees of freedom."""
+    n = num_dofs
+    Vector = wp.types.vector(n, wp.float32)
+    Matrix = wp.types.matrix((n, n), wp.float32)
+
+    @wp.func
+    def inertia_at(elements: wp.array2d[float], element: wp.array2d[int], world: int) -> Matrix:
+        inertia = Matrix()
+        for i in range(n):
+            for j in range(i + 1):
+                if element[i, j] >= 0:
+                    inertia[i, j] = elements[world, element[i, j]]
+                    inertia[j, i] = inertia[i, j]
+        return inertia
+
+    @wp.func
+    def solved(matrix: Matrix, right: Vector) -> Vector:
+        a, x = Matrix(matrix), Vector(right)
+        for k in range(n - 1):
+            for i in range(k + 1, n):
+                factor = a[i, k] / a[k, k]
+                for j in range(k + 1, n):
+                    a[i, j] = a[i, j] - factor * a[k, j]
+                x[i] = x[i] - factor * x[k]
+        for back in range(n):
+            k = n - 1 - back
+            left = x[k]
+            for j in range(k + 1, n):
+                left -= a[k, j] * x[j]
+            x[k] = left / a[k, k]
+        return x
+
+    return JointAlgebra(Vector, Matrix, inertia_at, solved)
+
 
 _SLIDE = wp.constant(int(mujoco.mjtJoint.mjJNT_SLIDE))
 _NO_ROOM_FOR_ROWS = wp.constant(int(mjw.OverflowType.NEFC))
@@ -59,10 +116,10 @@ class _Pose:
 
 
 @functools.cache
-def _kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
+def _compile_kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
     """Returns the kernels for what comes before and after the contacts, for `num_dofs` degrees of freedom."""
     n = num_dofs
-    Vector, Matrix, inertia_at, solved = algebra(n)
+    Vector, Matrix, inertia_at, solved = compile_algebra(n)
     Columns = wp.types.matrix((n, 3), wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -194,7 +251,7 @@ def _kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
     return before, after
 
 
-class Dynamics:
+class ArmDynamics:
     """Stands in for all of `mujoco_warp` but kinematics, collisions, constraints and their solution, for an arm driven by servos.
 
     Args:
@@ -205,7 +262,9 @@ class Dynamics:
     """
 
     def __init__(self, mujoco_model: mujoco.MjModel, model: mjw.Model, data: mjw.Data) -> None:
-        last_dof = np.array([_last_dof(mujoco_model, body) for body in range(mujoco_model.nbody)])
+        last_dof = np.array(
+            [_find_last_dof(mujoco_model, body) for body in range(mujoco_model.nbody)]
+        )
         bodies = np.argsort(last_dof, kind="stable")
         bodies = bodies[last_dof[bodies] >= 0]
         arm, pose = _Arm(), _Pose()
@@ -247,7 +306,7 @@ class Dynamics:
             *counts,
         ]
         self._after += [*state, data.time, data.qacc_warmstart, data.overflow]
-        self._kernels, self._num_worlds = _kernels(model.nv), data.nworld
+        self._kernels, self._num_worlds = _compile_kernels(model.nv), data.nworld
 
     def before_contacts(self) -> None:
         """From the kinematics to what collisions and the solver need: `cdof`, `M` and `qfrc_smooth`."""
@@ -258,7 +317,7 @@ class Dynamics:
         wp.launch(self._kernels[1], self._num_worlds, self._after, block_dim=_BLOCK)
 
 
-def _last_dof(model: mujoco.MjModel, body: int) -> int:
+def _find_last_dof(model: mujoco.MjModel, body: int) -> int:
     """Returns the last degree of freedom that moves `body`, -1 for none."""
     welded = model.body_weldid[body]
     return (

@@ -26,7 +26,7 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from brokk_rl.sim.warp_algebra import algebra
+from brokk_rl.sim.warp_dynamics import compile_algebra
 
 NUM_LANES = 32
 """Threads a world. A block that is one warp sums without waiting; an arm has fewer constraints than
@@ -43,7 +43,7 @@ _FRICTION = wp.types.vector(
 
 
 @wp.struct
-class Constraints:
+class ConstraintRows:
     """Rows of all worlds as `mujoco_warp.make_constraint` leaves them; the three rows of a contact follow each other.
 
     Attributes:
@@ -70,7 +70,7 @@ class Constraints:
 
 
 @wp.func
-def _span(constraints: Constraints, world: int, row: int, num_rows: int) -> int:
+def _count_rows(constraints: ConstraintRows, world: int, row: int, num_rows: int) -> int:
     """Rows of the constraint that begins at `row`: none if none begins there."""
     if constraints.kind[world, row] != _ELLIPTIC:
         return 1
@@ -80,7 +80,7 @@ def _span(constraints: Constraints, world: int, row: int, num_rows: int) -> int:
 
 
 @wp.func
-def _cone(
+def _evaluate_cone(
     residual: wp.vec3, stiffness: wp.vec3, mu: float, friction: wp.vec2
 ) -> tuple[wp.vec3, wp.mat33]:
     """Returns the force -∂s/∂r of a constraint and the curvature ∂²s/∂r² of its cost.
@@ -107,10 +107,10 @@ def _cone(
 
 
 @functools.cache
-def _kernel(num_dofs: int) -> wp.Kernel:
+def _compile_solver(num_dofs: int) -> wp.Kernel:
     """Returns the solver's kernel for `num_dofs` degrees of freedom."""
     n = num_dofs
-    Vector, Matrix, inertia_at, solved = algebra(n)
+    Vector, Matrix, inertia_at, solved = compile_algebra(n)
     Rows = wp.types.matrix((3, n), wp.float32)
     System = wp.types.matrix((n, n + 1), wp.float32)
 
@@ -126,7 +126,7 @@ def _kernel(num_dofs: int) -> wp.Kernel:
 
     @wp.func
     def rows_at(
-        constraints: Constraints, world: int, row: int, span: int
+        constraints: ConstraintRows, world: int, row: int, span: int
     ) -> tuple[Rows, wp.vec3, wp.vec3]:
         """Returns Jacobian, target and stiffness of a constraint, zeros below a single row."""
         jacobian, target, stiffness = Rows(), wp.vec3(), wp.vec3()
@@ -139,7 +139,7 @@ def _kernel(num_dofs: int) -> wp.Kernel:
         return jacobian, target, stiffness
 
     @wp.func
-    def friction_at(constraints: Constraints, world: int, row: int, span: int) -> wp.vec2:
+    def friction_at(constraints: ConstraintRows, world: int, row: int, span: int) -> wp.vec2:
         if span == 1:
             return wp.vec2()
         friction = constraints.friction[constraints.contact[world, row]]
@@ -147,16 +147,21 @@ def _kernel(num_dofs: int) -> wp.Kernel:
 
     @wp.func
     def expansion(
-        constraints: Constraints, world: int, lane: int, num_rows: int, cone_width: float, x: Vector
+        constraints: ConstraintRows,
+        world: int,
+        lane: int,
+        num_rows: int,
+        cone_width: float,
+        x: Vector,
     ) -> System:
         """Writes the forces at x and returns this thread's part of `[Hessian | gradient]` of the sum of constraints."""
         total = System()
         for row in range(lane, num_rows, wp.block_dim()):
-            span = _span(constraints, world, row, num_rows)
+            span = _count_rows(constraints, world, row, num_rows)
             if span > 0:
                 jacobian, target, stiffness = rows_at(constraints, world, row, span)
                 friction = friction_at(constraints, world, row, span)
-                force, curvature = _cone(
+                force, curvature = _evaluate_cone(
                     jacobian * x - target, stiffness, cone_width * friction[0], friction
                 )
                 for i in range(3):
@@ -168,7 +173,7 @@ def _kernel(num_dofs: int) -> wp.Kernel:
 
     @wp.func
     def slope(
-        constraints: Constraints,
+        constraints: ConstraintRows,
         world: int,
         lane: int,
         num_rows: int,
@@ -180,19 +185,21 @@ def _kernel(num_dofs: int) -> wp.Kernel:
         """Returns this thread's part of the first and second derivative along `step` of the sum of constraints."""
         total = wp.vec2()
         for row in range(lane, num_rows, wp.block_dim()):
-            span = _span(constraints, world, row, num_rows)
+            span = _count_rows(constraints, world, row, num_rows)
             if span > 0:
                 jacobian, target, stiffness = rows_at(constraints, world, row, span)
                 friction = friction_at(constraints, world, row, span)
                 along = jacobian * step
                 residual = jacobian * x - target + alpha * along
-                force, curvature = _cone(residual, stiffness, cone_width * friction[0], friction)
+                force, curvature = _evaluate_cone(
+                    residual, stiffness, cone_width * friction[0], friction
+                )
                 total += wp.vec2(-wp.dot(force, along), wp.dot(along, curvature * along))
         return total
 
     @wp.func
     def searched(
-        constraints: Constraints,
+        constraints: ConstraintRows,
         world: int,
         lane: int,
         num_rows: int,
@@ -234,7 +241,7 @@ def _kernel(num_dofs: int) -> wp.Kernel:
         element: wp.array2d[int],
         force: wp.array2d[float],
         warmstart: wp.array2d[float],
-        constraints: Constraints,
+        constraints: ConstraintRows,
         cone_width: wp.array[float],
         tolerance: wp.array[float],
         num_iterations: int,
@@ -291,7 +298,7 @@ def _kernel(num_dofs: int) -> wp.Kernel:
             for row in range(lane, num_rows, wp.block_dim()):
                 if (
                     constraints.kind[world, row] >= _FRICTIONLESS
-                    and _span(constraints, world, row, num_rows) > 0
+                    and _count_rows(constraints, world, row, num_rows) > 0
                 ):
                     normal += constraints.force[world, row]
             pressure = wp.tile_reduce(wp.add, wp.tile(normal))[0]
@@ -308,7 +315,7 @@ def _kernel(num_dofs: int) -> wp.Kernel:
     return solver
 
 
-class Solver:
+class ContactSolver:
     """Stands in for `mujoco_warp.solve` where all constraints are joint limits and contacts without torsional friction.
 
     Args:
@@ -321,13 +328,13 @@ class Solver:
 
     def __init__(self, model: mjw.Model, data: mjw.Data, peak: wp.array) -> None:
         rows, contact = data.efc, data.contact
-        constraints = Constraints()
+        constraints = ConstraintRows()
         constraints.num_rows, constraints.kind, constraints.contact = data.nefc, rows.type, rows.id
         constraints.first_row, constraints.friction = contact.efc_address, contact.friction
         constraints.jacobian, constraints.stiffness, constraints.target = rows.J, rows.D, rows.aref
         constraints.force = rows.force
         option = model.opt
-        self._kernel, self._num_worlds = _kernel(model.nv), data.nworld
+        self._kernel, self._num_worlds = _compile_solver(model.nv), data.nworld
         self._inputs = [
             data.M,
             model.M_elemid,

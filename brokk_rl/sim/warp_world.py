@@ -1,23 +1,141 @@
-"""Worlds stepped by `mujoco_warp`; see `brokk_rl.sim.warp` for the spec."""
+"""Worlds stepped by `mujoco_warp`, from its own stages or from our kernels.
+
+`brokk_rl.sim.simulator.WarpSimulator` is the spec that builds them.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
 
+import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import torch
 import warp as wp
 
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.sim.drive import Drive
+from brokk_rl.sim.drive import DriveReferences
 from brokk_rl.sim.model import compile_model
-from brokk_rl.sim.scene import Placement, nominal
-from brokk_rl.sim.warp_substep import check, fused, staged
+from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
+from brokk_rl.sim.warp_dynamics import MAX_DOFS, ArmDynamics
+from brokk_rl.sim.warp_solver import ContactSolver
 
-if TYPE_CHECKING:
-    from brokk_rl.sim.warp import Warp
+_CONTACT = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
+"""Constraints of this type and those after it are contacts."""
+
+
+@wp.kernel(enable_backward=False)
+def _keep_peak(
+    num_rows: wp.array[int],
+    kind: wp.array2d[int],
+    contact: wp.array2d[int],
+    force: wp.array2d[float],
+    first_row: wp.array2d[int],
+    peak: wp.array[float],
+):
+    """Raises each world's peak to the sum of the normal forces of its contacts, the first row of each in an elliptic cone.
+
+    The same as the sum of the touch sensors (`sim.native` reads those), for one launch instead of
+    eight.
+    """
+    world = wp.tid()
+    total = wp.float32(0.0)  # a plain literal would be a constant to Warp
+    for row in range(wp.min(num_rows[world], kind.shape[1])):
+        if kind[world, row] >= _CONTACT and first_row[contact[world, row], 0] == row:
+            total += force[world, row]
+    peak[world] = wp.max(peak[world], total)
+
+
+def check_supported(compiled: mujoco.MjModel, machine: Machine, is_fused: bool) -> None:
+    """Raises a `ConfigError` for what a substep leaves out."""
+    left_out = {
+        "tendons": compiled.ntendon,
+        "equalities": compiled.neq,
+        "deformable bodies": compiled.nflex,
+        "plugins": compiled.nplugin,
+        "friction in joints": compiled.dof_frictionloss.any(),
+    }
+    passive = (
+        compiled.jnt_stiffness,
+        compiled.dof_damping,
+        compiled.body_gravcomp,
+        compiled.opt.density,
+        compiled.opt.viscosity,
+    )
+    too_much = {
+        "actuators": compiled.nu != machine.num_joints,
+        "branches": (compiled.dof_parentid != np.arange(-1, compiled.nv - 1)).any(),
+        "springs, dampers or fluids": any(np.any(values) for values in passive),
+        "torsional friction (condim above 3)": (
+            np.concatenate([compiled.geom_condim, compiled.pair_dim]) > 3
+        ).any(),
+        f"more than {MAX_DOFS} joints": compiled.nv > MAX_DOFS,
+    }
+    if found := [
+        name for name, count in (left_out | (too_much if is_fused else {})).items() if count
+    ]:
+        instead = "sim.fused=false or sim=native" if is_fused else "sim=native"
+        raise ConfigError(
+            f"machine {machine.name}: sim=warp simulates arms that are one chain of links, but its MJCF has {', '.join(found)}; "
+            f"remove them, or choose {instead}"
+        )
+
+
+def make_staged_substep(model: mjw.Model, data: mjw.Data, peak: wp.array) -> Callable[[], None]:
+    """Returns `mjw.step` for a chain of bodies, without its stages for cameras, deformable bodies, tendons and sensors.
+
+    Some 60 launches, and ten an iteration of the solver. The GPU waits for launches, not for
+    arithmetic: every stage that a model does not need costs time.
+
+    Args:
+        model: The model.
+        data: All worlds.
+        peak: Raised to the contact force of each world, `(N,)`, N.
+    """
+    rows = data.efc
+    forces = [data.nefc, rows.type, rows.id, rows.force, data.contact.efc_address]
+
+    def step() -> None:
+        mjw.kinematics(model, data)
+        mjw.com_pos(model, data)
+        mjw.crb(model, data)
+        mjw.collision(model, data)
+        mjw.make_constraint(model, data)
+        mjw.transmission(model, data)
+        mjw.fwd_velocity(model, data)
+        mjw.fwd_actuation(model, data)
+        mjw.fwd_acceleration(model, data, factorize=True)
+        mjw.solve(model, data)
+        mjw.implicit(model, data)
+        wp.launch(_keep_peak, data.nworld, forces, [peak])
+
+    return step
+
+
+def make_fused_substep(
+    compiled: mujoco.MjModel, model: mjw.Model, data: mjw.Data, peak: wp.array
+) -> Callable[[], None]:
+    """Returns the same for an arm of a few joints driven by servos, in 18 launches.
+
+    Args:
+        compiled: The model as MuJoCo has it.
+        model: The model.
+        data: All worlds.
+        peak: Raised to the contact force of each world, `(N,)`, N.
+    """
+    dynamics, solve = ArmDynamics(compiled, model, data), ContactSolver(model, data, peak)
+
+    def step() -> None:
+        mjw.kinematics(model, data)
+        dynamics.before_contacts()
+        mjw.collision(model, data)
+        mjw.make_constraint(model, data)
+        solve()
+        dynamics.after_contacts()
+
+    return step
 
 
 # Too few iterations leave a slightly soft contact; what is lost to a full buffer is lost, and that
@@ -34,18 +152,37 @@ class WarpWorld:
     each iteration, which is slow.
 
     Args:
-        spec: Sizes and solver settings.
         machine: The machine.
-        num_worlds: `N`.
         device: A CUDA device or the CPU.
+        num_worlds: `N`.
+        substeps: Physics steps per control period.
+        num_contacts: Size of the contact buffer, per world on average.
+        num_constraints: Size of each world's buffer of constraint rows.
+        iterations: Bound on the solver's iterations.
+        linesearch_iterations: Bound on the line search's iterations.
+        tolerance: At which the solver stops.
+        fused: Use our own kernels for dynamics, contact solver and integration.
     """
 
-    def __init__(self, spec: Warp, machine: Machine, num_worlds: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        machine: Machine,
+        device: torch.device,
+        *,
+        num_worlds: int,
+        substeps: int,
+        num_contacts: int,
+        num_constraints: int,
+        iterations: int,
+        linesearch_iterations: int,
+        tolerance: float,
+        fused: bool,
+    ) -> None:
         self.num_worlds, self.device = num_worlds, device
         self.supports_graphs = device.type == "cuda"
-        self._substeps = spec.substeps
-        self.model = compile_model(machine, machine.period_s / spec.substeps)
-        check(self.model, machine, spec.fused)
+        self._substeps = substeps
+        self.model = compile_model(machine, machine.period_s / substeps)
+        check_supported(self.model, machine, fused)
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
         self._warp_device = wp.device_from_torch(device)
@@ -54,9 +191,9 @@ class WarpWorld:
                 self.model, batch_sizes={"geom_size": num_worlds, "geom_pos": num_worlds}
             )
             self._data = mjw.make_data(
-                self.model, num_worlds, nconmax=spec.num_contacts, njmax=spec.num_constraints
+                self.model, num_worlds, nconmax=num_contacts, njmax=num_constraints
             )
-        self._write_options(spec)
+        self._write_options(iterations, linesearch_iterations, tolerance)
         data, model = self._data, self._model
         names = (
             "qpos",
@@ -73,17 +210,19 @@ class WarpWorld:
         self._views |= {
             name: wp.to_torch(getattr(model, name)) for name in ("geom_size", "geom_pos")
         }
-        self._placement = Placement(self.model, device, torch.float32)
-        self._drive = Drive(self.model, machine, num_worlds, device, torch.float32)
+        self._placement = ScenePlacement(self.model, device, torch.float32)
+        self._drive = DriveReferences(self.model, machine, num_worlds, device, torch.float32)
         self.q = torch.zeros(num_worlds, machine.num_joints, device=device)
         self.contact_force_n = torch.zeros(num_worlds, device=device)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         peak = wp.from_torch(self.contact_force_n)
         self._substep = (
-            fused(self.model, model, data, peak) if spec.fused else staged(model, data, peak)
+            make_fused_substep(self.model, model, data, peak)
+            if fused
+            else make_staged_substep(model, data, peak)
         )
         home = torch.tensor(machine.home, dtype=torch.float32, device=device).expand(num_worlds, -1)
-        self.reset(torch.ones_like(self.faults), home, nominal(num_worlds, device))
+        self.reset(torch.ones_like(self.faults), home, make_nominal_scenes(num_worlds, device))
 
     def step(self, increment: torch.Tensor) -> None:
         """Advances one control period; see `brokk_rl.contracts.world.World`."""
@@ -133,12 +272,14 @@ class WarpWorld:
         own = {"q": self.q, "contact_force_n": self.contact_force_n, "faults": self.faults}
         return self._views | {"reference": self._drive.reference} | own
 
-    def _write_options(self, spec: Warp) -> None:
+    def _write_options(self, iterations: int, linesearch_iterations: int, tolerance: float) -> None:
         option = self._model.opt
-        option.iterations, option.ls_iterations = spec.iterations, spec.linesearch_iterations
-        option.tolerance.fill_(spec.tolerance)
-        option.disableflags |= int(mjw.DisableBit.FRICTIONLOSS)  # there is none, see `check`
-        option.warn_overflow = 0  # read on the device into `faults`, not printed from it
+        option.iterations, option.ls_iterations = iterations, linesearch_iterations
+        option.tolerance.fill_(tolerance)
+        # `check_supported` has made sure that no joint has friction
+        option.disableflags |= int(mjw.DisableBit.FRICTIONLOSS)
+        # overflows are read on the device into `faults`, not printed
+        option.warn_overflow = 0
 
     @contextlib.contextmanager
     def _on_torch_stream(self) -> Iterator[None]:

@@ -16,7 +16,7 @@ import onnxruntime
 
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import Encoder, Scaling
+from brokk_rl.observation import ObservationEncoder, TargetScaling
 from deploy.bus.description import resolve_package_path
 
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
@@ -46,12 +46,12 @@ class PolicyBundle:
         _check_contract(self.contract, machine, folder)
         observation = self.contract["observation"]
         pitch = observation.get("pitch")
-        scaling = Scaling(
+        scaling = TargetScaling(
             target_mean_m=observation["target"]["mean_m"],
             target_std_m=observation["target"]["std_m"],
             pitch_rad=(pitch["mean_rad"], pitch["std_rad"]) if pitch else None,
         )
-        self.encoder = Encoder(
+        self.encoder = ObservationEncoder(
             machine,
             scaling,
             with_proposals=any("proposals" in part for part in observation["order"]),

@@ -19,13 +19,13 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
 from brokk_rl.modes.train import Train
-from brokk_rl.rl.policy import CONTRACT, Trained
-from brokk_rl.rl.runner import Training
+from brokk_rl.rl.policy import CONTRACT, TrainedPolicy
+from brokk_rl.rl.runner import TrainingConfig
 from brokk_rl.rl.tracking import Tracking
-from brokk_rl.rl.vec_env import Plant
+from brokk_rl.rl.vec_env import ControlLoopConfig
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
-from diagnosis import downstream, downstream_page
+from brokk_rl.spec import name_spec, spec
+from diagnosis import retraining
 
 log = logging.getLogger(__name__)
 
@@ -81,10 +81,10 @@ class CloseGap:
     randomisation: dict[str, Effect]
     stand_in: StandIn
     follower: Follower
-    policy: Trained
+    policy: TrainedPolicy
     panel: dict[str, PolicySpec]
     warm: bool
-    rl: Training
+    rl: TrainingConfig
     tracking: Tracking
     evaluation: Evaluation
     resume: str | None
@@ -95,7 +95,7 @@ class CloseGap:
                 "close_gap: there is no effect to retrain with; give 'effect@found=[@<effects.yaml of mode=diagnose>]'. "
                 "A diagnosis that says none or unknown leaves nothing to repair."
             )
-        for name in (downstream.BEFORE, downstream.AFTER):
+        for name in (retraining.BEFORE, retraining.AFTER):
             if name in self.panel:
                 raise ConfigError(f"panel.{name}: this name is taken; give another")
         for one, other in (("effect", self.effect), ("randomisation", self.randomisation)):
@@ -116,8 +116,8 @@ class CloseGap:
         """
         folder = self.session.folder
         policies: dict[str, PolicySpec] = {
-            downstream.BEFORE: self.policy,
-            downstream.AFTER: Trained(folder=str(self._retrained())),
+            retraining.BEFORE: self.policy,
+            retraining.AFTER: TrainedPolicy(folder=str(self._retrained())),
             **self.panel,
         }
         plants = self._plants()
@@ -125,24 +125,24 @@ class CloseGap:
             name: self._evaluated(name, plant, policies) for name, plant in plants.items()
         }
         trained = json.loads((folder / RETRAINED / CONTRACT).read_text())["trained"]
-        found = downstream.compare(evaluations) | {
-            "plants": {name: _described(plant) for name, plant in plants.items()},
+        found = retraining.compare_policies(evaluations) | {
+            "plants": {name: _describe_plant(plant) for name, plant in plants.items()},
             "retraining": {
                 "began with": self.policy.folder if self.warm else "a fresh network",
-                "trained with": _described(self._training_plant()),
+                "trained with": _describe_plant(self._training_plant()),
                 "control steps": trained["env_steps"],
                 "seconds": trained["seconds"],
                 "device": trained["device"],
                 "seed": self.session.seed,
             },
         }
-        write_json(folder / downstream.FILE, found)
-        downstream_page.write(found, folder)
+        write_json(folder / retraining.COMPARISON_FILE, found)
+        retraining.write_report(found, folder)
         _show(found, folder)
         return float(found["achieved"]["mean"])
 
-    def _plants(self) -> dict[str, Plant]:
-        known = Plant(
+    def _plants(self) -> dict[str, ControlLoopConfig]:
+        known = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
             task=self.task,
@@ -158,7 +158,7 @@ class CloseGap:
             ),
         }
 
-    def _training_plant(self) -> Plant:
+    def _training_plant(self) -> ControlLoopConfig:
         known = self._plants()["repaired"]
         return replace(known, effects=self.effect | self.randomisation | self.found)
 
@@ -179,31 +179,31 @@ class CloseGap:
         return place
 
     def _evaluated(
-        self, name: str, plant: Plant, policies: dict[str, PolicySpec]
+        self, name: str, plant: ControlLoopConfig, policies: dict[str, PolicySpec]
     ) -> dict[str, Any]:
         """Returns `evaluation.json` on a plant; one that an interrupted run has written is kept."""
         place = self.session.folder / name
         if (place / EVALUATION).exists():
             return json.loads((place / EVALUATION).read_text())
         place.mkdir(exist_ok=True)
-        log.info("on the %s", downstream_page.WORDS[name])
+        log.info("on the %s", retraining.PLANT_NAMES[name])
         return evaluate_policies(
             plant, self.evaluation, replace(self.session, out=str(place)), policies
         )[0]
 
 
-def _described(plant: Plant) -> str:
-    return " + ".join([type(plant.actuator).__name__.lower(), *plant.effects])
+def _describe_plant(plant: ControlLoopConfig) -> str:
+    return " + ".join([name_spec(plant.actuator), *plant.effects])
 
 
 def _show(found: dict[str, Any], folder: Path) -> None:
     console = Console()
     view = Table(
-        "strict success", *(downstream_page.WORDS[plant] for plant in downstream.PLANTS), box=None
+        "strict success", *(retraining.PLANT_NAMES[plant] for plant in retraining.PLANTS), box=None
     )
     for policy, shares in found["success"].items():
-        name = downstream_page.NAMES.get(policy, policy)
-        view.add_row(name, *(downstream.said(shares[plant]) for plant in downstream.PLANTS))
-    console.print(downstream.headline(found)[0], style="bold", highlight=False)
+        name = retraining.POLICY_NAMES.get(policy, policy)
+        view.add_row(name, *(retraining.format_rate(shares[plant]) for plant in retraining.PLANTS))
+    console.print(retraining.write_headline(found)[0], style="bold", highlight=False)
     console.print(view)
-    console.print(f"report: {folder / downstream_page.PAGE}", highlight=False)
+    console.print(f"report: {folder / retraining.REPORT_FILE}", highlight=False)

@@ -14,18 +14,18 @@ from rich.table import Table
 
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import already, answer, case, library, page, prescription, simulator
+from diagnosis import answer, baseline, case, effect_library, pipeline, report
 from diagnosis.answer import Answer
+from diagnosis.baseline import Base
+from diagnosis.calibration import Certainty
 from diagnosis.case import Case
-from diagnosis.certainty import Certainty
-from diagnosis.conclusion import Diagnosis
-from diagnosis.engine import Prices
-from diagnosis.library import Kind
-from diagnosis.simulator import Base
+from diagnosis.detection import Prices
+from diagnosis.effect_library import Kind
+from diagnosis.pipeline import Diagnosis
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ class Diagnose:
     machine: Machine
     fit: ActuatorFit
     actuator: Actuator | None
-    thresholds: Thresholds
+    thresholds: InspectionThresholds
     excitation: dict[str, Excitation]
     diagnosis: Subject
 
@@ -93,7 +93,7 @@ class Diagnose:
         """
         self.session.seed_all()
         given = self._case()
-        kinds = library.load(self.machine, self.diagnosis.effects)
+        kinds = effect_library.load_effects(self.machine, self.diagnosis.effects)
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
         with Progress(transient=True) as progress:
             task = progress.add_task("simulator", total=1.0)
@@ -108,8 +108,8 @@ class Diagnose:
             )
         folder = self.session.folder
         outcome.save(folder)
-        prescription.write(outcome.answer, kinds, folder / prescription.FILE)
-        page.write(outcome, folder, self.machine)
+        pipeline.write_effects(outcome.answer, kinds, folder / pipeline.EFFECTS_FILE)
+        report.write_report(outcome, folder, self.machine)
         _show(outcome.answer, folder)
 
     def _case(self) -> Case:
@@ -131,16 +131,16 @@ class Diagnose:
             self.session.folder,
         )
         if given.reference:
-            return simulator.fitted(
+            return baseline.fitted(
                 given,
                 self.fit,
                 folder / "base",
                 seed,
                 device,
-                lambda base: already.refined(base, kinds, self.machine),
+                lambda base: baseline.refined(base, kinds, self.machine),
             )
         assert self.actuator is not None, "there is one where there is no reference"
-        return simulator.given(given, self.actuator, self.fit, folder / "flexible", seed, device)
+        return baseline.given(given, self.actuator, self.fit, folder / "flexible", seed, device)
 
 
 def _show(found: Answer, folder: Path) -> None:
@@ -164,4 +164,7 @@ def _show(found: Answer, folder: Path) -> None:
     console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False)
     if found.selected:
         console.print(table)
-    console.print(f"report: {folder / page.PAGE}, answer: {folder / answer.FILE}", highlight=False)
+    console.print(
+        f"report: {folder / report.REPORT_FILE}, answer: {folder / answer.ANSWER_FILE}",
+        highlight=False,
+    )

@@ -6,22 +6,22 @@ import torch
 
 from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.machine import Machine
-from brokk_rl.observation import Scaling
+from brokk_rl.observation import TargetScaling
 from brokk_rl.sim import scene
 from brokk_rl.spec import spec
-from tasks.advice import Advice
-from tasks.classical import Classical
-from tasks.measured import Measured
-from tasks.process import Options, ToolPoseProcess
-from tasks.reward import Term
-from tasks.starts import Arms, Targets, Uniform, random_starts
-from tasks.tool_pose import Action, Noise, Switch
+from tasks.advice import AdviceConfig
+from tasks.classical import ClassicalConfig
+from tasks.control import ActionMapping, ObservationNoise, PhaseSwitch
+from tasks.noise import MeasuredNoise
+from tasks.process import ToolPoseOptions, ToolPoseProcess
+from tasks.reward import RewardTerm
+from tasks.starts import ArmStarts, CandidateTargets, Uniform, draw_starts
 
 DOWN_RAD = math.pi / 2
 
 
 @spec
-class Hole:
+class BoreholeRanges:
     """Where the borehole may be; uniform ranges (lowest, highest).
 
     Attributes:
@@ -42,7 +42,7 @@ class Hole:
 
 
 @spec
-class Success:
+class InsertionCriteria:
     """When the chisel counts as inserted.
 
     Attributes:
@@ -91,37 +91,37 @@ class BoreholeInsertion:
     end_on_success: bool
     limit_margin: float
     depth_m: float
-    hole: Hole
-    arms: Arms
-    success: Success
+    hole: BoreholeRanges
+    arms: ArmStarts
+    success: InsertionCriteria
     memory: int
-    advice: Advice | None
-    noise: Noise | Measured
-    switch: Switch
-    action: Action
-    scaling: Scaling
-    classical: Classical
-    reward: dict[str, Term]
+    advice: AdviceConfig | None
+    noise: ObservationNoise | MeasuredNoise
+    switch: PhaseSwitch
+    action: ActionMapping
+    scaling: TargetScaling
+    classical: ClassicalConfig
+    reward: dict[str, RewardTerm]
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Returns the task for `num_envs` environments on `device`."""
         return ToolPoseProcess(
-            Insertion(self, machine), Options.of(self), machine, num_envs, device
+            InsertionGoal(self, machine), ToolPoseOptions.of(self), machine, num_envs, device
         )
 
 
-class Insertion:
-    """Starts and criteria of the borehole task; fulfils `tasks.process.Goal`."""
+class InsertionGoal:
+    """Starts and criteria of the borehole task; fulfils `tasks.process.ToolPoseGoal`."""
 
     def __init__(self, task: BoreholeInsertion, machine: Machine) -> None:
         self._task = task
         self._machine = machine
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """See `tasks.process.Goal`."""
+        """See `tasks.process.ToolPoseGoal`."""
         task, hole = self._task, self._task.hole
 
-        def draw(uniform: Uniform) -> Targets:
+        def draw(uniform: Uniform) -> CandidateTargets:
             distance, bearing = uniform(hole.distance_m), uniform(hole.bearing_rad)
             rim = torch.stack(
                 (distance * bearing.cos(), distance * bearing.sin(), uniform(hole.rim_z_m)), 1
@@ -134,7 +134,7 @@ class Insertion:
                 "block_scale": uniform(hole.block_scale),
                 "hole_radius_m": torch.full_like(distance, hole.radius_m),
             }
-            return Targets(
+            return CandidateTargets(
                 target_m=rim,
                 pitch_rad=torch.full_like(distance, DOWN_RAD),
                 scene=torch.stack([columns[name] for name in scene.COLUMNS], 1),
@@ -142,7 +142,7 @@ class Insertion:
             )
 
         controller = task.classical.build(self._machine, torch.device("cpu"))
-        return random_starts(
+        return draw_starts(
             count,
             seed,
             draw,
@@ -157,7 +157,7 @@ class Insertion:
     def judge(
         self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
     ) -> dict[str, torch.Tensor]:
-        """See `tasks.process.Goal`."""
+        """See `tasks.process.ToolPoseGoal`."""
         rules, rim = self._task.success, start["target_m"]
         lateral = (tip_m - rim)[:, :2].norm(dim=1)
         below = rim[:, 2] - tip_m[:, 2]
@@ -173,11 +173,13 @@ class Insertion:
         return {
             "success": inside & (below >= rules.strict_depth_m),
             "paper_success": aligned & (below >= rules.paper_height_m),
-            "closeness": _closeness(distance, lateral, turn, below * inside, rules.strict_depth_m),
+            "closeness": _measure_closeness(
+                distance, lateral, turn, below * inside, rules.strict_depth_m
+            ),
         }
 
 
-def _closeness(
+def _measure_closeness(
     distance_m: torch.Tensor,
     lateral_m: torch.Tensor,
     turn_rad: torch.Tensor,

@@ -5,15 +5,15 @@ import torch
 from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import Scaling
+from brokk_rl.observation import TargetScaling
 from brokk_rl.sim import scene
 from brokk_rl.spec import spec
-from tasks.advice import Advice
-from tasks.classical import Classical
-from tasks.process import Options, ToolPoseProcess
-from tasks.reward import Term
-from tasks.starts import Arms, Targets, Uniform, random_starts
-from tasks.tool_pose import Action, Noise, Switch
+from tasks.advice import AdviceConfig
+from tasks.classical import ClassicalConfig
+from tasks.control import ActionMapping, ObservationNoise, PhaseSwitch
+from tasks.process import ToolPoseOptions, ToolPoseProcess
+from tasks.reward import RewardTerm
+from tasks.starts import ArmStarts, CandidateTargets, Uniform, draw_starts
 
 BLOCK_AWAY_M = -20.0
 """Where the block stands along x: behind the machine and out of its reach, so that nothing but the
@@ -21,7 +21,7 @@ ground is in the way."""
 
 
 @spec
-class Pose:
+class PoseRanges:
     """Which poses are asked for; uniform ranges (lowest, highest), of which those are kept that the arm can reach.
 
     Attributes:
@@ -46,7 +46,7 @@ class Pose:
 
 
 @spec
-class Tolerance:
+class PoseCriteria:
     """When the pose counts as reached.
 
     Attributes:
@@ -86,17 +86,17 @@ class GoalPose:
     episode_s: float
     end_on_success: bool
     limit_margin: float
-    pose: Pose
-    arms: Arms
-    tolerance: Tolerance
+    pose: PoseRanges
+    arms: ArmStarts
+    tolerance: PoseCriteria
     memory: int
-    advice: Advice | None
-    noise: Noise
-    switch: Switch
-    action: Action
-    scaling: Scaling
-    classical: Classical
-    reward: dict[str, Term]
+    advice: AdviceConfig | None
+    noise: ObservationNoise
+    switch: PhaseSwitch
+    action: ActionMapping
+    scaling: TargetScaling
+    classical: ClassicalConfig
+    reward: dict[str, RewardTerm]
 
     def check(self) -> None:
         if self.scaling.pitch_rad is None and self.pose.pitch_rad[0] != self.pose.pitch_rad[1]:
@@ -107,26 +107,30 @@ class GoalPose:
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Returns the task for `num_envs` environments on `device`."""
         return ToolPoseProcess(
-            Reaching(self, machine), Options.of(self, depth_m=0.0), machine, num_envs, device
+            ReachingGoal(self, machine),
+            ToolPoseOptions.of(self, depth_m=0.0),
+            machine,
+            num_envs,
+            device,
         )
 
 
-class Reaching:
-    """Starts and criteria of the pose task; fulfils `tasks.process.Goal`."""
+class ReachingGoal:
+    """Starts and criteria of the pose task; fulfils `tasks.process.ToolPoseGoal`."""
 
     def __init__(self, task: GoalPose, machine: Machine) -> None:
         self._task = task
         self._machine = machine
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """See `tasks.process.Goal`."""
+        """See `tasks.process.ToolPoseGoal`."""
         task, pose = self._task, self._task.pose
 
-        def draw(uniform: Uniform) -> Targets:
+        def draw(uniform: Uniform) -> CandidateTargets:
             distance, bearing = uniform(pose.distance_m), uniform(pose.bearing_rad)
-            place = scene.nominal(len(distance))
+            place = scene.make_nominal_scenes(len(distance))
             place[:, scene.COLUMNS.index("hole_x_m")] = BLOCK_AWAY_M
-            return Targets(
+            return CandidateTargets(
                 target_m=torch.stack(
                     (distance * bearing.cos(), distance * bearing.sin(), uniform(pose.height_m)), 1
                 ),
@@ -136,7 +140,7 @@ class Reaching:
             )
 
         controller = task.classical.build(self._machine, torch.device("cpu"))
-        return random_starts(
+        return draw_starts(
             count,
             seed,
             draw,
@@ -151,7 +155,7 @@ class Reaching:
     def judge(
         self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
     ) -> dict[str, torch.Tensor]:
-        """See `tasks.process.Goal`."""
+        """See `tasks.process.ToolPoseGoal`."""
         rules = self._task.tolerance
         distance = (start["target_m"] - tip_m).norm(dim=1)
         turn = (start["target_pitch_rad"] - pitch_rad).abs()
@@ -159,11 +163,11 @@ class Reaching:
             "success": (distance <= rules.strict_distance_m) & (turn <= rules.strict_pitch_rad),
             "paper_success": (1 / (1 + distance) >= rules.paper_alignment)
             & (1 / (1 + turn) >= rules.paper_alignment),
-            "closeness": _closeness(distance, turn),
+            "closeness": _measure_closeness(distance, turn),
         }
 
 
-def _closeness(distance_m: torch.Tensor, turn_rad: torch.Tensor) -> torch.Tensor:
+def _measure_closeness(distance_m: torch.Tensor, turn_rad: torch.Tensor) -> torch.Tensor:
     """Returns how near a pose is to reached, 0 to 1: distance at three scales, pitch at three, and both together."""
     near = torch.stack([1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.05)]).mean(0)
     turned = torch.stack([1 / (1 + turn_rad / scale) for scale in (1.0, 0.3, 0.05)]).mean(0)

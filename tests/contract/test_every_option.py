@@ -21,8 +21,8 @@ from brokk_rl.checks import (
 )
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from brokk_rl.sim.link import Simulated
-from brokk_rl.sim.scene import nominal
+from brokk_rl.sim.link import SimulatedMachines
+from brokk_rl.sim.scene import make_nominal_scenes
 
 
 @every("actuator")
@@ -50,7 +50,7 @@ def test_it_is_an_excitation(name: str, machine: Machine) -> None:
 def test_the_simulated_machine_is_a_link(
     actuator: str, num_runs: int, machine: Machine, tmp_path: Path
 ) -> None:
-    connection = Simulated(actuator=option("actuator", actuator), noise=0.001)
+    connection = SimulatedMachines(actuator=option("actuator", actuator), noise=0.001)
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     check_link(connection.build(machine, num_runs, session), machine, num_runs)
 
@@ -69,4 +69,4 @@ def test_it_is_a_finder(name: str) -> None:
 @pytest.mark.slow
 def test_it_is_a_world(name: str, machine: Machine) -> None:
     device = "cuda" if torch.cuda.is_available() and name != "native" else "cpu"
-    check_world(option("sim", name), machine, nominal(NUM_ENVS), device)
+    check_world(option("sim", name), machine, make_nominal_scenes(NUM_ENVS), device)

@@ -5,14 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from brokk_rl.sim.native import Native
-from brokk_rl.sim.scene import nominal
-from brokk_rl.sim.warp import Warp
+from brokk_rl.sim.scene import make_nominal_scenes
+from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
 
 pytestmark = pytest.mark.gpu
 
 NUM_WORLDS = 64
-SPEC = Warp(
+SPEC = WarpSimulator(
     num_worlds=NUM_WORLDS,
     substeps=5,
     num_contacts=16,
@@ -61,11 +60,11 @@ def test_a_captured_control_step_does_what_the_eager_one_does(machine, spec):
 
 def test_free_motion_agrees_with_mujoco_c_for_five_seconds(machine, spec):
     warp = spec.build(machine, "cuda")
-    native = Native(num_worlds=NUM_WORLDS, substeps=5, num_threads=0).build(machine, "cpu")
+    native = NativeSimulator(num_worlds=NUM_WORLDS, substeps=5, num_threads=0).build(machine, "cpu")
     generator = torch.Generator().manual_seed(1)
     speed = torch.tensor(machine.max_speed, dtype=torch.float32)
     velocity = torch.zeros(NUM_WORLDS, machine.num_joints)
-    scene = nominal(NUM_WORLDS)
+    scene = make_nominal_scenes(NUM_WORLDS)
     scene[:, 0] = 6.0  # out of reach
     everywhere = torch.ones(NUM_WORLDS, dtype=torch.bool)
     native.reset(everywhere, native.q.clone(), scene)
@@ -87,7 +86,7 @@ def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine, spec):
     start = world.q.clone()
     world.step(increment)
     assert world.faults.nonzero().flatten().tolist() == [3]
-    world.reset(world.faults.clone(), start, nominal(NUM_WORLDS, "cuda"))
+    world.reset(world.faults.clone(), start, make_nominal_scenes(NUM_WORLDS, "cuda"))
     world.step(torch.zeros_like(increment))
     assert not world.faults.any()
     torch.testing.assert_close(world.q, start, atol=1e-6, rtol=0)

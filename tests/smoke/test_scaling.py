@@ -106,9 +106,9 @@ def test_two_processes_that_were_stopped_go_on_exactly(run: Path) -> None:
 DIFFER = """
 import sys, torch
 from brokk_rl.errors import DistributedError
-from brokk_rl.rl.distributed import Group
+from brokk_rl.rl.distributed import TrainingGroup
 try:
-    with Group(torch.device("cpu")) as group:
+    with TrainingGroup(torch.device("cpu")) as group:
         group.check_same({"weight": torch.ones(3)})
         group.check_same({"weight": torch.ones(3) + 1e-7 * group.rank.index})
 except DistributedError as error:
@@ -128,12 +128,12 @@ def test_processes_that_no_longer_agree_stop(tmp_path: Path) -> None:
 LEARN = """
 import copy, sys, torch
 from test_rl_ppo import _algorithm, _learn, _roll_out
-from brokk_rl import ranks
-from brokk_rl.rl.distributed import Group
+from brokk_rl import distributed
+from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.ppo import DevicePPO
 from rsl_rl.algorithms import PPO
-name = sys.argv[1] if sys.argv[1] == "cpu" else f"cuda:{ranks.own().local}"
-with Group(torch.device(name)) as group:
+name = sys.argv[1] if sys.argv[1] == "cpu" else f"cuda:{distributed.own().local}"
+with TrainingGroup(torch.device(name)) as group:
     device, index = str(group.device), group.rank.index
     numbers = {"global_rank": index, "local_rank": group.rank.local, "world_size": group.rank.count}
     for changes in ({}, {"schedule": "fixed"}, {"normalize_advantage_per_mini_batch": True}):

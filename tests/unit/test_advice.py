@@ -12,18 +12,18 @@ import training as runs
 from composed import option
 from hydra.utils import instantiate
 
-from actuators.person import Person
+from actuators.person import HumanFollower
 from brokk_rl.checks import check_task
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
-from brokk_rl.observation import Encoder
+from brokk_rl.observation import ObservationEncoder
 from brokk_rl.rl.vec_env import ControlLoop
-from tasks.advice import Advice
+from tasks.advice import AdviceConfig
 
 CPU = torch.device("cpu")
 
 
-def advice(**changes: Any) -> Advice:
+def advice(**changes: Any) -> AdviceConfig:
     numbers = {
         "delay_s": 0.3,
         "lag_s": 0.15,
@@ -32,15 +32,15 @@ def advice(**changes: Any) -> Advice:
         "hold_s": 0.3,
         "settle_s": 1.5,
     }
-    return Advice(**(numbers | changes))
+    return AdviceConfig(**(numbers | changes))
 
 
-def person(**changes: Any) -> Person:
+def person(**changes: Any) -> HumanFollower:
     numbers: dict[str, Any] = {
         "delay_s": 0.3, "lag_s": 0.15, "attention_s": 0.0, "gain": 1.0, "tremor": 0.0, "dead_zone": 0.0, "joints_at_once": None,
         "grip_s": 0.0,
     }  # fmt: skip
-    return Person(**(numbers | changes))
+    return HumanFollower(**(numbers | changes))
 
 
 def task(name: str = "borehole_insertion", **changes: Any) -> Any:
@@ -139,7 +139,7 @@ def test_a_task_that_proposes_to_a_person_keeps_the_promises_of_a_task(
 @pytest.mark.parametrize("with_pitch", [False, True])
 def test_the_vector_holds_the_proposals_at_its_end(with_pitch: bool, machine: Machine) -> None:
     scaling = option("task", "goal_pose" if with_pitch else "borehole_insertion").scaling
-    encoder = Encoder(machine, scaling, torch.tensor, torch.cat, with_proposals=True)
+    encoder = ObservationEncoder(machine, scaling, torch.tensor, torch.cat, with_proposals=True)
     target, q, u, proposed = (
         torch.rand(2, 3),
         torch.rand(2, 13, 5),

@@ -13,16 +13,15 @@ from composed import option
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import Windows
-from diagnosis import certainty, remainder, verdict
-from diagnosis.candidates import Candidates
-from diagnosis.certainty import Certainty
-from diagnosis.engine import Findings, Prices
-from diagnosis.evidence import Evidence
-from diagnosis.noise import Noise
-from diagnosis.repair import Repair
+from brokk_rl.open_loop import FreeRunWindows
+from diagnosis import calibration, decision, residual_model
+from diagnosis.calibration import Certainty
+from diagnosis.detection import Findings, Prices
+from diagnosis.effect_library import Candidates
+from diagnosis.refine import Repair
+from diagnosis.residuals import ErrorCovariance, Evidence
 from diagnosis.search import Chosen
-from exam.calibration import Item, halves, logistic
+from exam.calibration import WeighedCase, fit_logistic, split_by_family
 
 
 @pytest.fixture
@@ -34,7 +33,7 @@ def moving(
     machine: Machine, random: np.random.Generator, windows: int = 60, steps: int = 20
 ) -> Evidence:
     """Returns a simulator's motion in levels, whose errors have a noise of 1."""
-    full = machine.max_speed * machine.period_s * remainder.SPAN
+    full = machine.max_speed * machine.period_s * residual_model.SPAN
     way = (
         np.repeat(random.uniform(-0.4, 0.4, (windows, steps // 5, machine.num_joints)), 5, 1) * full
     )
@@ -47,7 +46,9 @@ def moving(
         machine=machine, running_s=np.linspace(0.0, 1800.0, windows), cut=cut
     )
     white = {"whitened_joint": lambda columns, j: columns.reshape(-1, columns.shape[-1])}
-    base = start[:, None] + np.cumsum(np.repeat(way, remainder.SPAN, 1) / remainder.SPAN, 1)
+    base = start[:, None] + np.cumsum(
+        np.repeat(way, residual_model.SPAN, 1) / residual_model.SPAN, 1
+    )
     return cast(
         Evidence, SimpleNamespace(way=way, base=base, start=start, candidates=candidates, **white)
     )
@@ -65,27 +66,27 @@ def moving(
         ("running time", lambda m: m.own * m.time[-1]),
         ("timing over the running time", lambda m: m.slip * m.time[0]),
         ("what it did before", lambda m: m.own * m.faded(np.minimum(m.work, 1.0), 0.94)),
-        (remainder.STARTS, lambda m: np.diff(m.own, axis=1, prepend=m.own[:, :1])),
+        (residual_model.STARTS, lambda m: np.diff(m.own, axis=1, prepend=m.own[:, :1])),
         (
-            remainder.CURVE,
+            residual_model.CURVE,
             lambda m: np.sign(m.own) * np.maximum(np.abs(m.share[..., m.j]) - 0.2, 0.0),
         ),
     ],
 )
 def test_what_is_left_is_traced_to_what_it_depends_on(
-    machine: Machine, clue: str, error: remainder.Callable
+    machine: Machine, clue: str, error: residual_model.Callable
 ) -> None:
     random = np.random.default_rng(0)
     evidence = moving(machine, random)
-    motion = remainder.Motion(evidence, 2)
+    motion = residual_model.Motion(evidence, 2)
     column, own = error(motion).ravel(), motion.own.ravel()
     column = (
-        column if clue in remainder.FORMS else column - own * (own @ column) / (own @ own)
+        column if clue in residual_model.FORMS else column - own * (own @ column) / (own @ own)
     )  # another gain is form
     z = random.standard_normal((machine.num_joints, column.size))
     z[2] += 0.5 * column / column.std()
-    earned = remainder.predictable(evidence, z)
-    best = list(remainder.CLUES)[int(earned[:, 2].argmax())]
+    earned = residual_model.predictable(evidence, z)
+    best = list(residual_model.CLUES)[int(earned[:, 2].argmax())]
     assert best == clue and earned[:, 2].max() > 30.0
     assert np.delete(earned, 2, 1).max() < 6.0, "chance earns little on the other joints"
 
@@ -93,7 +94,7 @@ def test_what_is_left_is_traced_to_what_it_depends_on(
 def test_work_is_remembered_from_window_to_window_of_a_recording_and_no_further(
     machine: Machine,
 ) -> None:
-    motion = remainder.Motion(
+    motion = residual_model.Motion(
         moving(machine, np.random.default_rng(6), windows=4), 2
     )  # two windows a recording
     worked = np.zeros((4, 20))
@@ -110,18 +111,18 @@ def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> 
     # before
     random, noise = (
         np.random.default_rng(7),
-        Noise(sensor=1e-5, change=0.0, wander=0.05, memory=0.01),
+        ErrorCovariance(sensor=1e-5, change=0.0, wander=0.05, memory=0.01),
     )
     windows, joints = 120, machine.num_joints
     way = (
-        np.repeat(random.uniform(0.02, 0.05, (windows, 20, joints)), remainder.SPAN, 1)
-        / remainder.SPAN
+        np.repeat(random.uniform(0.02, 0.05, (windows, 20, joints)), residual_model.SPAN, 1)
+        / residual_model.SPAN
     )
     before, start = np.cumsum(way, 1), np.zeros((windows, joints))
-    steady = np.repeat(0.05 * random.standard_normal((windows, 20, joints)), remainder.SPAN, 1)
+    steady = np.repeat(0.05 * random.standard_normal((windows, 20, joints)), residual_model.SPAN, 1)
     measured = 0.5 * np.cumsum(way * (1.0 + steady), 1)
     q = np.concatenate([start[:, None], measured], 1)
-    cut = Windows(np.zeros((windows, 100, joints)), q, np.repeat("one", windows), 1, 1)
+    cut = FreeRunWindows(np.zeros((windows, 100, joints)), q, np.repeat("one", windows), 1, 1)
     candidates = Candidates(cast(Actuator, None), machine, cut, np.zeros(windows), 0)
     evidence = Evidence(
         candidates, [noise] * joints, np.ones((windows, joints), dtype=bool), runs=before
@@ -130,17 +131,17 @@ def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> 
     repair = Repair(
         [], none.astype(bool), none, none[None], 0.5 * before, 0.5 * before, evidence.z, none
     )
-    left = remainder.repaired(evidence, repair)
+    left = residual_model.repaired(evidence, repair)
     np.testing.assert_allclose(left.z.std(1), 1.0, atol=0.06)
-    np.testing.assert_allclose(remainder.strayed(left, left.error), 1.0, atol=0.25)
+    np.testing.assert_allclose(residual_model.strayed(left, left.error), 1.0, atol=0.25)
     assert evidence.whitened(left.error[None]).std() == pytest.approx(0.5, abs=0.03)
-    assert remainder.repaired(evidence, None) is evidence
+    assert residual_model.repaired(evidence, None) is evidence
 
 
 def test_free_runs_stray_as_far_as_their_noise_says() -> None:
     random, noise = (
         np.random.default_rng(1),
-        Noise(sensor=1e-3, change=0.03, wander=0.05, memory=12.0),
+        ErrorCovariance(sensor=1e-3, change=0.03, wander=0.05, memory=12.0),
     )
     way = np.repeat(random.uniform(-0.05, 0.05, (1, 4)), 5, 1)
     root = np.linalg.cholesky(noise.covariance(way)[0])
@@ -149,7 +150,9 @@ def test_free_runs_stray_as_far_as_their_noise_says() -> None:
 
 
 def test_the_error_of_a_form_is_added_to_that_of_a_size() -> None:
-    low, size, high = certainty.widened(np.array([0.5 - 1.96 * 0.03, 0.5, 0.5 + 1.96 * 0.03]), 0.08)
+    low, size, high = calibration.widened(
+        np.array([0.5 - 1.96 * 0.03, 0.5, 0.5 + 1.96 * 0.03]), 0.08
+    )
     assert (
         size == 0.5
         and high - size == pytest.approx(1.96 * 0.05)
@@ -163,13 +166,13 @@ def test_weights_of_signs_are_those_that_made_the_truth() -> None:
         {"constant": 1.0, "margin": m, "names": n} for m, n in random.standard_normal((6000, 2))
     ]
     true = [
-        random.random() < certainty.chance({"constant": -1.0, "margin": 2.0, "names": 0.0}, one)
+        random.random() < calibration.chance({"constant": -1.0, "margin": 2.0, "names": 0.0}, one)
         for one in signs
     ]
     begin = {"constant": 0.0, "margin": 0.5, "names": 1.0}
-    found = logistic(signs, true, begin)
+    found = fit_logistic(signs, true, begin)
     assert found == pytest.approx({"constant": -1.0, "margin": 2.0, "names": 0.0}, abs=0.15)
-    few = logistic(
+    few = fit_logistic(
         signs[:4], true[:4], begin
     )  # a handful of answers changes little but how often anything is true
     assert [few[name] for name in ("margin", "names")] == pytest.approx([0.5, 1.0], abs=0.2)
@@ -189,9 +192,9 @@ def found(subsets: tuple[str, ...], others: tuple[str, ...] = ()) -> Findings:
 def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
     monkeypatch: pytest.MonkeyPatch, weights: Certainty, shown: float, unknown: bool
 ) -> None:
-    monkeypatch.setattr(verdict, "named_chances", lambda *_: {"t": shown, "a": 0.4})
-    monkeypatch.setattr(verdict, "unknown_chance", lambda *_: 0.7)
-    assert verdict.is_unknown(found(("a", ""), ("t",)), cast(Prices, None), weights) is unknown
+    monkeypatch.setattr(decision, "named_chances", lambda *_: {"t": shown, "a": 0.4})
+    monkeypatch.setattr(decision, "unknown_chance", lambda *_: 0.7)
+    assert decision.is_unknown(found(("a", ""), ("t",)), cast(Prices, None), weights) is unknown
 
 
 def test_what_was_named_only_beside_another_goes_with_it(
@@ -204,13 +207,13 @@ def test_what_was_named_only_beside_another_goes_with_it(
         frozenset("d"): {"d": 0.3},
     }
     monkeypatch.setattr(
-        verdict, "named_chances", lambda found, *_: beside.get(found.chosen.names, {"a": 0.9})
+        decision, "named_chances", lambda found, *_: beside.get(found.chosen.names, {"a": 0.9})
     )
 
     def kept(subsets: tuple[str, ...]) -> tuple[set[str], ...]:
         return tuple(
             set(one)
-            for one in verdict.likely(found(subsets), cast(Prices, None), weights).chosen.subsets
+            for one in decision.likely(found(subsets), cast(Prices, None), weights).chosen.subsets
         )
 
     assert kept(("ab", "c", "")) == ({"a"}, set(), set())
@@ -218,8 +221,8 @@ def test_what_was_named_only_beside_another_goes_with_it(
 
 
 def test_no_answer_is_surer_than_answers_can_tell(weights: Certainty) -> None:
-    sure = certainty.right(margin=1e6, adds=1.0, size=1.0, names=1, outside=-6.0)
-    assert certainty.chance({**weights.right, "margin": 5.0}, sure) == pytest.approx(
+    sure = calibration.right(margin=1e6, adds=1.0, size=1.0, names=1, outside=-6.0)
+    assert calibration.chance({**weights.right, "margin": 5.0}, sure) == pytest.approx(
         1.0 / (1.0 + np.exp(-6.0))
     )
 
@@ -232,8 +235,8 @@ def test_a_missing_or_unknown_sign_is_named(weights: Certainty) -> None:
 
 
 def test_halves_to_fit_and_to_judge_share_no_family() -> None:
-    def item(effects: list[str], outside: str | None) -> Item:
-        return Item(
+    def item(effects: list[str], outside: str | None) -> WeighedCase:
+        return WeighedCase(
             {
                 "effects": [{"effect": e} for e in effects],
                 "outside": {"ailment": outside} if outside else None,
@@ -248,6 +251,6 @@ def test_halves_to_fit_and_to_judge_share_no_family() -> None:
         item([], None),
         item([], None),
     ] * 3
-    first, second = halves(cases)
+    first, second = split_by_family(cases)
     assert len(first) + len(second) == len(cases)
     assert {one.family for one in first} & {one.family for one in second} <= {"none"}

@@ -13,17 +13,17 @@ import pytest
 import torch
 from composed import option
 
-from actuators.effects.affected import Affected
 from actuators.effects.command import DeadBand
+from actuators.effects.composition import Affected
 from actuators.effects.speed import Compliance, FlowGain
-from actuators.models.lag import Lag
+from actuators.models.lag import FirstOrderLag
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Effect
 from brokk_rl.errors import RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import already, answer, case, library, prescription, simulator
+from diagnosis import answer, baseline, case, effect_library, pipeline
 from diagnosis.answer import (
     Answer,
     Estimate,
@@ -36,11 +36,11 @@ from diagnosis.answer import (
     Where,
 )
 from diagnosis.case import Case
-from diagnosis.conclusion import Diagnosis
-from diagnosis.engine import Prices
+from diagnosis.detection import Prices
+from diagnosis.pipeline import Diagnosis
 
 CPU = torch.device("cpu")
-PLANT = Lag(
+PLANT = FirstOrderLag(
     dead_time_s=0.31,
     dead_band_extend=0.07,
     dead_band_retract=0.1,
@@ -109,16 +109,23 @@ def diagnosed(
     axis: Machine, reference: Sequence[Recording], effects: dict[str, Effect], folder: Path
 ) -> Answer:
     given = Case(axis, reference, driven(axis, effects, 2, 100.0, 2))
-    base = simulator.fitted(given, option("fit", "valve"), folder, 0, CPU)
+    base = baseline.fitted(given, option("fit", "valve"), folder, 0, CPU)
     thresholds, generator = option("thresholds", "default"), np.random.default_rng(0)
     excitations = {"levels": option("excitation", "levels")}
     certainty = option("certainty", "default")
     work = Diagnosis(
-        given, base, library.load(axis), PRICES, certainty, thresholds, excitations, generator
+        given,
+        base,
+        effect_library.load_effects(axis),
+        PRICES,
+        certainty,
+        thresholds,
+        excitations,
+        generator,
     )
     outcome = work.run(lambda doing, done: None)
     outcome.save(folder)
-    return answer.read(folder / answer.FILE)
+    return answer.read_answer(folder / answer.ANSWER_FILE)
 
 
 def test_a_speed_that_changed_is_found_on_a_single_axis_without_geometry(
@@ -149,10 +156,13 @@ def test_what_the_reference_shows_already_is_put_around_the_simulator(
     soft = driven(
         axis, {"compliance": Compliance(joints="all", ringing_s=0.3, damping=0.12)}, 3, 120.0, 4
     )
-    kinds, fit = library.load(axis, ("compliance", "dead_band", "lag")), option("fit", "valve")
+    kinds, fit = (
+        effect_library.load_effects(axis, ("compliance", "dead_band", "lag")),
+        option("fit", "valve"),
+    )
     given = Case(axis, soft, soft[:1])
-    after = simulator.fitted(
-        given, fit, tmp_path, 0, CPU, lambda base: already.refined(base, kinds, axis)
+    after = baseline.fitted(
+        given, fit, tmp_path, 0, CPU, lambda base: baseline.refined(base, kinds, axis)
     )
     ((kind, values),) = after.field.evidence.candidates.fixed
     assert kind.name == "compliance" and values["ringing_s"][0, 0] == pytest.approx(0.3, abs=0.1)
@@ -204,8 +214,8 @@ def test_recordings_of_another_machine_are_refused(tmp_path: Path, machine: Mach
     )
     for part in ("reference", "field"):
         one = driven(other, {}, 1, 10.0, 3)[0]
-        record.write(
-            dataclasses.replace(one, metadata={"fingerprint": record.stamp(other)}),
+        record.write_recording(
+            dataclasses.replace(one, metadata={"fingerprint": record.format_fingerprint(other)}),
             tmp_path / part / "a.parquet",
         )
     with pytest.raises(RecordingError, match="limits differ"):
@@ -217,7 +227,7 @@ def test_too_little_reference_to_judge_by_is_refused(
 ) -> None:
     given = Case(axis, reference[:1], reference[1:])
     with pytest.raises(RecordingError, match="not fitted to"):
-        simulator.fitted(given, option("fit", "valve"), tmp_path, 0, CPU)
+        baseline.fitted(given, option("fit", "valve"), tmp_path, 0, CPU)
 
 
 def said() -> Answer:
@@ -251,17 +261,17 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
     }
     assert found["where"]["joints"]["q3"] == {"rmse_rad": 0.03, "floor_rad": 0.002, "share": 1.0}
     assert found["gap"]["before"] == {"rmse_rad": 0.03}
-    assert answer.read(path) == said()
+    assert answer.read_answer(path) == said()
     path.write_text(json.dumps(found | {"schema": 2}))
     with pytest.raises(RecordingError, match="schema 2"):
-        answer.read(path)
+        answer.read_answer(path)
 
 
 def test_training_takes_the_found_effects_as_they_are(
     tmp_path: Path, machine: Machine, brokk: Callable[..., Any]
 ) -> None:
-    path = tmp_path / prescription.FILE
-    prescription.write(said(), library.load(machine), path)
+    path = tmp_path / pipeline.EFFECTS_FILE
+    pipeline.write_effects(said(), effect_library.load_effects(machine), path)
     done = brokk("mode=train", f"effect=@{path}", "--cfg", "job")
     assert done.code == 0, done.err
     text = done.out[done.out.index("backlash:") :]

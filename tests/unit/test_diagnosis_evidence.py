@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from actuators.models.valve import Pose
+from actuators.models.valve import PoseFeatures
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
-from diagnosis import around, gap, library, noise
-from diagnosis.evidence import rays
-from diagnosis.noise import Noise
-from diagnosis.search import Table, choose
-from diagnosis.shapes import rays_of
-from diagnosis.sizes import Shape, earned, fitted, plain
-from diagnosis.tied import tied
+from diagnosis import effect_library, gap, nonadditive_refit, residuals
+from diagnosis.residuals import ErrorCovariance, rays
+from diagnosis.responses import Shape, earned, fitted, plain, rays_of
+from diagnosis.search import Table, bind_shared_sizes, choose
 
 
 def motion(random: np.random.Generator, rows: int = 80, steps: int = 60) -> np.ndarray:
@@ -26,7 +23,7 @@ def motion(random: np.random.Generator, rows: int = 80, steps: int = 60) -> np.n
 def test_errors_of_a_wandering_speed_are_white_after_division_by_their_noise() -> None:
     random, truth = (
         np.random.default_rng(0),
-        Noise(sensor=4e-4, change=0.04, wander=0.05, memory=15.0),
+        ErrorCovariance(sensor=4e-4, change=0.04, wander=0.05, memory=15.0),
     )
     way = motion(random)
     error = np.stack(
@@ -35,7 +32,7 @@ def test_errors_of_a_wandering_speed_are_white_after_division_by_their_noise() -
     z = (truth.whitener(way) @ error[..., None])[..., 0]
     assert z.std() == pytest.approx(1.0, abs=0.03)
     assert abs(np.corrcoef(z[:, :-1].ravel(), z[:, 1:].ravel())[0, 1]) < 0.05
-    found = noise.fit(error, way)
+    found = residuals.fit_noise(error, way)
     assert found.sensor == pytest.approx(truth.sensor, rel=0.2)
     assert found.wander == pytest.approx(truth.wander, rel=0.25)
 
@@ -43,7 +40,7 @@ def test_errors_of_a_wandering_speed_are_white_after_division_by_their_noise() -
 def test_what_a_coarse_reading_adds_to_one_increment_it_takes_from_the_next() -> None:
     random, truth = (
         np.random.default_rng(9),
-        Noise(sensor=1e-4, change=0.0, wander=0.0, memory=10.0, reading=2e-3),
+        ErrorCovariance(sensor=1e-4, change=0.0, wander=0.0, memory=10.0, reading=2e-3),
     )
     error = np.diff(truth.reading * random.standard_normal((4000, 13)), axis=1)
     covariance = truth.covariance(np.zeros((1, 12)))[0]
@@ -59,8 +56,8 @@ def test_what_a_coarse_reading_adds_to_one_increment_it_takes_from_the_next() ->
 def test_increments_add_up_to_the_way_since_the_start() -> None:
     random = np.random.default_rng(1)
     paths, start = random.standard_normal((2, 3, 20, 1)), random.standard_normal((3, 1))
-    found = noise.increments(paths, start)
-    assert found.shape == (2, 3, 20 // noise.SPAN, 1)
+    found = residuals.to_increments(paths, start)
+    assert found.shape == (2, 3, 20 // residuals.SPAN, 1)
     np.testing.assert_allclose(found.sum(2), paths[:, :, -1] - start, atol=1e-12)
 
 
@@ -96,7 +93,9 @@ def test_what_an_effect_earns_is_its_bayes_factor() -> None:
     for size in (0.0, 0.6):
         z = size * column + random.standard_normal(400)
         fine = np.linspace(-2.0, 2.0, 4001)
-        likely = -noise.loss(z[:, None] - fine * column[:, None], 0) + noise.loss(z)
+        likely = -residuals.robust_loss(
+            z[:, None] - fine * column[:, None], 0
+        ) + residuals.robust_loss(z)
         whole = np.trapezoid(
             np.exp(likely - 0.5 * fine**2) / np.sqrt(2.0 * np.pi), fine
         )  # over the prior of the size
@@ -214,9 +213,11 @@ def test_a_cause_that_all_joints_share_gets_the_size_that_most_of_them_have(
         joint(size * x + random.standard_normal(800), {"clock_offset": [line(x)]})
         for size, x in zip(sizes, columns, strict=True)
     ]
-    (kind,) = library.load(machine, ("clock_offset",))
+    (kind,) = effect_library.load_effects(machine, ("clock_offset",))
     grown = {"clock_offset": rays(kind)}
-    ways, shapes = tied(frozenset(grown), tables, grown, [table.shapes for table in tables])
+    ways, shapes = bind_shared_sizes(
+        frozenset(grown), tables, grown, [table.shapes for table in tables]
+    )
     (way,) = ways["clock_offset"]
     assert way.is_tied and way.sizes[1] == pytest.approx(0.5, abs=0.1) and way.sizes[-1] < 0.8
     for mine, column in zip(shapes, columns, strict=True):
@@ -243,7 +244,7 @@ def test_shares_of_effects_that_pay_only_together_are_equal_and_add_up() -> None
 def test_the_weight_of_a_planar_arm_by_sums_of_angles_is_that_of_the_mechanics(
     machine: Machine,
 ) -> None:
-    pose = Pose(machine, torch.device("cpu"))
+    pose = PoseFeatures(machine, torch.device("cpu"))
     lower, upper = (
         torch.as_tensor(side, dtype=torch.float32) for side in (machine.lower, machine.upper)
     )
@@ -265,17 +266,19 @@ def test_of_two_effects_that_are_alike_one_stays() -> None:
             "c": [line(random.standard_normal(800))],
         },
     )
-    kept = around.paying([table], [frozenset("abc")], lambda j, subset: 4.0 * len(subset), 5.0)
-    assert len(kept[0]) == 1 and kept[0] <= frozenset("ab")
-    assert around.paying([table], [frozenset("c")], lambda j, subset: 4.0 * len(subset), 5.0) == (
-        frozenset(),
+    kept = nonadditive_refit.paying(
+        [table], [frozenset("abc")], lambda j, subset: 4.0 * len(subset), 5.0
     )
+    assert len(kept[0]) == 1 and kept[0] <= frozenset("ab")
+    assert nonadditive_refit.paying(
+        [table], [frozenset("c")], lambda j, subset: 4.0 * len(subset), 5.0
+    ) == (frozenset(),)
 
 
 def test_an_effect_that_rings_is_simulated_at_sizes_so_close_that_those_between_are_in_step(
     machine: Machine,
 ) -> None:
-    kind = next(kind for kind in library.load(machine) if kind.name == "compliance")
+    kind = next(kind for kind in effect_library.load_effects(machine) if kind.name == "compliance")
     number, t_s = kind.numbers["ringing_s"], np.arange(0.0, 1.5, machine.period_s)
 
     def ringing(sizes: np.ndarray) -> np.ndarray:

@@ -12,20 +12,19 @@ import pytest
 import torch
 from composed import option
 
-from actuators.effects.affected import Affected
 from actuators.effects.command import DeadBand, Saturation
-from actuators.models.lag import Lag
+from actuators.effects.composition import Affected
+from actuators.models.lag import FirstOrderLag
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import gap, library, repair, simulator
+from diagnosis import baseline, effect_library, gap, refine
 from diagnosis.case import Case
-from diagnosis.evidence import rays
-from diagnosis.noise import Noise
-from diagnosis.reach import Reach
+from diagnosis.gap import Reach
+from diagnosis.residuals import ErrorCovariance, rays
 
 CPU = torch.device("cpu")
-LINEAR = Lag(
+LINEAR = FirstOrderLag(
     dead_time_s=0.0,
     dead_band_extend=0.0,
     dead_band_retract=0.0,
@@ -148,19 +147,22 @@ def test_a_dead_band_and_a_saturation_far_beyond_the_typical_are_fitted_together
     axis: Machine, tmp_path: Path
 ) -> None:
     case = Case(axis, [], [driven(axis, seed) for seed in (1, 2)])
-    base = simulator.given(case, LINEAR, option("fit", "valve"), tmp_path, 0, CPU)
+    base = baseline.given(case, LINEAR, option("fit", "valve"), tmp_path, 0, CPU)
     assert base.is_flexible and base.nulls  # the floor is that of a flexible model
     evidence = base.field.evidence
-    ways = {kind.name: rays(kind) for kind in library.load(axis, ["dead_band", "saturation"])}
+    ways = {
+        kind.name: rays(kind)
+        for kind in effect_library.load_effects(axis, ["dead_band", "saturation"])
+    }
     all_rays = [ray for name in sorted(ways) for ray in ways[name]]
     known = np.array(
         [[2.5], [2.5], [0.0]]
     )  # a dead band of 0.15, as a search that adds effects up would begin with
-    sizes = repair.searched(
+    sizes = refine.searched(
         evidence, all_rays, np.ones((3, 1), bool), known, np.random.default_rng(0)
     )
     start = [{"dead_band": sizes[:2, 0], "saturation": sizes[2:, 0]}]
-    found = repair.repair(evidence, [frozenset(ways)], ways, start)
+    found = refine.repair(evidence, [frozenset(ways)], ways, start)
     extend, retract, saturation = found.sizes[:, 0] * [0.06, 0.06, -0.25] + [0.0, 0.0, 1.0]
     assert extend == pytest.approx(0.35, abs=0.02) and retract == pytest.approx(0.35, abs=0.02)
     assert saturation == pytest.approx(0.7, abs=0.03)
@@ -171,13 +173,13 @@ def test_a_dead_band_and_a_saturation_far_beyond_the_typical_are_fitted_together
 def test_a_half_of_the_recordings_that_says_nothing_of_a_size_does_not_deny_it(
     axis: Machine,
 ) -> None:
-    held = simulator.held(LINEAR, [(driven(axis, 3, 0.0, gentle=True), 0.0)], axis, 0)
+    held = baseline.held(LINEAR, [(driven(axis, 3, 0.0, gentle=True), 0.0)], axis, 0)
     evidence = replace(
-        held.evidence, noise=[Noise(sensor=4e-4, change=0.01, wander=0.01, memory=10.0)]
+        held.evidence, noise=[ErrorCovariance(sensor=4e-4, change=0.01, wander=0.01, memory=10.0)]
     )
     told = [float(np.square(evidence.z[:, evidence.fold == half]).mean()) for half in (0, 1)]
     assert 10.0 * min(told) < max(told)  # the saturation shows in one half only
-    ways = {kind.name: rays(kind) for kind in library.load(axis, ["saturation"])}
-    found = repair.repair(evidence, [frozenset(ways)], ways, [{"saturation": np.array([1.0])}])
+    ways = {kind.name: rays(kind) for kind in effect_library.load_effects(axis, ["saturation"])}
+    found = refine.repair(evidence, [frozenset(ways)], ways, [{"saturation": np.array([1.0])}])
     np.testing.assert_allclose(found.halves[:, 0, 0], (1.0 - 0.7) / 0.25, atol=0.1)
     assert np.square(found.z).mean() < 0.2 * np.square(evidence.z).mean()

@@ -9,7 +9,7 @@ import torch
 
 from brokk_rl import distributed
 from brokk_rl.errors import ConfigError, DeviceError
-from brokk_rl.rl.distributed import Group, fingerprint
+from brokk_rl.rl.distributed import TrainingGroup, hash_tensors
 from brokk_rl.session import Session
 
 
@@ -85,7 +85,7 @@ def test_each_process_has_its_own_gpu(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_alone_a_group_changes_nothing() -> None:
-    with Group(torch.device("cpu")) as group:
+    with TrainingGroup(torch.device("cpu")) as group:
         assert (
             not group.together
             and group.all(3) == [3]
@@ -100,7 +100,7 @@ def test_alone_a_group_changes_nothing() -> None:
 
 
 def test_figures_of_several_weigh_by_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    group = Group(torch.device("cpu"))
+    group = TrainingGroup(torch.device("cpu"))
     parts = [
         {"x": 1.0, "episodes": 3.0, "fault_rate": 0.0},
         {"x": 0.0, "episodes": 1.0, "fault_rate": 0.5},
@@ -113,7 +113,7 @@ def test_a_fingerprint_sees_the_last_bit() -> None:
     weights = {"a": torch.ones(3), "b": torch.tensor(2.0)}
     nudged = weights | {"b": torch.nextafter(weights["b"], torch.tensor(3.0))}
     assert (
-        fingerprint(weights)
-        == fingerprint({k: v.clone() for k, v in weights.items()})
-        != fingerprint(nudged)
+        hash_tensors(weights)
+        == hash_tensors({k: v.clone() for k, v in weights.items()})
+        != hash_tensors(nudged)
     )

@@ -9,7 +9,7 @@ import torch
 
 from brokk_rl.errors import ConfigError
 from tasks import reward
-from tasks.state import ToolState
+from tasks.reward import ToolState
 
 YES, NO = torch.tensor([True]), torch.tensor([False])
 
@@ -112,7 +112,7 @@ def test_the_papers_total_on_one_state(state: ToolState) -> None:
         "working_distance": 1,
     }
     total = sum(
-        reward.Term(function=f"tasks.reward:{name}", weight=weight)(done)
+        reward.RewardTerm(function=f"tasks.reward:{name}", weight=weight)(done)
         for name, weight in weights.items()
     )
     assert float(total) == pytest.approx(1.6 + 8.0 - 0.0075, rel=1e-5)
@@ -143,7 +143,7 @@ def test_contact_counts_kilonewtons_up_to_ten(state: ToolState) -> None:
 @pytest.mark.parametrize("function", ["tasks.reward:nonsense", "no.such.module:f", "tasks.reward"])
 def test_a_term_that_is_no_function_is_refused(function: str) -> None:
     with pytest.raises(ConfigError, match=r"expected package\.module:function"):
-        reward.Term(function=function, weight=1.0)
+        reward.RewardTerm(function=function, weight=1.0)
 
 
 @pytest.mark.parametrize(

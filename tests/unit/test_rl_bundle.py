@@ -17,9 +17,16 @@ from safetensors.torch import load_file, save_file
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import Encoder
+from brokk_rl.observation import ObservationEncoder
 from brokk_rl.rl import export
-from brokk_rl.rl.policy import Network, Trained, located, make_actor, read_bundle, write_bundle
+from brokk_rl.rl.policy import (
+    NetworkPolicy,
+    TrainedPolicy,
+    locate_bundle,
+    make_actor,
+    read_bundle,
+    write_bundle,
+)
 from brokk_rl.rl.vec_env import ControlLoop
 
 CPU = torch.device("cpu")
@@ -145,8 +152,8 @@ def test_on_the_machine_it_commands_what_it_did_in_the_simulator(
     session = onnxruntime.InferenceSession(
         made.folder / "policy.onnx", providers=["CPUExecutionProvider"]
     )
-    encoder = Encoder(machine, option("task", name).scaling)
-    loop, policy = made.loop, Network(made.actor, made.loop)
+    encoder = ObservationEncoder(machine, option("task", name).scaling)
+    loop, policy = made.loop, NetworkPolicy(made.actor, made.loop)
     loop.begin()
     off, rows = [], 0
     for _ in range(60):
@@ -171,9 +178,9 @@ def test_on_the_machine_it_commands_what_it_did_in_the_simulator(
 
 def test_a_trained_policy_is_read_back_as_it_was_written(bundle: Bundle) -> None:
     groups = dict(bundle.loop.get_observations().items())
-    again = Trained(folder=str(bundle.folder)).build(bundle.loop, 0)
+    again = TrainedPolicy(folder=str(bundle.folder)).build(bundle.loop, 0)
     with torch.no_grad():
-        assert torch.equal(again.act(groups), Network(bundle.actor, bundle.loop).act(groups))
+        assert torch.equal(again.act(groups), NetworkPolicy(bundle.actor, bundle.loop).act(groups))
 
 
 def test_an_empty_folder_holds_no_policy(tmp_path: Path, machine: Machine) -> None:
@@ -220,7 +227,7 @@ def test_a_policy_of_another_machine_names_what_differs(copied: Path, machine: M
 def test_a_policy_of_another_task_is_refused(copied: Path, machine: Machine) -> None:
     loop = runs.plant(machine, option("task", "goal_pose")).build(CPU, 2, 4, 0)
     with pytest.raises(CheckpointError, match=r"do not fit task and machine .*task=…"):
-        Trained(folder=str(copied)).build(loop, 0)
+        TrainedPolicy(folder=str(copied)).build(loop, 0)
 
 
 def test_an_observation_group_that_the_task_does_not_give_is_refused(bundle: Bundle) -> None:
@@ -259,7 +266,7 @@ def test_a_policy_that_ships_is_named_by_package_and_path(
     (package / "__init__.py").touch()
     copied.rename(package / "mine")
     monkeypatch.syspath_prepend(package.parent)
-    assert (located("shipping:mine") / "policy.json").exists()
-    assert located("runs/mine") == Path("runs/mine")
+    assert (locate_bundle("shipping:mine") / "policy.json").exists()
+    assert locate_bundle("runs/mine") == Path("runs/mine")
     with pytest.raises(CheckpointError, match="no package 'missing'"):
-        located("missing:mine")
+        locate_bundle("missing:mine")

@@ -15,8 +15,8 @@ from torch._dynamo.exc import BackendCompilerFailed
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.rl.evaluation import evaluate
-from brokk_rl.rl.policy import Classical, Untrained
+from brokk_rl.rl.evaluation import evaluate_policy
+from brokk_rl.rl.policy import ClassicalPolicy, UntrainedPolicy
 from brokk_rl.rl.vec_env import ControlLoop
 
 CPU = torch.device("cpu")
@@ -138,16 +138,18 @@ def test_the_action_of_a_step_is_in_force_in_that_step(machine: Machine) -> None
 
 def results(loop: ControlLoop, policy: Any, seed: int = 7) -> dict[str, Any]:
     starts = {name: value[: loop.num_envs] for name, value in loop.starts.items()}
-    return evaluate(loop, policy.build(loop, 0), starts, seed, 2)[0]
+    return evaluate_policy(loop, policy.build(loop, 0), starts, seed, 2)[0]
 
 
 def test_evaluating_a_policy_twice_gives_the_same_figures(machine: Machine) -> None:
     loop = make(machine, 32, episode_s=6.0)
-    first = results(loop, Classical())
+    first = results(loop, ClassicalPolicy())
     torch.rand(100)
-    assert results(loop, Classical()) == first and first["episodes"] == 32
+    assert results(loop, ClassicalPolicy()) == first and first["episodes"] == 32
     assert sum(first["terminations"].values()) == 32, "every episode ends in one way"
-    assert results(make(machine, 32, episode_s=6.0), Classical()) == first, "also in another loop"
+    assert results(make(machine, 32, episode_s=6.0), ClassicalPolicy()) == first, (
+        "also in another loop"
+    )
 
 
 def test_every_policy_meets_the_same_holes_and_the_same_errors(machine: Machine) -> None:
@@ -183,7 +185,7 @@ def test_every_policy_meets_the_same_holes_and_the_same_errors(machine: Machine)
 def test_an_untrained_policy_depends_on_its_seed_alone(machine: Machine) -> None:
     loop = make(machine)
     seen = dict(loop.get_observations().items())
-    untrained = Untrained(training=runs.small(max_seconds=1.0))
+    untrained = UntrainedPolicy(training=runs.small(max_seconds=1.0))
     before = torch.get_rng_state()
     first, again, other = (untrained.build(loop, seed).act(seen) for seed in (1, 1, 2))
     assert torch.equal(first, again) and not torch.equal(first, other)
@@ -195,7 +197,7 @@ def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(
 ) -> None:
     loop = make(machine, 4, episode_s=0.5)
     starts = {name: value[:4] for name, value in loop.starts.items()}
-    _, episodes, seen = evaluate(loop, Classical().build(loop, 0), starts, 7, 2)
+    _, episodes, seen = evaluate_policy(loop, ClassicalPolicy().build(loop, 0), starts, 7, 2)
     assert len(episodes) == 2 and seen.shape[1] == 133
     for row, episode in enumerate(episodes):
         assert episode.q[0] == pytest.approx(starts["q"][row].numpy()) and (episode.u[0] == 0).all()

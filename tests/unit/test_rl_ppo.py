@@ -9,8 +9,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from brokk_rl.rl.ppo import DevicePPO
-from brokk_rl.rl.rollout import Rollout
+from brokk_rl.rl.ppo import CapturedRollout, DevicePPO
 
 NUM_ENVS, STEPS, GROUPS = 16, 6, {"actor": ["policy"], "critic": ["policy"]}
 GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 0.3, "std_type": "log"}
@@ -125,7 +124,7 @@ def test_it_goes_on_exactly_from_a_saved_state() -> None:
         assert torch.equal(mine, other)
 
 
-def _check_storage(algorithm: PPO, rollout: Rollout, device: str) -> None:
+def _check_storage(algorithm: PPO, rollout: CapturedRollout, device: str) -> None:
     """Rolls out and checks what is stored against rsl-rl's own functions."""
     seen, rewards = (
         torch.randn(STEPS, NUM_ENVS, 7, device=device),
@@ -162,13 +161,13 @@ def _check_storage(algorithm: PPO, rollout: Rollout, device: str) -> None:
 
 def test_a_rollout_stores_what_rsl_rl_would_store() -> None:
     algorithm = _algorithm(PPO)
-    _check_storage(algorithm, Rollout(algorithm), "cpu")
+    _check_storage(algorithm, CapturedRollout(algorithm), "cpu")
 
 
 @pytest.mark.gpu
 def test_a_captured_rollout_stores_what_rsl_rl_would_store() -> None:
     algorithm = _algorithm(PPO, "cuda")
-    _check_storage(algorithm, Rollout(algorithm), "cuda")
+    _check_storage(algorithm, CapturedRollout(algorithm), "cuda")
 
 
 @pytest.mark.gpu

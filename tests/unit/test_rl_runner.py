@@ -15,7 +15,7 @@ import training as runs
 from brokk_rl.errors import CheckpointError, ConfigError, SimulationError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.train import find_checkpoint
-from brokk_rl.rl.runner import Budget, checkpoints, read_checkpoint
+from brokk_rl.rl.runner import TrainingBudget, list_checkpoints, read_checkpoint
 
 ITERATION = 16 * runs.STEPS
 """Control steps of one iteration."""
@@ -45,18 +45,18 @@ def test_the_budget_of_seconds_ends_training(machine: Machine, tmp_path: Path) -
 
 
 def test_the_first_budget_that_is_spent_counts() -> None:
-    budget = Budget(max_env_steps=100, max_seconds=10.0)
+    budget = TrainingBudget(max_env_steps=100, max_seconds=10.0)
     assert (
         budget.share_spent(50, 2.0) == 0.5
         and budget.share_spent(20, 9.0) == 0.9
         and budget.share_spent(100, 0.0) == 1.0
     )
-    assert Budget(max_env_steps=None, max_seconds=10.0).share_spent(10**9, 5.0) == 0.5
+    assert TrainingBudget(max_env_steps=None, max_seconds=10.0).share_spent(10**9, 5.0) == 0.5
 
 
 def test_training_without_an_end_is_refused() -> None:
     with pytest.raises(ConfigError, match="max_env_steps, max_seconds or both"):
-        Budget(max_env_steps=None, max_seconds=None)
+        TrainingBudget(max_env_steps=None, max_seconds=None)
 
 
 def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(
@@ -67,14 +67,14 @@ def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(
         tmp_path,
         runs.small(max_env_steps=7 * ITERATION, save_interval=2, keep_checkpoints=2),
     )
-    assert [path.name for path in checkpoints(tmp_path)] == ["model_6.pt", "model_7.pt"]
+    assert [path.name for path in list_checkpoints(tmp_path)] == ["model_6.pt", "model_7.pt"]
     assert not list(tmp_path.glob("*.part"))
 
 
 def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None:
     for iteration in (100, 9, 20):
         (tmp_path / f"model_{iteration}.pt").touch()
-    assert [path.name for path in checkpoints(tmp_path)] == [
+    assert [path.name for path in list_checkpoints(tmp_path)] == [
         "model_9.pt",
         "model_20.pt",
         "model_100.pt",

@@ -8,18 +8,18 @@ import pytest
 from composed import option
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from brokk_rl.rl.tracking import Off, TensorBoard, Wandb
+from brokk_rl.rl.tracking import NoTracking, TensorBoardTracking, WandbTracking
 
 
 def test_without_a_tracker_nothing_is_written(tmp_path: Path) -> None:
-    tracker = Off().open(tmp_path, {})
+    tracker = NoTracking().open(tmp_path, {})
     tracker.log({"a": 1.0}, 0)
     tracker.close()
     assert not list(tmp_path.iterdir())
 
 
 def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
-    tracker = TensorBoard().open(tmp_path, {})
+    tracker = TensorBoardTracking().open(tmp_path, {})
     for step in range(3):
         tracker.log({"episode/success_strict": 0.1 * step, "loss/value": 2.0}, step)
     tracker.close()
@@ -35,7 +35,7 @@ def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
 
 def test_wandb_is_offline_unless_asked() -> None:
     assert option("tracking", "wandb").mode == "offline" and isinstance(
-        option("tracking", "none"), Off
+        option("tracking", "none"), NoTracking
     )
 
 
@@ -45,7 +45,7 @@ def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(
 ) -> None:
     for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
         monkeypatch.setenv(name, str(tmp_path / "home"))
-    tracking = Wandb(project="tests", group=None, tags=("a", "b"), mode="offline")
+    tracking = WandbTracking(project="tests", group=None, tags=("a", "b"), mode="offline")
     folders = [tmp_path / name for name in ("job_0", "job_1")]
     for folder in folders:
         folder.mkdir()

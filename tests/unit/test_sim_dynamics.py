@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from brokk_rl.sim.warp_dynamics import Dynamics
-from brokk_rl.sim.warp_solver import Solver
+from brokk_rl.sim.warp_dynamics import ArmDynamics
+from brokk_rl.sim.warp_solver import ContactSolver
 
 NUM_WORLDS = 16
 ARM = """
@@ -47,8 +47,8 @@ class Arms:
         self.device_model = mjw.put_model(self.model)
         self.data = mjw.make_data(self.model, NUM_WORLDS, nconmax=16, njmax=40)
         self.device_model.opt.iterations = 50
-        self.dynamics = Dynamics(self.model, self.device_model, self.data)
-        self.solve = Solver(self.device_model, self.data, wp.zeros(NUM_WORLDS, dtype=float))
+        self.dynamics = ArmDynamics(self.model, self.device_model, self.data)
+        self.solve = ContactSolver(self.device_model, self.data, wp.zeros(NUM_WORLDS, dtype=float))
         self.reference = []
         for world in range(NUM_WORLDS):
             data = mujoco.MjData(self.model)

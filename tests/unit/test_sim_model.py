@@ -12,8 +12,13 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Dimension, Machine
 from brokk_rl.sim.model import compile_model
-from brokk_rl.sim.native import Native
-from brokk_rl.sim.scene import HOLE_RADIUS_M, Placement, collision_block, nominal
+from brokk_rl.sim.scene import (
+    HOLE_RADIUS_M,
+    ScenePlacement,
+    build_collision_geoms,
+    make_nominal_scenes,
+)
+from brokk_rl.sim.simulator import NativeSimulator
 
 SMALL_MJCF = """
 <mujoco>
@@ -117,8 +122,8 @@ def test_a_missing_mjcf_says_where_to_put_it(machine):
 
 def test_a_second_machine_is_only_a_machine_and_an_mjcf(machine, tmp_path):
     small = _small(machine, tmp_path / "small.xml")
-    world = Native(num_worlds=2, substeps=5, num_threads=1).build(small, "cpu")
-    scene = nominal(2)
+    world = NativeSimulator(num_worlds=2, substeps=5, num_threads=1).build(small, "cpu")
+    scene = make_nominal_scenes(2)
     scene[:, 0], scene[:, 2] = 1.5, 0.05
     start = torch.zeros(2, 3)
     world.reset(torch.ones(2, dtype=torch.bool), start, scene)
@@ -130,7 +135,7 @@ def test_a_second_machine_is_only_a_machine_and_an_mjcf(machine, tmp_path):
 
 
 def test_the_walls_of_the_hole_lie_exactly_at_its_radius():
-    block = collision_block(1.0, HOLE_RADIUS_M)
+    block = build_collision_geoms(1.0, HOLE_RADIUS_M)
     for name, size, pos, yaw in zip(block.names, block.size, block.pos, block.yaw_rad, strict=True):
         if name.startswith(("slab", "post")):
             outward = pos[:2] / np.linalg.norm(pos[:2])
@@ -140,7 +145,7 @@ def test_the_walls_of_the_hole_lie_exactly_at_its_radius():
 
 @pytest.mark.parametrize(("scale", "radius_m"), [(1.0, 0.05), (1.1, 0.045), (0.9, 0.08)])
 def test_a_hole_has_walls_all_round_and_nothing_inside(scale, radius_m):
-    block = collision_block(scale, radius_m)
+    block = build_collision_geoms(scale, radius_m)
     angles = np.linspace(0, 2 * np.pi, 721)
     for distance, expected in (
         (0.999, False),
@@ -161,12 +166,12 @@ def test_a_hole_has_walls_all_round_and_nothing_inside(scale, radius_m):
 
 def test_scenes_become_the_geoms_of_their_block(machine):
     model = compile_model(machine, 0.01)
-    placement = Placement(model, "cpu", torch.float64)
-    scene = nominal(2)
+    placement = ScenePlacement(model, "cpu", torch.float64)
+    scene = make_nominal_scenes(2)
     scene[1, 3:] = torch.tensor([0.3, 1.1, 0.06])
     size, pos = placement.geoms(scene)
     for row, (scale, radius_m) in enumerate([(1.0, 0.05), (1.1, 0.06)]):
-        block = collision_block(scale, radius_m)
+        block = build_collision_geoms(scale, radius_m)
         np.testing.assert_allclose(size[row, :-1], block.size, atol=1e-7)
         np.testing.assert_allclose(pos[row, :-1], block.pos, atol=1e-7)
     np.testing.assert_allclose(
@@ -178,8 +183,8 @@ def test_scenes_become_the_geoms_of_their_block(machine):
 
 def test_bounding_volumes_hold_every_block(machine):
     model = compile_model(machine, 0.01)
-    placement = Placement(model, "cpu", torch.float64)
-    scene = nominal(4)
+    placement = ScenePlacement(model, "cpu", torch.float64)
+    scene = make_nominal_scenes(4)
     scene[:, 4:] = torch.tensor([[0.5, 0.01], [1.25, 0.01], [0.5, 0.08], [9.0, 9.0]])
     size, _ = placement.geoms(scene)
     assert (size.norm(dim=-1) <= torch.tensor(model.geom_rbound)[placement.geom_ids] + 1e-9).all()

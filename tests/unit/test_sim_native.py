@@ -10,14 +10,15 @@ import torch
 from brokk_rl.errors import ConfigError, DeviceError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.sim.native import Native, NativeWorld
-from brokk_rl.sim.scene import nominal
+from brokk_rl.sim.native_world import NativeWorld
+from brokk_rl.sim.scene import make_nominal_scenes
+from brokk_rl.sim.simulator import NativeSimulator
 
 DOWN = math.pi / 2
 
 
 def _world(machine: Machine, num_worlds: int = 1) -> NativeWorld:
-    return Native(num_worlds=num_worlds, substeps=5, num_threads=2).build(machine, "cpu")
+    return NativeSimulator(num_worlds=num_worlds, substeps=5, num_threads=2).build(machine, "cpu")
 
 
 def _all(num_worlds: int) -> torch.Tensor:
@@ -108,7 +109,7 @@ def test_worlds_do_exactly_what_a_loop_over_plain_mujoco_does(machine):
 def test_the_number_of_threads_changes_nothing(machine):
     finals = []
     for threads in (1, 2):
-        world = Native(num_worlds=8, substeps=5, num_threads=threads).build(machine, "cpu")
+        world = NativeSimulator(num_worlds=8, substeps=5, num_threads=threads).build(machine, "cpu")
         generator = torch.Generator().manual_seed(0)
         for _ in range(20):
             world.step(0.02 * torch.randn(8, 5, generator=generator))
@@ -125,7 +126,7 @@ def test_the_arm_holds_its_place_for_a_minute(machine):
 
 
 def test_the_arm_does_not_creep_under_load(machine):
-    world, scene = _world(machine), nominal(1)
+    world, scene = _world(machine), make_nominal_scenes(1)
     q = _above_hole(machine, scene, torch.tensor([[0.15, 0.0]]))
     world.reset(_all(1), q, scene)
     _lower(machine, world, q, depth_m=0.054)
@@ -155,7 +156,7 @@ def test_free_motion_follows_the_prediction_within_a_milliradian(machine):
 
 def test_a_blocked_joint_pushes_no_harder_than_its_relief_valve_and_does_not_wind_up(machine):
     world = _world(machine)
-    scene = nominal(1)
+    scene = make_nominal_scenes(1)
     q = _above_hole(machine, scene, torch.tensor([[0.25, 0.0]]))
     world.reset(_all(1), q, scene)
     _lower(machine, world, q, depth_m=0.3)
@@ -178,7 +179,7 @@ def _settle(world: NativeWorld) -> torch.Tensor:
 
 
 def test_a_centred_chisel_goes_in_without_force(machine):
-    world, scene = _world(machine), nominal(1)
+    world, scene = _world(machine), make_nominal_scenes(1)
     q = _above_hole(machine, scene, torch.zeros(1, 2))
     world.reset(_all(1), q, scene)
     peak = _lower(machine, world, q, depth_m=0.35)
@@ -189,7 +190,7 @@ def test_a_centred_chisel_goes_in_without_force(machine):
 @pytest.mark.parametrize("offset_mm", [8, 15, 20])
 def test_a_chisel_beside_the_middle_slides_in(machine, offset_mm):
     angles = torch.arange(8) * math.pi / 4
-    scene = nominal(8)
+    scene = make_nominal_scenes(8)
     scene[:, 3] = 0.2  # a turned block, so that the directions meet flats and corners
     world = _world(machine, 8)
     q = _above_hole(machine, scene, offset_mm / 1000 * torch.stack([angles.cos(), angles.sin()], 1))
@@ -201,7 +202,7 @@ def test_a_chisel_beside_the_middle_slides_in(machine, offset_mm):
 
 
 def test_a_chisel_on_the_face_does_not_go_in(machine):
-    scene = nominal(3)
+    scene = make_nominal_scenes(3)
     world = _world(machine, 3)
     q = _above_hole(machine, scene, torch.tensor([[0.12, 0.0], [-0.2, 0.1], [0.0, -0.15]]))
     world.reset(_all(3), q, scene)
@@ -211,7 +212,7 @@ def test_a_chisel_on_the_face_does_not_go_in(machine):
 
 
 def test_a_hole_that_goes_deeper_than_the_ground_can_be_entered(machine):
-    scene = nominal(1)
+    scene = make_nominal_scenes(1)
     scene[:, 2] = 0.2
     world = _world(machine)
     q = _above_hole(machine, scene, torch.zeros(1, 2))
@@ -222,7 +223,7 @@ def test_a_hole_that_goes_deeper_than_the_ground_can_be_entered(machine):
 
 
 def test_a_narrower_hole_is_narrower(machine):
-    scene = nominal(2)
+    scene = make_nominal_scenes(2)
     scene[1, 5] = 0.035
     world = _world(machine, 2)
     q = _above_hole(machine, scene, torch.zeros(2, 2))
@@ -238,7 +239,7 @@ def test_a_reset_touches_only_the_worlds_of_its_mask(machine):
         world.step(torch.full((4, 5), 0.01))
     before = world.state_dict()
     mask = torch.tensor([False, True, False, False])
-    scene = nominal(4)
+    scene = make_nominal_scenes(4)
     scene[:, 0] += 0.3
     world.reset(mask, torch.zeros(4, 5), scene)
     after = world.state_dict()
@@ -252,14 +253,14 @@ def test_an_empty_mask_changes_nothing(machine):
     world = _world(machine, 2)
     world.step(torch.full((2, 5), 0.01))
     before = world.state_dict()
-    world.reset(torch.zeros(2, dtype=torch.bool), torch.zeros(2, 5), nominal(2))
+    world.reset(torch.zeros(2, dtype=torch.bool), torch.zeros(2, 5), make_nominal_scenes(2))
     assert all(torch.equal(tensor, world.state_dict()[name]) for name, tensor in before.items())
 
 
 def test_a_restored_state_goes_on_bit_for_bit(machine):
     generator = torch.Generator().manual_seed(3)
     increments = 0.02 * torch.randn(40, 4, 5, generator=generator)
-    scene = nominal(4)
+    scene = make_nominal_scenes(4)
     scene[:, 4], scene[:, 5] = torch.linspace(0.9, 1.1, 4), torch.linspace(0.045, 0.055, 4)
     world = _world(machine, 4)
     world.reset(_all(4), world.q.clone(), scene)
@@ -285,7 +286,7 @@ def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine):
     assert world.faults.tolist() == [False, True, False]
     world.step(torch.zeros(3, 5))
     assert world.faults.tolist() == [False, True, False]
-    world.reset(world.faults.clone(), start, nominal(3))
+    world.reset(world.faults.clone(), start, make_nominal_scenes(3))
     world.step(torch.zeros(3, 5))
     assert not world.faults.any()
     torch.testing.assert_close(world.q, start, atol=1e-6, rtol=0)
@@ -293,9 +294,11 @@ def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine):
 
 def test_a_gpu_asked_of_the_native_world_says_what_to_do(machine):
     with pytest.raises(DeviceError, match="sim=warp"):
-        Native(num_worlds=1, substeps=5, num_threads=0).build(machine, torch.device("cuda"))
+        NativeSimulator(num_worlds=1, substeps=5, num_threads=0).build(
+            machine, torch.device("cuda")
+        )
 
 
 def test_no_worlds_are_a_config_error():
     with pytest.raises(ConfigError, match="num_worlds"):
-        Native(num_worlds=0, substeps=5, num_threads=0)
+        NativeSimulator(num_worlds=0, substeps=5, num_threads=0)

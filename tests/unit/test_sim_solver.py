@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from brokk_rl.sim.warp_solver import Solver
+from brokk_rl.sim.warp_solver import ContactSolver
 
 NUM_WORLDS = 64
 TOLERANCE = 1e-6
@@ -69,7 +69,7 @@ class Problem:
             mujoco.mj_forward(self.model, data)
             self.reference.append(data)
         self.peak = wp.zeros(NUM_WORLDS, dtype=float)
-        self.solve = Solver(self.warp_model, self.data, self.peak)
+        self.solve = ContactSolver(self.warp_model, self.data, self.peak)
         self.prepare()
 
     def prepare(self):
@@ -220,7 +220,7 @@ def test_a_stopped_slide_takes_the_mean_of_what_it_would_and_what_the_stop_wants
     data.qfrc_applied.assign([[-8.0], [800_000.0]])
     for stage in (mjw.fwd_position, mjw.fwd_velocity, mjw.fwd_actuation, mjw.fwd_acceleration):
         stage(warp_model, data)
-    Solver(warp_model, data, wp.zeros(2, dtype=float))()
+    ContactSolver(warp_model, data, wp.zeros(2, dtype=float))()
     weight, target = data.efc.D.numpy()[0, 0], data.efc.aref.numpy()[0, 0]
     np.testing.assert_allclose(
         data.qacc.numpy(),

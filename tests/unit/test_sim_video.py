@@ -7,8 +7,8 @@ import pytest
 
 from brokk_rl.errors import StorageError
 from brokk_rl.sim import video
-from brokk_rl.sim.probe import working_renderer
-from brokk_rl.sim.scene import nominal
+from brokk_rl.sim.probe import find_renderer
+from brokk_rl.sim.scene import make_nominal_scenes
 
 
 @pytest.fixture
@@ -18,12 +18,12 @@ def motion(machine):
         q=machine.lower + share * (machine.upper - machine.lower),
         u=np.zeros((5, machine.num_joints)),
         force_n=np.zeros(5),
-        scene=nominal(1)[0].numpy(),
+        scene=make_nominal_scenes(1)[0].numpy(),
     )
 
 
 def test_without_a_gl_library_the_video_is_a_drawing(machine, motion, tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "working_renderer", lambda: None)
+    monkeypatch.setattr(video, "find_renderer", lambda: None)
     path = video.render_video(machine, motion, tmp_path / "insertion.mp4")
     assert path.stat().st_size > 1000
     assert sorted(file.name for file in tmp_path.glob("*.png")) == [
@@ -32,12 +32,12 @@ def test_without_a_gl_library_the_video_is_a_drawing(machine, motion, tmp_path, 
 
 
 def test_a_renderer_that_fails_still_leaves_a_drawing(machine, motion, tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "working_renderer", lambda: "nonsense")
+    monkeypatch.setattr(video, "find_renderer", lambda: "nonsense")
     assert video.render_video(machine, motion, tmp_path / "insertion.mp4").stat().st_size > 1000
 
 
 def test_a_folder_that_cannot_be_written_is_a_storage_error(machine, motion, tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "working_renderer", lambda: None)
+    monkeypatch.setattr(video, "find_renderer", lambda: None)
     with pytest.raises(StorageError, match="could not be written"):
         video.render_video(machine, motion, tmp_path / "missing" / "insertion.mp4")
 
@@ -46,7 +46,7 @@ def test_a_folder_that_cannot_be_written_is_a_storage_error(machine, motion, tmp
 def test_a_gl_library_gives_pictures_of_the_machine(machine, motion, tmp_path):
     import imageio.v2 as imageio
 
-    if working_renderer() is None:
+    if find_renderer() is None:
         pytest.skip("no GL library works here")
     video.render_video(machine, motion, tmp_path / "insertion.mp4")
     picture = imageio.imread(tmp_path / "insertion_2.png").astype(int)

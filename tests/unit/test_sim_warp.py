@@ -7,14 +7,13 @@ import pytest
 import torch
 
 from brokk_rl.errors import ConfigError, DeviceError
-from brokk_rl.sim.auto import Auto
 from brokk_rl.sim.model import ASSETS
-from brokk_rl.sim.native import Native, NativeWorld
-from brokk_rl.sim.scene import nominal
-from brokk_rl.sim.warp import Warp
+from brokk_rl.sim.native_world import NativeWorld
+from brokk_rl.sim.scene import make_nominal_scenes
+from brokk_rl.sim.simulator import AutoSimulator, NativeSimulator, WarpSimulator
 
 NUM_WORLDS = 8
-WARP = Warp(
+WARP = WarpSimulator(
     num_worlds=NUM_WORLDS,
     substeps=5,
     num_contacts=16,
@@ -26,7 +25,7 @@ WARP = Warp(
 )
 FUSED = dataclasses.replace(WARP, fused=True)
 both = pytest.mark.parametrize("warp", [WARP, FUSED], ids=["staged", "fused"])
-NATIVE = Native(num_worlds=NUM_WORLDS, substeps=5, num_threads=2)
+NATIVE = NativeSimulator(num_worlds=NUM_WORLDS, substeps=5, num_threads=2)
 
 
 def _motion(machine, steps, push):
@@ -103,7 +102,7 @@ def test_a_masked_reset_and_a_restored_state_are_exact(machine, warp):
     before = world.state_dict()
     mask = torch.zeros(NUM_WORLDS, dtype=torch.bool)
     mask[2] = True
-    scene = nominal(NUM_WORLDS)
+    scene = make_nominal_scenes(NUM_WORLDS)
     scene[:, 4] = 1.1
     world.reset(mask, torch.zeros(NUM_WORLDS, machine.num_joints), scene)
     after = world.state_dict()
@@ -124,7 +123,7 @@ def test_a_masked_reset_and_a_restored_state_are_exact(machine, warp):
 @both
 def test_nan_and_a_full_buffer_are_faults_of_their_worlds_alone(machine, warp):
     world = dataclasses.replace(warp, num_worlds=3, num_constraints=2).build(machine, "cpu")
-    start, scene = world.q.clone(), nominal(3)
+    start, scene = world.q.clone(), make_nominal_scenes(3)
     start[2] = torch.tensor([0.0, 0.0, 0.9, 1.0, -0.329])  # deep in the ground: more rows than two
     world.reset(torch.ones(3, dtype=torch.bool), start, scene)
     increment = torch.zeros(3, machine.num_joints)
@@ -155,11 +154,11 @@ def test_what_the_launches_leave_out_is_refused_by_name(machine, tmp_path, drawn
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_an_error_that_says_what_to_do(machine):
-    for spec in (WARP, Auto(native=NATIVE, warp=WARP)):
+    for spec in (WARP, AutoSimulator(native=NATIVE, warp=WARP)):
         with pytest.raises(DeviceError, match="sim=native"):
             spec.build(machine, "cuda")
 
 
 def test_auto_takes_the_threads_on_a_cpu(machine):
-    world = Auto(native=NATIVE, warp=WARP).build(machine, "cpu", num_worlds=3)
+    world = AutoSimulator(native=NATIVE, warp=WARP).build(machine, "cpu", num_worlds=3)
     assert isinstance(world, NativeWorld) and world.num_worlds == 3

@@ -15,7 +15,7 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from tasks.process import REASONS
-from tasks.starts import keep, reachable
+from tasks.starts import check_reachable, join_starts
 
 CPU = torch.device("cpu")
 TASKS = ("borehole_insertion", "goal_pose")
@@ -92,13 +92,13 @@ def test_too_few_reachable_starts_are_an_error_that_says_what_to_change() -> Non
     with pytest.raises(
         ConfigError, match="goal_pose: only 2 of 3 starts were reachable; widen the joint limits"
     ):
-        keep(3, [{"q": torch.zeros(2, 5)}, {"q": torch.zeros(0, 5)}], "goal_pose")
+        join_starts(3, [{"q": torch.zeros(2, 5)}, {"q": torch.zeros(0, 5)}], "goal_pose")
 
 
 def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
     task = option("task", "goal_pose")
     controller = task.classical.build(machine, CPU)
-    found = reachable(
+    found = check_reachable(
         controller, machine, torch.zeros(0, 5), torch.zeros(0, 3), torch.zeros(0), (1.7, 2.4), 0.1
     )
     assert found.shape == (0,)

@@ -11,11 +11,11 @@ import torch
 from composed import option
 
 from brokk_rl.machine import Machine, mask_exclusive_joints
-from tasks.tool_pose import Action, Switch
+from tasks.control import ActionMapping, PhaseSwitch
 
 
-def switch(rule: str) -> Switch:
-    return Switch(rule=rule, reach_m=(1.7, 2.4), height_m=0.2)  # type: ignore[arg-type]
+def switch(rule: str) -> PhaseSwitch:
+    return PhaseSwitch(rule=rule, reach_m=(1.7, 2.4), height_m=0.2)  # type: ignore[arg-type]
 
 
 def seen(reach_m: float, reach_3d_m: float, tip_z_m: float) -> Any:
@@ -77,7 +77,7 @@ FREE = torch.ones(5)
 
 
 def test_no_action_drives_a_joint_into_its_end() -> None:
-    action = Action(kind="residual", scale=1.0, mask=False, limits=True)
+    action = ActionMapping(kind="residual", scale=1.0, mask=False, limits=True)
     lowest, highest = (
         torch.tensor([[-1.0, 0.0, -0.3, -1.0, -1.0]]),
         torch.tensor([[0.0, 1.0, 1.0, 0.4, 1.0]]),
@@ -97,7 +97,7 @@ def test_no_action_drives_a_joint_into_its_end() -> None:
 @pytest.mark.parametrize("kind", ["direct", "residual"])
 def test_q2_never_moves_with_another_joint(kind: str, machine: Machine) -> None:
     torch.manual_seed(0)
-    action = Action(kind=kind, scale=0.5, mask=True, limits=False)  # type: ignore[arg-type]
+    action = ActionMapping(kind=kind, scale=0.5, mask=True, limits=False)  # type: ignore[arg-type]
     positioning = torch.arange(64) % 2 == 0
     exclusive = torch.as_tensor(machine.is_exclusive)
     u = action.command(
@@ -109,7 +109,7 @@ def test_q2_never_moves_with_another_joint(kind: str, machine: Machine) -> None:
 
 
 def test_the_masks_are_the_papers_and_those_of_the_machine(machine: Machine) -> None:
-    action = Action(kind="direct", scale=1.0, mask=True, limits=False)
+    action = ActionMapping(kind="direct", scale=1.0, mask=True, limits=False)
     for positioning, paper in ((True, [0, 1, 0, 0, 0]), (False, [1, 0, 1, 1, 1])):
         flag = torch.tensor([positioning])
         u = action.command(
@@ -133,11 +133,13 @@ def test_direct_and_residual_actions_on_numbers(machine: Machine) -> None:
         torch.tensor([[0.5, 0.5, 0.5, 0.5, -0.25]]),
     )
     rest = (-FREE, FREE, torch.tensor([False]), torch.as_tensor(machine.is_exclusive))
-    direct = Action(kind="direct", scale=0.5, mask=True, limits=False).command(output, base, *rest)
-    residual = Action(kind="residual", scale=0.5, mask=True, limits=False).command(
+    direct = ActionMapping(kind="direct", scale=0.5, mask=True, limits=False).command(
         output, base, *rest
     )
-    unmasked = Action(kind="residual", scale=0.5, mask=False, limits=False).command(
+    residual = ActionMapping(kind="residual", scale=0.5, mask=True, limits=False).command(
+        output, base, *rest
+    )
+    unmasked = ActionMapping(kind="residual", scale=0.5, mask=False, limits=False).command(
         output, base, *rest
     )
     np.testing.assert_allclose(direct[0], [0.2, 0.0, -0.2, 1.0, 0.0], atol=1e-6)

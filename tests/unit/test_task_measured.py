@@ -17,7 +17,7 @@ from hydra.utils import instantiate
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from tasks.measured import Measured
+from tasks.noise import MeasuredNoise
 
 AHEAD = torch.tensor([[0.3 + 2.0, 0.45, 1.9], [0.3, 0.45, 1.9 - 3.0]])
 """Targets 2 m and 3 m from the camera."""
@@ -36,7 +36,7 @@ def table(path: Path, **changes: Any) -> Path:
     return path
 
 
-def measured(**changes: Any) -> Measured:
+def measured(**changes: Any) -> MeasuredNoise:
     return replace(option("task/noise", "measured"), calibration_m=0.0, **changes)
 
 
@@ -118,4 +118,4 @@ def test_the_option_is_chosen_by_name() -> None:
         cfg = hydra.compose(
             "config", ["mode=train", "task/noise=measured", "task.noise.table=nowhere.json"]
         )
-    assert isinstance(instantiate(cfg.task.noise, _convert_="all"), Measured)
+    assert isinstance(instantiate(cfg.task.noise, _convert_="all"), MeasuredNoise)

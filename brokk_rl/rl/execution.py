@@ -1,0 +1,75 @@
+"""Execution of control steps: CUDA graphs, `torch.compile`, and threads on a CPU."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+import torch
+from torch._dynamo.exc import BackendCompilerFailed
+
+from brokk_rl.errors import ConfigError
+
+WARM_UP = 3
+"""Calls before the capture: kernels are compiled and buffers allocated before anything is
+recorded."""
+
+
+def capture_graph(
+    step: Callable[[], None], device: torch.device, gradients: bool = False
+) -> torch.cuda.CUDAGraph:
+    """Returns a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses.
+
+    Args:
+        step: What to capture; called `WARM_UP` times before.
+        device: A CUDA device.
+        gradients: Whether `step` differentiates.
+    """
+    with torch.cuda.device(device), torch.set_grad_enabled(gradients):
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UP):
+                step()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        # gradients remember the stream on which they were first added up; NCCL has a thread that
+        # asks for events meanwhile
+        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+            step()
+    return graph
+
+
+@contextlib.contextmanager
+def report_compile_errors() -> Iterator[None]:
+    """Says what to do where `torch.compile` finds nothing to compile with.
+
+    Raises:
+        ConfigError: Something that is first called in here cannot be compiled.
+    """
+    try:
+        yield
+    except BackendCompilerFailed as error:
+        raise ConfigError(
+            f"rl.fuse: cannot compile the control step ({str(error).splitlines()[0]}); install a C++ compiler (g++), or give "
+            "rl.fuse=false"
+        ) from error
+
+
+@contextlib.contextmanager
+def limit_to_one_thread(device: torch.device | str) -> Iterator[None]:
+    """Keeps torch to one thread meanwhile; nothing changes where `device` is a GPU.
+
+    The tensors of a control step are too small to share. Torch's other threads would only wait for
+    the next one, and they wait spinning, on the cores on which the physics runs; where the computer
+    has other work too, all stand still for the slowest.
+    """
+    before = torch.get_num_threads()
+    if torch.device(device).type != "cpu" or before == 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,111 @@
+"""The world on CPU threads: `mujoco.batch.Batch`, the default without a GPU."""
+
+from __future__ import annotations
+
+import torch
+from mujoco.batch import Batch, SimulationError
+
+from brokk_rl.machine import Machine
+from brokk_rl.sim.drive import DriveReferences
+from brokk_rl.sim.model import compile_model, mask_contact_sensors
+from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
+
+
+class NativeWorld:
+    """Fulfils `brokk_rl.contracts.world.World` with a thread pool; results are the same at any number of threads.
+
+    Args:
+        machine: The machine.
+        num_worlds: `N`.
+        substeps: Physics steps per control period.
+        num_threads: Threads; 0 takes all cores.
+    """
+
+    supports_graphs = False
+
+    def __init__(self, machine: Machine, num_worlds: int, substeps: int, num_threads: int) -> None:
+        self.num_worlds, self.device = num_worlds, torch.device("cpu")
+        self.model = compile_model(machine, machine.period_s / substeps)
+        self._batch = Batch(self.model, num_worlds, num_threads)
+        self._substeps = substeps
+        self._state, self._warning = (
+            torch.from_numpy(self._batch.state),
+            torch.from_numpy(self._batch.warning),
+        )
+        bound = {
+            name: torch.from_numpy(self._batch.bind(name))
+            for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
+        }
+        self._qpos, self._qvel, self._act, self._ctrl, self._mocap_pos, self._mocap_quat = (
+            bound.values()
+        )
+        self._geom_size, self._geom_pos = (
+            torch.from_numpy(self._batch.expand(name)) for name in ("geom_size", "geom_pos")
+        )
+        self._placement = ScenePlacement(self.model, self.device, torch.float64)
+        self._drive = DriveReferences(self.model, machine, num_worlds, self.device, torch.float64)
+        # touch sensors measure in every substep; recording them all catches a peak between two
+        # control steps
+        self._recorded = self._batch.rollout(substeps, record=("sensordata",))
+        self._sensors = torch.from_numpy(self._recorded["sensordata"])
+        self._is_touch = torch.from_numpy(mask_contact_sensors(self.model))
+        self.q = torch.zeros(num_worlds, machine.num_joints)
+        self.contact_force_n = torch.zeros(num_worlds)
+        self.faults = torch.zeros(num_worlds, dtype=torch.bool)
+        home = torch.tensor(machine.home, dtype=torch.float32).expand(num_worlds, -1)
+        self.reset(~self.faults, home, make_nominal_scenes(num_worlds))
+
+    def step(self, increment: torch.Tensor) -> None:
+        """Advances one control period; see `brokk_rl.contracts.world.World`."""
+        self._drive.step(self._qpos, increment, self._act, self._ctrl)
+        try:
+            self._batch.rollout(self._substeps, record=("sensordata",), out=self._recorded)
+        except SimulationError as error:  # those worlds keep the state they had, all others went on
+            self.faults[torch.from_numpy(error.ids)] = True
+        self.contact_force_n.copy_((self._sensors @ self._is_touch).amax(1))
+        self.q.copy_(self._qpos)
+        self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(
+            self._warning.flatten(1).any(1)
+        )
+
+    def bare_step(self) -> None:
+        """Does nothing but `mujoco.batch`: as many substeps, no drive, nothing read out; what `step` is held against."""
+        self._batch.step(nstep=self._substeps)
+
+    def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
+        """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
+        rows = mask.nonzero()[:, 0]
+        if not len(rows):
+            return
+        start, placed = q[rows], scene[rows]
+        self._state[rows] = 0.0
+        self._qpos[rows] = self._act[rows] = start.double()
+        self._drive.reset(mask, q)
+        position, turn = self._placement.pose(placed)
+        self._mocap_pos[rows, 0], self._mocap_quat[rows, 0] = position, turn
+        size, pos = self._placement.geoms(placed)
+        index = (rows[:, None], self._placement.geom_ids)
+        self._geom_size[index], self._geom_pos[index] = size, pos
+        self._warning[rows] = 0
+        self.q[rows], self.contact_force_n[rows], self.faults[rows] = start, 0.0, False
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Returns copies of everything that must be stored to go on bit for bit."""
+        return {name: tensor.clone() for name, tensor in self._stored().items()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Restores what `state_dict` returned."""
+        for name, tensor in self._stored().items():
+            tensor.copy_(state[name])
+
+    def _stored(self) -> dict[str, torch.Tensor]:
+        return {
+            "state": self._state,
+            "warning": self._warning,
+            "reference": self._drive.reference,
+            "geom_size": self._geom_size,
+            "geom_pos": self._geom_pos,
+            "q": self.q,
+            "contact_force_n": self.contact_force_n,
+            "faults": self.faults,
+        }

@@ -1,0 +1,156 @@
+"""How sure an answer is: the chances of what it says, from a few signs, by weights fitted to answers whose truth is known.
+
+Evidence in log likelihood is no probability: simulators, noise and forms of effects are all a
+little wrong, and so a Bayes factor
+of e to 40 is wrong once in twenty. What it is worth is learned from development exams
+(`exam.do=calibrate`): logistic regressions on signs that mean the same on any machine.
+`conf/certainty` holds their weights.
+Axes: `J` joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.spec import spec
+from diagnosis.detection import Findings
+from diagnosis.residual_model import CLUES, CURVE, FORMS, LATER, STARTS, TIME
+
+OUTSIDE = ("constant", "clue", "form", "curve", "scatter", "strays", "tool")
+RIGHT = ("constant", "margin", "adds", "size", "names", "outside")
+NONE = ("constant", "nearest", "outside")
+STAGES = ("timing", "actuation", "sensing", "kinematics", "perception")
+BY_CHANCE = 1.5
+"""Times that a clue must earn what it earns on the reference before it counts."""
+NATS = 10.0
+"""Evidence below is little."""
+MUCH = 50.0
+"""What effects explain is much beyond: then a part that they leave says less, as no form is exactly
+that of the library."""
+MOST = 100.0
+"""The same of a clue's evidence."""
+TELLING = {STARTS: 50.0, CURVE: 1000.0, TIME: 1000.0, LATER: 1000.0}
+"""The same of single clues: real forms differ most in starts and stops, little in their curve, and
+not with the running time."""
+
+
+@spec
+class Certainty:
+    """Weights of signs, and how far forms of effects differ.
+
+    Attributes:
+        outside: Of the signs that the cause lies outside the library; their weighted sum is the
+            logarithm of the odds.
+        right: Of the signs that an effect is rightly named.
+        none: Of the signs that there is nothing to find, where nothing was found.
+        form: By stage: standard deviation of what real forms of an effect add to the error of its
+            size, over the size.
+        temperature: Of effects that were not named: a worth of so much less makes odds of 1 to e.
+    """
+
+    outside: dict[str, float]
+    right: dict[str, float]
+    none: dict[str, float]
+    form: dict[str, float]
+    temperature: float
+
+    def check(self) -> None:
+        known = {"outside": OUTSIDE, "right": RIGHT, "none": NONE, "form": STAGES}
+        for name, signs in known.items():
+            for sign in getattr(self, name):
+                if sign not in signs:
+                    raise ConfigError(
+                        f"certainty.{name}: '{sign}' is no sign; {list_choices(sign, signs)}"
+                    )
+            if missing := [sign for sign in signs if sign not in getattr(self, name)]:
+                raise ConfigError(
+                    f"certainty.{name}: expected a number for {', '.join(missing)} too"
+                )
+        if min(self.form.values()) < 0 or self.temperature <= 0:
+            raise ConfigError("certainty: expected form of 0 or more and temperature above 0")
+
+
+def chance(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
+    """Returns the probability that goes with signs."""
+    return float(1.0 / (1.0 + np.exp(-odds(weights, signs))))
+
+
+def odds(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
+    """Returns the logarithm of the odds, within what answers can tell."""
+    return float(np.clip(sum(weights[name] * value for name, value in signs.items()), -6.0, 6.0))
+
+
+def predicted(findings: Findings) -> np.ndarray:
+    """Returns what clues earn on what is left, beyond what they may on the reference, `(clues, J)`."""
+    return np.maximum(findings.left - BY_CHANCE * findings.left_null, 0.0)
+
+
+def outside(findings: Findings) -> dict[str, float]:
+    """Returns the signs that something is there which no effect of the library is."""
+    stages, left = {one.kind.stage for one in findings.others}, predicted(findings)
+    subsets = zip(findings.tables, findings.chosen.subsets, strict=True)
+    gained = np.array([table.score(subset).total if subset else 0.0 for table, subset in subsets])
+    explained = 1.0 + float(np.log1p(gained.sum() / MUCH))
+    late = "timing" in stages  # frames that come late scatter errors, whatever else is there
+    seen = bool(stages & {"kinematics", "sensing"})
+    clues = {
+        name: float(np.log1p((row / (1.0 + gained / TELLING.get(name, MOST))).max() / NATS))
+        for name, row in zip(
+            CLUES, left, strict=False
+        )  # the curve has not always been a clue of its own
+    }
+    return {
+        "constant": 1.0,
+        "clue": max((value for name, value in clues.items() if name not in FORMS), default=0.0),
+        "form": clues[STARTS],
+        "curve": clues.get(CURVE, 0.0),
+        "scatter": 0.0 if late else _log(findings.scatter) / explained,
+        "strays": _log(findings.strays) / explained,
+        "tool": 0.0 if seen else _log(np.array(findings.tool_left)),
+    }
+
+
+def _log(ratios: np.ndarray) -> float:
+    return float(np.log(np.maximum(ratios, 1.0)).max())
+
+
+def right(margin: float, adds: float, size: float, names: int, outside: float) -> dict[str, float]:
+    """Returns the signs that an effect is rightly named.
+
+    Args:
+        margin: By how much more it is worth than nothing in its place, and than any other effect.
+        adds: Share of what all effects of its joints earn that is lost without it.
+        size: Its largest size, over the typical one.
+        names: Effects that were named.
+        outside: Logarithm of the odds that the cause lies outside.
+    """
+    return {
+        "constant": 1.0,
+        "margin": float(np.arcsinh(margin / NATS)),
+        "adds": float(np.log(np.clip(adds, 0.01, 1.0))),
+        "size": float(np.log(np.clip(size, 0.05, 3.0))),
+        "names": names - 1.0,
+        "outside": outside,
+    }
+
+
+def none(nearest: float, outside: float) -> dict[str, float]:
+    """Returns the signs that there is nothing to find.
+
+    Args:
+        nearest: What the best effect is worth; it was not enough.
+        outside: Logarithm of the odds that the cause lies outside.
+    """
+    return {"constant": 1.0, "nearest": float(np.arcsinh(nearest / NATS)), "outside": outside}
+
+
+def widened(ends: np.ndarray, form: float) -> np.ndarray:
+    """Returns low end, value and high end of a size `(3, …)` with the error of its form added to both sides."""
+    low, value, high = ends
+    more = 1.96 * form * np.abs(value)
+    return np.stack(
+        [value - np.hypot(value - low, more), value, value + np.hypot(high - value, more)]
+    )

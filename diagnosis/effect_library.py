@@ -1,0 +1,335 @@
+"""The registered effects as a diagnosis sees them, and free runs of a simulator with effects around it.
+
+A diagnosis knows effects by their contract only, so that effects of third parties take part.
+Axes: `C` candidates, `W` windows, `K` steps, `J` joints, `L` samples before the free run, `H` of
+them history.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from brokk_rl import registry
+from brokk_rl.contracts.actuator import Actuator, ActuatorModel
+from brokk_rl.errors import BrokkError, ConfigError, list_choices
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.open_loop import FreeRunWindows
+from diagnosis.answer import Estimate
+
+log = logging.getLogger(__name__)
+
+ORDER = {"joints": 0, "speed": 1, "command": 2, "measurement": 4, "kinematics": 5}
+"""From the machine outwards; delays of a command lie outside of what the valve makes of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """An effect of the registry.
+
+    Attributes:
+        name: As in `effect=[name]`.
+        target: The spec.
+        num_joints: `J` of the machine that it is used on.
+    """
+
+    name: str
+    target: Any
+    num_joints: int
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What is known about each of its numbers: `none`, `typical`, `bounds`, `unit`, `per_joint`."""
+        return self.target.numbers
+
+    @property
+    def stage(self) -> str:
+        """On which part of the way from command to estimate it lies."""
+        return self.target.stage
+
+    @property
+    def order(self) -> tuple[int, int]:
+        """Place from the machine outwards."""
+        return ORDER.get(self.target.side, 3), int(self.target.stage == "timing")
+
+    @property
+    def running(self) -> str | None:
+        """Name of the number that is the time since the machine was started; it is given, not fitted."""
+        return getattr(self.target, "running", None)
+
+    @property
+    def together(self) -> bool:
+        """Whether what it does to one joint depends on the others."""
+        return self.target.side == "joints"
+
+    @cached_property
+    def fitted(self) -> tuple[str, ...]:
+        """Numbers that make the effect: those with a neutral value."""
+        return tuple(name for name, number in self.numbers.items() if number.none is not None)
+
+    @cached_property
+    def shaping(self) -> tuple[str, ...]:
+        """Numbers that only shape it, such as a time constant."""
+        return tuple(
+            n for n, number in self.numbers.items() if number.none is None and n != self.running
+        )
+
+    @cached_property
+    def neutral(self) -> Any:
+        """The spec with every number at its neutral or, for one that has none, at its typical value."""
+        values = {
+            n: number.typical if number.none is None else number.none
+            for n, number in self.numbers.items()
+        }
+        if any(field.name == "joints" for field in fields(self.target)):
+            values["joints"] = "all"
+        return self.target(**values)
+
+    def wrap(
+        self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
+    ) -> Any:
+        """Returns `model` with the effect around it, at its neutral value; numbers are written into `parameters`."""
+        return self.neutral.wrap(model, machine, num_envs, device)
+
+    def size(self, name: str) -> float:
+        """Returns typical less neutral value: the natural unit of a number. One without a neutral value: its typical value."""
+        number = self.numbers[name]
+        return number.typical - (number.none or 0.0)
+
+    def clipped(self, name: str, value: np.ndarray) -> np.ndarray:
+        """Returns `value` within the bounds of number `name`."""
+        return np.clip(value, *self.numbers[name].bounds)
+
+
+def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[Kind]:
+    """Returns the effects of the registry that can be simulated on `machine`, or of these `names`.
+
+    Raises:
+        ConfigError: a name is unknown, or an effect cannot be imported.
+    """
+    found = {}
+    for option in registry.list_options():
+        if option.group != "effect":
+            continue
+        path = (yaml.safe_load(option.path.read_text()) or {}).get("_target_", "")
+        module, _, attribute = str(path).rpartition(".")
+        try:
+            target = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ConfigError(
+                f"effect={option.name}: {path} cannot be imported ({error}); reinstall {option.package}"
+            ) from error
+        if hasattr(target, "numbers"):  # an option may hold several effects: it is none itself
+            found[option.name] = Kind(option.name, target, machine.num_joints)
+    for name in names or ():
+        if name not in found:
+            raise ConfigError(
+                f"diagnosis.effects: '{name}' is no effect; {list_choices(name, found)}"
+            )
+    usable = []
+    for kind in (found[name] for name in names or found):
+        try:
+            _try(kind, machine)
+            usable.append(kind)
+        except ConfigError as error:
+            log.info("%s is left out: %s", kind.name, error)
+    return usable
+
+
+def shared(kinds: Iterable[Kind]) -> frozenset[str]:
+    """Returns the effects with one cause for all joints."""
+    return frozenset(kind.name for kind in kinds if getattr(kind.target, "shared", False))
+
+
+def _try(kind: Kind, machine: Machine) -> None:
+    """Raises a `ConfigError` when the effect needs what is not known of the machine."""
+    device = torch.device("cpu")
+    rest = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32).expand(
+        1, machine.num_history, -1
+    )
+    model = kind.wrap(Still(), machine, 1, device)
+    with torch.inference_mode():
+        model.step(History(q=rest.clone(), u=torch.zeros_like(rest)))
+        model.misplacement(rest[:, -1]) if kind.target.side == "kinematics" else None
+
+
+class Still:
+    """A machine that does not move."""
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Nothing."""
+        return {}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Nothing to forget."""
+
+    def step(self, history: Any) -> torch.Tensor:
+        """Returns the positions as they are."""
+        return history.q[:, -1]
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect with its numbers.
+
+    Attributes:
+        kind: The effect.
+        joints: Which joints have it, `(J,)` bool.
+        parameters: By name and joint, or `machine`.
+        worth: What it earns in log likelihood less its price.
+        gain: What it earns.
+        closed: Share of what the statistic shows that the effect explains.
+        rivals: What other effects would earn in its place, by name.
+    """
+
+    kind: Kind
+    joints: np.ndarray
+    parameters: Mapping[str, Mapping[str, Estimate]]
+    worth: float
+    gain: float
+    closed: float
+    rivals: Mapping[str, float]
+
+    def values(self, count: int = 1) -> dict[str, np.ndarray]:
+        """Returns the numbers of `count` candidates that all have the effect, each `(C, J)` or `(C, 1)`."""
+        found = {}
+        for name, estimates in self.parameters.items():
+            if "machine" in estimates:
+                row = np.array([estimates["machine"].mean])
+            else:
+                row = np.full(len(self.joints), float(self.kind.numbers[name].none))
+                row[self.joints] = [one.mean for one in estimates.values()]
+            found[name] = np.repeat(row[None], count, 0)
+        return found
+
+
+def fit_interval(sizes: np.ndarray, likelihood: np.ndarray) -> tuple[float, float, float]:
+    """Returns the most likely size and the ends of its 95 % interval from log likelihoods at rising `sizes`."""
+    fine = np.interp(np.linspace(0, len(sizes) - 1, 401), np.arange(len(sizes)), np.log(sizes))
+    curve = np.interp(fine, np.log(sizes), likelihood)
+    best = int(np.argmax(likelihood))
+    if 0 < best < len(sizes) - 1:  # a parabola through the best three
+        part = slice(best - 1, best + 2)
+        a, b, c = np.polyfit(np.log(sizes[part]), likelihood[part], 2)
+        near = (fine >= np.log(sizes[best - 1])) & (fine <= np.log(sizes[best + 1]))
+        if a < 0:
+            curve = np.where(near, np.maximum(curve, a * fine**2 + b * fine + c), curve)
+    inside = np.exp(fine[curve > curve.max() - 1.92])
+    return float(np.exp(fine[int(np.argmax(curve))])), float(inside.min()), float(inside.max())
+
+
+ROWS = 1536
+"""Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""
+
+Values = Mapping[str, np.ndarray]
+"""Numbers of an effect by name, each `(C, J)`, or `(C, 1)` for one that joints do not have."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Free runs of one base through one cut, as a function of effects.
+
+    Attributes:
+        base: The simulator.
+        machine: The machine.
+        cut: FreeRunWindows.
+        running_s: Time since the machine was started at the beginning of each window, `(W,)`.
+        seed: Of the random numbers that stochastic effects draw.
+        fixed: Effects that all candidates have, with numbers `(1, J)`.
+    """
+
+    base: Actuator
+    machine: Machine
+    cut: FreeRunWindows
+    running_s: np.ndarray
+    seed: int
+    fixed: Sequence[tuple[Kind, Values]] = ()
+
+    def paths(
+        self,
+        effects: Sequence[tuple[Kind, Values]],
+        count: int = 1,
+        own: Values = MappingProxyType({}),
+    ) -> np.ndarray:
+        """Returns measured positions of free runs, `(C, W, K, J)`.
+
+        Args:
+            effects: Effects with the numbers of each candidate.
+            count: Number of candidates, `C`.
+            own: Numbers of the base itself that candidates change, of those in its `parameters`.
+
+        Raises:
+            BrokkError: the model ran into NaN.
+        """
+        fixed = [
+            (kind, {name: np.repeat(value, count, 0) for name, value in values.items()})
+            for kind, values in self.fixed
+        ]
+        effects = sorted([*effects, *fixed], key=lambda one: one[0].order)
+        windows = len(self.cut.q)
+        found = np.empty((count * windows, *self.cut.measured.shape[1:]), dtype=np.float32)
+        for start in range(0, len(found), ROWS):
+            rows = np.arange(start, min(start + ROWS, len(found)))
+            found[rows] = self._run(effects, own, rows // windows, rows % windows)
+        if not np.isfinite(found).all():
+            names = ", ".join(kind.name for kind, _ in effects) or "no effect"
+            raise BrokkError(
+                f"the simulator ran into NaN in a free run with {names}; look at its fit"
+            )
+        return found.reshape(count, windows, *found.shape[1:])
+
+    def _run(
+        self,
+        effects: Sequence[tuple[Kind, Values]],
+        own: Values,
+        candidate: np.ndarray,
+        window: np.ndarray,
+    ) -> np.ndarray:
+        """Returns one free run a row, `(N, K, J)`."""
+        cut, count, device = self.cut, len(window), torch.device("cpu")
+        size, before = cut.num_history, cut.num_before
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(
+                self.seed + int(candidate[0])
+            )  # rows of other batches draw other numbers
+            model: Any = self.base.build(self.machine, count, device)
+            for name, value in own.items():
+                model.parameters[name].copy_(torch.as_tensor(value[candidate], dtype=torch.float32))
+            for kind, values in effects:
+                model = kind.wrap(model, self.machine, count, device)
+                for name, value in values.items():
+                    model.parameters[name].copy_(
+                        torch.as_tensor(value[candidate], dtype=torch.float32)
+                    )
+                if kind.running:
+                    begun_s = self.running_s[window] - (before - size) * self.machine.period_s
+                    model.parameters[kind.running].copy_(
+                        torch.as_tensor(begun_s, dtype=torch.float32)[:, None]
+                    )
+        measure, truth = (getattr(model, name, None) for name in ("measure", "truth"))
+        measure = measure if "measurement" in getattr(model, "sides", ()) else None
+        u = torch.as_tensor(cut.u[window], dtype=torch.float32)
+        q = torch.empty(count, before + cut.measured.shape[1], u.shape[2])
+        q[:, :before] = torch.as_tensor(cut.q[window, :before])
+        if measure and truth:
+            q[:, :before] = truth(q[:, :before])
+        seen = torch.empty_like(q[:, before:])
+        with torch.inference_mode():
+            model.reset(torch.ones(count, dtype=torch.bool))
+            for k in range(size, q.shape[1]):
+                position = model.step(History(q=q[:, k - size : k], u=u[:, k - size : k]))
+                if k >= before:
+                    q[:, k] = position
+                    seen[:, k - before] = measure(position) if measure else position
+        return seen.numpy()

@@ -1,0 +1,98 @@
+"""The next experiment: which excitation would separate best what these recordings leave open.
+
+Each rival is simulated on each excitation; how far two of them end up apart, over the simulator's
+noise, is what one would learn.
+Axes: `C` rivals, `K` steps, `J` joints, `I` increments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from brokk_rl import open_loop
+from brokk_rl.contracts.actuator import Actuator, Excitation
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from diagnosis.answer import NextExperiment
+from diagnosis.effect_library import Candidates, Kind, Values
+from diagnosis.residuals import LONGEST, ErrorCovariance, to_increments
+
+SECONDS = 30.0
+ENOUGH = 8.0
+"""Expected difference in log likelihood in `SECONDS` from which an experiment is worth the time."""
+MOST = 60.0
+"""Differences beyond this are as good as this: the rivals are apart."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """An effect with numbers, each `(1, J)`, and how probable it is."""
+
+    kind: Kind
+    values: Values
+    probability: float
+
+
+def best(
+    actuator: Actuator,
+    noises: Sequence[ErrorCovariance],
+    rivals: Sequence[Rival],
+    excitations: Mapping[str, Excitation],
+    machine: Machine,
+    generator: np.random.Generator,
+) -> NextExperiment | None:
+    """Returns the excitation that separates the rivals best; `None` where none does, or nothing is left to separate."""
+    steps, before = round(SECONDS / machine.period_s), open_loop.count_samples_before(machine)
+    programs = {}
+    for name, excitation in excitations.items() if len(rivals) > 1 else ():
+        try:
+            segments = excitation.segments(machine, SECONDS, generator, [])
+        except ConfigError:  # not a single segment fits
+            continue
+        u = np.concatenate([segment.u for segment in segments])[:steps]
+        programs[name] = segments[0].start, np.pad(u, ((before - 1, steps - len(u)), (0, 0)))
+    if not programs:
+        return None
+    u = np.stack([u for _, u in programs.values()]).astype(np.float32)
+    q = np.full((len(u), before + steps, machine.num_joints), np.nan, dtype=np.float32)
+    q[:, :before] = np.stack([start for start, _ in programs.values()])[:, None]
+    cut = open_loop.FreeRunWindows(u, q, np.array(list(programs)), machine.num_history, before)
+    apart = _apart(Candidates(actuator, machine, cut, np.zeros(len(u)), 0), noises, rivals)
+    chance = {rival.kind.name: rival.probability for rival in rivals}
+    worth = {
+        pair: chance[pair[0]] * chance[pair[1]] * np.minimum(distance, MOST)
+        for pair, distance in apart.items()
+    }
+    chosen = int(np.argmax(np.sum(list(worth.values()), 0)))
+    first, second = max(worth, key=lambda pair: worth[pair][chosen])
+    distance = apart[first, second][chosen]
+    if distance < ENOUGH:
+        return None
+    why = f"{SECONDS:.0f} s of it put {first} and {second} apart by a log likelihood of {distance:.0f}"
+    return NextExperiment(list(programs)[chosen], (first, second), why)
+
+
+def _apart(
+    candidates: Candidates, noises: Sequence[ErrorCovariance], rivals: Sequence[Rival]
+) -> dict[tuple[str, str], np.ndarray]:
+    """Returns the expected difference in log likelihood of each pair of rivals in each window, `(W,)`."""
+    cut = candidates.cut
+    at, count = cut.q[:, cut.num_before - 1], len(cut.q)
+    base = to_increments(candidates.paths([])[0], at)
+    ways = {
+        rival.kind.name: to_increments(candidates.paths([(rival.kind, rival.values)])[0], at)
+        for rival in rivals
+    }
+    found = {pair: np.zeros(count) for pair in combinations(ways, 2)}
+    for j, noise in enumerate(noises):
+        for first in range(0, base.shape[1], LONGEST):
+            rows = slice(first, first + LONGEST)
+            whitener = noise.whitener(base[:, rows, j])
+            for a, b in found:
+                apart = whitener @ (ways[a][:, rows, j] - ways[b][:, rows, j])[..., None]
+                found[a, b] += 0.5 * np.square(apart).sum((1, 2))
+    return found

@@ -1,0 +1,216 @@
+"""The search around sets of effects whose responses do not add up.
+
+The search adds up the responses of single effects. A saturation does nothing to a simulator without
+dead band, and a dead band of a third of the command changes the responses of all other effects.
+Where the sum is far off, each effect is simulated again beside the others of the set, and all sizes
+of a set with one more effect are fitted together from many starts.
+Axes: `J` joints, `R` growth paths, `E` entries (whitened increments).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from diagnosis.refine import (
+    Repair,
+    known_sizes,
+    refit_from,
+    searched,
+    simulate,
+    subsets_of,
+    thinned,
+)
+from diagnosis.residuals import GRID, Evidence, Ray, rays, robust_loss, to_increments
+from diagnosis.responses import FELT, Shape
+from diagnosis.search import Chosen, Price, Table
+
+WIDE = tuple(sorted({*GRID, 4.0, 5.5, 7.5, 10.0, 14.0}))
+"""Sizes, over the typical one, at which effects are simulated; numbers keep their bounds."""
+
+ROUGH = 0.7
+"""A set that earns less than so much of what adding up promised does not add up."""
+
+LARGE = 2.6
+"""Sizes over the typical one from which adding up is not trusted."""
+
+ADDED_TRIED = 6
+"""Effects that are tried beside a set by fitting all sizes together."""
+
+ADDED_THINNING = 4
+"""They are tried on one of so many parts of the recordings."""
+
+Shapes = list[dict[str, list[Shape]]]
+
+Around = tuple[np.ndarray, dict[str, list[Ray]], Shapes]
+"""The errors that are to be explained `(J, E)`, the rays of each effect, and what they do to each
+joint."""
+
+
+def is_needed(evidence: Evidence, repaired: Repair, promised: float) -> bool:
+    """Says whether effects hardly add up: sizes are far beyond the typical, and some hide others, or earn far less than `promised`.
+
+    What acts on the command hides what else does: nothing shows within a dead band. A speed that is
+    far off hides nothing.
+    """
+    far = [
+        ray
+        for ray, sizes in zip(repaired.rays, repaired.sizes, strict=True)
+        if np.abs(sizes).max() > LARGE
+    ]
+    hides = any(ray.kind.target.side == "command" for ray in far)
+    return hides or (
+        bool(far) and float(robust_loss(evidence.z) - robust_loss(repaired.z)) < ROUGH * promised
+    )
+
+
+def simulated(evidence: Evidence, grown: Mapping[str, Sequence[Ray]], repaired: Repair) -> Around:
+    """Returns what effects do in the company of a set."""
+    joints = evidence.way.shape[2]
+    shapes: Shapes = [{} for _ in range(joints)]
+    left = evidence.whitened(
+        evidence.error_of(simulate(evidence.candidates, repaired.rays, repaired.sizes[None]))
+    )[:, 0]
+    wide: dict[str, list[Ray]] = {}
+    mine = {(ray.kind.name, ray.name): place for place, ray in enumerate(repaired.rays)}
+    for name, ways in grown.items():
+        grid = sorted(
+            {*WIDE, *ways[0].sizes[ways[0].sizes > 0.0].tolist()}
+        )  # as close as they were before
+        wide[name] = [replace(ray, shape=ways[0].shape) for ray in rays(ways[0].kind, grid)]
+        responses = [_response(evidence, ray, wide[name], repaired) for ray in wide[name]]
+        for j in range(joints):
+            if max(np.abs(response[j]).max() for response in responses) >= FELT:
+                shapes[j][name] = [
+                    Shape(ray.sizes, response[j])
+                    for ray, response in zip(wide[name], responses, strict=True)
+                ]
+        for ray, response in zip(wide[name], responses, strict=True):
+            place = mine.get((name, ray.name))
+            for j in range(joints) if place is not None else ():
+                left[j] += Shape(ray.sizes, response[j]).at(float(repaired.sizes[place, j]))[0]
+    return left, wide, shapes
+
+
+def _response(evidence: Evidence, ray: Ray, ways: Sequence[Ray], repaired: Repair) -> np.ndarray:
+    """Returns what a ray changes at each of its sizes, in the company of the set, over the noise, `(J, C, E)`."""
+    has = any(one.kind.name == ray.kind.name for one in repaired.rays)
+    company = [*repaired.rays, *([] if has else ways)]
+    place = next(
+        k
+        for k, one in enumerate(company)
+        if one.kind.name == ray.kind.name and one.name == ray.name
+    )
+    sizes = np.zeros((len(ray.sizes), len(company), repaired.sizes.shape[1]))
+    sizes[:, : len(repaired.rays)] = repaired.sizes
+    sizes[:, place] = ray.sizes[:, None]
+    ends = to_increments(simulate(evidence.candidates, company, sizes), evidence.start)
+    return evidence.whitened(ends - ends[np.flatnonzero(ray.sizes == 0.0)[0]])
+
+
+def grown(
+    evidence: Evidence,
+    ways: Mapping[str, Sequence[Ray]],
+    tables: Sequence[Table],
+    chosen: Chosen,
+    repaired: Repair,
+    price: float,
+) -> Repair | None:
+    """Returns the set with one more effect, on the joints where it pays, all sizes fitted together; `None` where none pays.
+
+    A saturation pays only when dead band and speed move along with it: adding up does not show
+    that, a joint fit does. `price` is that of a joint with an effect, in the part of the recordings
+    on which this is tried.
+    """
+    part = thinned(evidence, ADDED_THINNING)
+    least = _losses(part, repaired.rays, repaired.sizes)
+    found, most = None, 0.0
+    for name in _promising(tables, chosen, ways):
+        subsets = [
+            s | {name} if s and name in t.shapes else s
+            for t, s in zip(tables, chosen.subsets, strict=True)
+        ]
+        rays_ = [ray for one in sorted(frozenset().union(*subsets)) for ray in ways[one]]
+        mask = np.array([[ray.kind.name in subset for subset in subsets] for ray in rays_])
+        sizes = searched(part, rays_, mask, known_sizes(rays_, repaired), np.random.default_rng(0))
+        gain = least - _losses(part, rays_, sizes)
+        new = np.array(
+            [name in s and name not in old for s, old in zip(subsets, chosen.subsets, strict=True)]
+        )
+        pays = new & (gain > price)
+        if (worth := float((gain - price)[pays].sum())) > most:
+            kept = [
+                s if p else old for s, p, old in zip(subsets, pays, chosen.subsets, strict=True)
+            ]
+            start = np.where(pays, sizes, known_sizes(rays_, repaired))
+            found, most = (kept, rays_, start), worth
+    return refit_from(evidence, ways, *found) if found else None
+
+
+def best(
+    evidence: Evidence, ways: Mapping[str, Sequence[Ray]], tried: Sequence[Repair], price: Price
+) -> Repair | None:
+    """Returns the repair that takes for each joint the best of those `tried`, none where errors of free runs only grow by it.
+
+    `price` is what a set costs on a joint. `None` where no joint is left.
+    """
+    measured = evidence.candidates.cut.measured
+    squares = [
+        np.square(paths - measured).mean((0, 1))
+        for paths in (evidence.base, *(one.after for one in tried))
+    ]
+    subsets, rays_ = (
+        [],
+        list({(ray.kind.name, ray.name): ray for one in tried for ray in one.rays}.values()),
+    )
+    start = np.zeros((len(rays_), evidence.way.shape[2]))
+    for j in range(evidence.way.shape[2]):
+        own = [subsets_of(one)[j] for one in tried]
+        cost = [
+            float(robust_loss(one.z[j])) + (price(j, s) if s else 0.0)
+            for one, s in zip(tried, own, strict=True)
+        ]
+        closing = [k for k in np.argsort(cost) if squares[k + 1][j] < squares[0][j]]
+        subsets.append(own[closing[0]] if closing else frozenset())
+        if closing:
+            start[:, j] = known_sizes(rays_, tried[closing[0]])[:, j]
+    return refit_from(evidence, ways, subsets, rays_, start) if any(subsets) else None
+
+
+def paying(
+    tables: Sequence[Table], subsets: Sequence[frozenset[str]], price: Price, name_price: float
+) -> tuple[frozenset[str], ...]:
+    """Returns the sets without effects that add less than they cost, dropped one by one: of two that are alike one stays."""
+    while names := frozenset().union(*subsets):
+        own = dict.fromkeys(names, -name_price)
+        for j, (table, subset) in enumerate(zip(tables, subsets, strict=True)):
+            for name in subset:
+                gain = table.score(subset).total - table.score(subset - {name}).total
+                own[name] += gain - (price(j, subset) - price(j, subset - {name}))
+        least = min(own, key=own.__getitem__)
+        if own[least] > 0.0:
+            break
+        subsets = tuple(subset - {least} for subset in subsets)
+    return tuple(subsets)
+
+
+def _losses(evidence: Evidence, rays_: Sequence[Ray], sizes: np.ndarray) -> np.ndarray:
+    """Returns the loss of each joint at sizes `(R, J)`, `(J,)`."""
+    paths = simulate(evidence.candidates, rays_, sizes[None])
+    return robust_loss(evidence.whitened(evidence.error_of(paths))[:, 0], 1)
+
+
+def _promising(
+    tables: Sequence[Table], chosen: Chosen, ways: Mapping[str, Sequence[Ray]]
+) -> list[str]:
+    """Returns effects that some joint with a set lacks: those on the command, which hide behind each other, then what adds most."""
+    found: dict[str, float] = {}
+    for table, subset in zip(tables, chosen.subsets, strict=True):
+        own = table.score(subset).total
+        for name in table.shapes.keys() - subset if subset else ():
+            found[name] = found.get(name, 0.0) + max(0.0, table.score(subset | {name}).total - own)
+    return sorted(
+        found, key=lambda name: (ways[name][0].kind.target.side != "command", -found[name])
+    )[:ADDED_TRIED]

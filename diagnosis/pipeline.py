@@ -1,0 +1,370 @@
+"""The whole way from a case to an outcome, and `effects.yaml` for a training on the machine as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from brokk_rl.contracts.actuator import Excitation
+from brokk_rl.errors import StorageError
+from brokk_rl.inspection import InspectionThresholds
+from brokk_rl.session import write_text
+from diagnosis import calibration, decision, detection, next_experiment
+from diagnosis.answer import Answer, Estimate, NextExperiment, Outcome, Ranked, Selected, Where
+from diagnosis.baseline import Base
+from diagnosis.calibration import Certainty
+from diagnosis.case import Case
+from diagnosis.detection import Findings, Prices, Tell
+from diagnosis.effect_library import Kind
+from diagnosis.free_runs import FreeRuns
+from diagnosis.gap import Reach, apart
+from diagnosis.refine import Repair
+from diagnosis.residual_model import CLUES
+from diagnosis.stages import survey_gap
+
+NEAR = 0.6
+"""A rival that earns so much of what a selected effect earns is worth an experiment."""
+DECIDED_BY = {
+    frozenset(
+        {"flow_gain", "encoder_scale"}
+    ): "an outside measurement of the angle (inclinometer, laser) at two positions",
+    frozenset(
+        {"dead_time", "clock_offset"}
+    ): "one clock for commands and positions, or a pulse that both record",
+}
+"""Measurements that would tell apart what commands and joint positions cannot."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a diagnosis works with.
+
+    Attributes:
+        case: The recordings.
+        base: The simulator.
+        kinds: The library.
+        prices: What effects must earn.
+        certainty: How sure what is said is.
+        thresholds: When a stretch of a recording is worth telling.
+        excitations: Experiments that could follow, by name.
+        generator: Draws bootstraps, permutations and excitations.
+    """
+
+    case: Case
+    base: Base
+    kinds: Sequence[Kind]
+    prices: Prices
+    calibration: Certainty
+    thresholds: InspectionThresholds
+    excitations: Mapping[str, Excitation]
+    generator: np.random.Generator
+
+    def run(self, tell: Tell) -> Outcome:
+        """Returns the outcome; `tell` is told what is being done and how much of the whole is done."""
+        if doubts := self.case.doubts():
+            return self._cannot_tell("; ".join(doubts))
+        search = detection.Search(self.case, self.base, self.kinds, self.prices, tell)
+        return self._outcome(search.run())
+
+    def _outcome(self, findings: Findings) -> Outcome:
+        weighed = decision.record_weights(findings, self.prices)
+        findings = decision.likely(findings, self.prices, self.certainty)
+        field, evidence = self.base.field, findings.evidence
+        before, floor = field.runs(field.evidence.base), self._floor()
+        unknown = decision.is_unknown(findings, self.prices, self.certainty)
+        repaired = None if unknown else findings.repair
+        found = [] if unknown else findings.others
+        mean = 0.0 if evidence.mean is None else evidence.mean
+        paths = (
+            repaired.after if repaired else evidence.base + mean if found else field.evidence.base
+        )
+        reach = Reach(
+            self.base, self.case.machine, paths, repaired and repaired.own, self.generator
+        )
+        foretold = reach.foretold()
+        selected = [
+            decision.other(findings, one, self.certainty, self.case.machine) for one in found
+        ]
+        selected += self._selected(findings, reach) if repaired else []
+        selected.sort(key=lambda one: -one.probability)
+        told = "unknown" if unknown else "effects" if selected else "none"
+        after = field.runs(paths) if selected else None
+        machine = self.case.machine
+        seen = survey_gap(
+            before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
+        )
+        remainder = self._remainder(findings, reach) if selected else None
+        chance = decision.unknown_chance(findings, self.prices, self.certainty)
+        answer = Answer(
+            verdict=told,
+            selected=tuple(selected),
+            ranking=tuple(
+                decision.ranking(findings, selected, self.prices, self.certainty, machine, chance)
+            ),
+            where=seen.where(),
+            gap=reach.gap(),
+            next_experiment=self._next(findings, selected),
+            reason=self._reason(told, findings, selected, remainder),
+            more=seen.more()
+            | self._more(findings, weighed, foretold)
+            | {"unknown_remainder": remainder}
+            | self._unseen(findings, repaired),
+        )
+        return Outcome(answer, before, after, floor)
+
+    def _selected(self, findings: Findings, reach: Reach) -> list[Selected]:
+        kinds = {kind.name: kind for kind in self.kinds}
+        chosen = decision.chosen_kinds(findings, kinds)
+        shares = reach.by_effect(findings, [kind.name for kind in chosen])
+        assert findings.repair is not None, "what is selected has been simulated"
+        found = []
+        for kind in chosen:
+            swaps = decision.rivals(findings, kind.name)
+            like = decision.same_as(swaps, decision.own_gain(findings, kind.name))
+            signs = decision.named_signs(
+                findings, self.prices, self.certainty, kind.name, swaps, like
+            )
+            joints = findings.repair.joints_of(kind)
+            decided = next(
+                (how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)),
+                None,
+            )
+            found.append(
+                Selected(
+                    effect=kind.name,
+                    joints=tuple(
+                        name
+                        for name, has in zip(self.case.machine.joint_names, joints, strict=True)
+                        if has
+                    ),
+                    probability=calibration.chance(self.certainty.right, signs),
+                    parameters=decision.numbers(
+                        findings, kind, self.case.machine, self.certainty.form[kind.stage]
+                    ),
+                    gap_closed=shares[kind.name],
+                    same_as=like,
+                    decided_by=decided,
+                )
+            )
+        return sorted(found, key=lambda one: -one.probability)
+
+    def _remainder(self, findings: Findings, reach: Reach) -> dict[str, Any] | None:
+        """Returns what is left beside the effects that were named and has no name; `None` where that is nothing."""
+        predictable = decision.unexplained(findings)
+        names = self.case.machine.joint_names
+        beyond = reach.beyond()
+        joints = [
+            name for name, more in zip(names, predictable, strict=True) if more or name in beyond
+        ]
+        if not joints:
+            return None
+        told = [name for name, more in zip(names, predictable, strict=True) if more]
+        why = f"a flexible model still predicts the error of {', '.join(told)}" if told else ""
+        over = f"the error of {', '.join(beyond)} exceeds the floor" if beyond else ""
+        return {"joints": joints, "reason": "; ".join(filter(None, (why, over)))}
+
+    def _unseen(self, findings: Findings, repaired: Repair | None) -> dict[str, Any]:
+        """Returns how far the effects carry on recordings apart."""
+        if not self.case.unseen or repaired is None:
+            return {}
+        return {"unseen": apart(findings, self.case.unseen, self.case.machine)}
+
+    def _next(self, findings: Findings, selected: Sequence[Selected]) -> NextExperiment | None:
+        """Returns the experiment that would separate what is left open: classes, and rivals that earn nearly as much."""
+        kinds, rivals = {kind.name: kind for kind in self.kinds}, []
+        undecided = next((one for one in selected if one.same_as), None)
+        for one in selected:
+            swaps = (
+                []
+                if one.effect not in findings.chosen.names
+                else decision.rivals(findings, one.effect)
+            )
+            near = {swap.name: max(0.0, swap.share) for swap in swaps[:3] if swap.share > NEAR}
+            if near and (undecided is None or one is undecided):
+                rivals = [
+                    next_experiment.Rival(
+                        kinds[one.effect],
+                        decision.values(findings, one.effect, one.effect),
+                        one.probability,
+                    )
+                ]
+                rivals += [
+                    next_experiment.Rival(
+                        kinds[name],
+                        decision.values(findings, one.effect, name),
+                        share * one.probability,
+                    )
+                    for name, share in near.items()
+                ]
+                break
+        noises = self.base.field.evidence.noise or []
+        found = next_experiment.best(
+            self.base.actuator, noises, rivals, self.excitations, self.case.machine, self.generator
+        )
+        if found is None and undecided and undecided.decided_by:
+            return NextExperiment(
+                "",
+                (undecided.effect, *undecided.same_as),
+                f"no excitation does; {undecided.decided_by} would",
+            )
+        return found
+
+    def _floor(self) -> FreeRuns | None:
+        if not self.base.nulls:
+            return None
+        recordings, source, row, paths = [], [], [], []
+        for one in self.base.nulls:
+            source.append(one.source + len(recordings))
+            recordings += one.recordings
+            row.append(one.row)
+            paths.append(one.evidence.base)
+        return FreeRuns(
+            recordings,
+            np.concatenate(source),
+            np.concatenate(row),
+            np.concatenate(paths).astype(float),
+        )
+
+    def _dead_time_s(self) -> np.ndarray:
+        return np.full(self.case.machine.num_joints, self.case.machine.dead_time_s)
+
+    def _more(
+        self, findings: Findings, weighed: Mapping[str, Any], foretold: Estimate | None
+    ) -> dict[str, Any]:
+        names = self.case.machine.joint_names
+        rivals = [
+            {
+                "name": f"{name} on {joint}",
+                "effect": name,
+                "joints": [joint],
+                "score": table.scored[subset].total,
+                "selected": name in findings.chosen.subsets[j],
+            }
+            for j, (joint, table) in enumerate(zip(names, findings.tables, strict=True))
+            for subset in table.scored
+            if len(subset) == 1 and (name := next(iter(subset)))
+        ]
+        rivals = sorted(rivals, key=lambda row: -row["score"])[:40]
+        clues = tuple(CLUES)
+        left = {
+            name: {
+                "clue": clues[best],
+                "earned": float(a[best]),
+                "null": float(b[best]),
+                "scatter": float(c),
+            }
+            for name, a, b, c in zip(
+                names, findings.left.T, findings.left_null.T, findings.scatter, strict=True
+            )
+            for best in [int(np.argmax(a - b))]
+        }
+        null = [
+            row["null"]
+            for joint in weighed["joints"]
+            for row in joint["subsets"]
+            if len(row["effects"]) == 1 and "null" in row
+        ]
+        return {
+            "evidence": {
+                "rivals": rivals,
+                "threshold": self.prices.name + self.prices.joint,
+                "null": null,
+                "unit": "log likelihood",
+            },
+            "remainder": left,
+            "weighed": weighed,
+            "predicted_closed": foretold and {"mean": foretold.mean, "ci95": list(foretold.ci95)},
+        }
+
+    def _reason(
+        self,
+        told: str,
+        findings: Findings,
+        selected: Sequence[Selected],
+        remainder: Mapping[str, Any] | None,
+    ) -> str:
+        if told == "effects":
+            text = "; ".join(
+                f"{one.effect} on {', '.join(one.joints) or 'the machine'}" for one in selected
+            )
+            return text + (
+                f"; an unknown remainder on {', '.join(remainder['joints'])}" if remainder else ""
+            )
+        if told == "unknown":
+            joints = np.flatnonzero(decision.unexplained(findings))
+            where = ", ".join(self.case.machine.joint_names[j] for j in joints) or "some joints"
+            best = calibration.predicted(findings).max(1)
+            clues = [
+                clue
+                for clue, earned in zip(CLUES, best, strict=True)
+                if earned > max(decision.LEFT, 0.5 * best.max())
+            ]
+            if not clues:
+                return f"the gap of {where} is real, and no effect of the library explains it"
+            return f"the gap of {where} can be predicted ({'; '.join(clues)}), but by no effect of the library"
+        return "no effect earns more on the field recordings than it would by chance"
+
+    def _cannot_tell(self, why: str) -> Outcome:
+        """Returns the answer of recordings that cannot tell anything."""
+        field = self.base.field
+        runs, floor = field.runs(field.evidence.base), self._floor()
+        known = Reach(self.base, self.case.machine, field.evidence.base, None, self.generator).gap()
+        known = replace(known, closed=None)
+        answer = Answer(
+            verdict="unknown", selected=(), ranking=(Ranked("unknown", (), 1.0),), where=Where({}, (), None), gap=known,
+            next_experiment=None, reason=f"cannot tell, because {why}",
+        )  # fmt: skip
+        return Outcome(answer, runs, None, floor)
+
+
+EFFECTS_FILE = "effects.yaml"
+
+
+def write_effects(answer: Answer, kinds: Sequence[Kind], path: Path) -> None:
+    """Writes the selected effects, the one nearest to the machine first; a note alone where nothing was selected.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    by_name = {kind.name: kind for kind in kinds}
+    chosen = sorted(answer.selected, key=lambda one: by_name[one.effect].order)
+    lines = [
+        "# @package effect",
+        f"# {answer.verdict}: {answer.reason}",
+        "# taken by effect=@<this file>",
+    ]
+    text = (
+        yaml.safe_dump(
+            {one.effect: _node(one, by_name[one.effect]) for one in chosen}, sort_keys=False
+        )
+        if chosen
+        else ""
+    )
+    try:
+        write_text(path, "\n".join(lines) + "\n" + text)
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _node(one: Selected, kind: Kind) -> dict:
+    target = kind.target
+    node: dict = {"_target_": f"{target.__module__}.{target.__name__}"}
+    if "joints" in target.__annotations__:
+        node["joints"] = list(one.joints) or "all"
+    for name, number in kind.numbers.items():
+        values = {
+            joint: float(f"{value.mean:.6g}")
+            for joint, value in one.parameters.get(name, {}).items()
+        }
+        if not values:
+            node[name] = number.typical if number.none is None else number.none
+        elif number.per_joint:
+            node[name] = values | {"other": number.typical if number.none is None else number.none}
+        else:
+            node[name] = next(iter(values.values()))
+    return node

@@ -1,0 +1,293 @@
+"""Responses of the whitened residuals to effects, and the sizes that explain the residuals best.
+
+The score of a set of effects is the logarithm of its Bayes factor against the simulator alone, by
+Laplace's approximation: the likelihood at the best sizes, less the priors of sizes and of faults of
+the simulator, less Occam's factor. The response at a size is interpolated between simulated sizes,
+and effects are added up. Both are near enough to choose by; the chosen set is simulated again.
+Axes: `E` entries (whitened increments), `S` sizes of a growth path, `J` joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from diagnosis.effect_library import Kind, shared
+from diagnosis.residuals import FREEDOM, GRID, Evidence, Ray, rays, robust_loss, robust_weight
+
+PARTS = (0.25, 0.5, 0.75)
+"""Of the way between two simulated sizes: a fit also begins there."""
+STEPS = 10
+"""Gauss-Newton steps at most."""
+ENOUGH = 0.02
+"""Gain in log likelihood below which the steps end."""
+FAULTS = 6.0
+"""Faults of a simulator are no larger, in standard deviations."""
+PRIOR = 1.0
+"""Standard deviation of a size, over the typical one: tells nothing where the recordings do, and
+settles what they leave open."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """What growing along a ray does to one joint: `change` `(S, E)` at `sizes` `(S,)`."""
+
+    sizes: np.ndarray
+    change: np.ndarray
+
+    def at(self, size: float) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the change at a size and its slope over the size, each `(E,)`."""
+        cell = min(
+            max(int(np.searchsorted(self.sizes, size, side="right")) - 1, 0), len(self.sizes) - 2
+        )
+        slope = (self.change[cell + 1] - self.change[cell]) / (
+            self.sizes[cell + 1] - self.sizes[cell]
+        )
+        return self.change[cell] + (size - self.sizes[cell]) * slope, slope
+
+
+def predicted(shapes: Sequence[Shape], sizes: np.ndarray) -> np.ndarray:
+    """Returns the sum of the changes, `(E,)`."""
+    return np.sum([shape.at(size)[0] for shape, size in zip(shapes, sizes, strict=True)], 0)
+
+
+def fitted(
+    z: np.ndarray,
+    shapes: Sequence[Shape],
+    start: np.ndarray | None = None,
+    faults: np.ndarray | None = None,
+    used: np.ndarray | None = None,
+) -> np.ndarray:
+    """Returns the sizes that explain the errors best: most likely under a t distribution and a wide prior.
+
+    Args:
+        z: Errors over the noise, `(E,)`.
+        shapes: What effects change.
+        start: Sizes from which the search begins; `None`: what each would be alone.
+        faults: What small faults of the simulator change, in standard deviations of theirs, `(P,
+            E)`.
+        used: Weight of each entry, `(E,)`; `None`: all count.
+
+    Returns:
+        Sizes of the shapes, then those of the faults.
+    """
+    count = len(shapes)
+    lines = np.zeros((0, len(z))) if faults is None else faults
+    used = np.ones(len(z)) if used is None else used
+    if start is None:
+        start = np.array([alone(z, shape, used) for shape in shapes]) * (1.0 if count == 1 else 0.7)
+    size = np.concatenate([start, np.zeros(count + len(lines) - len(start))])
+    if not len(size):
+        return size
+    high = np.concatenate([[shape.sizes[-1] for shape in shapes], np.full(len(lines), FAULTS)])
+    low = np.concatenate([[shape.sizes[0] for shape in shapes], np.full(len(lines), -FAULTS)])
+    precision = np.concatenate([np.full(count, PRIOR**-2.0), np.ones(len(lines))])
+
+    def left_at(at: np.ndarray) -> np.ndarray:
+        return (
+            z
+            - at[count:] @ lines
+            - sum(
+                (shape.at(one)[0] for shape, one in zip(shapes, at, strict=False)), np.zeros(len(z))
+            )
+        )
+
+    def total(left: np.ndarray, at: np.ndarray) -> float:
+        return 0.5 * (FREEDOM + 1.0) * float(
+            used @ np.log1p(np.square(left) / FREEDOM)
+        ) + 0.5 * float(precision @ np.square(at))
+
+    left = left_at(size)
+    now, damping = total(left, size), 1e-3
+    for _ in range(STEPS):
+        slope = _slopes(shapes, lines, size)
+        weighted = slope * (robust_weight(left) * used)
+        normal, gradient = (
+            weighted @ slope.T + np.diag(precision),
+            weighted @ left - precision * size,
+        )
+        free = ~((size <= low) & (gradient < 0.0) | (size >= high) & (gradient > 0.0))
+        gain = 0.0
+        for _ in range(3):
+            damped = (normal + damping * np.diag(np.diag(normal)))[np.ix_(free, free)]
+            trial = size.copy()
+            trial[free] = np.clip(
+                size[free] + np.linalg.solve(damped, gradient[free]), low[free], high[free]
+            )
+            remains = left_at(trial)
+            then = total(remains, trial)
+            if then < now - 1e-9:
+                gain, size, left, now, damping = now - then, trial, remains, then, damping / 5
+                break
+            damping = 10 * max(damping, 1e-3)
+        if gain < ENOUGH:
+            break
+    return size
+
+
+def _slopes(shapes: Sequence[Shape], lines: np.ndarray, size: np.ndarray) -> np.ndarray:
+    return np.concatenate(
+        [*(shape.at(one)[1][None] for shape, one in zip(shapes, size, strict=False)), lines]
+    )
+
+
+def alone(z: np.ndarray, shape: Shape, used: np.ndarray | None = None) -> float:
+    """Returns the best of the simulated sizes and those `PARTS` of the way between them: some begin just there."""
+    used = np.ones(len(z)) if used is None else used
+    between = [(1.0 - part) * shape.change[:-1] + part * shape.change[1:] for part in PARTS]
+    trials = np.concatenate(
+        [shape.sizes, *((1.0 - part) * shape.sizes[:-1] + part * shape.sizes[1:] for part in PARTS)]
+    )
+    left = z - np.concatenate([shape.change, *between])
+    totals = 0.5 * (FREEDOM + 1.0) * np.log1p(np.square(left) / FREEDOM) @ used + 0.5 * np.square(
+        trials / PRIOR
+    )
+    return float(trials[int(np.argmin(totals))])
+
+
+@dataclass(frozen=True)
+class Plain:
+    """A joint's errors without any effect, small faults of the simulator itself fitted.
+
+    Attributes:
+        z: Errors over the noise, `(E,)`.
+        faults: What the simulator's own numbers change, `(P, E)`.
+        loss: Loss of each entry.
+        price: Of the faults: how unlikely their sizes are, and of having fitted them.
+    """
+
+    z: np.ndarray
+    faults: np.ndarray
+    loss: np.ndarray
+    price: float
+
+
+def plain(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray) -> Plain:
+    """Returns a joint's errors with the simulator's faults, `(P, E)`, fitted."""
+    lines = np.reshape(np.asarray(faults, dtype=float), (-1, len(z)))
+    whole = fitted(z, [], faults=lines)
+    left = z - whole @ lines
+    return Plain(z, lines, robust_loss(left[:, None], axis=1), _price(left, [], lines, whole))
+
+
+def earned(
+    joint: Plain, shapes: Sequence[Shape], start: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns by how much shapes make the errors more likely, entry by entry `(E,)`, and their best sizes.
+
+    Prices of sizes and faults are spread over the entries.
+    """
+    whole = fitted(joint.z, shapes, start, joint.faults)
+    count = len(shapes)
+    left = (
+        joint.z
+        - whole[count:] @ joint.faults
+        - (predicted(shapes, whole[:count]) if shapes else 0.0)
+    )
+    saved = joint.price - _price(left, shapes, joint.faults, whole)
+    return joint.loss - robust_loss(left[:, None], axis=1) + saved / len(left), whole[:count]
+
+
+def _price(left: np.ndarray, shapes: Sequence[Shape], lines: np.ndarray, size: np.ndarray) -> float:
+    """Returns the loss of sizes and faults under their priors, and Occam's factor: how much narrower the recordings make them."""
+    slope = _slopes(shapes, lines, size)
+    precision = np.concatenate([np.full(len(shapes), PRIOR**-2.0), np.ones(len(lines))])
+    told = (slope * robust_weight(left)) @ slope.T / precision + np.eye(len(size))
+    return 0.5 * float(precision @ np.square(size)) + 0.5 * float(np.linalg.slogdet(told)[1])
+
+
+def crossed(z: np.ndarray, shapes: Sequence[Shape], fold: np.ndarray) -> np.ndarray:
+    """Returns what shapes change, `(E,)`, on each half `fold` with sizes fitted to the other."""
+    change = np.zeros(len(z))
+    for half in (0, 1):
+        other = fold == half
+        if shapes and other.any() and not other.all():
+            change[other] = predicted(shapes, fitted(z, shapes, used=np.where(other, 0.0, 1.0)))[
+                other
+            ]
+    return change
+
+
+SHAPES = (0.35, 0.5, 0.7, 1.4, 2.0)
+"""Values of a number that only shapes an effect that are tried beside the typical one, over it."""
+FINE = tuple(np.geomspace(GRID[0], GRID[-1], 20).round(3).tolist())
+"""Sizes at which an effect is simulated that rings: between those of `GRID` it would be out of
+step, and only a dull one fits."""
+SMALL = GRID[:4]
+"""Sizes at which effects are simulated on the reference: small ones of the field's, as many effects
+begin at a threshold."""
+FELT = 1e-3
+"""An effect that changes errors over the noise by less does nothing to a joint."""
+
+
+def rays_of(kind: Kind, grid: Sequence[float] = GRID) -> list[Ray]:
+    """Returns the ways in which an effect can grow, at sizes as close as it has to be simulated; none beyond those of `grid`."""
+    fine = [size for size in FINE if size <= grid[-1]]
+    return rays(kind, fine if kind.shaping and not shared([kind]) else grid)
+
+
+def add(
+    shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray], evidence: Evidence
+) -> list[Ray]:
+    """Adds the shapes of an effect to the joints that it does something to.
+
+    Numbers that only shape the effect are tried at several values; each joint keeps the best, and
+    the rays remember them.
+    """
+    kind = ways[0].kind
+    trials: list[dict[str, float]] = [{}]
+    if not ways[0].shape:
+        trials += [{number: part} for number in kind.shaping for part in SHAPES]
+    shaped = [
+        [replace(ray, shape=_all(trial, len(shapes))) if trial else ray for ray in ways]
+        for trial in trials
+    ]
+    responses = [[evidence.response(ray) for ray in one] for one in shaped]
+    best = np.zeros(len(shapes), dtype=int)
+    for j, mine in enumerate(shapes):
+        if max(np.abs(response[j]).max() for response in responses[0]) < FELT:
+            continue
+        made = [
+            [Shape(ray.sizes, r[j]) for ray, r in zip(ways, response, strict=True)]
+            for response in responses
+        ]
+        if len(made) > 1:
+            best[j] = int(
+                np.argmin(
+                    [
+                        robust_loss(evidence.z[j] - predicted(one, fitted(evidence.z[j], one)))
+                        for one in made
+                    ]
+                )
+            )
+        mine[name] = made[best[j]]
+    if len(trials) == 1:
+        return list(ways)
+    shape = {
+        number: np.array([trials[b].get(number, 1.0) for b in best]) for number in kind.shaping
+    }
+    return [replace(ray, shape=shape) for ray in ways]
+
+
+def plain_joints(
+    evidence: Evidence, scatter: np.ndarray | None = None, z: np.ndarray | None = None
+) -> list[Plain]:
+    """Returns the errors of each joint with small faults of the simulator, in units of `scatter` times the noise.
+
+    Args:
+        evidence: Errors over the noise.
+        scatter: Mean square error over what the noise says, `(J,)`.
+        z: Errors to explain in place of those of the evidence, `(J, E)`.
+    """
+    by = np.ones(len(evidence.z)) if scatter is None else 1.0 / np.sqrt(scatter)
+    z = evidence.z if z is None else z
+    return [
+        plain(one * part, lines * part)
+        for one, lines, part in zip(z, evidence.faults, by, strict=True)
+    ]
+
+
+def _all(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:
+    return {name: np.full(joints, part) for name, part in trial.items()}

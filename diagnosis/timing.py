@@ -1,0 +1,370 @@
+"""Frames that are late or lost: hidden delays of single commands, each measured by where its joint ends up.
+
+A command that changes acts a little earlier or later; what one period later would do is simulated.
+A frame carries the commands of
+all joints: the delays that explain the errors of all of them best, one for each frame that changes
+a command, scatter no more than on the reference where all frames arrive in time; how they scatter
+tells lost frames (whole periods, seldom) from jitter (parts of periods, always).
+Axes: `W` windows, `K` steps, `I` increments, `J` joints, `D` changes of a command, `C` candidates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import stats
+
+from diagnosis.answer import Estimate
+from diagnosis.effect_library import Found, Kind, Values, fit_interval
+from diagnosis.residuals import Evidence, to_increments
+from diagnosis.responses import fitted
+from diagnosis.search import weighted_median
+
+CHANGE = 0.06
+"""Smaller changes of a command tell nothing about when it arrived."""
+WIDE = 1.5
+"""Prior standard deviation of a delay, periods."""
+LEAST = 0.3
+"""A delay of one period that changes no error over the noise by more tells nothing."""
+NEAR = 0.1
+"""Delays that differ by so few periods are the same: a simulator's own timing is no better."""
+SURE = 0.4
+"""Largest standard error, in periods, of a delay that counts."""
+FEWEST = 20
+"""Fewer delays tell nothing about how they scatter."""
+SIZES = np.geomspace(0.2, 8.0, 12)
+DRAWN = 3
+"""Times that the chances of each window are drawn."""
+MOST = 300
+"""Delays drawn by which those seen are judged."""
+BEYOND = 2.0
+"""The mean of delays by chance is off by so much of itself at most; what joints are late by beyond
+is an effect of its own."""
+SCALES, FREEDOMS = np.linspace(0.7, 1.5, 9), (3.0, 5.0, 7.0, 10.0)
+"""Among which the distribution of the errors of delays is found."""
+WIDER = 1.1
+"""Scatter of the delays, over that of reference recordings, below which nothing is looked for."""
+
+
+@dataclass(frozen=True)
+class Delays:
+    """Hidden delays of frames that could be measured, less what is late always.
+
+    Attributes:
+        value: In periods, `(D,)`.
+        error: Their standard errors, `(D,)`.
+        joint: Number of the joint that tells most of each, `(D,)`.
+    """
+
+    value: np.ndarray
+    error: np.ndarray
+    joint: np.ndarray
+
+    def of(self, joint: int) -> Delays:
+        """Returns those of one joint."""
+        mine = self.joint == joint
+        return Delays(self.value[mine], self.error[mine], self.joint[mine])
+
+
+@dataclass(frozen=True)
+class Usual:
+    """How delays err where all frames arrive in time: a t distribution.
+
+    Attributes:
+        scale: Their errors over the standard errors.
+        freedom: Degrees of freedom: how seldom they err by much.
+    """
+
+    scale: float
+    freedom: float
+
+    @classmethod
+    def of(cls, known: Sequence[Delays]) -> Usual:
+        """Returns the most likely one for the delays of recordings in which no frame is late."""
+        tried = [cls(scale, freedom) for scale in SCALES for freedom in FREEDOMS]
+        return max(
+            tried,
+            key=lambda one: sum(float(one.log(seen.value, seen.error).sum()) for seen in known),
+        )
+
+    def log(self, off: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """Returns the logarithm of the density of what delays with these standard errors are off by."""
+        width = np.hypot(self.scale * error, NEAR)
+        return stats.t.logpdf(off / width, self.freedom) - np.log(width)
+
+    def gain(self, seen: Delays, drawn: np.ndarray) -> float:
+        """Returns the log likelihood of the delays seen, where true ones are like those `drawn`, over that without any."""
+        if not len(seen.value):
+            return 0.0
+        among = np.exp(self.log(seen.value[:, None] - drawn[None], seen.error[:, None])).mean(1)
+        return float((np.log(among + 1e-12) - self.log(seen.value, seen.error)).sum())
+
+
+@dataclass(frozen=True)
+class Changes:
+    """The changes of commands in some windows, and what it would do if they came one period later."""
+
+    evidence: Evidence
+
+    @cached_property
+    def _ranks(self) -> np.ndarray:
+        """Which of a joint's changes in a window a sample is, from 1 on; 0 where its command stays, `(W, L, J)`."""
+        cut = self.evidence.candidates.cut
+        jump = np.abs(np.diff(cut.u, axis=1)) > CHANGE
+        jump[:, : cut.num_before - cut.num_history] = False  # over when the free run begins
+        return np.cumsum(jump, 1) * jump
+
+    @cached_property
+    def responses(self) -> np.ndarray:
+        """Increments that change where the n-th change of each joint's command in a window comes late, `(C, W, I, J)`."""
+        cut, rank = self.evidence.candidates.cut, self._ranks
+        count, windows = int(rank.max(initial=0)), len(cut.u)
+        if not count:
+            return np.zeros((0, *self.evidence.way.shape))
+        late = [
+            np.where(rank == number, cut.u[:, :-1], cut.u[:, 1:]) for number in range(1, count + 1)
+        ]
+        u = np.concatenate([np.repeat(cut.u[None, :, :1], count, 0), np.stack(late)], 2)
+        rows = np.tile(np.arange(windows), count)
+        many = replace(cut, u=u.reshape(-1, *u.shape[2:]), q=cut.q[rows], run=cut.run[rows])
+        candidates = replace(
+            self.evidence.candidates, cut=many, running_s=self.evidence.candidates.running_s[rows]
+        )
+        paths = candidates.paths([])[0].reshape(count, windows, *self.evidence.base.shape[1:])
+        return to_increments(paths, self.evidence.start) - self.evidence.way
+
+    @cached_property
+    def _told(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per window: what each frame that changes a command does to errors over the noise when it comes a period late, `(J I, D)`.
+
+        With the number of the joint that tells most of each, `(D,)`.
+        """
+        assert self.evidence.noise is not None, "noise is known by now"
+        found, joints = [], self.evidence.way.shape[2]
+        for w, ranks in enumerate(self._ranks):
+            frames = np.flatnonzero(ranks.any(1))
+            columns = np.zeros((joints, self.evidence.way.shape[1], len(frames)))
+            for j, whiteners in enumerate(self._whiteners if len(frames) else ()):
+                rank = ranks[frames, j]
+                columns[j][:, rank > 0] = (
+                    whiteners[w]
+                    @ self.responses[rank[rank > 0] - 1, w, :, j].T
+                    * self.evidence.claims[w, j]
+                )
+            telling = np.abs(columns).max((0, 1)) > LEAST
+            columns = columns[..., telling]
+            found.append(
+                (
+                    columns.reshape(joints * columns.shape[1], telling.sum()),
+                    np.square(columns).sum(1).argmax(0),
+                )
+            )
+        return found
+
+    @cached_property
+    def _whiteners(self) -> list[np.ndarray]:
+        assert self.evidence.noise is not None, "noise is known by now"
+        return [
+            noise.whitener(self.evidence.way[..., j]) for j, noise in enumerate(self.evidence.noise)
+        ]
+
+    @cached_property
+    def _every(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        return self._solved(None)
+
+    def _solved(self, without: int | None) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per window: matrix from errors over the noise to delays, and their standard errors."""
+        found, steps = [], self.evidence.way.shape[1]
+        for x, _ in self._told:
+            counted = x * np.repeat(np.arange(len(x) // steps) != without, steps)[:, None]
+            inverse = np.linalg.inv(counted.T @ counted + np.eye(x.shape[1]) / WIDE**2)
+            found.append((inverse @ counted.T, np.sqrt(np.diag(inverse))))
+        return found
+
+    def delays(self, error: np.ndarray, without: int | None = None) -> Delays:
+        """Returns the delays that explain errors `(W, I, J)` (measured less simulated increments) best.
+
+        What a joint alone is late by on average is none of them; `without`: a joint whose errors do
+        not count.
+        """
+        z = np.stack(
+            [(w @ error[..., j, None])[..., 0] for j, w in enumerate(self._whiteners)], 1
+        )  # (W, J, I)
+        always = np.stack([x.sum(1).reshape(z.shape[1:]) for x, _ in self._told])
+        share = (always * z).sum((0, 2)) / (np.square(always).sum((0, 2)) + WIDE**-2)
+        z = z - share[:, None] * always
+        value, deviation, joint = [], [], []
+        solutions = self._every if without is None else self._solved(without)
+        for row, (matrix, errors), (_, most) in zip(z, solutions, self._told, strict=True):
+            sure = errors < SURE
+            value.append((matrix @ row.ravel())[sure])
+            deviation.append(errors[sure])
+            joint.append(most[sure])
+        value, deviation, joint = (
+            np.concatenate(value),
+            np.concatenate(deviation),
+            np.concatenate(joint),
+        )
+        return Delays(
+            value - np.average(value, weights=deviation**-2) if len(value) else value,
+            deviation,
+            joint,
+        )
+
+    def spread(self, error: np.ndarray) -> np.ndarray:
+        """Returns what each change does when it comes late by the standard deviation of the delays seen, `(W, C, I, J)`."""
+        seen = self.delays(error)
+        by = np.sqrt(max(0.0, float(np.mean(np.square(seen.value) - np.square(seen.error)))))
+        return by * self.responses.swapaxes(0, 1)
+
+
+def search(
+    changes: Changes,
+    error: np.ndarray,
+    nulls: Sequence[Evidence],
+    kinds: Sequence[Kind],
+    price: float,
+    name_price: float,
+) -> Found | None:
+    """Returns the effect on the arrival of commands that the scatter of hidden delays shows, if any.
+
+    Args:
+        changes: Of the commands in the field.
+        error: Measured less simulated increments after what else was found, `(W, I, J)`.
+        nulls: The simulator against parts of the reference that it was not fitted to.
+        kinds: The library.
+        price: Beside what is earned on the reference.
+        name_price: For the effect as such.
+    """
+    kinds = [kind for kind in kinds if kind.target.stochastic and kind.target.side == "command"]
+    others = [Changes(one) for one in nulls]
+    seen, known = changes.delays(error), [one.delays(one.evidence.error) for one in others]
+    if not kinds or len(seen.value) < FEWEST or sum(len(one.value) for one in known) < FEWEST:
+        return None
+    usual = Usual.of(known)
+    if _scatter(seen.value / seen.error) < WIDER * _scatter(
+        np.concatenate([one.value / one.error for one in known])
+    ):
+        return None
+    gains, earned = {}, {}
+    for kind in kinds:
+        drawn = [_thinned(one) for one in _drawn(changes, kind)]
+        gains[kind.name] = np.array([usual.gain(seen, one) for one in drawn])
+        best = drawn[int(np.argmax(gains[kind.name]))]
+        by_joint = {
+            int(j): usual.gain(seen.of(j), best)
+            for j in np.unique(seen.joint)
+            if len(seen.of(j).value) >= FEWEST
+        }
+        rest = (
+            changes.delays(error, max(by_joint, key=by_joint.__getitem__))
+            if len(by_joint) > 1
+            else seen
+        )
+        if min(by_joint.values(), default=0.0) < -price or usual.gain(rest, best) < price:
+            gains[kind.name] = gains[kind.name] * 0.0  # frames are late for all joints or for none
+        share = [len(seen.value) / max(1, len(one.value)) for one in known]
+        earned[kind.name] = max(
+            0.0, *(usual.gain(one, best) * part for one, part in zip(known, share, strict=True))
+        )
+    worth = {
+        name: float(gain.max()) - price - 1.5 * earned[name] - name_price
+        for name, gain in gains.items()
+    }
+    best = max(kinds, key=lambda kind: worth[kind.name])
+    if worth[best.name] <= 0:
+        return None
+    ends = np.array(fit_interval(SIZES, gains[best.name]))
+    machine = changes.evidence.candidates.machine
+    parameters = {}
+    for name in best.fitted:
+        mean, low, high = (
+            float(v) for v in best.clipped(name, best.numbers[name].none + best.size(name) * ends)
+        )
+        parameters[name] = {joint: Estimate(mean, (low, high)) for joint in machine.joint_names}
+    rest = {name: float(gain.max()) for name, gain in gains.items() if name != best.name}
+    every = np.ones(machine.num_joints, dtype=bool)
+    return Found(
+        best,
+        every,
+        parameters,
+        worth[best.name],
+        float(gains[best.name].max()),
+        _explained(seen, usual.scale),
+        rest,
+    )
+
+
+def expected(evidence: Evidence, found: Found, steady: Sequence[tuple[Kind, Values]]) -> Evidence:
+    """Returns the evidence with what the found effect changes on average, and the mean delay that joints share beyond it.
+
+    How delays scatter does not tell their mean: frames that may not overtake each other wait twice
+    as long as others that scatter alike. Frames are late for all joints alike, so that what one
+    joint alone is late by is left for an effect of its own.
+
+    Args:
+        evidence: The simulator against the field.
+        found: The effect.
+        steady: Other effects that are there.
+    """
+    count, candidates = (
+        4 * DRAWN,
+        replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady]),
+    )
+    mean = (
+        candidates.paths([(found.kind, found.values(count))], count).mean(0)
+        - candidates.paths([])[0]
+    )
+    u = evidence.candidates.cut.u
+    late = replace(evidence.candidates.cut, u=np.concatenate([u[:, :1], u[:, :-1]], 1))
+    later = replace(evidence.candidates, cut=late).paths([])[0] - evidence.base
+    known = replace(evidence, mean=mean)
+    moved, usual = (
+        known.whitened(to_increments(one, np.zeros_like(evidence.start))[None])[:, 0]
+        for one in (later, mean)
+    )
+    shares = [
+        fitted(z, [], faults=np.concatenate([faults, WIDE * line[None]]))[-1] * WIDE
+        for z, faults, line in zip(known.z, known.faults, moved, strict=True)
+    ]
+    told = np.square(moved).sum(1)
+    own = weighted_median((moved * usual).sum(1) / np.maximum(told, 1e-9), told)
+    more = weighted_median(np.array(shares), told)
+    return replace(evidence, mean=mean + more * later) if abs(more) <= BEYOND * abs(own) else known
+
+
+def _drawn(changes: Changes, kind: Kind) -> list[np.ndarray]:
+    """Returns hidden delays that an effect of each size makes, without errors of measurement, each `(D,)`."""
+    evidence, joints = changes.evidence, changes.evidence.way.shape[2]
+    sizes = np.repeat(SIZES, DRAWN)[:, None]
+    values = {}
+    for name in kind.fitted:
+        values[name] = np.repeat(
+            kind.clipped(name, kind.numbers[name].none + sizes * kind.size(name)), joints, 1
+        )
+    paths = evidence.candidates.paths([(kind, values)], len(sizes))
+    moved = to_increments(paths, evidence.start) - evidence.way
+    found = [changes.delays(one).value for one in moved]
+    return [np.concatenate(found[start : start + DRAWN]) for start in range(0, len(found), DRAWN)]
+
+
+def _scatter(values: np.ndarray) -> float:
+    """Returns the root mean square, outliers cut."""
+    return float(np.sqrt(np.mean(np.minimum(np.square(values), 25.0))))
+
+
+def _thinned(drawn: np.ndarray) -> np.ndarray:
+    """Returns delays that are distributed alike, at most `MOST`."""
+    return np.sort(drawn)[np.linspace(0, len(drawn) - 1, min(MOST, len(drawn))).astype(int)]
+
+
+def _explained(seen: Delays, scale: float) -> float:
+    """Returns the share of the scatter of the delays that is more than their errors."""
+    return float(
+        np.clip(
+            1.0 - np.mean((scale * seen.error) ** 2) / max(np.mean(seen.value**2), 1e-12), 0.0, 1.0
+        )
+    )
