@@ -1,4 +1,4 @@
-"""Reading captures back, whole or cut off: what a crash left is read up to where it ends."""
+"""Reads and recovers captures, whole or cut off by a crash; those up to where they end."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ log = logging.getLogger(__name__)
 
 
 class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
-    """The messages of a topic, in order: (t_s, values); `t_s` is monotonic time.
+    """Messages of a topic, in order: (t_s, values); `t_s` is monotonic time.
 
-    Topics of numbers alone, which is what a bus says, are kept by column: an hour of them takes a
-    tenth of the memory of as many dictionaries.
+    Topics of numbers alone, as those of the bus, are kept by column: an hour of them takes a tenth
+    of the memory of as many dictionaries.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
 
     @property
     def names(self) -> frozenset[str]:
-        """What the first of them says."""
+        """Names of the values in the first message."""
         return frozenset(self._columns or self._rows[0])
 
     def series(self, name: str) -> np.ndarray:
@@ -85,7 +85,7 @@ class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
 
 @dataclass
 class CaptureContents:
-    """What a capture holds.
+    """Contents of a capture.
 
     Attributes:
         facts: Metadata of the run: `machine`, `fingerprint`, `dbc`, `started_ns`, …
@@ -137,7 +137,7 @@ def is_whole(path: Path) -> bool:
 
 
 def recover_mcap(path: Path, out: Path) -> int:
-    """Write what can be read of a cut-off capture as a whole one; returns the number of messages.
+    """Write the readable part of a cut-off capture as a whole one; return its number of messages.
 
     Raises:
         RecordingError: nothing can be read.
@@ -180,7 +180,7 @@ def recover_mcap(path: Path, out: Path) -> int:
 
 
 def recover_blf(path: Path, out: Path) -> int:
-    """Write what can be read of a cut-off BLF as a whole one; returns the number of frames."""
+    """Write the readable part of a cut-off BLF as a whole one; return its number of frames."""
     part, count = out.with_name(f".{out.name}.part"), 0
     writer = DurableBlfWriter(part)
     try:
@@ -236,8 +236,7 @@ class CaptureRecovery:
     """Captures to recover.
 
     Attributes:
-        input: Glob, or list of globs, of `.mcap` and `.blf` files; what else lies beside them is
-            left out.
+        input: Glob, or list of globs, of `.mcap` and `.blf` files; others are left out.
     """
 
     input: str | tuple[str, ...]

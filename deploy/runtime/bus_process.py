@@ -74,7 +74,7 @@ class BusProcess:
         self._wire, self._memory, self._machine = config.wire, memory, config.machine
         self._description = BusDescription(config.dbc, config.machine)
         self._receiver = BusReceiver(self._description, config.machine, config.limits)
-        self._guard = Guard(config.limits, self._receiver.body)
+        self._guard = Guard(config.limits, self._receiver.bounds)
         self._gap_s = config.limits.gap_s
         self._bus: OpenCanBus | OpenBusReplay | None = None
         self._was_down, self._reopen_s = False, 0.0

@@ -66,13 +66,13 @@ class BusReceiver:
         signals += [f"Position_{joint}" for joint in machine.joint_names]
         # channels without which nothing may be commanded
         self._needed = {described.message_of(name) for name in signals} & set(self.channels)
-        self.body = build_joint_bounds(
+        self.bounds = build_joint_bounds(
             machine.lower.tolist(),
             machine.upper.tolist(),
             machine.max_speed.tolist(),
             machine.is_exclusive.tolist(),
         )
-        self.plausibility = PlausibilityFilter(self.limits, self.body)
+        self.plausibility = PlausibilityFilter(self.limits, self.bounds)
         count = machine.num_joints
         self.q, self.q_valid = np.zeros(count), np.zeros(count, dtype=bool)
         self.q_t_s = np.full(count, -math.inf)

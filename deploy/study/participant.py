@@ -257,7 +257,7 @@ class _Taking:
                     angles_rad, remote.button_right = self._own.levers(self._given())
                     remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
                 cycle += 1
-                bus.send(remote.frame())
+                bus.send(remote.build_frame())
 
     def _given(self) -> np.ndarray:
         """Returns what the hands give in the coming period, `(J,)`; nothing but in a trial."""

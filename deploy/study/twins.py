@@ -255,7 +255,7 @@ class _Desk:
     def _cycle(self) -> None:
         self._now_s += CYCLE_S
         if self._cycles % round(self._remote.period_s / CYCLE_S) == 0:
-            frame = self._remote.frame()
+            frame = self._remote.build_frame()
             self._twin.hear(frame, self._now_s)
             self._receiver.take(frame, self._now_s)
         self._cycles += 1

@@ -24,7 +24,8 @@ the benchmark's."""
 @pytest.fixture(scope="module")
 def desk(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+        folders = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+        patch.setenv("PYTHONPATH", os.pathsep.join(folders))
         with Desk(machine, option("guard", "default"), tmp_path_factory.mktemp("desk")) as made:
             for name in ("twin", "bus", "commander"):
                 made.start(name)
