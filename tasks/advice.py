@@ -48,7 +48,7 @@ class AdviceConfig:
                 )
 
     def build(self, machine: Machine, device: torch.device) -> "LeverAdviser":
-        """Returns the adviser for `machine` on `device`."""
+        """Return the adviser for `machine` on `device`."""
         return LeverAdviser(self, machine, device)
 
 
@@ -66,7 +66,7 @@ class LeverAdviser:
         self._future = _predict_levers(advice, machine).to(device)
 
     def coming(self, proposed: torch.Tensor, given: torch.Tensor) -> torch.Tensor:
-        """Returns the commands that hands will yet give, `(N, F, J)`, if nothing more is proposed.
+        """Return the commands that hands will yet give, `(N, F, J)`, if nothing more is proposed.
 
         Args:
             proposed: What was proposed, oldest first, `(N, H, J)`.
@@ -81,7 +81,7 @@ class LeverAdviser:
         )
 
     def proposal(self, wanted: torch.Tensor, proposed: torch.Tensor) -> torch.Tensor:
-        """Returns what to propose, `(N, J)`, where the commands `wanted`, `(N, J)`, are to be given.
+        """Return what to propose, `(N, J)`, where the commands `wanted`, `(N, J)`, are to be given.
 
         Args:
             wanted: Commands under the masks.
@@ -97,7 +97,7 @@ class LeverAdviser:
         return torch.where(select_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
 
     def _shown(self, command: torch.Tensor) -> torch.Tensor:
-        """Returns the deflection that commands `command`."""
+        """Return the deflection that commands `command`."""
         return torch.where(
             command == 0,
             0.0,
@@ -106,7 +106,7 @@ class LeverAdviser:
 
 
 def _predict_levers(advice: AdviceConfig, machine: Machine) -> torch.Tensor:
-    """Returns what makes levers of the coming periods, `(F, H + 1)`, of `H` proposals, oldest first, and the hand as it is."""
+    """Return what makes levers of the coming periods, `(F, H + 1)`, of `H` proposals, oldest first, and the hand as it is."""
     num, period_s = machine.num_history, machine.period_s
     delay, lag = (
         _take_middle(advice.delay_s) / period_s,

@@ -164,7 +164,7 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(
         *about,
         "exam.do=score",
         f"+exam.answers.none={answers}",
-        f"exam.report={ledger}",
+        f"exam.ledger={ledger}",
         f"session.out={marks}",
     )
     assert done.code == 0, done.err
