@@ -18,7 +18,6 @@ import secrets
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from http import HTTPStatus
-from importlib.resources import files
 from typing import Generic, Protocol, TypeVar
 
 from websockets.asyncio.server import ServerConnection, serve
@@ -31,6 +30,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.page import access, frame_codec
 from deploy.page.clock import PageClock
+from deploy.page.files import FILES, SECURITY, load_files
 from deploy.page.protocol import DrawReport, PageFeed, PageState
 from deploy.page.settings import LINK, PageSettings
 
@@ -66,28 +66,6 @@ CONNECTIONS = 3
 STATE, FRAMES, CONTROL = "/state", "/frames", "/control"
 POLICY_VIOLATION = 1008
 """Close code of a WebSocket (RFC 6455)."""
-
-FILES = {
-    ".html": "text/html; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".json": "application/json; charset=utf-8",
-    ".txt": "text/plain; charset=utf-8",
-    ".svg": "image/svg+xml",
-}
-"""Content type by suffix; other files are not served."""
-SECURITY = {
-    # only this server's own files, no code or style in the page itself, no frame around it
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; worker-src 'self'; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Cache-Control": "no-store",
-}
 
 
 class PageExtension(Protocol):
@@ -159,23 +137,6 @@ def write_link(session: Session, address: str) -> None:
     path = session.folder / LINK
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
         file.write(address + "\n")
-
-
-def load_files(setup: bytes) -> dict[str, tuple[str, bytes]]:
-    """Return type and content of each file by its path; `/setup.json` is `setup`."""
-    found = {"/setup.json": (FILES[".json"], setup)} | read_static_files("deploy.page")
-    found["/"] = found["/index.html"]
-    return found
-
-
-def read_static_files(package: str) -> dict[str, tuple[str, bytes]]:
-    """Return type and content of each file in the folder `static` of a package, by its path."""
-    found = {}
-    for entry in files(package).joinpath("static").iterdir():
-        kind = FILES.get("." + entry.name.rpartition(".")[2])
-        if kind and entry.is_file():
-            found[f"/{entry.name}"] = (kind, entry.read_bytes())
-    return found
 
 
 T = TypeVar("T")

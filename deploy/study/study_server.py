@@ -17,9 +17,10 @@ from typing import Any
 from websockets.asyncio.server import ServerConnection
 
 from brokk_rl.signals import Frame
+from deploy.page.files import read_static_files
 from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 from deploy.page.protocol import DrawReport, OperatorRequest, PageFeed, PageState
-from deploy.page.server import read_static_files, serve_page
+from deploy.page.server import serve_page
 from deploy.page.settings import LINK
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory

@@ -22,9 +22,10 @@ from brokk_rl.signals import Frame
 from deploy.page import access, frame_codec
 from deploy.page.clock import PageClock
 from deploy.page.demo import DemoMachine
+from deploy.page.files import load_files
 from deploy.page.protocol import OperatorRequest, SourceAge
 from deploy.page.scene import plan_approach
-from deploy.page.server import SendWindow, build_link, load_files
+from deploy.page.server import SendWindow, build_link
 
 MINE = access.list_own_hosts("127.0.0.1", 8170, ())
 
