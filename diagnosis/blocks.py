@@ -14,7 +14,7 @@ from math import comb
 import numpy as np
 from scipy.stats import false_discovery_control
 
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 
 FEWEST_PERMUTATIONS = 1000
 """Below so many ways to distribute recordings over two sides, no cell of some forty could be told
@@ -39,7 +39,7 @@ class Blocks:
     unit: str
 
 
-def blocks(field: FreeRuns, reference: FreeRuns) -> Blocks:
+def blocks(field: WindowedRuns, reference: WindowedRuns) -> Blocks:
     """Returns recordings as blocks, or parts of them where recordings are too few."""
     sides = [np.unique(side.source, return_inverse=True)[1] for side in (field, reference)]
     few = comb(len(set(sides[0])) + len(set(sides[1])), len(set(sides[0]))) < FEWEST_PERMUTATIONS
@@ -51,7 +51,7 @@ def blocks(field: FreeRuns, reference: FreeRuns) -> Blocks:
     )
 
 
-def parts(runs: FreeRuns) -> np.ndarray:
+def parts(runs: WindowedRuns) -> np.ndarray:
     """Returns the number of the part of `PART_S` of a recording that each window lies in, `(W,)`."""
     begin_s = np.array(
         [

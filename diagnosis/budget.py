@@ -16,7 +16,7 @@ import torch
 
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Budget:
         }
 
 
-def account(runs: FreeRuns, machine: Machine) -> Account:
+def account(runs: WindowedRuns, machine: Machine) -> Account:
     """Returns the error of the tip over free runs.
 
     Raises:

@@ -17,18 +17,18 @@ from brokk_rl.record import Recording
 from brokk_rl.split import COMMANDED
 
 HORIZON_S = 5.0
-LEAST_S = 60.0
+MIN_TOTAL_S = 60.0
 """Field recordings that are shorter in all say nothing that holds beyond them."""
-MOVED = 0.01
+MIN_TRAVEL_SHARE = 0.01
 """A joint that moved less, of its travel, in all field recordings shows nothing."""
-PART_S = 150.0
+MAX_PART_S = 150.0
 """Longest part of a recording that stays together when some are left out."""
 PAUSE_S = 4.0 * 3600.0
 """After so long without a recording the machine has been off."""
 
 
 @dataclass(frozen=True)
-class Case:
+class GapCase:
     """What a diagnosis is given.
 
     Attributes:
@@ -48,9 +48,9 @@ class Case:
         """Returns reasons why these recordings cannot tell anything, in words for people; none where they can."""
         found = []
         total_s = sum(recording.duration_s for recording in self.field)
-        if total_s < LEAST_S:
+        if total_s < MIN_TOTAL_S:
             found.append(
-                f"the field recordings last {total_s:.0f} s in all; {LEAST_S:.0f} s or more are needed"
+                f"the field recordings last {total_s:.0f} s in all; {MIN_TOTAL_S:.0f} s or more are needed"
             )
         if open_loop.longest_s(self.field, self.machine) < HORIZON_S:
             found.append(f"no field recording is long enough for a free run of {HORIZON_S:g} s")
@@ -71,7 +71,7 @@ class Case:
         return np.logical_not(np.any(commanded, axis=0))
 
 
-def load(folder: Path, machine: Machine) -> Case:
+def load_case(folder: Path, machine: Machine) -> GapCase:
     """Reads a gap case: `reference/*.parquet` and `field/*.parquet`.
 
     Raises:
@@ -90,10 +90,12 @@ def load(folder: Path, machine: Machine) -> Case:
                 f"{folder}: no {name}/*.parquet; a case has both"
                 + (f" ({why})" if name == "reference" else "")
             )
-    return Case(machine, *(recorded(str(part / "*.parquet"), machine) for part in parts.values()))
+    return GapCase(
+        machine, *(read_recordings(str(part / "*.parquet"), machine) for part in parts.values())
+    )
 
 
-def recorded(where: str | tuple[str, ...], machine: Machine) -> list[Recording]:
+def read_recordings(where: str | tuple[str, ...], machine: Machine) -> list[Recording]:
     """Reads recordings of the machine.
 
     Raises:
@@ -114,7 +116,7 @@ def _check_stamp(stamp: str, recording: Recording, machine: Machine) -> None:
         raise RecordingError(f"{recording.path}: {error}") from error
 
 
-def running_s(recordings: Sequence[Recording]) -> list[float]:
+def estimate_running_s(recordings: Sequence[Recording]) -> list[float]:
     """Returns how long the machine had been running at the beginning of each recording, as far as their dates tell."""
     dates = [recording.metadata.get("created") for recording in recordings]
     if not all(dates):
@@ -129,11 +131,11 @@ def running_s(recordings: Sequence[Recording]) -> list[float]:
     return found.tolist()
 
 
-def parts(recordings: Sequence[Recording]) -> list[Recording]:
+def split_recordings(recordings: Sequence[Recording]) -> list[Recording]:
     """Returns the recordings, those longer than `PART_S` cut into equal parts, each part a run by itself."""
     found = []
     for number, recording in enumerate(recordings):
-        count = max(1, round(recording.duration_s / PART_S))
+        count = max(1, round(recording.duration_s / MAX_PART_S))
         for part, rows in enumerate(np.array_split(np.arange(recording.num_samples), count)):
             rows = slice(rows[0], rows[-1] + 1)
             extra = {name: values[rows] for name, values in recording.extra.items()}

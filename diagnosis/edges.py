@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from brokk_rl.machine import Machine
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.occasions import REGIMES, SHORTLY_S, in_force, regimes
 
 SLOWEST = 0.1
@@ -23,7 +23,7 @@ MAD = 1.4826
 
 
 def figures(
-    runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
+    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Returns the spread of the lateness of starts (s) as `delay_jitter` and ringing (rad or m) as `compliance`, by joint.
 
@@ -51,7 +51,9 @@ def figures(
     return found
 
 
-def _lateness(runs: FreeRuns, label: np.ndarray, joint: int, machine: Machine) -> Iterator[float]:
+def _lateness(
+    runs: WindowedRuns, label: np.ndarray, joint: int, machine: Machine
+) -> Iterator[float]:
     """Yields for each start within a window how much later the machine moves, s."""
     ahead = round(SHORTLY_S / machine.period_s)
     is_start = label == REGIMES.index("start")
@@ -72,7 +74,7 @@ def _lateness(runs: FreeRuns, label: np.ndarray, joint: int, machine: Machine) -
             yield float(late_s)
 
 
-def _ringing(runs: FreeRuns, label: list[np.ndarray], joint: int) -> Iterator[float]:
+def _ringing(runs: WindowedRuns, label: list[np.ndarray], joint: int) -> Iterator[float]:
     """Yields for each stop how much the measured position swings about a straight line in the second half of the time after."""
     for recording, regime in zip(runs.recordings, label, strict=True):
         is_stop = regime == REGIMES.index("stop")

@@ -23,7 +23,7 @@ from brokk_rl.record import Recording
 
 
 @dataclass(frozen=True)
-class FreeRuns:
+class WindowedRuns:
     """Free runs, each begun at what was measured.
 
     Attributes:
@@ -77,13 +77,13 @@ class FreeRuns:
         )  # fmt: skip
 
 
-def free_runs(
+def simulate_free_runs(
     actuator: Actuator,
     recordings: Sequence[Recording],
     machine: Machine,
     horizon_s: float,
     device: torch.device,
-) -> FreeRuns:
+) -> WindowedRuns:
     """Runs a simulator through recordings from one end to the other, begun anew every `horizon_s`; the last may be shorter.
 
     Raises:
@@ -103,4 +103,4 @@ def free_runs(
             f"too little data: a free run needs recordings of more than {before * machine.period_s:g} s"
         )
     simulated = open_loop.free_run(actuator, machine, open_loop.joined(cuts), device)
-    return FreeRuns(recordings, np.array(source), np.array(row), simulated.astype(float))
+    return WindowedRuns(recordings, np.array(source), np.array(row), simulated.astype(float))

@@ -19,7 +19,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import answer
 from diagnosis.answer import Answer
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 
 ARRAYS = "diagnosis.npz"
 
@@ -38,9 +38,9 @@ class Outcome:
     """
 
     answer: Answer
-    before: FreeRuns
-    after: FreeRuns | None
-    floor: FreeRuns | None
+    before: WindowedRuns
+    after: WindowedRuns | None
+    floor: WindowedRuns | None
 
     def save(self, folder: Path) -> None:
         """Writes `diagnosis.json` and `diagnosis.npz`, each in one step.
@@ -89,7 +89,7 @@ def load(folder: Path, machine: Machine) -> Outcome:
     )
 
 
-def _packed(name: str, runs: FreeRuns) -> dict[str, Any]:
+def _packed(name: str, runs: WindowedRuns) -> dict[str, Any]:
     arrays: dict[str, Any] = {
         f"{name}.source": runs.source, f"{name}.row": runs.row, f"{name}.simulated": runs.simulated.astype(np.float32),
         f"{name}.titles": np.array([r.path.stem if r.path else r.run for r in runs.recordings]),
@@ -101,7 +101,7 @@ def _packed(name: str, runs: FreeRuns) -> dict[str, Any]:
     return arrays
 
 
-def _unpacked(name: str, arrays: Any, machine: Machine) -> FreeRuns | None:
+def _unpacked(name: str, arrays: Any, machine: Machine) -> WindowedRuns | None:
     if f"{name}.row" not in arrays:
         return None
     empty = Recording(
@@ -118,7 +118,7 @@ def _unpacked(name: str, arrays: Any, machine: Machine) -> FreeRuns | None:
         )
         for number, (title, begun, rate_hz) in enumerate(zip(titles, created, rates, strict=True))
     ]  # fmt: skip
-    return FreeRuns(
+    return WindowedRuns(
         recordings,
         arrays[f"{name}.source"],
         arrays[f"{name}.row"],

@@ -20,7 +20,7 @@ from brokk_rl.plot import BLUE, GREY, RED, clean, legend, panels
 from brokk_rl.split import COMMANDED
 from diagnosis import wording
 from diagnosis.answer import Answer
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.growth import READINGS, curve
 from diagnosis.outcome import Outcome
 from diagnosis.sanity import name_of
@@ -70,7 +70,7 @@ def ladder(answer: Answer) -> Figure | None:
     return figure
 
 
-def heat(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
+def heat(answer: Answer, before: WindowedRuns, machine: Machine) -> Figure:
     """Draws which joint and regime the gap lies in, and how large the error of each joint is over the running time."""
     location = answer.more["location"]
     parts = location["parts"]["regime"]
@@ -292,7 +292,7 @@ def waterfall(budget: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _over_time(axis: Axes, before: FreeRuns, machine: Machine) -> None:
+def _over_time(axis: Axes, before: WindowedRuns, machine: Machine) -> None:
     """Fills the axis with the error of each joint over running time, in parts of its travel."""
     square = np.nanmean(before.error**2, 1) / (machine.upper - machine.lower) ** 2
     order = np.lexsort((before.row, before.source))

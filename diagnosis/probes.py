@@ -22,7 +22,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.split import COMMANDED
 from diagnosis import edges
 from diagnosis.blocks import parts
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.occasions import CREEP, REGIMES, in_force, regimes
 
 SPAN_S = 0.25
@@ -123,7 +123,7 @@ TEXTS = {
 
 
 def probes(
-    runs: FreeRuns, reference: FreeRuns | None, machine: Machine, dead_time_s: np.ndarray
+    runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine, dead_time_s: np.ndarray
 ) -> list[Probe]:
     """Returns all figures, those that stand out most first.
 
@@ -157,7 +157,7 @@ def _said(effect: str, value: float, unit: str) -> str:
 
 
 def _coefficients(
-    runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
+    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Returns the coefficient of each probe and its standard error, by effect and joint."""
     span = max(1, round(SPAN_S / machine.period_s))
@@ -187,7 +187,7 @@ def _coefficients(
 class _Clues:
     """What each effect would leave behind in the speed that the simulator has too much, `(W, K)` for each joint."""
 
-    def __init__(self, runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> None:
+    def __init__(self, runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray) -> None:
         acting = [in_force(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
         self._u = runs.cut(acting)
         self._regime = runs.cut(

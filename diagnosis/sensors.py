@@ -16,8 +16,8 @@ import torch
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
-from diagnosis.case import Case, parts
-from diagnosis.effect_library import Found, Kind, Still, fit_interval
+from diagnosis.case import GapCase, split_recordings
+from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel, estimate_interval
 
 SIZES = np.geomspace(0.05, 6.0, 25)
 AT_REST, MOVING = 0.01, 0.08
@@ -76,9 +76,11 @@ def readings(
     return np.sqrt(np.maximum(now - then, 0.0).max(1) / WHITE)
 
 
-def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -> list[Found]:
+def search(
+    case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float
+) -> list[DetectedEffect]:
     """Returns the effects on sensors that the scatter of the field's samples shows."""
-    field, reference, machine = case.field, parts(case.reference), case.machine
+    field, reference, machine = case.field, split_recordings(case.reference), case.machine
     if len(reference) < 2:
         return []
     kinds = [
@@ -111,7 +113,7 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
             continue
         parameters: dict[str, dict[str, Estimate]] = {}
         for j in np.flatnonzero(mask):
-            ends = np.array(fit_interval(SIZES, likelihood[kind.name][:, j]))
+            ends = np.array(estimate_interval(SIZES, likelihood[kind.name][:, j]))
             for name in kind.fitted:
                 mean, low, high = kind.numbers[name].none + kind.size(name) * ends
                 parameters.setdefault(name, {})[machine.joint_names[j]] = Estimate(
@@ -133,7 +135,9 @@ def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -
             np.square((seen - plain.mean(0)) / BLUR)[mask]
         )
         found.append(
-            Found(kind, mask, parameters, worth, earned, float(np.clip(closed, 0.0, 1.0)), rivals)
+            DetectedEffect(
+                kind, mask, parameters, worth, earned, float(np.clip(closed, 0.0, 1.0)), rivals
+            )
         )
     return found
 
@@ -152,14 +156,16 @@ def _likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.nd
     return -0.5 * np.nansum(off + np.where(np.isfinite(off), np.log(variance), 0.0), 1)
 
 
-def _with(kind: Kind, size: float, reference: Sequence[Recording], machine: Machine) -> np.ndarray:
+def _with(
+    kind: EffectType, size: float, reference: Sequence[Recording], machine: Machine
+) -> np.ndarray:
     """Returns the statistics of the reference with an effect on all joints, `(P, J, F)`."""
     found = []
     for recording in reference:
         q = torch.as_tensor(recording.q, dtype=torch.float32)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            model = kind.wrap(Still(), machine, len(q), torch.device("cpu"))
+            model = kind.wrap(StationaryModel(), machine, len(q), torch.device("cpu"))
         for name in kind.fitted:
             value = kind.clipped(name, np.array(kind.numbers[name].none + size * kind.size(name)))
             model.parameters[name].fill_(float(value))

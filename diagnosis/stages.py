@@ -18,7 +18,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Stage
 from diagnosis.budget import Budget
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import COLUMNS, Geometry
 from diagnosis.probes import SPAN_S, Probe
 from diagnosis.where import Location
@@ -75,7 +75,7 @@ class Known:
 
 
 def stages(
-    known: Known, runs: FreeRuns, reference: FreeRuns | None, machine: Machine
+    known: Known, runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine
 ) -> list[StageFinding]:
     """Returns what each stage has to do with the gap, those about which something can be said."""
     whole_m = _beyond(known.budget) if known.budget else None
@@ -107,8 +107,8 @@ def _beyond(budget: Budget) -> float:
 
 def _of_joints(
     known: Known,
-    runs: FreeRuns,
-    reference: FreeRuns | None,
+    runs: WindowedRuns,
+    reference: WindowedRuns | None,
     machine: Machine,
     whole_m: float | None,
 ) -> list[StageFinding]:
@@ -219,7 +219,7 @@ def perception(recordings: Sequence[Recording], machine: Machine) -> StageFindin
     return StageFinding("perception", None, rms_m, text)
 
 
-def _contact(runs: FreeRuns) -> StageFinding | None:
+def _contact(runs: WindowedRuns) -> StageFinding | None:
     if not all("force_n" in recording.extra for recording in runs.recordings):
         return None
     force = runs.cut([recording.extra["force_n"] for recording in runs.recordings])

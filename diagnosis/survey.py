@@ -12,7 +12,7 @@ from brokk_rl.inspection import Thresholds
 from brokk_rl.machine import Machine
 from diagnosis.answer import JointGap, RegimeGap, Where
 from diagnosis.budget import Budget, account
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import Geometry, geometry
 from diagnosis.probes import Probe, probes
 from diagnosis.sanity import Remark, examine
@@ -64,14 +64,14 @@ class Survey:
 
 
 def survey(
-    before: FreeRuns,
-    floor: FreeRuns | None,
-    after: FreeRuns | None,
+    before: WindowedRuns,
+    floor: WindowedRuns | None,
+    after: WindowedRuns | None,
     machine: Machine,
     thresholds: Thresholds,
     dead_time_s: np.ndarray,
     generator: np.random.Generator,
-    whole: FreeRuns | None = None,
+    whole: WindowedRuns | None = None,
 ) -> Survey:
     """Returns what is to be said.
 

@@ -17,8 +17,8 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
-from diagnosis.case import Case
-from diagnosis.effect_library import Found, Kind, Still
+from diagnosis.case import GapCase
+from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
 
 COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 FEWEST = 40
@@ -44,7 +44,7 @@ Fit = tuple[float, np.ndarray, np.ndarray]
 class _Cause:
     """One error: an effect on one joint, or of the whole machine; `columns` `(D, P)` per unit of `names`."""
 
-    kind: Kind
+    kind: EffectType
     joint: int | None
     names: tuple[str, ...]
     columns: np.ndarray
@@ -72,11 +72,11 @@ class Seen:
             measured.
     """
 
-    found: Sequence[Found]
+    found: Sequence[DetectedEffect]
     left: float
 
 
-def search(case: Case, kinds: Sequence[Kind], price: float, name_price: float) -> Seen:
+def search(case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float) -> Seen:
     """Returns the errors of geometry and encoders that the measured tool points of the field show; none where there are none."""
     field, reference, machine = case.field, case.reference, case.machine
     if not is_tracked(field, machine):
@@ -148,7 +148,7 @@ def _found(
     fits: Mapping[tuple[int, ...], Fit],
     worth: Mapping[tuple[int, ...], float],
     machine: Machine,
-) -> Found:
+) -> DetectedEffect:
     gain, values, covariance = fits[best]
     deviation, parameters, mask, place = (
         np.sqrt(np.diag(covariance)),
@@ -181,11 +181,11 @@ def _found(
         value for chosen, value in worth.items() if not any(causes[c].kind is kind for c in chosen)
     )
     closed = float(np.clip(own / max(gain, 1e-9), 0.0, 1.0))
-    return Found(kind, mask, parameters, worth[best] - without, own, closed, rivals)
+    return DetectedEffect(kind, mask, parameters, worth[best] - without, own, closed, rivals)
 
 
 def _causes(
-    kinds: Sequence[Kind], q: np.ndarray, ways: np.ndarray, machine: Machine
+    kinds: Sequence[EffectType], q: np.ndarray, ways: np.ndarray, machine: Machine
 ) -> list[_Cause]:
     """Returns the errors that move the tool point at all, other than along the ways that it goes."""
     plain, found = _points(None, {}, q, machine), []
@@ -206,7 +206,9 @@ def _causes(
     return found
 
 
-def _value(kind: Kind, name: str, joint: int | None, by: float, machine: Machine) -> np.ndarray:
+def _value(
+    kind: EffectType, name: str, joint: int | None, by: float, machine: Machine
+) -> np.ndarray:
     """Returns a number of an effect that is `by` more than neutral on a joint, or on all, `(J,)` or `(1,)`."""
     value = np.full(
         machine.num_joints if kind.numbers[name].per_joint else 1,
@@ -301,14 +303,14 @@ def _is_seen(recording: Recording) -> bool:
 
 
 def _points(
-    kind: Kind | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine
+    kind: EffectType | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine
 ) -> np.ndarray:
     """Returns where the tool point is at measured positions, with an effect or none, `(S, 3)`."""
     at, device = torch.as_tensor(q, dtype=torch.float32), torch.device("cpu")
     kinematics = Kinematics(machine, device)
     if kind is None:
         return kinematics.pose(at).tip_in_base_m.numpy().astype(float)
-    model = kind.wrap(Still(), machine, len(q), device)
+    model = kind.wrap(StationaryModel(), machine, len(q), device)
     for name, value in values.items():
         model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
     true = model.truth(at)

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from brokk_rl.machine import Machine
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.occasions import Dimension, dimensions
 from diagnosis.sanity import name_of
 
@@ -63,7 +63,7 @@ def traced(error: np.ndarray, label: np.ndarray, num_categories: int) -> np.ndar
     return np.stack([np.cumsum(added * (label == c), 1) for c in range(num_categories)]) * given
 
 
-def by_joint(runs: FreeRuns, machine: Machine) -> Sums:
+def by_joint(runs: WindowedRuns, machine: Machine) -> Sums:
     """Returns the sums of each joint as a single category."""
     count = np.isfinite(runs.error).sum(1)[..., None].astype(float)
     return Sums(
@@ -74,7 +74,7 @@ def by_joint(runs: FreeRuns, machine: Machine) -> Sums:
     )
 
 
-def by_occasion(runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> dict[str, Sums]:
+def by_occasion(runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray) -> dict[str, Sums]:
     """Returns the sums by regime, direction, load (where masses are known) and frequency."""
     every = dimensions(list(runs.recordings), machine, dead_time_s)
     return {dimension.name: _arisen(runs, dimension, machine) for dimension in every} | {
@@ -82,7 +82,7 @@ def by_occasion(runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> di
     }
 
 
-def by_time(runs: FreeRuns, machine: Machine) -> dict[str, Sums]:
+def by_time(runs: WindowedRuns, machine: Machine) -> dict[str, Sums]:
     """Returns the sums by recording and by running time, which are those of whole windows."""
     edges = np.linspace(runs.elapsed_s.min(), runs.elapsed_s.max(), AGES + 1)
     age = np.clip(np.searchsorted(edges, runs.elapsed_s, "right") - 1, 0, AGES - 1)
@@ -99,14 +99,14 @@ def by_time(runs: FreeRuns, machine: Machine) -> dict[str, Sums]:
     }
 
 
-def _added(runs: FreeRuns, machine: Machine) -> np.ndarray:
+def _added(runs: WindowedRuns, machine: Machine) -> np.ndarray:
     """Returns the size of what was added to the error within the last `SPAN_S`, `(W, K, J)`, 0 after the end of a recording."""
     span = max(1, round(SPAN_S / machine.period_s))
     before = np.pad(runs.error, ((0, 0), (span, 0), (0, 0)))[:, : runs.error.shape[1]]
     return np.nan_to_num(np.abs(runs.error - before))
 
 
-def _arisen(runs: FreeRuns, dimension: Dimension, machine: Machine) -> Sums:
+def _arisen(runs: WindowedRuns, dimension: Dimension, machine: Machine) -> Sums:
     label, error, added = (
         runs.cut(dimension.label),
         np.nan_to_num(runs.error),
@@ -119,7 +119,7 @@ def _arisen(runs: FreeRuns, dimension: Dimension, machine: Machine) -> Sums:
     return Sums(names, *(np.moveaxis(values, 0, 2) for values in sums))
 
 
-def _bands(runs: FreeRuns, machine: Machine) -> Sums:
+def _bands(runs: WindowedRuns, machine: Machine) -> Sums:
     """Splits by Parseval's theorem; after the end of a recording the error counts as 0, which adds nothing."""
     error = np.nan_to_num(runs.error)
     power = np.abs(np.fft.rfft(error, axis=1)) ** 2 / error.shape[1]

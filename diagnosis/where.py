@@ -16,7 +16,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from diagnosis.blocks import FALSE_DISCOVERIES, adjusted, blocks, excess_p, standard_error, summed
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.growth import Growth, growth
 from diagnosis.tracing import Sums, by_joint, by_occasion, by_time
 
@@ -119,12 +119,12 @@ class Location:
 
 
 def locate(
-    runs: FreeRuns,
-    reference: FreeRuns | None,
+    runs: WindowedRuns,
+    reference: WindowedRuns | None,
     machine: Machine,
     dead_time_s: np.ndarray,
     generator: np.random.Generator,
-    whole: FreeRuns | None = None,
+    whole: WindowedRuns | None = None,
 ) -> Location:
     """Returns where the gap lies.
 
@@ -151,8 +151,8 @@ class _Judge:
 
     def __init__(
         self,
-        runs: FreeRuns,
-        reference: FreeRuns | None,
+        runs: WindowedRuns,
+        reference: WindowedRuns | None,
         machine: Machine,
         generator: np.random.Generator,
     ) -> None:

@@ -24,9 +24,9 @@ from brokk_rl.machine import Machine
 from diagnosis import answer, decision
 from diagnosis import calibration as certainty
 from diagnosis.answer import Answer, Selected, Where
-from diagnosis.calibration import Certainty
-from diagnosis.detection import Prices
-from diagnosis.effect_library import Kind
+from diagnosis.calibration import ProbabilityModel
+from diagnosis.detection import Penalties
+from diagnosis.effect_library import EffectType
 from exam import marking, seal
 from exam.marking import QUIET, Mark, Number
 
@@ -115,25 +115,38 @@ class Claims:
 
 
 def answered(
-    item: Item, prices: Prices, weights: Certainty, kinds: Sequence[Kind], machine: Machine
+    item: Item,
+    prices: Penalties,
+    weights: ProbabilityModel,
+    kinds: Sequence[EffectType],
+    machine: Machine,
 ) -> tuple[Answer, Claims]:
     """Returns what the diagnosis would say at these prices, without numbers, and why it is so sure."""
-    found = decision.likely(decision.restore_result(item.told, prices, kinds), prices, weights)
+    found = decision.drop_unlikely_effects(
+        decision.restore_result(item.told, prices, kinds), prices, weights
+    )
     unknown = decision.is_unknown(found, prices, weights)
     selected = (
-        [] if unknown else [decision.other(found, one, weights, machine) for one in found.others]
+        []
+        if unknown
+        else [
+            decision.describe_detected_effect(found, one, weights, machine)
+            for one in found.detected
+        ]
     )
-    signs = [(one.kind.name, decision.other_signs(found, weights, one)) for one in found.others]
+    signs = [
+        (one.kind.name, decision.read_detected_signs(found, weights, one)) for one in found.detected
+    ]
     for name in found.chosen.names:
-        swaps = decision.rivals(found, name)
-        like = decision.same_as(swaps, decision.own_gain(found, name))
-        signs.append((name, decision.named_signs(found, prices, weights, name, swaps, like)))
+        swaps = decision.rank_substitutions(found, name)
+        like = decision.list_equivalents(swaps, decision.compute_own_gain(found, name))
+        signs.append((name, decision.read_chosen_signs(found, prices, weights, name, swaps, like)))
         joints = tuple(
             j
             for j, subset in zip(machine.joint_names, found.chosen.subsets, strict=True)
             if name in subset
         )
-        chance = certainty.chance(weights.right, signs[-1][1])
+        chance = certainty.compute_probability(weights.right, signs[-1][1])
         one = Selected(
             effect=name,
             joints=joints,
@@ -144,13 +157,15 @@ def answered(
         )
         selected += [] if unknown else [one]
     told = "unknown" if unknown else "effects" if selected else "none"
-    chance = decision.unknown_chance(found, prices, weights)
-    ranked = tuple(decision.ranking(found, selected, prices, weights, machine, chance))
+    chance = decision.compute_unknown_probability(found, prices, weights)
+    ranked = tuple(decision.rank_hypotheses(found, selected, prices, weights, machine, chance))
     said = Answer(
         verdict=told, selected=tuple(selected), ranking=ranked, where=Where({}, (), None), gap=None, next_experiment=None
     )  # fmt: skip
     return said, Claims(
-        certainty.outside(found), signs, decision.none_signs(found, prices, weights)
+        certainty.collect_outside_signs(found),
+        signs,
+        decision.read_none_signs(found, prices, weights),
     )
 
 
@@ -184,19 +199,21 @@ class Calibration:
     """
 
     machine: Machine
-    kinds: Sequence[Kind]
+    kinds: Sequence[EffectType]
     classes: Sequence[Sequence[str]]
     of_machine: Sequence[str]
     trials: int
     seed: int
     workers: int
 
-    def marks(self, cases: Sequence[Item], prices: Prices, weights: Certainty) -> list[Mark]:
+    def marks(
+        self, cases: Sequence[Item], prices: Penalties, weights: ProbabilityModel
+    ) -> list[Mark]:
         """Returns the marks of all cases at these prices, with these weights."""
         return [mark for mark, _ in self._marked(cases, prices, weights)]
 
     def _marked(
-        self, cases: Sequence[Item], prices: Prices, weights: Certainty
+        self, cases: Sequence[Item], prices: Penalties, weights: ProbabilityModel
     ) -> list[tuple[Mark, Claims]]:
         said = [answered(item, prices, weights, self.kinds, self.machine) for item in cases]
         return [
@@ -204,14 +221,18 @@ class Calibration:
             for i, (one, claims) in zip(cases, said, strict=True)
         ]
 
-    def value(self, cases: Sequence[Item], prices: Prices, weights: Certainty) -> float:
+    def value(self, cases: Sequence[Item], prices: Penalties, weights: ProbabilityModel) -> float:
         """Returns the mean worth of the answers."""
         pairs = np.array([worth(mark) for mark in self.marks(cases, prices, weights)])
         return float(pairs[:, 0].sum() / pairs[:, 1].sum())
 
     def fitted(
-        self, cases: Sequence[Item], start: Prices, weights: Certainty, advance: Callable[[], None]
-    ) -> tuple[Prices, Certainty]:
+        self,
+        cases: Sequence[Item],
+        start: Penalties,
+        weights: ProbabilityModel,
+        advance: Callable[[], None],
+    ) -> tuple[Penalties, ProbabilityModel]:
         """Returns the prices of the best answers: half the trials anywhere, half around the best; then the weights of signs."""
         weights = self.weighed(cases, start, weights)
         generator, best = (
@@ -229,7 +250,9 @@ class Calibration:
                         best = value, prices
         return best[1], self.weighed(cases, best[1], weights)
 
-    def weighed(self, cases: Sequence[Item], prices: Prices, start: Certainty) -> Certainty:
+    def weighed(
+        self, cases: Sequence[Item], prices: Penalties, start: ProbabilityModel
+    ) -> ProbabilityModel:
         """Returns the weights under which what is true of these cases is most probable, and what forms add to errors."""
         is_outside = [item.label["kind"] == "outside" for item in cases]
         outside = logistic(
@@ -252,7 +275,7 @@ class Calibration:
         return replace(weights, form=self.forms(cases, weights.form), **found)
 
     def _named(
-        self, cases: Sequence[Item], prices: Prices, weights: Certainty
+        self, cases: Sequence[Item], prices: Penalties, weights: ProbabilityModel
     ) -> tuple[list[dict[str, float]], list[bool]]:
         """Returns the signs of all effects that are named, and whether they are there."""
         signs, true = [], []
@@ -287,7 +310,7 @@ class Calibration:
             found |= dict.fromkeys(group, round(float(holds[0]), 3)) if holds else {}
         return found
 
-    def _drawn(self, near: Prices, half: int, generator: np.random.Generator) -> Prices:
+    def _drawn(self, near: Penalties, half: int, generator: np.random.Generator) -> Penalties:
         drawn = {}
         for name, (low, high) in RANGES.items():
             at = (
@@ -303,11 +326,11 @@ _work: list[Any] = []
 """What a process values: a calibration, its cases and weights, sent once."""
 
 
-def _begin(calibration: Calibration, cases: Sequence[Item], weights: Certainty) -> None:
+def _begin(calibration: Calibration, cases: Sequence[Item], weights: ProbabilityModel) -> None:
     _work[:] = [calibration, cases, weights]
 
 
-def _value(prices: Prices) -> float:
+def _value(prices: Penalties) -> float:
     calibration, cases, weights = _work
     return calibration.value(cases, prices, weights)
 

@@ -13,9 +13,9 @@ import torch
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.machine import Machine
 from diagnosis import baseline, case, effect_library
-from diagnosis.baseline import Base
-from diagnosis.residuals import Ray, rays
-from diagnosis.responses import Shape
+from diagnosis.baseline import Baseline
+from diagnosis.residuals import ParameterRay, build_rays
+from diagnosis.responses import Response
 
 TOUCHES = 1e-3
 """Change of an error, over its noise, below which an effect does nothing to a joint."""
@@ -33,10 +33,10 @@ class Errors:
     """
 
     z: np.ndarray
-    shapes: dict[str, list[Shape]]
+    shapes: dict[str, list[Response]]
     fold: np.ndarray
 
-    def rays(self, names: frozenset[str]) -> list[Shape]:
+    def rays(self, names: frozenset[str]) -> list[Response]:
         """Returns the shapes of several effects, in the order of their names."""
         return [shape for name in sorted(names) for shape in self.shapes[name]]
 
@@ -51,8 +51,8 @@ class Ground:
         errors: Of each joint.
     """
 
-    base: Base
-    rays: dict[str, Sequence[Ray]]
+    base: Baseline
+    rays: dict[str, Sequence[ParameterRay]]
     errors: list[Errors]
 
 
@@ -65,24 +65,24 @@ def of_case(
         RecordingError: the simulator cannot be fitted.
     """
     with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
-        base = baseline.fitted(
-            case.load(folder, machine), fit, Path(scratch), 0, torch.device("cpu")
+        base = baseline.fit_baseline(
+            case.load_case(folder, machine), fit, Path(scratch), 0, torch.device("cpu")
         )
-    evidence, grown = base.field.evidence, {}
-    shapes: list[dict[str, list[Shape]]] = [{} for _ in range(machine.num_joints)]
+    residuals, grown = base.field.residuals, {}
+    shapes: list[dict[str, list[Response]]] = [{} for _ in range(machine.num_joints)]
     for kind in effect_library.load_effects(machine, None if names is None else tuple(names)):
         if kind.target.stochastic or kind.target.side == "kinematics":
             continue
-        ways = grown[kind.name] = rays(kind)
-        responses = [evidence.response(ray) for ray in ways]
+        ways = grown[kind.name] = build_rays(kind)
+        responses = [residuals.response(ray) for ray in ways]
         for j, mine in enumerate(shapes):
             if max((np.abs(response[j]).max() for response in responses), default=0.0) > TOUCHES:
                 mine[kind.name] = [
-                    Shape(ray.sizes, response[j])
+                    Response(ray.sizes, response[j])
                     for ray, response in zip(ways, responses, strict=True)
                 ]
     return Ground(
         base,
         grown,
-        [Errors(z, mine, evidence.fold) for z, mine in zip(evidence.z, shapes, strict=True)],
+        [Errors(z, mine, residuals.fold) for z, mine in zip(residuals.z, shapes, strict=True)],
     )

@@ -11,8 +11,8 @@ import numpy as np
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.machine import Machine
 from diagnosis import gap
-from diagnosis.refine import repair
-from diagnosis.responses import fitted
+from diagnosis.refine import fit_set
+from diagnosis.responses import fit_sizes
 from exam import ground
 from exam.ground import Errors
 
@@ -38,26 +38,28 @@ def closed_by(
         RecordingError: the simulator cannot be fitted.
     """
     found = ground.of_case(folder, fit, machine, tuple(effects))
-    evidence = found.base.field.evidence
+    residuals = found.base.field.residuals
     subsets = [
         frozenset(
             name for name, joints in effects.items() if joint in joints and name in errors.shapes
         )
         for joint, errors in zip(machine.joint_names, found.errors, strict=True)
     ]
-    measured = evidence.candidates.cut.measured
-    before = gap.squares(evidence.base, measured, machine)
+    measured = residuals.simulator.cut.measured
+    before = gap.compute_squares(residuals.base, measured, machine)
     floors = [
-        gap.squares(one.evidence.base, one.evidence.candidates.cut.measured, machine)
-        for one in found.base.nulls
+        gap.compute_squares(one.residuals.base, one.residuals.simulator.cut.measured, machine)
+        for one in found.base.left_out
     ]
     floor = np.concatenate(floors)
-    if not any(subsets) or gap.rmse(before) < NO_GAP * gap.rmse(floor):
+    if not any(subsets) or gap.compute_rmse(before) < NO_GAP * gap.compute_rmse(floor):
         return None
     start = [_start(errors, subset) for errors, subset in zip(found.errors, subsets, strict=True)]
-    after = gap.squares(repair(evidence, subsets, found.rays, start).after, measured, machine)
+    after = gap.compute_squares(
+        fit_set(residuals, subsets, found.rays, start).after, measured, machine
+    )
     return float(
-        gap.shares(before, after, floor, [])[0]
+        gap.compute_shares(before, after, floor, [])[0]
     )  # as an answer says it: no repair is better than the floor
 
 
@@ -79,5 +81,5 @@ def _start(errors: Errors, names: frozenset[str]) -> dict[str, np.ndarray]:
         return {}
     ends = np.cumsum([len(errors.shapes[name]) for name in sorted(names)])[:-1]
     return dict(
-        zip(sorted(names), np.split(fitted(errors.z, errors.rays(names)), ends), strict=True)
+        zip(sorted(names), np.split(fit_sizes(errors.z, errors.rays(names)), ends), strict=True)
     )

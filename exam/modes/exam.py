@@ -26,8 +26,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis import answer, effect_library
-from diagnosis.calibration import Certainty
-from diagnosis.detection import Prices
+from diagnosis.calibration import ProbabilityModel
+from diagnosis.detection import Penalties
 from exam import ledger, marking, oracle, page, paper, seal, sitting
 from exam.calibration import Calibration, halves, items
 from exam.making import Half, Workshop
@@ -84,8 +84,8 @@ class Examination:
     oracle: ActuatorFit
     oracles: str | None
     ledger: str | None
-    prices: Prices
-    certainty: Certainty
+    prices: Penalties
+    certainty: ProbabilityModel
     trials: int
     mix: Mix
     plants: PlantFamily

@@ -10,7 +10,7 @@ import pytest
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.blocks import FALSE_DISCOVERIES, adjusted, excess_p
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.growth import growth
 from diagnosis.occasions import REGIMES, in_force, loads, regimes
 from diagnosis.tracing import traced
@@ -48,17 +48,19 @@ def recordings(machine: Machine, count: int, seed: int) -> list[Recording]:
     return found
 
 
-def runs(machine: Machine, count: int, seed: int, size: float = 0.0003) -> FreeRuns:
+def runs(machine: Machine, count: int, seed: int, size: float = 0.0003) -> WindowedRuns:
     """Returns free runs through `recordings` whose errors are random walks."""
     every = recordings(machine, count, seed)
     row = np.tile(np.arange(100, 1100, STEPS), count)
     source = np.repeat(np.arange(count), 10)
     walk = size * np.random.default_rng(seed + 1000).standard_normal((len(row), STEPS, 5)).cumsum(1)
-    empty = FreeRuns(every, source, row, walk)
+    empty = WindowedRuns(every, source, row, walk)
     return replace(empty, simulated=empty.measured + walk)
 
 
-def planted(base: FreeRuns, machine: Machine, joint: int, regime: str, speed: float) -> FreeRuns:
+def planted(
+    base: WindowedRuns, machine: Machine, joint: int, regime: str, speed: float
+) -> WindowedRuns:
     """Returns free runs in which one joint is simulated too fast, by `speed` rad/s, in one regime."""
     label = base.cut(
         [
@@ -73,7 +75,7 @@ def planted(base: FreeRuns, machine: Machine, joint: int, regime: str, speed: fl
     return replace(base, simulated=base.simulated + added)
 
 
-def located(field: FreeRuns, reference: FreeRuns | None, machine: Machine) -> Location:
+def located(field: WindowedRuns, reference: WindowedRuns | None, machine: Machine) -> Location:
     return locate(field, reference, machine, np.full(5, DELAY_S), np.random.default_rng(0))
 
 
