@@ -412,7 +412,7 @@ def drop_unlikely_effects(
             tuple(subset - {least} for subset in kept.chosen.subsets), kept.chosen.net_gain
         )
         kept = replace(
-            kept, chosen=chosen, others=[one for one in kept.detected if one.kind.name != least]
+            kept, chosen=chosen, detected=[one for one in kept.detected if one.kind.name != least]
         )
     subsets, fitted = kept.chosen.subsets, result.fitted
     if fitted and subsets != result.chosen.subsets:

@@ -450,7 +450,7 @@ def drop_windows(residuals: Residuals, each: int) -> Residuals:
     )
     some = {
         name: value[rows]
-        for name in ("claims", "mean", "bias", "late")
+        for name in ("valid_mask", "mean", "bias", "late")
         if (value := getattr(residuals, name, None)) is not None
     }
     return replace(

@@ -45,7 +45,7 @@ def moving(
     simulator = SimpleNamespace(
         machine=machine, running_s=np.linspace(0.0, 1800.0, windows), cut=cut
     )
-    white = {"whitened_joint": lambda columns, j: columns.reshape(-1, columns.shape[-1])}
+    white = {"whiten_joint": lambda columns, j: columns.reshape(-1, columns.shape[-1])}
     base = start[:, None] + np.cumsum(np.repeat(way, INCREMENT_SAMPLES, 1) / INCREMENT_SAMPLES, 1)
     return cast(
         Residuals,
@@ -185,15 +185,15 @@ def found(subsets: tuple[str, ...], others: tuple[str, ...] = ()) -> DetectionRe
     shown = [
         SimpleNamespace(kind=SimpleNamespace(name=name, stage="kinematics")) for name in others
     ]
-    return DetectionResult(**cast(dict, {**fields, "chosen": chosen, "others": shown}))
+    return DetectionResult(**cast(dict, {**fields, "chosen": chosen, "detected": shown}))
 
 
 @pytest.mark.parametrize(("shown", "unknown"), [(0.95, False), (0.6, True)])
 def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
     monkeypatch: pytest.MonkeyPatch, weights: ProbabilityModel, shown: float, unknown: bool
 ) -> None:
-    monkeypatch.setattr(decision, "named_chances", lambda *_: {"t": shown, "a": 0.4})
-    monkeypatch.setattr(decision, "unknown_chance", lambda *_: 0.7)
+    monkeypatch.setattr(decision, "compute_effect_probabilities", lambda *_: {"t": shown, "a": 0.4})
+    monkeypatch.setattr(decision, "compute_unknown_probability", lambda *_: 0.7)
     assert decision.is_unknown(found(("a", ""), ("t",)), cast(Penalties, None), weights) is unknown
 
 
@@ -207,7 +207,9 @@ def test_what_was_named_only_beside_another_goes_with_it(
         frozenset("d"): {"d": 0.3},
     }
     monkeypatch.setattr(
-        decision, "named_chances", lambda found, *_: beside.get(found.chosen.names, {"a": 0.9})
+        decision,
+        "compute_effect_probabilities",
+        lambda found, *_: beside.get(found.chosen.names, {"a": 0.9}),
     )
 
     def kept(subsets: tuple[str, ...]) -> tuple[set[str], ...]:
