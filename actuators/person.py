@@ -24,11 +24,11 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.ranges import CHANCE, Number, Ranges, Value
-from actuators.models import draw
-from actuators.models.transport import commands_in_force, opened
+from actuators.effects.ranges import CHANCE, EffectNumber, ParameterRanges, Value
+from actuators.models import random_draws
+from actuators.models.transport import open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
-from brokk_rl.follower import moved_levers
+from brokk_rl.follower import select_levers
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.spec import spec
 
@@ -37,7 +37,7 @@ Range = float | tuple[float, float]
 
 
 @spec
-class Person:
+class HumanFollower:
     """A person at the levers: reaction delay, lag of the hand, dead zone, wrong amplitude, few levers at once.
 
     Each number may be a range `[low, high]`, drawn per environment at each reset: another person.
@@ -55,6 +55,8 @@ class Person:
             larger request draws the hand away.
     """
 
+    label: ClassVar = "person"
+
     delay_s: Range
     lag_s: Range
     attention_s: Range
@@ -65,13 +67,13 @@ class Person:
     grip_s: Range
 
     numbers: ClassVar = {
-        "delay_s": Number("s", none=0.0, typical=0.3, bounds=(0.0, 2.0), per_joint=False),
-        "lag_s": Number("s", none=0.0, typical=0.15, bounds=(0.0, 2.0), per_joint=False),
-        "attention_s": Number("s", none=0.0, typical=0.3, bounds=(0.0, 5.0), per_joint=False),
-        "gain": Number("1", none=1.0, typical=0.85, bounds=(0.1, 3.0), per_joint=False),
-        "tremor": Number("1", none=0.0, typical=0.03, bounds=(0.0, 1.0), per_joint=False),
-        "dead_zone": Number("1", none=0.0, typical=0.05, bounds=(0.0, 0.5)),
-        "grip_s": Number("s", none=0.0, typical=0.5, bounds=(0.0, 5.0), per_joint=False),
+        "delay_s": EffectNumber("s", none=0.0, typical=0.3, bounds=(0.0, 2.0), per_joint=False),
+        "lag_s": EffectNumber("s", none=0.0, typical=0.15, bounds=(0.0, 2.0), per_joint=False),
+        "attention_s": EffectNumber("s", none=0.0, typical=0.3, bounds=(0.0, 5.0), per_joint=False),
+        "gain": EffectNumber("1", none=1.0, typical=0.85, bounds=(0.1, 3.0), per_joint=False),
+        "tremor": EffectNumber("1", none=0.0, typical=0.03, bounds=(0.0, 1.0), per_joint=False),
+        "dead_zone": EffectNumber("1", none=0.0, typical=0.05, bounds=(0.0, 0.5)),
+        "grip_s": EffectNumber("s", none=0.0, typical=0.5, bounds=(0.0, 5.0), per_joint=False),
     }
     """What is known about each number; `joints_at_once` is a count."""
 
@@ -87,16 +89,16 @@ class Person:
         number = num_joints if self.joints_at_once is None else self.joints_at_once
         return number if isinstance(number, tuple) else (number, number)
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> PersonModel:
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> HumanFollowerModel:
         """Returns `num_envs` persons; see `brokk_rl.contracts.actuator.Follower`.
 
         Raises:
             ConfigError: A number is out of bounds, a range upside down, or a joint unknown.
         """
-        return PersonModel(self, machine, num_envs, device)
+        return HumanFollowerModel(self, machine, num_envs, device)
 
 
-class PersonModel:
+class HumanFollowerModel:
     """Persons at work; fulfils `brokk_rl.contracts.actuator.FollowerModel`.
 
     Attributes:
@@ -104,7 +106,7 @@ class PersonModel:
     """
 
     def __init__(
-        self, person: Person, machine: Machine, num_envs: int, device: torch.device
+        self, person: HumanFollower, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
         self._period_s = machine.period_s
         self._exclusive = torch.as_tensor(machine.is_exclusive, device=device)
@@ -118,11 +120,11 @@ class PersonModel:
         else:
             fields["joints_at_once"] = float(low)
         numbers = person.numbers | {
-            "joints_at_once": Number("1", None, 2.0, (0.0, math.inf), per_joint=False)
+            "joints_at_once": EffectNumber("1", None, 2.0, (0.0, math.inf), per_joint=False)
         }
         self._trembles = person.tremor not in (0.0, (0.0, 0.0))
         salt = zlib.crc32(b"follower")
-        self._ranges = Ranges(
+        self._ranges = ParameterRanges(
             fields, numbers, "all", machine, num_envs, device, self._trembles, salt, "follower"
         )
         longest_s = person.delay_s[1] if isinstance(person.delay_s, tuple) else person.delay_s
@@ -153,7 +155,7 @@ class PersonModel:
         value, state = self._ranges.value, self.state
         self._look(proposed)
         delay = (value["delay_s"] / self._period_s).expand_as(proposed)
-        earlier, later, part = commands_in_force(state["seen"], delay)
+        earlier, later, part = select_commands_in_force(state["seen"], delay)
         held = self._held(later)
         after, first = self._reach(state["hand"], earlier, part)
         hand, second = self._reach(after, later, 1.0 - part)
@@ -163,9 +165,9 @@ class PersonModel:
             counter = self._ranges.advance()
             assert counter is not None
             deflection = deflection * (
-                1.0 + value["tremor"] * draw.normal(counter, CHANCE, proposed.shape[1])
+                1.0 + value["tremor"] * random_draws.draw_normal(counter, CHANCE, proposed.shape[1])
             )
-        return opened(deflection.clamp(-1.0, 1.0), value["dead_zone"], value["dead_zone"])
+        return open_valve(deflection.clamp(-1.0, 1.0), value["dead_zone"], value["dead_zone"])
 
     def _look(self, proposed: torch.Tensor) -> None:
         """Appends what the person goes by from now on: the proposal where it is time to look, else what was seen before."""
@@ -191,7 +193,7 @@ class PersonModel:
         taken, held_s = asked != 0, self.state["held_s"]
         kept = taken & (held_s > 0) & (held_s < self._ranges.value["grip_s"] - 1e-6)
         most = self._ranges.value["joints_at_once"].round().clamp(*self._levers)
-        held = free & moved_levers(torch.where(free, priority + 2.0 * kept, -1.0), most)
+        held = free & select_levers(torch.where(free, priority + 2.0 * kept, -1.0), most)
         held_s.copy_(torch.where(held & taken, held_s + self._period_s, 0.0))
         return held
 

@@ -7,6 +7,8 @@ other is a departure.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from brokk_rl.machine import Machine
@@ -14,15 +16,17 @@ from brokk_rl.spec import spec
 
 
 @spec
-class Nobody:
+class NoFollower:
     """Nobody: the policy's command is given as it is, at once."""
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> Direct:
+    label: ClassVar = "nobody"
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> NoFollowerModel:
         """Returns the follower that changes nothing; see `brokk_rl.contracts.actuator.Follower`."""
-        return Direct()
+        return NoFollowerModel()
 
 
-class Direct:
+class NoFollowerModel:
     """Gives what is proposed."""
 
     def __init__(self) -> None:
@@ -36,7 +40,7 @@ class Direct:
         return proposed
 
 
-def moved_levers(priority: torch.Tensor, most: torch.Tensor | int) -> torch.Tensor:
+def select_levers(priority: torch.Tensor, most: torch.Tensor | int) -> torch.Tensor:
     """Returns which levers are moved, `(N, J)` bool: the `most`, a number or `(N, 1)`, of highest `priority`, `(N, J)`.
 
     Of equals the first.

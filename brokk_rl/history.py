@@ -28,17 +28,17 @@ class History:
     u: Any
 
     def push_u(self, u: Any) -> None:
-        """Appends the commands in force from now on, shape `(N, J)`."""
+        """Append the commands in force from now on, shape `(N, J)`."""
         self.u.copy_(self.u.roll(-1, 1))
         self.u[:, -1] = u
 
     def push_q(self, q: Any) -> None:
-        """Appends newly measured positions, shape `(N, J)`."""
+        """Append newly measured positions, shape `(N, J)`."""
         self.q.copy_(self.q.roll(-1, 1))
         self.q[:, -1] = q
 
     def reset(self, mask: Any, q: Any) -> None:
-        """Backfills the environments of `mask`, shape `(N,)` bool: at rest at `q`, shape `(N, J)`, no command."""
+        """Backfill the environments of `mask`, shape `(N,)` bool: at rest at `q`, shape `(N, J)`, no command."""
         rows = mask[:, None, None]
         self.q.copy_(q[:, None, :].where(rows, self.q))
         self.u.masked_fill_(rows, 0.0)

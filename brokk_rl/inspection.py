@@ -11,8 +11,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
-from brokk_rl.recording_validation import runs
+from brokk_rl.record import Recording, find_stretches
 from brokk_rl.spec import spec
 
 Kind = Literal["no motion", "no command", "frozen", "repeated rows", "beyond limit", "exclusive"]
@@ -35,7 +34,7 @@ JUMP = 1.5
 
 
 @spec
-class Thresholds:
+class InspectionThresholds:
     """When a stretch of a recording is worth telling.
 
     Attributes:
@@ -71,7 +70,7 @@ class Thresholds:
 
 
 @dataclass(frozen=True)
-class Finding:
+class RecordingFinding:
     """A stretch of a recording that wants an explanation.
 
     Attributes:
@@ -105,14 +104,16 @@ class Inspection:
 
     timing: dict[str, float | None]
     joints: dict[str, dict[str, float | None]]
-    findings: list[Finding]
+    findings: list[RecordingFinding]
 
 
-def inspect(recording: Recording, machine: Machine, thresholds: Thresholds) -> Inspection:
+def inspect_recording(
+    recording: Recording, machine: Machine, thresholds: InspectionThresholds
+) -> Inspection:
     """Returns what is in a recording of `machine`."""
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
-        look = _Look(recording, machine, thresholds)
+        look = _RecordingScan(recording, machine, thresholds)
         findings = [
             *look.no_motion(),
             *look.no_command(),
@@ -126,10 +127,12 @@ def inspect(recording: Recording, machine: Machine, thresholds: Thresholds) -> I
         )
 
 
-class _Look:
+class _RecordingScan:
     """One look at a recording: what the findings have in common."""
 
-    def __init__(self, recording: Recording, machine: Machine, thresholds: Thresholds) -> None:
+    def __init__(
+        self, recording: Recording, machine: Machine, thresholds: InspectionThresholds
+    ) -> None:
         self._machine, self._limits = machine, thresholds
         self._t_s, self._u, self._q = (
             recording.t_s,
@@ -147,10 +150,10 @@ class _Look:
         self._is_moving = np.abs(self._v) > thresholds.still * machine.max_speed
         self._lead = round((machine.dead_time_s + thresholds.settle_s) / self._period_s)
         self._idle = np.stack(
-            [_held(np.abs(u) < thresholds.commanded, self._lead) for u in self._u.T], 1
+            [_find_held(np.abs(u) < thresholds.commanded, self._lead) for u in self._u.T], 1
         )
         self._noise = np.array([self._noise_of(j) for j in range(machine.num_joints)])
-        self._step = np.array([_step(q) for q in self._q.T])
+        self._step = np.array([_estimate_step(q) for q in self._q.T])
         self._visible = thresholds.steps * np.fmax(
             np.nan_to_num(self._step), np.nan_to_num(self._noise)
         )
@@ -169,11 +172,11 @@ class _Look:
             }
         median_s = float(np.median(period_s))
         return {
-            "duration_s": _plain(np.nanmax(self._t_s) - np.nanmin(self._t_s)),
+            "duration_s": _to_json_number(np.nanmax(self._t_s) - np.nanmin(self._t_s)),
             "rate_hz": 1.0 / median_s if median_s > 0 else None,
             "stated_rate_hz": 1.0 / self._period_s,
-            "jitter_s": _plain(np.percentile(np.abs(period_s - median_s), 95)),
-            "longest_s": _plain(period_s.max()),
+            "jitter_s": _to_json_number(np.percentile(np.abs(period_s - median_s), 95)),
+            "longest_s": _to_json_number(period_s.max()),
         }
 
     def joints(self) -> dict[str, dict[str, float | None]]:
@@ -185,27 +188,27 @@ class _Look:
         )
         for j, name in enumerate(self._machine.joint_names):
             found[name] = {
-                "lowest": _plain(np.nanmin(self._q[:, j])),
-                "highest": _plain(np.nanmax(self._q[:, j])),
-                "commanded": _plain(np.mean(size[:, j] > self._limits.commanded)),
-                "full_command": _plain(np.mean(size[:, j] > 0.99)),
-                "moving": _plain(np.mean(self._is_moving[:, j])),
-                "at_limit": _plain(np.mean(at_limit[:, j])),
-                "fastest": _plain(np.nanquantile(np.abs(self._v[:, j]), 0.99)),
-                "noise": _plain(self._noise[j]),
-                "step": _plain(self._step[j]),
+                "lowest": _to_json_number(np.nanmin(self._q[:, j])),
+                "highest": _to_json_number(np.nanmax(self._q[:, j])),
+                "commanded": _to_json_number(np.mean(size[:, j] > self._limits.commanded)),
+                "full_command": _to_json_number(np.mean(size[:, j] > 0.99)),
+                "moving": _to_json_number(np.mean(self._is_moving[:, j])),
+                "at_limit": _to_json_number(np.mean(at_limit[:, j])),
+                "fastest": _to_json_number(np.nanquantile(np.abs(self._v[:, j]), 0.99)),
+                "noise": _to_json_number(self._noise[j]),
+                "step": _to_json_number(self._step[j]),
             }
         return found
 
-    def no_motion(self) -> list[Finding]:
+    def no_motion(self) -> list[RecordingFinding]:
         """Finds commands that should move a joint and do not, away from the stop that they lead to."""
         found, margin = [], self._limits.at_limit * self._travel
         for j, name in enumerate(self._machine.joint_names):
             for sign in (1, -1):
-                driven = _held(sign * self._u[:, j] > self._limits.driving, self._lead)
+                driven = _find_held(sign * self._u[:, j] > self._limits.driving, self._lead)
                 stop = self._q[:, j] > self._machine.upper[j] - margin[j]
                 stop = stop if sign > 0 else self._q[:, j] < self._machine.lower[j] + margin[j]
-                for row, count in runs(
+                for row, count in find_stretches(
                     driven & ~self._is_moving[:, j] & ~stop & np.isfinite(self._v[:, j])
                 ):
                     if count * self._period_s >= self._limits.unanswered_s:
@@ -221,11 +224,11 @@ class _Look:
                         )
         return found
 
-    def no_command(self) -> list[Finding]:
+    def no_command(self) -> list[RecordingFinding]:
         """Finds stretches without command over which a joint goes elsewhere."""
         found = []
         for j, (name, unit) in enumerate(self._units()):
-            for row, count in runs(self._idle[:, j]):
+            for row, count in find_stretches(self._idle[:, j]):
                 ends = min(5, count)
                 moved = np.nanmedian(self._q[row + count - ends : row + count, j]) - np.nanmedian(
                     self._q[row : row + ends, j]
@@ -236,13 +239,13 @@ class _Look:
                     found.append(self._finding("no command", name, row, count, text))
         return found
 
-    def frozen(self) -> list[Finding]:
+    def frozen(self) -> list[RecordingFinding]:
         """Finds equal samples amid motion, and at rest where the sensor is otherwise never still."""
         found = []
         for j, (name, unit) in enumerate(self._units()):
             equal = np.append(False, np.diff(self._q[:, j]) == 0)
             is_noisy = equal.mean() < 0.05
-            for row, count in runs(equal):
+            for row, count in find_stretches(equal):
                 end = row + count  # first row with another value
                 jump = abs(self._q[end, j] - self._q[end - 1, j]) if end < len(equal) else 0.0
                 before, after = (
@@ -261,23 +264,23 @@ class _Look:
                 found.append(self._finding("frozen", name, row - 1, count + 1, text))
         return found
 
-    def repeated(self) -> list[Finding]:
+    def repeated(self) -> list[RecordingFinding]:
         """Finds rows that repeat all positions of the row before although a joint moves visibly within a period."""
         same = np.append(False, (np.diff(self._q, axis=0) == 0).all(1))
         seen = (np.abs(self._v) * self._period_s > self._visible).any(1)
         return [
             self._finding("repeated rows", None, row, count, f"{count} rows repeat the one before")
-            for row, count in runs(same & seen)
+            for row, count in find_stretches(same & seen)
         ]
 
-    def beyond(self) -> list[Finding]:
+    def beyond(self) -> list[RecordingFinding]:
         """Finds positions outside the limits, by more than the sensor's own noise and step."""
         found = []
         for j, (name, unit) in enumerate(self._units()):
             over = np.fmax(
                 self._q[:, j] - self._machine.upper[j], self._machine.lower[j] - self._q[:, j]
             )
-            for row, count in runs(over > self._visible[j]):
+            for row, count in find_stretches(over > self._visible[j]):
                 most = np.nanmax(over[row : row + count])
                 found.append(
                     self._finding(
@@ -290,13 +293,13 @@ class _Look:
                 )
         return found
 
-    def exclusive(self) -> list[Finding]:
+    def exclusive(self) -> list[RecordingFinding]:
         """Finds commands to an exclusive joint together with others."""
         commanded, mask = np.abs(self._u) > self._limits.commanded, self._machine.is_exclusive
         found = []
         for j in np.flatnonzero(mask):
             others = np.delete(commanded, j, axis=1).any(1)
-            for row, count in runs(commanded[:, j] & others):
+            for row, count in find_stretches(commanded[:, j] & others):
                 name = self._machine.joint_names[j]
                 found.append(
                     self._finding(
@@ -305,9 +308,11 @@ class _Look:
                 )
         return found
 
-    def _finding(self, kind: Kind, joint: str | None, row: int, count: int, text: str) -> Finding:
+    def _finding(
+        self, kind: Kind, joint: str | None, row: int, count: int, text: str
+    ) -> RecordingFinding:
         begin_s, end_s = float(self._t_s[row]), float(self._t_s[row + count - 1])
-        return Finding(kind, joint, row, count, begin_s, end_s - begin_s, text)
+        return RecordingFinding(kind, joint, row, count, begin_s, end_s - begin_s, text)
 
     def _units(self) -> list[tuple[str, str]]:
         return [(joint.name, joint.unit) for joint in self._machine.joints]
@@ -328,15 +333,15 @@ class _Look:
         return float(np.nanstd(change) / np.sqrt(2.0)) if len(change) > 20 else np.nan
 
 
-def _held(condition: np.ndarray, num_rows: int) -> np.ndarray:
+def _find_held(condition: np.ndarray, num_rows: int) -> np.ndarray:
     """Returns where `condition`, `(T,)`, has held for more than `num_rows` rows on end."""
     held = np.zeros(len(condition), dtype=bool)
-    for row, count in runs(condition):
+    for row, count in find_stretches(condition):
         held[row + num_rows : row + count] = True
     return held
 
 
-def _step(q: np.ndarray) -> float:
+def _estimate_step(q: np.ndarray) -> float:
     """Returns the step of a coarse sensor from the values that it repeats, NaN where it repeats too few to tell."""
     values, counts = np.unique(q[np.isfinite(q)], return_counts=True)
     codes = values[counts >= CODE_REPEATS]
@@ -345,6 +350,6 @@ def _step(q: np.ndarray) -> float:
     return float(np.quantile(np.diff(codes), STEP_QUANTILE))
 
 
-def _plain(value: Any) -> float | None:
+def _to_json_number(value: Any) -> float | None:
     """Returns a number as JSON knows it, `None` for NaN."""
     return float(value) if np.isfinite(value) else None

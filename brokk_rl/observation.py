@@ -34,7 +34,7 @@ class TargetScaling:
 
 
 def compute_size(machine: Machine, with_pitch: bool = False, with_proposals: bool = False) -> int:
-    """Returns the length of the observation vector, that of the paper or with wanted pitch and proposals behind it."""
+    """Return the length of the observation vector, that of the paper or with wanted pitch and proposals behind it."""
     return 3 + (2 + with_proposals) * machine.num_history * machine.num_joints + with_pitch
 
 
@@ -74,7 +74,7 @@ class ObservationEncoder:
     def encode(
         self, target_in_base_m: Any, q: Any, u: Any, pitch_rad: Any = None, proposed: Any = None
     ) -> Any:
-        """Returns the vector, shape `(N, size)`.
+        """Return the vector, shape `(N, size)`.
 
         Args:
             target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N,
@@ -95,25 +95,25 @@ class ObservationEncoder:
         return self._concat(parts, 1)
 
     def decode(self, vector: Any) -> tuple[Any, Any, Any]:
-        """Inverts `encode`: returns target `(N, 3)` in m, positions and commands `(N, H, J)`."""
+        """Invert `encode`: returns target `(N, 3)` in m, positions and commands `(N, H, J)`."""
         num = self.shape[0] * self.shape[1]
         target = vector[:, :3] * self._target_std_m + self._target_mean_m
         q = vector[:, 3 : 3 + num].reshape(-1, *self.shape) * self._q_std + self._q_mean
         return target, q, vector[:, 3 + num : 3 + 2 * num].reshape(-1, *self.shape)
 
     def decode_pitch(self, vector: Any) -> Any:
-        """Returns the wanted pitch `(N,)` in rad, where `has_pitch`."""
+        """Return the wanted pitch `(N,)` in rad, where `has_pitch`."""
         return (
             vector[:, 3 + 2 * self.shape[0] * self.shape[1]] * self._pitch_std_rad
             + self._pitch_mean_rad
         )
 
     def decode_proposals(self, vector: Any) -> Any:
-        """Returns what was proposed, `(N, H, J)`, where `has_proposals`."""
+        """Return what was proposed, `(N, H, J)`, where `has_proposals`."""
         return vector[:, -self.shape[0] * self.shape[1] :].reshape(-1, *self.shape)
 
     def describe(self) -> dict[str, Any]:
-        """Returns order and scale of the vector as plain JSON data, for the contract of a policy."""
+        """Return order and scale of the vector as plain JSON data, for the contract of a policy."""
         lower, upper = self._machine.lower, self._machine.upper
         order = ["target_in_base_m (3)", "q oldest first (H x J)", "u oldest first (H x J)"]
         pitch = (

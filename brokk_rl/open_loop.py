@@ -19,7 +19,7 @@ from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.split import by_run
+from brokk_rl.split import group_by_run
 
 WARM_UP_S = 1.0
 """Before a free run a model sees recorded positions for so long: a model with a state of its own
@@ -28,7 +28,7 @@ the recorded one is moving."""
 
 
 @dataclass(frozen=True)
-class Windows:
+class FreeRunWindows:
     """Windows of recordings for free runs; where the recording ends within a window, positions are NaN from there on.
 
     Attributes:
@@ -52,24 +52,24 @@ class Windows:
         return self.q[:, self.num_before :]
 
 
-def longest_s(recordings: Sequence[Recording], machine: Machine) -> float:
+def find_longest_horizon_s(recordings: Sequence[Recording], machine: Machine) -> float:
     """Returns the longest free run that fits into one of the recordings, s; not above 0 where none does."""
     longest = max((recording.num_samples for recording in recordings), default=0)
-    return (longest - num_before(machine)) * machine.period_s
+    return (longest - count_samples_before(machine)) * machine.period_s
 
 
-def num_before(machine: Machine) -> int:
+def count_samples_before(machine: Machine) -> int:
     """Returns the number of samples before a free run, `L`."""
     return machine.num_history + round(WARM_UP_S / machine.period_s)
 
 
-def windows(
+def cut_windows(
     recordings: Sequence[Recording],
     machine: Machine,
     horizon_s: float,
     stride_s: float,
     shortest_s: float | None = None,
-) -> Windows:
+) -> FreeRunWindows:
     """Cuts recordings into windows of `horizon_s` after what comes before, one every `stride_s`.
 
     Args:
@@ -83,11 +83,11 @@ def windows(
     Raises:
         RecordingError: no recording is long enough.
     """
-    before, steps = num_before(machine), round(horizon_s / machine.period_s)
+    before, steps = count_samples_before(machine), round(horizon_s / machine.period_s)
     least = steps if shortest_s is None else min(steps, round(shortest_s / machine.period_s))
     stride = max(1, round(stride_s / machine.period_s))
     u, q, run = [], [], []
-    for name, parts in by_run(recordings).items():
+    for name, parts in group_by_run(recordings).items():
         for recording in parts:
             for start in range(0, recording.num_samples - before - least + 1, stride):
                 end = min(start + before + steps, recording.num_samples)
@@ -101,17 +101,17 @@ def windows(
             f"too little data: a free run of {least * machine.period_s:g} s needs {(before + least) * machine.period_s:g} s of "
             f"recording, the longest of {len(recordings)} has {found_s:.1f} s"
         )
-    return Windows(np.stack(u), np.stack(q), np.array(run), machine.num_history, before)
+    return FreeRunWindows(np.stack(u), np.stack(q), np.array(run), machine.num_history, before)
 
 
-def joined(cuts: Sequence[Windows]) -> Windows:
+def join_windows(cuts: Sequence[FreeRunWindows]) -> FreeRunWindows:
     """Returns the windows of several cuts of the same shape as one, in their order."""
     u, q, run = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("u", "q", "run"))
-    return Windows(u, q, run, cuts[0].num_history, cuts[0].num_before)
+    return FreeRunWindows(u, q, run, cuts[0].num_history, cuts[0].num_before)
 
 
-def free_run(
-    actuator: Actuator, machine: Machine, cut: Windows, device: torch.device
+def roll_out(
+    actuator: Actuator, machine: Machine, cut: FreeRunWindows, device: torch.device
 ) -> np.ndarray:
     """Returns the positions of free runs through all windows at once, shape `(W, K, J)`.
 

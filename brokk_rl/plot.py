@@ -14,7 +14,7 @@ PANEL_INCHES = (3.9, 2.9)
 """Width and height of a panel, inches."""
 
 
-def panels(machine: Machine, shared: str) -> tuple[Figure, list[Axes]]:
+def make_joint_panels(machine: Machine, shared: str) -> tuple[Figure, list[Axes]]:
     """Returns a figure with one panel a joint, in rows of three at most, with the same scale along the axes in `shared`."""
     columns = 2 if machine.num_joints in (2, 4) else min(3, machine.num_joints)
     rows = -(-machine.num_joints // columns)
@@ -32,13 +32,13 @@ def panels(machine: Machine, shared: str) -> tuple[Figure, list[Axes]]:
     ]
 
 
-def legend(figure: Figure, axis: Axes) -> None:
+def add_legend(figure: Figure, axis: Axes) -> None:
     """Explains above all panels what is drawn in one of them."""
     handles, labels = axis.get_legend_handles_labels()
     place = "outside upper center" if figure.get_layout_engine() else "upper center"
     figure.legend(handles, labels, loc=place, ncols=len(labels), frameon=False)
 
 
-def clean(axis: Axes) -> None:
+def remove_frame(axis: Axes) -> None:
     """Takes the frame away where it says nothing."""
     axis.spines[["top", "right"]].set_visible(False)

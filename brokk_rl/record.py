@@ -1,13 +1,13 @@
-"""Recordings: the log of one run of a machine, its twin or the simulator, as one Parquet file.
+"""The rules of the recording format, and every place where a file breaks one.
 
-Axes: `T` time, `J` joints in machine order. Row `k` holds the measured position at `t_s[k]` and the
-command in force from then on.
+Reading stops at the first breach; inspecting a recording lists them all. Rows count from 0; `T` is
+time.
 """
 
 import contextlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from glob import glob
@@ -17,10 +17,123 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from brokk_rl import recording_validation
-from brokk_rl.errors import RecordingError, StorageError
+from brokk_rl.errors import RecordingError, StorageError, list_choices
 from brokk_rl.machine import Machine
-from brokk_rl.recording_validation import SCHEMA, Breach
+
+SCHEMA = "1"
+RATE_TOLERANCE = 0.2
+"""Largest relative deviation of a period from the stated rate."""
+COMMAND_TOLERANCE = 1e-6
+"""Rounding of float32 that is still no command outside [-1, 1]."""
+
+
+@dataclass(frozen=True)
+class Breach:
+    """A place where a recording breaks a rule.
+
+    Attributes:
+        text: What was expected and what is there.
+        column: Column concerned, `None` where it is the file as a whole.
+        row: First row concerned, `None` where it is the column or the file as a whole.
+        num_rows: Number of rows on end that break the same rule.
+    """
+
+    text: str
+    column: str | None = None
+    row: int | None = None
+    num_rows: int = 1
+
+    def __str__(self) -> str:
+        where = "" if self.row is None else f"row {self.row}, column '{self.column}': "
+        more = f" ({self.num_rows} such rows on end)" if self.num_rows > 1 else ""
+        return f"{where}{self.text}{more}"
+
+
+def check_metadata(metadata: Mapping[str, str], machine: str) -> Iterator[Breach]:
+    """Yields what is wrong with the metadata (without the prefix `brokk.`) of a recording made on the machine of that name."""
+    for key in ("schema", "machine", "rate_hz"):
+        if key not in metadata:
+            yield Breach(
+                f"metadata 'brokk.{key}' is missing; not a recording, or one made by another program"
+            )
+    if metadata.get("schema", SCHEMA) != SCHEMA:
+        yield Breach(f"brokk.schema is '{metadata['schema']}', this version reads '{SCHEMA}'")
+    if metadata.get("machine", machine) != machine:
+        yield Breach(
+            f"unknown machine '{metadata['machine']}', expected '{machine}'; choose it with machine=…"
+        )
+    if "rate_hz" in metadata and parse_rate_hz(metadata) is None:
+        yield Breach(f"brokk.rate_hz is '{metadata['rate_hz']}', expected a positive number")
+
+
+def parse_rate_hz(metadata: Mapping[str, str]) -> float | None:
+    """Returns the stated rate, `None` where there is none or none that makes sense."""
+    try:
+        rate = float(metadata.get("rate_hz", ""))
+    except ValueError:
+        return None
+    return rate if 0.0 < rate < float("inf") else None
+
+
+def check_names(required: Sequence[str], present: Sequence[str]) -> Iterator[Breach]:
+    """Yields the columns that are missing."""
+    for name in required:
+        if name not in present:
+            yield Breach(f"column '{name}' is missing; {list_choices(name, present)}", name)
+
+
+def check_columns(
+    columns: Mapping[str, np.ndarray], required: Sequence[str], stated_hz: float
+) -> Iterator[Breach]:
+    """Yields what is wrong with the numbers.
+
+    In an optional column NaN means "not measured"; everywhere else it is a breach.
+
+    Args:
+        columns: By name, each `(T,)`; missing ones are left out.
+        required: Names of the columns that every recording has: time, commands, positions.
+        stated_hz: Rate that the file states.
+    """
+    num_samples = max(map(len, columns.values()), default=0)
+    if num_samples < 2:
+        yield Breach(f"{num_samples} rows; a recording has at least 2")
+    for name, values in columns.items():
+        if len(values) != num_samples:
+            yield Breach(f"column '{name}' has {len(values)} rows, others have {num_samples}", name)
+        if name in required:
+            for row, count in find_stretches(~np.isfinite(values)):
+                yield Breach(f"{values[row]} is not a number", name, row, count)
+    for name, values in columns.items():
+        if name.startswith("u_") and name in required:
+            for row, count in find_stretches(np.abs(values) > 1.0 + COMMAND_TOLERANCE):
+                yield Breach(f"command {values[row]:g} lies outside [-1, 1]", name, row, count)
+    if "t_s" in columns:
+        yield from _check_time(columns["t_s"], stated_hz)
+
+
+def _check_time(t_s: np.ndarray, stated_hz: float) -> Iterator[Breach]:
+    period_s = np.diff(t_s)
+    for row, count in find_stretches(period_s <= 0):
+        yield Breach(
+            f"time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)",
+            "t_s",
+            row + 1,
+            count,
+        )
+    for row, count in find_stretches(
+        (np.abs(period_s * stated_hz - 1.0) > RATE_TOLERANCE) & (period_s > 0)
+    ):
+        text = (
+            f"{period_s[row]:g} s after the row before, but brokk.rate_hz = {stated_hz:g} means {1.0 / stated_hz:g} s "
+            f"({RATE_TOLERANCE:.0%} are allowed); split the recording at the gap or state its rate"
+        )
+        yield Breach(text, "t_s", row + 1, count)
+
+
+def find_stretches(condition: np.ndarray) -> list[tuple[int, int]]:
+    """Returns first row and length of each stretch of rows on end where `condition`, `(T,)`, holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], condition, [False]]).astype(np.int8)))
+    return [(int(begin), int(end - begin)) for begin, end in edges.reshape(-1, 2)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,29 +181,29 @@ class Recording:
         return float(self.t_s[-1] - self.t_s[0]) if self.num_samples else 0.0
 
 
-def command_column(joint: str) -> str:
+def name_command_column(joint: str) -> str:
     """Returns the name of the column with the command of `joint`."""
     return f"u_{joint}"
 
 
-def position_column(joint: str, unit: str) -> str:
+def name_position_column(joint: str, unit: str) -> str:
     """Returns the name of the column with the position of `joint`, in `unit` (`rad` or `m`)."""
     return f"q_{joint}_{unit}"
 
 
-def write(recording: Recording, path: Path) -> None:
+def write_recording(recording: Recording, path: Path) -> None:
     """Writes `recording` to `path`: under a temporary name first, so that `path` is either whole or absent.
 
     Raises:
         RecordingError: the recording breaks a rule of the format.
         StorageError: the file could not be written.
     """
-    check(recording, str(path))
+    check_recording(recording, str(path))
     columns: dict[str, np.ndarray] = {"t_s": recording.t_s.astype(np.float64)}
     for j, joint in enumerate(recording.joints):
-        columns[command_column(joint)] = recording.u[:, j].astype(np.float32)
+        columns[name_command_column(joint)] = recording.u[:, j].astype(np.float32)
     for j, (joint, unit) in enumerate(zip(recording.joints, recording.units, strict=True)):
-        columns[position_column(joint, unit)] = recording.q[:, j].astype(np.float32)
+        columns[name_position_column(joint, unit)] = recording.q[:, j].astype(np.float32)
     columns.update(
         {name: np.asarray(values, dtype=np.float32) for name, values in recording.extra.items()}
     )
@@ -116,20 +229,20 @@ def write(recording: Recording, path: Path) -> None:
         ) from error
 
 
-def read(path: Path, machine: Machine) -> Recording:
+def read_recording(path: Path, machine: Machine) -> Recording:
     """Reads the recording at `path`, made on `machine`.
 
     Raises:
         RecordingError: the file is missing or truncated, was made on another machine, lacks a
             column, or breaks a rule of the format; the message names file, row and column.
     """
-    recording, found = examine(path, machine)
+    recording, found = examine_recording(path, machine)
     if recording is None or found:
         raise RecordingError(f"{path}: {found[0]}")
     return recording
 
 
-def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach]]:
+def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach]]:
     """Reads what can be read of the recording at `path`.
 
     Returns:
@@ -152,15 +265,13 @@ def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach
         if key.startswith("brokk.")
     }
     units = tuple(joint.unit for joint in machine.joints)
-    commands = [command_column(name) for name in machine.joint_names]
+    commands = [name_command_column(name) for name in machine.joint_names]
     positions = [
-        position_column(name, unit) for name, unit in zip(machine.joint_names, units, strict=True)
+        name_position_column(name, unit)
+        for name, unit in zip(machine.joint_names, units, strict=True)
     ]
     required = ["t_s", *commands, *positions]
-    found = [
-        *recording_validation.of_metadata(metadata, machine.name),
-        *recording_validation.of_names(required, table.column_names),
-    ]
+    found = [*check_metadata(metadata, machine.name), *check_names(required, table.column_names)]
     columns: dict[str, np.ndarray] = {}
     for name in [*required, *(name for name in table.column_names if name not in required)]:
         if name not in table.column_names:
@@ -170,8 +281,8 @@ def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach
             columns[name] = column.cast(pa.float64()).to_numpy()  # an empty cell becomes NaN
         else:
             found.append(Breach(f"column '{name}' holds {column.type}, expected numbers", name))
-    rate_hz = recording_validation.rate_hz(metadata) or 1.0 / machine.period_s
-    found += recording_validation.of_columns(columns, required, rate_hz)
+    rate_hz = parse_rate_hz(metadata) or 1.0 / machine.period_s
+    found += check_columns(columns, required, rate_hz)
     missing = np.full(table.num_rows, np.nan)
     recording = Recording(
         machine=metadata.get("machine", machine.name),
@@ -196,16 +307,16 @@ def examine(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach
     return recording, found
 
 
-def read_all(patterns: str | Sequence[str], machine: Machine) -> list[Recording]:
+def read_recordings(patterns: str | Sequence[str], machine: Machine) -> list[Recording]:
     """Reads all recordings that match a glob or any of several, in order of their names.
 
     Raises:
         RecordingError: nothing matches, or one of them cannot be used.
     """
-    return [read(path, machine) for path in matching(patterns, "recording")]
+    return [read_recording(path, machine) for path in find_files(patterns, "recording")]
 
 
-def matching(patterns: str | Sequence[str], what: str) -> list[Path]:
+def find_files(patterns: str | Sequence[str], what: str) -> list[Path]:
     """Returns the files that match a glob or any of several, in order of their names; `what` they are goes into the message.
 
     Raises:
@@ -218,7 +329,7 @@ def matching(patterns: str | Sequence[str], what: str) -> list[Path]:
     return [Path(name) for name in paths]
 
 
-def check(recording: Recording, where: str) -> None:
+def check_recording(recording: Recording, where: str) -> None:
     """Raises a `RecordingError` that names file (`where`), row (from 0) and column when `recording` breaks a rule of the format.
 
     In an optional column NaN means "not measured"; everywhere else it is refused.
@@ -231,27 +342,25 @@ def check(recording: Recording, where: str) -> None:
             )
     columns = {"t_s": recording.t_s}
     for j, (joint, unit) in enumerate(zip(recording.joints, recording.units, strict=True)):
-        columns[command_column(joint)] = recording.u[:, j]
-        columns[position_column(joint, unit)] = recording.q[:, j]
+        columns[name_command_column(joint)] = recording.u[:, j]
+        columns[name_position_column(joint, unit)] = recording.q[:, j]
     required = list(columns)
-    for breach in recording_validation.of_columns(
-        columns | dict(recording.extra), required, recording.rate_hz
-    ):
+    for breach in check_columns(columns | dict(recording.extra), required, recording.rate_hz):
         raise RecordingError(f"{where}: {breach}")
 
 
-def now() -> str:
+def format_now() -> str:
     """Returns the present time as `brokk.created` wants it."""
     return datetime.now().astimezone().isoformat(timespec="milliseconds")
 
 
-def later(created: str, elapsed_s: float) -> str:
+def add_seconds(created: str, elapsed_s: float) -> str:
     """Returns the time `elapsed_s` after `created`, both as `brokk.created` wants them."""
     return (datetime.fromisoformat(created) + timedelta(seconds=elapsed_s)).isoformat(
         timespec="milliseconds"
     )
 
 
-def stamp(machine: Machine) -> str:
+def format_fingerprint(machine: Machine) -> str:
     """Returns the machine's fingerprint as `brokk.fingerprint` holds it: JSON."""
     return json.dumps(machine.fingerprint())

@@ -1,9 +1,9 @@
 """One self-contained HTML page: text, tables and pictures in a single file that opens without a network, on a phone or printed.
 
     page = Page("Identification of brokk170", "The network is better than the linear model on every
-    joint.") page.heading("Errors")
-    page.table(["joint", "mlp", "arx"], [["q1", Cell(0.012, best=True), 0.034]], "RMSE at 5 s, rad")
-    page.picture(figure, "Measured and predicted position")
+    joint.") page.add_heading("Errors")
+    page.add_table(["joint", "mlp", "arx"], [["q1", Cell(0.012, best=True), 0.034]], "RMSE at 5 s, rad")
+    page.add_picture(figure, "Measured and predicted position")
     page.write(folder / "identification.html")
 
 Everything that is given is escaped; nothing is taken as markup. The page forbids itself scripts and
@@ -94,7 +94,7 @@ class Cell:
     best: bool = False
 
 
-class Page:
+class Report:
     """A page that grows from top to bottom.
 
     Args:
@@ -107,13 +107,13 @@ class Page:
         self._title = title
         self._parts: list[str] = []
         if summary:
-            self.text(summary, tone, "summary")
+            self.add_text(summary, tone, "summary")
 
-    def heading(self, text: str, level: int = 2) -> None:
+    def add_heading(self, text: str, level: int = 2) -> None:
         """Begins a section (level 2) or a part of one (level 3)."""
         self._parts.append(f"<h{level}>{escape(text)}</h{level}>")
 
-    def text(self, text: str, tone: Tone = "plain", style: str = "") -> None:
+    def add_text(self, text: str, tone: Tone = "plain", style: str = "") -> None:
         """Adds paragraphs; an empty line separates them. `tone` sets one apart as good news, bad news or a warning."""
         classes = " ".join(filter(None, (style, tone if tone != "plain" else "")))
         for paragraph in filter(None, (part.strip() for part in text.split("\n\n"))):
@@ -123,15 +123,15 @@ class Page:
                 else f"<p>{escape(paragraph)}</p>"
             )
 
-    def items(self, texts: Sequence[str]) -> None:
+    def add_list(self, texts: Sequence[str]) -> None:
         """Adds a list of short texts."""
         self._parts.append("<ul>" + "".join(f"<li>{escape(text)}</li>" for text in texts) + "</ul>")
 
-    def code(self, text: str) -> None:
+    def add_code(self, text: str) -> None:
         """Adds commands or a file, as they are."""
         self._parts.append(f"<pre>{escape(text)}</pre>")
 
-    def table(
+    def add_table(
         self,
         columns: Sequence[str],
         rows: Sequence[Sequence[str | float | Cell | None]],
@@ -160,7 +160,7 @@ class Page:
         )
         body = "".join(
             "<tr>"
-            + "".join(_cell(row[i], numeric[i], i == 0, digits) for i in range(len(row)))
+            + "".join(_format_cell(row[i], numeric[i], i == 0, digits) for i in range(len(row)))
             + "</tr>"
             for row in cells
         )
@@ -172,11 +172,11 @@ class Page:
             f'<figure>{title}<div class="scroll"><table>{top}<tbody>{body}</tbody></table></div></figure>'
         )
 
-    def facts(self, facts: dict[str, str | float | None]) -> None:
+    def add_facts(self, facts: dict[str, str | float | None]) -> None:
         """Adds names and what is known of them, one a line."""
-        self.table(["", ""], [[name, Cell(value)] for name, value in facts.items()])
+        self.add_table(["", ""], [[name, Cell(value)] for name, value in facts.items()])
 
-    def picture(self, source: Figure | Path, caption: str = "", description: str = "") -> None:
+    def add_picture(self, source: Figure | Path, caption: str = "", description: str = "") -> None:
         """Adds a picture; its data become part of the page.
 
         Args:
@@ -209,7 +209,7 @@ class Page:
         )
 
     @contextmanager
-    def details(self, summary: str, is_open: bool = False) -> Iterator[None]:
+    def add_details(self, summary: str, is_open: bool = False) -> Iterator[None]:
         """Puts what is added within the block behind a line to click on; printed in full."""
         self._parts.append(
             f"<details{' open' if is_open else ''}><summary>{escape(summary)}</summary>"
@@ -219,7 +219,7 @@ class Page:
         finally:
             self._parts.append("</details>")
 
-    def html(self) -> str:
+    def render(self) -> str:
         """Returns the whole page."""
         head = (
             '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -237,7 +237,7 @@ class Page:
             StorageError: it could not be written.
         """
         try:
-            write_text(path, self.html())
+            write_text(path, self.render())
         except OSError as error:
             raise StorageError(
                 f"cannot write {path}: {error.strerror or error}; nothing was left behind"
@@ -250,7 +250,7 @@ def _is_numeric(values: Sequence[str | float | None]) -> bool:
     return bool(given) and all(not isinstance(value, str) or FIGURE.match(value) for value in given)
 
 
-def _cell(cell: Cell, is_numeric: bool, is_name: bool, digits: int) -> str:
+def _format_cell(cell: Cell, is_numeric: bool, is_name: bool, digits: int) -> str:
     value = cell.value
     if value is None:
         text = MISSING

@@ -24,6 +24,14 @@ def spec(cls: type[T]) -> type[T]:
     return dataclass(frozen=True, kw_only=True)(cls)
 
 
+def name_spec(value: object) -> str:
+    """Return the name of a spec in reports and files: its `label`, else its class in lower case.
+
+    A class attribute `label` keeps the name in files when the class is renamed.
+    """
+    return getattr(value, "label", type(value).__name__.lower())
+
+
 def _post_init(self: Any) -> None:
     hints = typing.get_type_hints(type(self))
     for field in fields(self):

@@ -19,7 +19,7 @@ COMMANDED = 0.02
 """A joint whose command stays below this is at rest, whatever its dead band."""
 
 
-def by_run(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
+def group_by_run(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
     """Returns the recordings of each run, by a name that is the run's alone.
 
     Two collections may give their runs the same names; the seed tells them apart. A recording that
@@ -36,7 +36,7 @@ def by_run(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
     return runs
 
 
-def commanded_s(recordings: Sequence[Recording]) -> np.ndarray:
+def measure_commanded_s(recordings: Sequence[Recording]) -> np.ndarray:
     """Returns for how long each joint is commanded in all recordings together, s, shape `(J,)`."""
     return np.sum(
         [(np.abs(recording.u) > COMMANDED).sum(0) / recording.rate_hz for recording in recordings],
@@ -44,7 +44,7 @@ def commanded_s(recordings: Sequence[Recording]) -> np.ndarray:
     )
 
 
-def split(
+def split_runs(
     runs: Mapping[str, Sequence[Recording]], shares: Mapping[str, float]
 ) -> dict[str, list[str]]:
     """Distributes runs over sets such that each joint is commanded in each set for about its share of the time.
@@ -68,7 +68,7 @@ def split(
     # the last column, the length of the runs, distributes those in which nothing is commanded
     seconds = np.stack(
         [
-            np.append(commanded_s(runs[name]), sum(r.duration_s for r in runs[name]))
+            np.append(measure_commanded_s(runs[name]), sum(r.duration_s for r in runs[name]))
             for name in names
         ]
     )
@@ -95,7 +95,7 @@ def check_commanded(
     runs: Mapping[str, Sequence[Recording]], machine: Machine, needed: int, why: str
 ) -> None:
     """Raises a `RecordingError` that names a joint commanded in fewer than `needed` runs, and what to record; `why`: for what."""
-    moving = {name: commanded_s(recordings) > 0 for name, recordings in runs.items()}
+    moving = {name: measure_commanded_s(recordings) > 0 for name, recordings in runs.items()}
     minutes = (
         sum(recording.duration_s for recordings in runs.values() for recording in recordings) / 60.0
     )

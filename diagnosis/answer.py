@@ -1,20 +1,28 @@
-"""`diagnosis.json`: the answer of a diagnosis as data.
+"""The answer of a diagnosis (`diagnosis.json`) and the free runs that its report draws (`diagnosis.npz`).
 
-Effects, joints and numbers have the names of the effect registry. Fields that a reader may rely on
-stand here; `more` holds everything else that the diagnosis reports, as plain JSON.
+Effects, joints and parameters have the names of the effect registry. A reader may rely on the fields
+of `Answer`; `Answer.more` holds further plain JSON.
+Axes: `W` windows, `K` steps, `J` joints.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from brokk_rl.errors import RecordingError, StorageError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
 from brokk_rl.session import write_json
+from diagnosis.free_runs import WindowedRuns
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,7 @@ class Gap:
 
 
 SCHEMA = 1
-FILE = "diagnosis.json"
+ANSWER_FILE = "diagnosis.json"
 
 Verdict = Literal["effects", "none", "unknown"]
 Stage = Literal["actuation", "sensing", "kinematics", "timing", "perception"]
@@ -204,7 +212,7 @@ class Answer:
                 name: {self.gap.key: getattr(self.gap, name)}
                 for name in ("before", "after", "floor")
             },
-            "closed": None if self.gap.closed is None else _estimate(self.gap.closed),
+            "closed": None if self.gap.closed is None else _serialize_estimate(self.gap.closed),
             "floor_of": self.gap.floor_of,
             "joints": {name: dataclasses.asdict(one) for name, one in self.gap.joints.items()},
         }
@@ -212,13 +220,13 @@ class Answer:
             "schema": SCHEMA,
             "verdict": self.verdict,
             "reason": self.reason,
-            "selected": [_selected(one) for one in self.selected],
-            "ranking": [_listed(dataclasses.asdict(one)) for one in self.ranking],
+            "selected": [_serialize_selected(one) for one in self.selected],
+            "ranking": [_serialize_tuples(dataclasses.asdict(one)) for one in self.ranking],
             "where": where,
             "gap": gap,
             "next_experiment": None
             if self.next_experiment is None
-            else _listed(dataclasses.asdict(self.next_experiment)),
+            else _serialize_tuples(dataclasses.asdict(self.next_experiment)),
             **self.more,
         }
 
@@ -234,7 +242,7 @@ class Answer:
             raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def read(path: Path) -> Answer:
+def read_answer(path: Path) -> Answer:
     """Reads a `diagnosis.json`.
 
     Raises:
@@ -244,7 +252,7 @@ def read(path: Path) -> Answer:
         found = json.loads(path.read_text())
         if found["schema"] != SCHEMA:
             raise RecordingError(f"{path}: schema {found['schema']}, expected {SCHEMA}")
-        return _answer(found)
+        return _parse_answer(found)
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: cannot be read as a diagnosis ({error})") from error
     except (KeyError, TypeError) as error:
@@ -253,7 +261,7 @@ def read(path: Path) -> Answer:
         ) from error
 
 
-def _answer(found: dict[str, Any]) -> Answer:
+def _parse_answer(found: dict[str, Any]) -> Answer:
     joints, units = {}, {}
     for name, gap in found["where"]["joints"].items():
         units[name] = "m" if "rmse_m" in gap else "rad"
@@ -306,16 +314,16 @@ def _read_gap(given: dict[str, Any]) -> Gap:
     )
 
 
-def _selected(one: Selected) -> dict[str, Any]:
+def _serialize_selected(one: Selected) -> dict[str, Any]:
     return {
         "effect": one.effect,
         "joints": list(one.joints),
         "probability": one.probability,
         "parameters": {
-            name: {joint: _estimate(value) for joint, value in values.items()}
+            name: {joint: _serialize_estimate(value) for joint, value in values.items()}
             for name, values in one.parameters.items()
         },
-        "gap_closed": None if one.gap_closed is None else _estimate(one.gap_closed),
+        "gap_closed": None if one.gap_closed is None else _serialize_estimate(one.gap_closed),
         "same_as": list(one.same_as),
         "decided_by": one.decided_by,
     }
@@ -339,7 +347,7 @@ def _read_selected(one: dict[str, Any]) -> Selected:
     )
 
 
-def _estimate(value: Estimate) -> dict[str, Any]:
+def _serialize_estimate(value: Estimate) -> dict[str, Any]:
     return {"mean": value.mean, "ci95": list(value.ci95)}
 
 
@@ -347,7 +355,117 @@ def _read_estimate(value: dict[str, Any] | None) -> Estimate | None:
     return None if value is None else Estimate(value["mean"], tuple(value["ci95"]))
 
 
-def _listed(fields: dict[str, Any]) -> dict[str, Any]:
+def _serialize_tuples(fields: dict[str, Any]) -> dict[str, Any]:
     return {
         key: list(value) if isinstance(value, tuple) else value for key, value in fields.items()
     }
+
+
+ARRAYS_FILE = "diagnosis.npz"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A finished diagnosis.
+
+    Attributes:
+        answer: What it says.
+        before: Free runs of the simulator as it was through field recordings that no effect was
+            fitted to.
+        after: The same with the selected effects; `None` where none was selected.
+        floor: The simulator's through reference recordings that it was not fitted to; `None`
+            without any.
+    """
+
+    answer: Answer
+    before: WindowedRuns
+    after: WindowedRuns | None
+    floor: WindowedRuns | None
+
+    def save(self, folder: Path) -> None:
+        """Writes `diagnosis.json` and `diagnosis.npz`, each in one step.
+
+        Raises:
+            StorageError: something could not be written.
+        """
+        arrays: dict[str, Any] = {}
+        for name in ("before", "after", "floor"):
+            runs = getattr(self, name)
+            if runs is not None:
+                arrays |= _pack_runs(name, runs)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        temporary = folder / f".{ARRAYS_FILE}.{os.getpid()}.part"
+        try:
+            temporary.write_bytes(buffer.getvalue())
+            os.replace(temporary, folder / ARRAYS_FILE)
+        except OSError as error:
+            temporary.unlink(missing_ok=True)
+            raise StorageError(
+                f"cannot write {folder / ARRAYS_FILE}: {error.strerror or error}; nothing was left behind"
+            ) from error
+        self.answer.write(folder / ANSWER_FILE)
+
+
+def load_outcome(folder: Path, machine: Machine) -> Outcome:
+    """Reads what `Outcome.save` wrote.
+
+    Raises:
+        RecordingError: a file is missing or damaged.
+    """
+    try:
+        with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
+            found = {
+                name: _unpack_runs(name, arrays, machine) for name in ("before", "after", "floor")
+            }
+    except (OSError, ValueError, KeyError) as error:
+        raise RecordingError(
+            f"{folder / ARRAYS_FILE}: cannot be read as the arrays of a diagnosis ({error})"
+        ) from error
+    if found["before"] is None:
+        raise RecordingError(f"{folder / ARRAYS_FILE}: holds no free runs; run mode=diagnose again")
+    return Outcome(
+        read_answer(folder / ANSWER_FILE), found["before"], found["after"], found["floor"]
+    )
+
+
+def _pack_runs(name: str, runs: WindowedRuns) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        f"{name}.source": runs.source, f"{name}.row": runs.row, f"{name}.simulated": runs.simulated.astype(np.float32),
+        f"{name}.titles": np.array([r.path.stem if r.path else r.run for r in runs.recordings]),
+        f"{name}.created": np.array([r.metadata.get("created", "") for r in runs.recordings]),
+        f"{name}.rate_hz": np.array([r.rate_hz for r in runs.recordings]),
+    }  # fmt: skip
+    for number, recording in enumerate(runs.recordings):
+        arrays |= {f"{name}.{number}.{key}": getattr(recording, key) for key in ("t_s", "u", "q")}
+    return arrays
+
+
+def _unpack_runs(name: str, arrays: Any, machine: Machine) -> WindowedRuns | None:
+    if f"{name}.row" not in arrays:
+        return None
+    empty = Recording(
+        machine=machine.name, joints=machine.joint_names, units=tuple(joint.unit for joint in machine.joints),
+        rate_hz=1.0 / machine.period_s, t_s=np.zeros(0), u=np.zeros(0), q=np.zeros(0),
+    )  # fmt: skip
+    titles, created, rates = (
+        arrays[f"{name}.{key}"].tolist() for key in ("titles", "created", "rate_hz")
+    )
+    recordings = [
+        replace(
+            empty, rate_hz=rate_hz, metadata={"run": title} | ({"created": begun} if begun else {}),
+            **{key: arrays[f"{name}.{number}.{key}"] for key in ("t_s", "u", "q")},
+        )
+        for number, (title, begun, rate_hz) in enumerate(zip(titles, created, rates, strict=True))
+    ]  # fmt: skip
+    return WindowedRuns(
+        recordings,
+        arrays[f"{name}.source"],
+        arrays[f"{name}.row"],
+        arrays[f"{name}.simulated"].astype(float),
+    )
+
+
+def format_error(value: float, unit: str) -> str:
+    """Returns an error as a person reads it: in mrad, mm, or in percent of the joints' travel where units differ."""
+    return f"{100 * value:.1f} % of travel" if unit == "travel" else f"{1e3 * value:.1f} m{unit}"

@@ -186,12 +186,12 @@ def compare_simulator(
     actuator: Actuator, begun: StartedRecordings, machine: Machine, seed: int
 ) -> SimulatorComparison:
     """Returns `actuator` held against all whole windows of recordings."""
-    before, steps = open_loop.num_before(machine), round(HORIZON_S / machine.period_s)
+    before, steps = open_loop.count_samples_before(machine), round(HORIZON_S / machine.period_s)
     cuts, source, row, running = [], [], [], []
     for number, (recording, begun_s) in enumerate(begun):
         if recording.num_samples < before + steps:
             continue
-        cut = open_loop.windows([recording], machine, HORIZON_S, HORIZON_S)
+        cut = open_loop.cut_windows([recording], machine, HORIZON_S, HORIZON_S)
         rows = before + steps * np.arange(len(cut.q))
         cuts.append(replace(cut, run=np.full(len(cut.q), f"{number}")))
         source += [number] * len(rows)
@@ -201,7 +201,7 @@ def compare_simulator(
         raise RecordingError(
             f"too little data: no recording is long enough for a free run of {HORIZON_S:g} s"
         )
-    windows = open_loop.joined(cuts)
+    windows = open_loop.join_windows(cuts)
     valid_mask = np.ones((len(windows.q), machine.num_joints), dtype=bool)
     simulator = EffectSimulator(actuator, machine, windows, np.array(running), seed)
     return SimulatorComparison(

@@ -52,7 +52,7 @@ class GapCase:
             found.append(
                 f"the field recordings last {total_s:.0f} s in all; {MIN_TOTAL_S:.0f} s or more are needed"
             )
-        if open_loop.longest_s(self.field, self.machine) < HORIZON_S:
+        if open_loop.find_longest_horizon_s(self.field, self.machine) < HORIZON_S:
             found.append(f"no field recording is long enough for a free run of {HORIZON_S:g} s")
         if not self.reference and len(self.field) == 1:
             found.append(
@@ -101,7 +101,7 @@ def read_recordings(where: str | tuple[str, ...], machine: Machine) -> list[Reco
     Raises:
         RecordingError: there are none, or one cannot be used (another machine, NaN, gaps, …).
     """
-    found = record.read_all(where, machine)
+    found = record.read_recordings(where, machine)
     for recording in found:
         if stamp := recording.metadata.get("fingerprint"):
             _check_stamp(stamp, recording, machine)
@@ -141,7 +141,7 @@ def split_recordings(recordings: Sequence[Recording]) -> list[Recording]:
             extra = {name: values[rows] for name, values in recording.extra.items()}
             named = {**recording.metadata, "run": f"{number}.{part}"}
             if created := recording.metadata.get("created"):
-                named["created"] = record.later(created, float(recording.t_s[rows][0]))
+                named["created"] = record.add_seconds(created, float(recording.t_s[rows][0]))
             t_s = recording.t_s[rows] - recording.t_s[rows][0]
             found.append(
                 replace(

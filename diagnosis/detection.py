@@ -14,12 +14,12 @@ import numpy as np
 from brokk_rl.spec import spec
 from diagnosis import (
     effect_library,
+    geometry,
     nonadditive_refit,
     refine,
     residual_model,
     sensors,
     timing,
-    tool,
 )
 from diagnosis.baseline import Baseline
 from diagnosis.case import GapCase
@@ -142,13 +142,17 @@ class EffectSearch:
         """Returns what is found."""
         penalties, left_out = self.penalties, [one.residuals for one in self.base.left_out]
         self.tell("sensors", 0.32)
-        on_sensors = sensors.search(self.case, self.kinds, penalties.joint, penalties.name)
-        on_tool = tool.search(self.case, self.kinds, penalties.joint, penalties.name)
+        on_sensors = sensors.find_sensor_effects(
+            self.case, self.kinds, penalties.joint, penalties.name
+        )
+        on_tool = geometry.find_geometry_errors(
+            self.case, self.kinds, penalties.joint, penalties.name
+        )
         residuals = _adjust_residuals(
             self.base.field.residuals, self.case, [*on_sensors, *on_tool.found]
         )
         grown, shapes = self._simulated(
-            residuals, tool.is_tracked(self.case.field, self.case.machine)
+            residuals, geometry.is_tracked(self.case.field, self.case.machine)
         )
         small = {name: choose_rays(ways[0].kind, REFERENCE_GRID) for name, ways in grown.items()}
         known = ReferenceScores(
@@ -426,7 +430,9 @@ def _adjust_residuals(
     if not rough:
         return residuals
     assert residuals.noise is not None, "noise is known by now"
-    reading = sensors.readings(case.field, case.reference, case.machine) * np.any(rough, 0)
+    reading = sensors.measure_excess_scatter(case.field, case.reference, case.machine) * np.any(
+        rough, 0
+    )
     noise = [
         replace(one, reading=float(more))
         for one, more in zip(residuals.noise, reading, strict=True)

@@ -24,7 +24,7 @@ from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import Windows
+from brokk_rl.open_loop import FreeRunWindows
 from diagnosis.answer import Estimate
 
 log = logging.getLogger(__name__)
@@ -243,7 +243,7 @@ class EffectSimulator:
     Attributes:
         base: The simulator.
         machine: The machine.
-        cut: Windows.
+        cut: FreeRunWindows.
         running_s: Time since the machine was started at the beginning of each window, `(W,)`.
         seed: Of the random numbers that stochastic effects draw.
         fixed: Effects that all candidates have, with numbers `(1, J)`.
@@ -251,7 +251,7 @@ class EffectSimulator:
 
     base: Actuator
     machine: Machine
-    cut: Windows
+    cut: FreeRunWindows
     running_s: np.ndarray
     seed: int
     fixed: Sequence[tuple[EffectType, EffectValues]] = ()

@@ -89,12 +89,12 @@ def simulate_free_runs(
     Raises:
         RecordingError: no recording is long enough.
     """
-    before, steps = open_loop.num_before(machine), round(horizon_s / machine.period_s)
+    before, steps = open_loop.count_samples_before(machine), round(horizon_s / machine.period_s)
     cuts, source, row = [], [], []
     for number, recording in enumerate(recordings):
         if recording.num_samples <= before:
             continue
-        cut = open_loop.windows([recording], machine, horizon_s, horizon_s, machine.period_s)
+        cut = open_loop.cut_windows([recording], machine, horizon_s, horizon_s, machine.period_s)
         cuts.append(cut)
         source += [number] * len(cut.q)
         row += [before + steps * window for window in range(len(cut.q))]
@@ -102,5 +102,5 @@ def simulate_free_runs(
         raise RecordingError(
             f"too little data: a free run needs recordings of more than {before * machine.period_s:g} s"
         )
-    simulated = open_loop.free_run(actuator, machine, open_loop.joined(cuts), device)
+    simulated = open_loop.roll_out(actuator, machine, open_loop.join_windows(cuts), device)
     return WindowedRuns(recordings, np.array(source), np.array(row), simulated.astype(float))

@@ -286,15 +286,15 @@ def evaluate_unseen(
     assert result.fitted is not None, "there is something to carry"
     begun = estimate_running_s(recordings)
     cuts = [
-        open_loop.windows([one], machine, HORIZON_S, HORIZON_S)
+        open_loop.cut_windows([one], machine, HORIZON_S, HORIZON_S)
         for one in recordings
         if _is_long(one, machine)
     ]
     running = [at for one, at in zip(recordings, begun, strict=True) if _is_long(one, machine)]
     cut = (
-        open_loop.joined(cuts)
+        open_loop.join_windows(cuts)
         if cuts
-        else open_loop.windows(recordings, machine, HORIZON_S, HORIZON_S)
+        else open_loop.cut_windows(recordings, machine, HORIZON_S, HORIZON_S)
     )
     running_at = np.repeat(running, [len(one.q) for one in cuts])
     simulator = replace(result.residuals.simulator, cut=cut, running_s=running_at)
@@ -308,7 +308,7 @@ def evaluate_unseen(
 
 
 def _is_long(recording: Recording, machine: Machine) -> bool:
-    return open_loop.longest_s([recording], machine) >= HORIZON_S
+    return open_loop.find_longest_horizon_s([recording], machine) >= HORIZON_S
 
 
 def _compute_joint_rmse(paths: Sequence[np.ndarray], measured: Sequence[np.ndarray]) -> np.ndarray:

@@ -1,14 +1,16 @@
-"""Measured tool points against forward kinematics: how far off, and which single error of geometry explains it best.
+"""Errors of geometry and encoders, from measured tool points and forward kinematics alone.
 
-Works on measured positions alone, no simulator takes part: what is off here is off whatever the
-actuators do.
-Axes: `S` samples, `J` joints.
+No simulator takes part, so the actuators do not matter. `compare_tool_points` measures the distance
+and the best single explanation. `find_geometry_errors` compares sets of errors by least squares:
+the errors are small, so their effects add up.
+Axes: `S` samples, `J` joints, `D` coordinates of all samples (`S` times 3).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -17,14 +19,17 @@ import torch
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis.answer import Estimate
+from diagnosis.case import GapCase
+from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
 
-COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
-FEWEST = 100
+TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
+MIN_SAMPLES = 100
 """Samples with a measured tool point below which nothing is said."""
 
 
 @dataclass(frozen=True)
-class Geometry:
+class ToolPointErrors:
     """How measured tool points differ from those of the machine's file.
 
     Attributes:
@@ -48,32 +53,34 @@ class Geometry:
         return asdict(self)
 
 
-def geometry(recordings: Sequence[Recording], machine: Machine) -> Geometry | None:
+def compare_tool_points(
+    recordings: Sequence[Recording], machine: Machine
+) -> ToolPointErrors | None:
     """Returns how far off measured tool points are, `None` where there are too few, or the machine's geometry is not known."""
     if not machine.has_bodies:
         return None
-    having = [r for r in recordings if all(column in r.extra for column in COLUMNS)]
+    having = [r for r in recordings if all(column in r.extra for column in TOOL_COLUMNS)]
     if not having:
         return None
     seen = np.concatenate(
-        [np.stack([r.extra[column] for column in COLUMNS], 1) for r in having]
+        [np.stack([r.extra[column] for column in TOOL_COLUMNS], 1) for r in having]
     ).astype(float)
     q = np.concatenate([r.q for r in having])
     given = np.isfinite(seen).all(1)
-    if given.sum() < FEWEST:
+    if given.sum() < MIN_SAMPLES:
         return None
     pose, jacobian = Kinematics(machine).pose_and_jacobian(
         torch.as_tensor(q[given], dtype=torch.float32)
     )
     off = seen[given] - pose.tip_in_base_m.numpy()
     whole = float((off**2).sum())
-    columns = _columns(machine, q[given], pose, jacobian.tip.numpy())
-    found = [(*_fitted(column, off, whole), cause, unit) for cause, unit, column in columns]
+    columns = _list_single_errors(machine, q[given], pose, jacobian.tip.numpy())
+    found = [(*_fit_size(column, off, whole), cause, unit) for cause, unit, column in columns]
     explained, size, cause, unit = max(found)
-    return Geometry(float(np.sqrt(whole / len(off))), cause, size, unit, explained, len(off))
+    return ToolPointErrors(float(np.sqrt(whole / len(off))), cause, size, unit, explained, len(off))
 
 
-def _columns(
+def _list_single_errors(
     machine: Machine, q: np.ndarray, pose: Any, tip: np.ndarray
 ) -> Iterator[tuple[str, str, np.ndarray]]:
     """Yields the way in which each error of unit size moves the measured tip, `(S, 3)`, relative to the computed one."""
@@ -99,8 +106,331 @@ def _columns(
         yield f"offset along {name}", "m", np.tile(axis, (len(end), 1))
 
 
-def _fitted(column: np.ndarray, off: np.ndarray, whole: float) -> tuple[float, float]:
+def _fit_size(column: np.ndarray, off: np.ndarray, whole: float) -> tuple[float, float]:
     """Returns the explained part of the squared distance and the size."""
     norm = max(float((column**2).sum()), np.finfo(float).tiny)
     size = float((column * off).sum()) / norm
     return size**2 * norm / max(whole, np.finfo(float).tiny), size
+
+
+COLUMNS_TOOL = ("ee_x_m", "ee_y_m", "ee_z_m")
+MIN_SECONDS = 40
+"""Seconds with measured tool points that tell something."""
+NUM_ROUNDS = 3
+"""Times that sets of errors are compared: about nothing, then about what was found."""
+MAX_ERRORS = 3
+"""Errors in a set."""
+DIFFERENCE_STEP = 0.2
+"""Finite difference, of the typical size."""
+MIN_NOISE_M = 3e-4
+"""No instrument is better."""
+MIN_SIZE = 0.3
+"""Smallest size, over the typical one, that is worth naming: trackers see millimetres that no
+drawing and no zero hold."""
+
+
+SetFit = tuple[float, np.ndarray, np.ndarray]
+"""What a set of errors earns, their numbers, and the covariance of these."""
+
+
+@dataclass(frozen=True)
+class _GeometryError:
+    """One error: an effect on one joint, or of the whole machine; `columns` `(D, P)` per unit of `names`."""
+
+    kind: EffectType
+    joint: int | None
+    names: tuple[str, ...]
+    columns: np.ndarray
+
+
+def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
+    """Says whether the recordings hold enough measured tool points of a machine whose geometry is known."""
+    if not machine.has_bodies:
+        return False
+    given = [
+        np.isfinite(np.stack([r.extra[column] for column in COLUMNS_TOOL])).all(0).sum() / r.rate_hz
+        for r in recordings
+        if _is_measured(r)
+    ]
+    return sum(given) >= MIN_SECONDS
+
+
+@dataclass(frozen=True)
+class GeometryFindings:
+    """What measured tool points show.
+
+    Attributes:
+        found: Errors of geometry and encoders.
+        left: Root mean square of what they leave over that of the reference; 1 where nothing is
+            measured.
+    """
+
+    found: Sequence[DetectedEffect]
+    left: float
+
+
+def find_geometry_errors(
+    case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float
+) -> GeometryFindings:
+    """Returns the errors of geometry and encoders that the measured tool points of the field show; none where there are none."""
+    field, reference, machine = case.field, case.reference, case.machine
+    if not is_tracked(field, machine):
+        return GeometryFindings([], 1.0)
+    kinds = [
+        k
+        for k in kinds
+        if not k.target.stochastic
+        and k.target.smooth
+        and k.target.side in ("kinematics", "measurement")
+    ]
+    q, seen, ways = _collect_samples(field, machine)
+    off, causes = (
+        _remove_timing((seen - _compute_tool_points(None, {}, q, machine)).ravel(), ways),
+        _list_errors(kinds, q, ways, machine),
+    )
+    everything = np.concatenate([cause.columns for cause in causes], 1)
+    size_m = usual_m = max(
+        MIN_NOISE_M,
+        float(np.std(off - everything @ np.linalg.lstsq(everything, off, rcond=1e-9)[0])),
+    )
+    if is_tracked(reference, machine):
+        at, known, moved = _collect_samples(reference, machine)
+        usual_m = max(
+            MIN_NOISE_M,
+            float(
+                np.std(
+                    _remove_timing(
+                        (known - _compute_tool_points(None, {}, at, machine)).ravel(), moved
+                    )
+                )
+            ),
+        )
+        size_m = max(size_m, usual_m)
+    straight, chosen = off, ()
+    for _ in range(
+        NUM_ROUNDS
+    ):  # what errors do is straight about what was found, not about nothing
+        fits, worth = _score_sets(causes, straight, size_m, price, name_price)
+        before, chosen = chosen, max(worth, key=worth.__getitem__)
+        if chosen in ((), before):
+            break
+        values = _split(causes, chosen, fits[chosen][1])
+        bent = [
+            _compute_nonlinearity(causes[c], own, q, machine)
+            for c, own in zip(chosen, values, strict=True)
+        ]
+        straight = off - _remove_timing(np.sum(bent, 0), ways)
+    sizes = zip(chosen, _split(causes, chosen, fits[chosen][1]), strict=False)
+    large = tuple(c for c, own in sizes if _measure_size(causes[c], own) >= MIN_SIZE)
+    names = dict.fromkeys(causes[c].kind.name for c in large)
+    left = (
+        straight - np.concatenate([causes[c].columns for c in chosen], 1) @ fits[chosen][1]
+        if chosen
+        else straight
+    )
+    return GeometryFindings(
+        [_describe_effect(name, large, causes, fits, worth, machine) for name in names],
+        float(np.std(left)) / usual_m,
+    )
+
+
+def _score_sets(
+    causes: Sequence[_GeometryError],
+    off: np.ndarray,
+    size_m: float,
+    price: float,
+    name_price: float,
+) -> tuple[dict[tuple[int, ...], SetFit], dict[tuple[int, ...], float]]:
+    """Returns all sets of causes, by their numbers, and what they are worth."""
+    fits: dict[tuple[int, ...], SetFit] = {(): (0.0, np.zeros(0), np.zeros((0, 0)))}
+    worth: dict[tuple[int, ...], float] = {(): 0.0}
+    for count in range(1, MAX_ERRORS + 1):
+        for chosen in combinations(range(len(causes)), count):
+            fits[chosen] = _fit([causes[c] for c in chosen], off, size_m)
+            names = {causes[c].kind.name for c in chosen}
+            worth[chosen] = fits[chosen][0] - price * count - name_price * len(names)
+    return fits, worth
+
+
+def _describe_effect(
+    name: str,
+    best: tuple[int, ...],
+    causes: Sequence[_GeometryError],
+    fits: Mapping[tuple[int, ...], SetFit],
+    worth: Mapping[tuple[int, ...], float],
+    machine: Machine,
+) -> DetectedEffect:
+    gain, values, covariance = fits[best]
+    deviation, parameters, mask, place = (
+        np.sqrt(np.diag(covariance)),
+        {},
+        np.zeros(machine.num_joints, dtype=bool),
+        0,
+    )
+    kind = next(causes[c].kind for c in best if causes[c].kind.name == name)
+    for c in best:
+        cause = causes[c]
+        for number in cause.names:
+            if cause.kind is kind:
+                mean, half = kind.numbers[number].none + values[place], 1.96 * deviation[place]
+                joint = "machine" if cause.joint is None else machine.joint_names[cause.joint]
+                estimate = Estimate(float(mean), (float(mean - half), float(mean + half)))
+                parameters.setdefault(number, {})[joint] = estimate
+                mask[slice(None) if cause.joint is None else cause.joint] = True
+            place += 1
+    mine = tuple(c for c in best if causes[c].kind is kind)
+    rest = tuple(c for c in best if c not in mine)
+    own = gain - fits[rest][0]
+    rivals = {}
+    for c, cause in enumerate(causes):
+        swapped = tuple(sorted({*rest, c}))
+        if cause.kind is not kind and swapped in fits:
+            rivals[cause.kind.name] = max(
+                rivals.get(cause.kind.name, -np.inf), fits[swapped][0] - fits[rest][0]
+            )
+    without = max(
+        value for chosen, value in worth.items() if not any(causes[c].kind is kind for c in chosen)
+    )
+    closed = float(np.clip(own / max(gain, 1e-9), 0.0, 1.0))
+    return DetectedEffect(kind, mask, parameters, worth[best] - without, own, closed, rivals)
+
+
+def _list_errors(
+    kinds: Sequence[EffectType], q: np.ndarray, ways: np.ndarray, machine: Machine
+) -> list[_GeometryError]:
+    """Returns the errors that move the tool point at all, other than along the ways that it goes."""
+    plain, found = _compute_tool_points(None, {}, q, machine), []
+    for kind in kinds:
+        joined = all(not kind.numbers[name].per_joint for name in kind.fitted)
+        for joint in [None] if joined else range(machine.num_joints):
+            columns = []
+            for name in kind.fitted:
+                step = DIFFERENCE_STEP * kind.size(name)
+                moved = (
+                    _compute_tool_points(
+                        kind, {name: _offset_neutral(kind, name, joint, step, machine)}, q, machine
+                    )
+                    - plain
+                )
+                columns.append(_remove_timing(moved.ravel() / step, ways))
+            column = np.stack(columns, 1)
+            if np.abs(column).max() > 1e-6:
+                found.append(_GeometryError(kind, joint, kind.fitted, column))
+    return found
+
+
+def _offset_neutral(
+    kind: EffectType, name: str, joint: int | None, by: float, machine: Machine
+) -> np.ndarray:
+    """Returns a number of an effect that is `by` more than neutral on a joint, or on all, `(J,)` or `(1,)`."""
+    value = np.full(
+        machine.num_joints if kind.numbers[name].per_joint else 1,
+        kind.numbers[name].none,
+        dtype=float,
+    )
+    value[slice(None) if joint is None else joint] += by
+    return value
+
+
+def _compute_nonlinearity(
+    cause: _GeometryError, values: np.ndarray, q: np.ndarray, machine: Machine
+) -> np.ndarray:
+    """Returns by how much an error of some size moves the tool point other than in proportion, `(D,)`."""
+    given = {
+        n: _offset_neutral(cause.kind, n, cause.joint, value, machine)
+        for n, value in zip(cause.names, values, strict=True)
+    }
+    steps = {n: DIFFERENCE_STEP * cause.kind.size(n) for n in cause.names}
+    small = [
+        _compute_tool_points(
+            cause.kind, {n: _offset_neutral(cause.kind, n, cause.joint, by, machine)}, q, machine
+        )
+        for n, by in steps.items()
+    ]
+    plain = _compute_tool_points(None, {}, q, machine)
+    line = sum(
+        (
+            value / by * (one - plain)
+            for value, by, one in zip(values, steps.values(), small, strict=True)
+        ),
+        np.zeros(()),
+    )
+    return (_compute_tool_points(cause.kind, given, q, machine) - plain - line).ravel()
+
+
+def _remove_timing(off: np.ndarray, ways: np.ndarray) -> np.ndarray:
+    """Returns errors `(D,)` without their part along the ways `(D, 2)` that the tool point goes.
+
+    Instruments beside the machine have a clock of their own: a period between them and the encoders
+    moves the tool by centimetres.
+    """
+    return off - ways @ np.linalg.lstsq(ways, off, rcond=1e-9)[0]
+
+
+def _fit(causes: Sequence[_GeometryError], off: np.ndarray, size_m: float) -> SetFit:
+    """Returns what a set of errors earns, their numbers (as differences from neutral), and their covariance."""
+    x = np.concatenate([cause.columns for cause in causes], 1)
+    unit = np.concatenate(
+        [[abs(cause.kind.size(name)) for name in cause.names] for cause in causes]
+    )
+    # instruments err together for a while: a sample a second counts as a third of one
+    normal = x.T @ x / size_m**2 / 3.0 + np.diag(1.0 / (3.0 * unit) ** 2)
+    covariance = np.linalg.inv(normal)
+    values = covariance @ (x.T @ off) / size_m**2 / 3.0
+    left = off - x @ values
+    return float((off @ off - left @ left) / 2.0 / size_m**2 / 3.0), values, covariance
+
+
+def _split(
+    causes: Sequence[_GeometryError], chosen: Sequence[int], values: np.ndarray
+) -> list[np.ndarray]:
+    return np.split(values, np.cumsum([len(causes[c].names) for c in chosen])[:-1])
+
+
+def _measure_size(cause: _GeometryError, values: np.ndarray) -> float:
+    return max(
+        abs(value / cause.kind.size(name)) for name, value in zip(cause.names, values, strict=True)
+    )
+
+
+def _collect_samples(
+    recordings: Sequence[Recording], machine: Machine
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns positions, measured tool points and the ways of a period to and from them, `(D, 2)`, about once a second."""
+    having = [r for r in recordings if _is_measured(r)]
+    every = max(1, round(having[0].rate_hz))
+    seen = np.concatenate(
+        [np.stack([r.extra[column] for column in COLUMNS_TOOL], 1)[::every] for r in having]
+    ).astype(float)
+    q = [r.q.astype(float) for r in having]
+    steps = [np.diff(_compute_tool_points(None, {}, one, machine), axis=0) for one in q]
+    none = np.zeros((1, 3))
+    ways = [
+        np.stack([np.concatenate([none, one]), np.concatenate([one, none])], -1)[::every]
+        for one in steps
+    ]
+    given = np.isfinite(seen).all(1)
+    return (
+        np.concatenate([one[::every] for one in q])[given],
+        seen[given],
+        np.concatenate(ways)[given].reshape(-1, 2),
+    )
+
+
+def _is_measured(recording: Recording) -> bool:
+    return all(column in recording.extra for column in COLUMNS_TOOL)
+
+
+def _compute_tool_points(
+    kind: EffectType | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine
+) -> np.ndarray:
+    """Returns where the tool point is at measured positions, with an effect or none, `(S, 3)`."""
+    at, device = torch.as_tensor(q, dtype=torch.float32), torch.device("cpu")
+    kinematics = Kinematics(machine, device)
+    if kind is None:
+        return kinematics.pose(at).tip_in_base_m.numpy().astype(float)
+    model = kind.wrap(StationaryModel(), machine, len(q), device)
+    for name, value in values.items():
+        model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
+    true = model.truth(at)
+    return model.tool(kinematics.pose(true).tip_in_base_m, true).numpy().astype(float)

@@ -46,7 +46,7 @@ def choose_experiment(
     generator: np.random.Generator,
 ) -> NextExperiment | None:
     """Returns the excitation that separates the rivals best; `None` where none does, or nothing is left to separate."""
-    steps, before = round(EXPERIMENT_S / machine.period_s), open_loop.num_before(machine)
+    steps, before = round(EXPERIMENT_S / machine.period_s), open_loop.count_samples_before(machine)
     programs = {}
     for name, excitation in excitations.items() if len(rivals) > 1 else ():
         try:
@@ -60,7 +60,7 @@ def choose_experiment(
     u = np.stack([u for _, u in programs.values()]).astype(np.float32)
     q = np.full((len(u), before + steps, machine.num_joints), np.nan, dtype=np.float32)
     q[:, :before] = np.stack([start for start, _ in programs.values()])[:, None]
-    cut = open_loop.Windows(u, q, np.array(list(programs)), machine.num_history, before)
+    cut = open_loop.FreeRunWindows(u, q, np.array(list(programs)), machine.num_history, before)
     apart = _compute_distances(
         EffectSimulator(actuator, machine, cut, np.zeros(len(u)), 0), noises, rivals
     )

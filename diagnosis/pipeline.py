@@ -12,10 +12,10 @@ import yaml
 
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import StorageError
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.session import write_text
 from diagnosis import calibration, decision, detection, next_experiment
-from diagnosis.answer import Answer, Estimate, NextExperiment, Ranked, Selected, Where
+from diagnosis.answer import Answer, Estimate, NextExperiment, Outcome, Ranked, Selected, Where
 from diagnosis.baseline import Baseline
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.case import GapCase
@@ -23,10 +23,9 @@ from diagnosis.detection import DetectionResult, Penalties, ProgressCallback
 from diagnosis.effect_library import EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
-from diagnosis.outcome import Outcome
 from diagnosis.refine import FittedSet
 from diagnosis.residual_model import CLUES
-from diagnosis.survey import survey
+from diagnosis.stages import survey_gap
 
 RIVAL_SHARE = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
@@ -61,7 +60,7 @@ class DiagnosisPipeline:
     kinds: Sequence[EffectType]
     penalties: Penalties
     calibration: ProbabilityModel
-    thresholds: Thresholds
+    thresholds: InspectionThresholds
     excitations: Mapping[str, Excitation]
     generator: np.random.Generator
 
@@ -95,7 +94,7 @@ class DiagnosisPipeline:
         told = "unknown" if unknown else "effects" if selected else "none"
         after = field.runs(paths) if selected else None
         machine = self.case.machine
-        seen = survey(
+        seen = survey_gap(
             before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
         )
         remainder = self._remainder(result, reach) if selected else None

@@ -1,10 +1,11 @@
-"""Residual probes: figures that a person can read as evidence for one family of effects or another.
+"""Residual probes: regressions of the residual that point to families of effects.
 
-What the simulator's speed has too much, over `SPAN_S`, is explained by what each effect would leave
-behind: the acceleration (the machine moves later), the speed itself (gain), its size (asymmetry),
-the speed at small or large commands, with others moving, under load, later in the day. Each is
-fitted together with gain and timing, which every simulator gets a little wrong, and compared with
-the same figure on the reference. These figures point; which effect it is, is decided by fitting it.
+The target is the excess of the simulated speed, over `SPAN_S`. Each probe is the regressor that one
+effect would leave behind: acceleration (later motion), speed (gain), size of the speed (asymmetry),
+speed at small or large commands, with other joints moving, under load, later in time. Each probe is
+fitted together with gain and timing, in which every simulator errs a little, and compared with the
+reference. Two further probes come from single events: the spread of the lateness of starts, and the
+ringing after stops. Probes are evidence for people; the search decides by fitting.
 Axes: `W` windows, `K` steps, `J` joints, `S` samples.
 """
 
@@ -20,17 +21,88 @@ import torch
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 from brokk_rl.split import COMMANDED
-from diagnosis import edges
-from diagnosis.blocks import parts
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.occasions import CREEP, REGIMES, in_force, regimes
+from diagnosis.permutation_test import number_parts
+from diagnosis.regimes import CREEP_COMMAND, REGIMES, TRANSIENT_S, label_regimes, shift_by_dead_time
+
+MIN_SPEED = 0.1
+"""Starts slower than this part of the full speed tell no time."""
+MIN_EVENTS = 8
+MAD = 1.4826
+"""Median absolute deviation to standard deviation."""
+
+
+def measure_onsets(
+    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """Returns the spread of the lateness of starts (s) as `delay_jitter` and ringing (rad or m) as `compliance`, by joint.
+
+    Each with its standard error; joints with fewer than `FEWEST` starts or stops are left out.
+    """
+    acting = [shift_by_dead_time(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
+    label = [
+        label_regimes(u, r.q, machine, r.rate_hz)
+        for u, r in zip(acting, runs.recordings, strict=True)
+    ]
+    found = {}
+    for j, name in enumerate(machine.joint_names):
+        late_s = np.array(list(_measure_lateness(runs, runs.cut(label)[..., j], j, machine)))
+        if len(late_s) >= MIN_EVENTS:
+            off = MAD * np.abs(late_s - np.median(late_s))
+            found["delay_jitter", name] = (
+                float(np.median(off)),
+                float(off.std() / np.sqrt(len(off))),
+            )
+        shaken = np.array(list(_measure_ringing(runs, [part[:, j] for part in label], j)))
+        if len(shaken) >= MIN_EVENTS:
+            found["compliance", name] = (
+                float(np.median(shaken)),
+                float(MAD * shaken.std() / np.sqrt(len(shaken))),
+            )
+    return found
+
+
+def _measure_lateness(
+    runs: WindowedRuns, label: np.ndarray, joint: int, machine: Machine
+) -> Iterator[float]:
+    """Yields for each start within a window how much later the machine moves, s."""
+    ahead = round(TRANSIENT_S / machine.period_s)
+    is_start = label == REGIMES.index("start")
+    error, path = runs.error[..., joint], runs.simulated[..., joint]
+    for window, begin in zip(*np.nonzero(is_start[:, 1:] & ~is_start[:, :-1]), strict=True):
+        end = begin + ahead
+        if end >= error.shape[1] or not is_start[window, begin + 1 : end].all():
+            continue
+        speed = (path[window, end] - path[window, end - ahead // 3]) / (
+            ahead // 3 * machine.period_s
+        )
+        late_s = (
+            (error[window, end] - error[window, begin]) / speed
+            if abs(speed) > MIN_SPEED * machine.max_speed[joint]
+            else np.nan
+        )
+        if np.isfinite(late_s):
+            yield float(late_s)
+
+
+def _measure_ringing(runs: WindowedRuns, label: list[np.ndarray], joint: int) -> Iterator[float]:
+    """Yields for each stop how much the measured position swings about a straight line in the second half of the time after."""
+    for recording, regime in zip(runs.recordings, label, strict=True):
+        is_stop = regime == REGIMES.index("stop")
+        edges = np.flatnonzero(np.diff(is_stop.astype(np.int8)))
+        for begin, end in zip(edges[::2], edges[1::2], strict=False) if not is_stop[0] else []:
+            after = recording.q[begin + 1 + (end - begin) // 2 : end + 1, joint].astype(float)
+            if len(after) >= 5:
+                line = np.polyfit(np.arange(len(after)), after, 1)
+                yield float(np.std(after - np.polyval(line, np.arange(len(after)))))
+
 
 SPAN_S = 0.25
-FULL = 0.7
+LARGE_COMMAND = 0.7
 """Commands beyond this are large."""
-CLEAR = 4.0
+CLEAR_Z = 4.0
 """A figure that differs from the reference's by so many standard errors is worth a sentence."""
-FEWEST = 40
+MIN_SAMPLES = 40
 """Samples with the condition below which a probe says nothing."""
 
 
@@ -57,7 +129,7 @@ class Probe:
     @property
     def is_clear(self) -> bool:
         """Says whether it stands out."""
-        return abs(self.z) > CLEAR
+        return abs(self.z) > CLEAR_Z
 
     def plain(self) -> dict[str, Any]:
         """Returns it as plain JSON data."""
@@ -122,7 +194,7 @@ TEXTS = {
 """What a coefficient above and below 0 says, and its factor."""
 
 
-def probes(
+def probe_residuals(
     runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine, dead_time_s: np.ndarray
 ) -> list[Probe]:
     """Returns all figures, those that stand out most first.
@@ -135,7 +207,7 @@ def probes(
         dead_time_s: Time from command to motion of each joint, `(J,)`.
     """
     mine, other = (
-        _coefficients(side, machine, dead_time_s) | edges.figures(side, machine, dead_time_s)
+        _fit_coefficients(side, machine, dead_time_s) | measure_onsets(side, machine, dead_time_s)
         if side
         else {}
         for side in (runs, reference)
@@ -144,28 +216,30 @@ def probes(
     for (effect, joint), (value, error) in mine.items():
         base, base_error = other.get((effect, joint), (0.0, 0.0))
         unit = machine.joints[machine.joint_names.index(joint)].unit
-        text = f"{joint} {_said(effect, value, unit)}"
-        text += f"; on the reference it {_said(effect, base, unit)}" if other else ""
+        text = f"{joint} {_describe_coefficient(effect, value, unit)}"
+        text += (
+            f"; on the reference it {_describe_coefficient(effect, base, unit)}" if other else ""
+        )
         z = (value - base) / max(float(np.hypot(error, base_error)), np.finfo(float).tiny)
         found.append(Probe(effect, joint, value, base, z, text))
     return sorted(found, key=lambda probe: -abs(probe.z))
 
 
-def _said(effect: str, value: float, unit: str) -> str:
+def _describe_coefficient(effect: str, value: float, unit: str) -> str:
     above, below, factor = TEXTS[effect]
     return (below if value < 0 else above).format(abs(factor * value), unit=unit)
 
 
-def _coefficients(
+def _fit_coefficients(
     runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Returns the coefficient of each probe and its standard error, by effect and joint."""
     span = max(1, round(SPAN_S / machine.period_s))
-    lacks = _change(runs.error, span) / SPAN_S
-    speed = _change(runs.simulated, span) / SPAN_S
-    acceleration = _change(speed, span) / SPAN_S
-    clues = _Clues(runs, machine, dead_time_s)
-    block = np.broadcast_to(parts(runs)[:, None], lacks.shape[:2])
+    lacks = _difference_over(runs.error, span) / SPAN_S
+    speed = _difference_over(runs.simulated, span) / SPAN_S
+    acceleration = _difference_over(speed, span) / SPAN_S
+    clues = _ProbeColumns(runs, machine, dead_time_s)
+    block = np.broadcast_to(number_parts(runs)[:, None], lacks.shape[:2])
     found = {}
     for j, name in enumerate(machine.joint_names):
         given = np.isfinite(lacks[..., j]) & np.isfinite(acceleration[..., j])
@@ -177,22 +251,24 @@ def _coefficients(
                 if effect in ("dead_time", "flow_gain")
                 else np.concatenate([always, column[:, None]], 1)
             )
-            if (np.abs(column) > 0).sum() < FEWEST:
+            if (np.abs(column) > 0).sum() < MIN_SAMPLES:
                 continue
             place = {"dead_time": 0, "flow_gain": 1}.get(effect, 2)
-            found[effect, name] = _jackknifed(rows, lacks[..., j][given], block[given], place)
+            found[effect, name] = _jackknife_coefficient(
+                rows, lacks[..., j][given], block[given], place
+            )
     return found
 
 
-class _Clues:
+class _ProbeColumns:
     """What each effect would leave behind in the speed that the simulator has too much, `(W, K)` for each joint."""
 
     def __init__(self, runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray) -> None:
-        acting = [in_force(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
+        acting = [shift_by_dead_time(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
         self._u = runs.cut(acting)
         self._regime = runs.cut(
             [
-                regimes(u, r.q, machine, r.rate_hz)
+                label_regimes(u, r.q, machine, r.rate_hz)
                 for u, r in zip(acting, runs.recordings, strict=True)
             ]
         )
@@ -214,13 +290,13 @@ class _Clues:
         others = (np.abs(self._u) > COMMANDED).sum(2) - moving > 0
         if self._load is not None and np.nanmax(np.abs(self._load[..., joint])) > 0.05:
             yield "creep", -np.sign(self._load[..., joint]) * (regime == REGIMES.index("hold"))
-        if moving.sum() < FEWEST:
+        if moving.sum() < MIN_SAMPLES:
             return
         yield "dead_time", speed
         yield "flow_gain", speed
         yield "asymmetry", np.abs(speed)
-        yield "dead_band", speed * (moving & (size < CREEP))
-        yield "saturation", speed * (size > FULL)
+        yield "dead_band", speed * (moving & (size < CREEP_COMMAND))
+        yield "saturation", speed * (size > LARGE_COMMAND)
         yield "flow_sharing", speed * others
         yield "thermal_drift", speed * self._late
         yield (
@@ -232,14 +308,14 @@ class _Clues:
             yield "load_dependence", -np.sign(u) * load * np.abs(speed)
 
 
-def _change(values: np.ndarray, span: int) -> np.ndarray:
+def _difference_over(values: np.ndarray, span: int) -> np.ndarray:
     """Returns the change over the last `span` steps, `(W, K, J)`, NaN before there are so many."""
     found = np.full(values.shape, np.nan)
     found[:, span:] = values[:, span:] - values[:, :-span]
     return found
 
 
-def _jackknifed(
+def _jackknife_coefficient(
     rows: np.ndarray, target: np.ndarray, block: np.ndarray, place: int
 ) -> tuple[float, float]:
     """Returns one coefficient of a least-squares fit, and its standard error from leaving out one block at a time."""

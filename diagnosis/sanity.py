@@ -1,8 +1,8 @@
-"""Whether recordings can be trusted, before any physics: clocks, lost frames, interlocks, sensors, and joints that nobody moved.
+"""Checks of recordings before any physics: clocks, lost frames, interlocks, sensors, idle joints.
 
-What a single stretch shows is found by `brokk_rl.inspection`; here stretches of one kind become one
-remark a recording, those that share a condition an interlock, and what only a whole recording shows
-(clock, saturation, excitation) is added.
+`brokk_rl.inspection` finds single stretches. This module merges stretches of one kind into one
+remark a recording, and stretches that share a condition into an interlock. It adds the checks that
+need a whole recording: clock, saturation, excitation.
 Axes: `T` time, `J` joints.
 """
 
@@ -15,29 +15,160 @@ from typing import Any, Literal
 
 import numpy as np
 
-from brokk_rl.inspection import Finding, Thresholds, inspect
+from brokk_rl.inspection import InspectionThresholds, RecordingFinding, inspect_recording
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
-from brokk_rl.recording_validation import runs
-from diagnosis.interlock import Interlock, interlock
+from brokk_rl.record import Recording, find_stretches
+
+MIN_STRETCHES = 5
+"""Ignored stretches below which a condition that they share may be a coincidence."""
+MIN_AGREEMENT = 0.9
+"""A condition holds in at least this part of the ignored time, and in at most the rest of it of the
+answered time."""
+SPEED_ROWS = 3
+"""Rows before and after one by which its speed is told."""
+NUM_POSITIONS = 15
+"""Places tried for a threshold on a pose."""
+
+
+@dataclass(frozen=True)
+class Interlock:
+    """A condition under which a joint ignores its command.
+
+    Attributes:
+        joint: The joint.
+        text: The condition, and how well it holds.
+        rows: Ignored rows of each recording.
+        num_stretches: Ignored stretches of each recording.
+    """
+
+    joint: str
+    text: str
+    rows: list[np.ndarray]
+    num_stretches: list[int]
+
+
+def find_interlock(
+    inspected: Sequence[tuple[Recording, Sequence[RecordingFinding]]],
+    machine: Machine,
+    joint: int,
+    thresholds: InspectionThresholds,
+) -> Interlock | None:
+    """Returns the one condition that tells ignored commands of a joint from obeyed ones, `None` where no simple one does.
+
+    Conditions tried: another joint is commanded, none is, the command's own sign, a joint is beyond
+    a position.
+    """
+    name = machine.joint_names[joint]
+    lead = round((machine.dead_time_s + thresholds.settle_s) / machine.period_s)
+    ignored, driven, rows, counts = [], [], [], []
+    for recording, findings in inspected:
+        mask, held = np.zeros((2, recording.num_samples), dtype=bool)
+        mine = [
+            finding for finding in findings if finding.kind == "no motion" and finding.joint == name
+        ]
+        for finding in mine:
+            mask[finding.row : finding.row + finding.num_rows] = True
+        for row, count in find_stretches(np.abs(recording.u[:, joint]) > thresholds.driving):
+            held[row + lead : row + count] = True
+        speed = (
+            (
+                np.roll(recording.q[:, joint], -SPEED_ROWS)
+                - np.roll(recording.q[:, joint], SPEED_ROWS)
+            )
+            * recording.rate_hz
+            / (2 * SPEED_ROWS)
+        )
+        held &= np.abs(speed) > 2.0 * thresholds.still * machine.max_speed[joint]
+        ignored.append(mask)
+        driven.append(held)
+        rows.append(np.flatnonzero(mask))
+        counts.append(len(mine))
+    if sum(counts) < MIN_STRETCHES:
+        return None
+    ignores, holds = np.concatenate(ignored), np.concatenate(driven)
+    obeys = holds & ~_dilate(ignores, lead)
+    if not obeys.any():
+        return Interlock(name, f"{name} ignores every command", rows, counts)
+    u = np.concatenate([recording.u for recording, _ in inspected])
+    q = np.concatenate([recording.q for recording, _ in inspected])
+    best = 0.0, 1.0, ""
+    for text, condition in _list_conditions(u, q, machine, joint, thresholds):
+        for delay_s in (
+            0.0,
+            machine.dead_time_s,
+        ):  # a lock may stop the motion itself, or the command on its way
+            found = _measure_agreement(
+                np.roll(condition, round(delay_s / machine.period_s)),
+                ignores,
+                obeys,
+                thresholds,
+                machine,
+            )
+            best = max(best, (*found, text), key=lambda row: row[0] - row[1])
+    if best[0] < MIN_AGREEMENT or best[1] > 1.0 - MIN_AGREEMENT:
+        return None
+    of_ignored, of_obeyed = (f"{100 * share:.0f} %" for share in best[:2])
+    text = f"{name} ignores its command when {best[2]}: so in {of_ignored} of the ignored and {of_obeyed} of the obeyed time"
+    return Interlock(name, text, rows, counts)
+
+
+def _measure_agreement(
+    condition: np.ndarray,
+    ignores: np.ndarray,
+    obeys: np.ndarray,
+    thresholds: InspectionThresholds,
+    machine: Machine,
+) -> tuple[float, float]:
+    """Returns the parts of the ignored and of the obeyed time in which a condition holds, where it has not just changed."""
+    steady = ~_dilate(
+        np.append(False, np.diff(condition)), round(thresholds.settle_s / machine.period_s)
+    )
+    either = steady & ignores, steady & obeys
+    if min(mask.sum() for mask in either) < MIN_STRETCHES:
+        return 0.0, 1.0
+    return float(condition[either[0]].mean()), float(condition[either[1]].mean())
+
+
+def _list_conditions(
+    u: np.ndarray, q: np.ndarray, machine: Machine, joint: int, thresholds: InspectionThresholds
+) -> Iterator[tuple[str, np.ndarray]]:
+    commanded = np.abs(u) > thresholds.commanded
+    others = np.delete(commanded, joint, axis=1)
+    yield "any other joint is commanded", np.asarray(others.any(1))
+    yield "no other joint is commanded", ~np.asarray(others.any(1))
+    for k, name in enumerate(machine.joint_names):
+        if k != joint:
+            yield f"{name} is commanded", commanded[:, k]
+        for value in np.quantile(q[:, k], np.linspace(0.0, 1.0, NUM_POSITIONS + 2)[1:-1]):
+            unit = machine.joints[k].unit
+            yield f"{name} is above {value:.2f} {unit}", q[:, k] > value
+            yield f"{name} is below {value:.2f} {unit}", q[:, k] < value
+    yield "its command is positive", u[:, joint] > 0
+    yield "its command is negative", u[:, joint] < 0
+
+
+def _dilate(mask: np.ndarray, num_rows: int) -> np.ndarray:
+    """Returns where `mask`, `(T,)`, holds within `num_rows` rows: there a command has not been answered yet."""
+    return np.convolve(mask, np.ones(2 * num_rows + 1), mode="same") > 0.5
+
 
 Severity = Literal["note", "warn", "bad"]
-IRREGULAR = 0.05
+MAX_IRREGULAR_SHARE = 0.05
 """Of the periods further than 10 % from the median, as a part of all, above which a clock is
 irregular."""
 JUMP_PERIODS = 1.15
 """A period so many times the median is a jump; the format refuses those beyond 1.2."""
-CLOCK_PPM = 2000.0
+MAX_CLOCK_PPM = 2000.0
 """Largest deviation of the clock's rate from the stated one; 1e-5 to 4e-3 is what loggers show."""
-AT_EXTREME = 10
+MIN_SATURATED_ROWS = 10
 """So many equal samples on end at the very end of what a sensor ever says, away from the joint's
 stops, are no coincidence."""
-THIN_S = 10.0
+MIN_COMMANDED_S = 10.0
 """A joint commanded for less says nothing about itself."""
 
 
 @dataclass(frozen=True)
-class Remark:
+class RecordingRemark:
     """Something about a recording that a person should know before believing what follows from it.
 
     Attributes:
@@ -118,7 +249,7 @@ TEXTS: dict[str, tuple[Severity, str, str]] = {
     ),
     "clock rate": (
         "note",
-        "the clock runs faster or slower than the stated rate",
+        "the clock find_stretches faster or slower than the stated rate",
         "state the true rate, or discipline the clock",
     ),
     "saturated sensor": (
@@ -129,11 +260,11 @@ TEXTS: dict[str, tuple[Severity, str, str]] = {
     "joint at rest": (
         "note",
         "hardly commanded here: nothing can be said about this joint",
-        "record runs that move it",
+        "record find_stretches that move it",
     ),
 }
 """Severity, meaning and advice of each remark."""
-NAMES = {
+FINDING_NAMES = {
     "no motion": "command without motion",
     "no command": "motion without command",
     "frozen": "frozen sensor",
@@ -144,28 +275,30 @@ NAMES = {
 """What `brokk_rl.inspection` calls them."""
 
 
-def examine(
-    recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds
-) -> list[Remark]:
+def examine_recordings(
+    recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
+) -> list[RecordingRemark]:
     """Returns what is to be said about recordings of `machine`, the gravest first."""
     inspected = [
-        (recording, inspect(recording, machine, thresholds).findings) for recording in recordings
+        (recording, inspect_recording(recording, machine, thresholds).findings)
+        for recording in recordings
     ]
     locks = list(
         filter(
-            None, (interlock(inspected, machine, j, thresholds) for j in range(machine.num_joints))
+            None,
+            (find_interlock(inspected, machine, j, thresholds) for j in range(machine.num_joints)),
         )
     )
-    remarks = [remark for lock in locks for remark in _locked(lock, recordings)]
+    remarks = [remark for lock in locks for remark in _report_interlock(lock, recordings)]
     locked = {lock.joint for lock in locks}
     for recording, findings in inspected:
         rest = [f for f in findings if not (f.kind == "no motion" and f.joint in locked)]
         remarks += [
-            *_grouped(recording, rest),
-            *_clock(recording),
-            *_saturated(recording, machine, thresholds),
+            *_group_findings(recording, rest),
+            *_check_clock(recording),
+            *_check_saturation(recording, machine, thresholds),
         ]
-    remarks += _at_rest(recordings, machine, thresholds)
+    remarks += _check_excitation(recordings, machine, thresholds)
     order = {"bad": 0, "warn": 1, "note": 2}
     return sorted(
         remarks,
@@ -178,22 +311,22 @@ def examine(
     )
 
 
-def name_of(recording: Recording) -> str:
+def name_recording(recording: Recording) -> str:
     """Returns how a recording is called in a report: by its file, else by its run."""
     return recording.path.stem if recording.path else recording.run
 
 
-def _remark(
+def _make_remark(
     name: str,
     joint: str | None,
     recording: Recording | str,
     span_s: tuple[float | np.ndarray, float | np.ndarray],
     count: int,
     amount: str,
-) -> Remark:
+) -> RecordingRemark:
     severity, meaning, advice = TEXTS[name]
-    where = recording if isinstance(recording, str) else name_of(recording)
-    return Remark(
+    where = recording if isinstance(recording, str) else name_recording(recording)
+    return RecordingRemark(
         name,
         severity,
         joint,
@@ -207,10 +340,12 @@ def _remark(
     )
 
 
-def _grouped(recording: Recording, findings: Sequence[Finding]) -> Iterator[Remark]:
+def _group_findings(
+    recording: Recording, findings: Sequence[RecordingFinding]
+) -> Iterator[RecordingRemark]:
     """Yields one remark for all stretches of one kind and joint."""
 
-    def key(finding: Finding) -> tuple[str, str]:
+    def key(finding: RecordingFinding) -> tuple[str, str]:
         return finding.kind, finding.joint or ""
 
     for (kind, joint), group in groupby(sorted(findings, key=key), key):
@@ -219,31 +354,33 @@ def _grouped(recording: Recording, findings: Sequence[Finding]) -> Iterator[Rema
         part = seconds / max(recording.duration_s, 1.0 / recording.rate_hz)
         text = f"{some[0].text}; {seconds:.1f} s in all, {100 * part:.1f} % of the recording"
         span_s = some[0].t_s, some[-1].t_s + some[-1].duration_s
-        yield _remark(NAMES[kind], joint or None, recording, span_s, len(some), text)
+        yield _make_remark(FINDING_NAMES[kind], joint or None, recording, span_s, len(some), text)
 
 
-def _locked(lock: Interlock, recordings: Sequence[Recording]) -> Iterator[Remark]:
+def _report_interlock(
+    lock: Interlock, recordings: Sequence[Recording]
+) -> Iterator[RecordingRemark]:
     for number, recording in enumerate(recordings):
         rows = lock.rows[number]
         if len(rows):
             span_s = recording.t_s[rows[0]], recording.t_s[rows[-1]]
-            yield _remark(
+            yield _make_remark(
                 "interlock", lock.joint, recording, span_s, lock.num_stretches[number], lock.text
             )
 
 
-def _clock(recording: Recording) -> Iterator[Remark]:
+def _check_clock(recording: Recording) -> Iterator[RecordingRemark]:
     period_s = np.diff(recording.t_s)
     median_s = float(np.median(period_s))
     whole = recording.t_s[0], recording.t_s[-1]
     odd = np.abs(period_s / median_s - 1.0)
-    if (odd > 0.1).mean() > IRREGULAR:
+    if (odd > 0.1).mean() > MAX_IRREGULAR_SHARE:
         low, high = np.percentile(period_s, (5, 95)) * 1e3
         text = f"periods of {low:.1f} to {high:.1f} ms (5 to 95 %), median {median_s * 1e3:.1f} ms"
-        yield _remark("irregular clock", None, recording, whole, int((odd > 0.1).sum()), text)
+        yield _make_remark("irregular clock", None, recording, whole, int((odd > 0.1).sum()), text)
     elif len(late := np.flatnonzero(period_s > JUMP_PERIODS * median_s)):
         text = f"up to {period_s.max() * 1e3:.1f} ms, median {median_s * 1e3:.1f} ms"
-        yield _remark(
+        yield _make_remark(
             "clock jumps",
             None,
             recording,
@@ -253,8 +390,8 @@ def _clock(recording: Recording) -> Iterator[Remark]:
         )
     mean_s = (recording.t_s[-1] - recording.t_s[0]) / len(period_s)
     ppm = 1e6 * (mean_s * recording.rate_hz - 1.0)
-    if abs(ppm) > CLOCK_PPM:
-        yield _remark(
+    if abs(ppm) > MAX_CLOCK_PPM:
+        yield _make_remark(
             "clock rate",
             None,
             recording,
@@ -264,7 +401,9 @@ def _clock(recording: Recording) -> Iterator[Remark]:
         )
 
 
-def _saturated(recording: Recording, machine: Machine, thresholds: Thresholds) -> Iterator[Remark]:
+def _check_saturation(
+    recording: Recording, machine: Machine, thresholds: InspectionThresholds
+) -> Iterator[RecordingRemark]:
     margin, back = (
         thresholds.at_limit * (machine.upper - machine.lower),
         round(machine.dead_time_s * recording.rate_hz),
@@ -278,24 +417,28 @@ def _saturated(recording: Recording, machine: Machine, thresholds: Thresholds) -
             if abs(stop - extreme) < margin[j]:
                 continue
             driven = outward * acting > thresholds.driving
-            stuck = [run for run in runs((q == extreme) & driven) if run[1] >= AT_EXTREME]
+            stuck = [
+                run
+                for run in find_stretches((q == extreme) & driven)
+                if run[1] >= MIN_SATURATED_ROWS
+            ]
             if stuck:
                 rows = sum(count for _, count in stuck)
                 span_s = recording.t_s[stuck[0][0]], recording.t_s[sum(stuck[-1]) - 1]
                 text = f"{rows} samples at {extreme:.4g} {recording.units[j]} while driven further"
-                yield _remark("saturated sensor", name, recording, span_s, len(stuck), text)
+                yield _make_remark("saturated sensor", name, recording, span_s, len(stuck), text)
 
 
-def _at_rest(
-    recordings: Sequence[Recording], machine: Machine, thresholds: Thresholds
-) -> Iterator[Remark]:
+def _check_excitation(
+    recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
+) -> Iterator[RecordingRemark]:
     if not recordings:
         return
     for j, name in enumerate(machine.joint_names):
         seconds = sum(
             float((np.abs(r.u[:, j]) > thresholds.commanded).sum()) / r.rate_hz for r in recordings
         )
-        if seconds < THIN_S:
+        if seconds < MIN_COMMANDED_S:
             total_s = sum(recording.duration_s for recording in recordings)
             text = f"commanded for {seconds:.1f} s of {total_s:.0f} s"
-            yield _remark("joint at rest", name, "all recordings", (0.0, total_s), 1, text)
+            yield _make_remark("joint at rest", name, "all recordings", (0.0, total_s), 1, text)

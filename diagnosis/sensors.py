@@ -1,8 +1,7 @@
-"""Noise and coarse steps of a sensor: too small for free runs to show, plain in how the samples scatter.
+"""Noise and quantisation of sensors, from the scatter of samples; free runs are too coarse for them.
 
-Each recording is summed up by a few statistics a joint. An effect is put onto recordings of the
-reference, at several sizes; the size whose statistics are nearest to those of the field is the most
-likely one.
+A few statistics describe each recording, by joint. An effect is put onto recordings of the reference
+at several sizes. The most likely size has the statistics that are nearest to those of the field.
 Axes: `T` time, `J` joints, `P` parts of the reference, `F` statistics.
 """
 
@@ -20,22 +19,22 @@ from diagnosis.case import GapCase, split_recordings
 from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel, estimate_interval
 
 SIZES = np.geomspace(0.05, 6.0, 25)
-AT_REST, MOVING = 0.01, 0.08
+REST_SPEED, MOVING_SPEED = 0.01, 0.08
 """Mean speed over a second, of full speed, below which a joint rests and above which it moves."""
-FEWEST = 20
+MIN_STEPS = 20
 """Fewer steps do not show the smallest."""
-BLUR = np.array([0.08, 0.08, 0.03, 0.03, 0.08, 0.08])
+STATISTICS_SIGMA = np.array([0.08, 0.08, 0.03, 0.03, 0.08, 0.08])
 """Differences in the statistics that say nothing: sensors are not quite the same from day to
 day."""
-MOST = 60.0
+MAX_GAIN = 60.0
 """Evidence is not counted beyond this: the statistics are no exact likelihood."""
-WHITE = 6.0
+WHITE_NOISE_FACTOR = 6.0
 """Variance of the second differences of white noise, over its own."""
-TINY = 2e-6
+FLOAT_NOISE = 2e-6
 """Noise that float32 cannot hold, rad or m."""
 
 
-def statistics(q: np.ndarray, machine: Machine) -> np.ndarray:
+def compute_scatter_statistics(q: np.ndarray, machine: Machine) -> np.ndarray:
     """Returns, by joint, at rest and in motion: scatter of second differences, share of equal neighbours, smallest steps, `(J, F)`.
 
     Scatter and steps are logarithms. The smallest steps are those of the sensor, where it has any.
@@ -47,19 +46,19 @@ def statistics(q: np.ndarray, machine: Machine) -> np.ndarray:
     bend, step = np.abs(np.diff(q, 2, axis=0)), np.abs(np.diff(q, axis=0))[1:]
     found = np.full((q.shape[1], 6), np.nan)
     for j in range(q.shape[1]):
-        for place, rows in enumerate((speed[1:-1, j] < AT_REST, speed[1:-1, j] > MOVING)):
+        for place, rows in enumerate((speed[1:-1, j] < REST_SPEED, speed[1:-1, j] > MOVING_SPEED)):
             if rows.sum() >= 3 * second:
                 cut = np.minimum(bend[rows, j], 4 * np.sqrt(np.mean(bend[rows, j] ** 2)))
-                found[j, place] = np.log(np.sqrt(np.mean(cut**2)) + TINY)
-                found[j, 2 + place] = np.mean(step[rows, j] < TINY / 2)
-                moved = step[rows, j][step[rows, j] >= TINY / 2]
+                found[j, place] = np.log(np.sqrt(np.mean(cut**2)) + FLOAT_NOISE)
+                found[j, 2 + place] = np.mean(step[rows, j] < FLOAT_NOISE / 2)
+                moved = step[rows, j][step[rows, j] >= FLOAT_NOISE / 2]
                 found[j, 4 + place] = np.log(
-                    np.quantile(moved, 0.2) if len(moved) > FEWEST else TINY
+                    np.quantile(moved, 0.2) if len(moved) > MIN_STEPS else FLOAT_NOISE
                 )
     return found
 
 
-def readings(
+def measure_excess_scatter(
     field: Sequence[Recording], reference: Sequence[Recording], machine: Machine
 ) -> np.ndarray:
     """Returns how far positions in the field scatter as they are read, beyond those of the reference, rad or m, `(J,)`.
@@ -69,14 +68,19 @@ def readings(
     """
     squares = []
     for some in (field, reference):
-        seen = np.exp(2.0 * np.stack([statistics(r.q.astype(float), machine)[:, :2] for r in some]))
+        seen = np.exp(
+            2.0
+            * np.stack(
+                [compute_scatter_statistics(r.q.astype(float), machine)[:, :2] for r in some]
+            )
+        )
         told = np.isfinite(seen)
         squares.append(np.where(told, seen, 0.0).sum(0) / np.maximum(told.sum(0), 1))
     now, then = squares
-    return np.sqrt(np.maximum(now - then, 0.0).max(1) / WHITE)
+    return np.sqrt(np.maximum(now - then, 0.0).max(1) / WHITE_NOISE_FACTOR)
 
 
-def search(
+def find_sensor_effects(
     case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float
 ) -> list[DetectedEffect]:
     """Returns the effects on sensors that the scatter of the field's samples shows."""
@@ -88,16 +92,21 @@ def search(
         for kind in kinds
         if kind.target.side == "measurement" and (kind.target.stochastic or not kind.target.smooth)
     ]
-    seen = np.nanmean([statistics(r.q.astype(float), machine) for r in field], 0)
-    plain = np.stack([statistics(r.q.astype(float), machine) for r in reference])  # (P, J, F)
-    none = _likelihood(seen, plain, plain)
-    drawn = {kind.name: [_with(kind, size, reference, machine) for size in SIZES] for kind in kinds}
+    seen = np.nanmean([compute_scatter_statistics(r.q.astype(float), machine) for r in field], 0)
+    plain = np.stack(
+        [compute_scatter_statistics(r.q.astype(float), machine) for r in reference]
+    )  # (P, J, F)
+    none = _compute_likelihood(seen, plain, plain)
+    drawn = {
+        kind.name: [_simulate_statistics(kind, size, reference, machine) for size in SIZES]
+        for kind in kinds
+    }
     likelihood = {
-        name: np.stack([_likelihood(seen, one, plain) for one in by_size])
+        name: np.stack([_compute_likelihood(seen, one, plain) for one in by_size])
         for name, by_size in drawn.items()
     }
     highest = {name: values.max(0) for name, values in likelihood.items()}
-    gain = {name: np.minimum(values - none, MOST) for name, values in highest.items()}
+    gain = {name: np.minimum(values - none, MAX_GAIN) for name, values in highest.items()}
     best = (
         [max(highest, key=lambda name: highest[name][j]) for j in range(machine.num_joints)]
         if highest
@@ -131,8 +140,8 @@ def search(
                 for j, row in enumerate(likelihood[kind.name].T)
             ]
         )
-        closed = 1.0 - np.nansum(np.square((seen - after) / BLUR)[mask]) / np.nansum(
-            np.square((seen - plain.mean(0)) / BLUR)[mask]
+        closed = 1.0 - np.nansum(np.square((seen - after) / STATISTICS_SIGMA)[mask]) / np.nansum(
+            np.square((seen - plain.mean(0)) / STATISTICS_SIGMA)[mask]
         )
         found.append(
             DetectedEffect(
@@ -142,7 +151,7 @@ def search(
     return found
 
 
-def _likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
+def _compute_likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
     """Returns the log likelihood of the field's statistics `(J, F)` where those of the parts `(P, J, F)` are typical, `(J,)`.
 
     Parts scatter at least as they do without an effect, `plain` `(P, J, F)`: a few of them may
@@ -150,13 +159,13 @@ def _likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.nd
     """
     variance = (
         np.fmax(np.nanvar(drawn, 0, ddof=1), np.nanvar(plain, 0, ddof=1)) * (1.0 + 1.0 / len(drawn))
-        + BLUR**2
+        + STATISTICS_SIGMA**2
     )
     off = np.square(seen - np.nanmean(drawn, 0)) / variance
     return -0.5 * np.nansum(off + np.where(np.isfinite(off), np.log(variance), 0.0), 1)
 
 
-def _with(
+def _simulate_statistics(
     kind: EffectType, size: float, reference: Sequence[Recording], machine: Machine
 ) -> np.ndarray:
     """Returns the statistics of the reference with an effect on all joints, `(P, J, F)`."""
@@ -170,5 +179,7 @@ def _with(
             value = kind.clipped(name, np.array(kind.numbers[name].none + size * kind.size(name)))
             model.parameters[name].fill_(float(value))
         with torch.inference_mode():
-            found.append(statistics(model.measure(q).numpy().astype(float), machine))
+            found.append(
+                compute_scatter_statistics(model.measure(q).numpy().astype(float), machine)
+            )
     return np.stack(found)

@@ -1,7 +1,13 @@
-"""On which part of the way from command to estimate the gap lies: timing, actuation, sensing, kinematics, perception, contact.
+"""Survey of a gap before any effect is fitted: tip error, stages of the chain, recordings, location.
 
-Timing, actuation and sensing share the gap of the joints; kinematics and perception are errors of
-their own, told in millimetres.
+The stages are timing, actuation, sensing, kinematics, perception and contact. Timing, actuation and
+sensing share the error of the joints. Kinematics and perception are errors of their own, in metres
+at the tool.
+
+The errors of the joints add up at the tip as vectors and may cancel. The part of joint `j` is its
+contribution along the whole error, summed over all samples: `Σ (J_j e_j) · d / Σ d · d` with
+`d = Σ_j J_j e_j`. The parts add up to 1.
+Axes: `W` windows, `K` steps, `J` joints, `S` samples.
 """
 
 from __future__ import annotations
@@ -13,15 +19,90 @@ from typing import Any
 import numpy as np
 import torch
 
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis.answer import Stage
-from diagnosis.budget import Budget
+from diagnosis.answer import JointGap, RegimeGap, Stage, Where
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.geometry import COLUMNS, Geometry
-from diagnosis.probes import SPAN_S, Probe
-from diagnosis.where import Location
+from diagnosis.geometry import TOOL_COLUMNS, ToolPointErrors, compare_tool_points
+from diagnosis.probes import SPAN_S, Probe, probe_residuals
+from diagnosis.sanity import RecordingRemark, examine_recordings
+from diagnosis.where import GapLocation, locate_gap
+
+
+@dataclass(frozen=True)
+class TipError:
+    """Error of the tip over free runs of one simulator.
+
+    Attributes:
+        tip_rms_m: Root mean square distance between simulated and measured tip, m.
+        joint_rms_m: What each joint's error alone would move the tip by, root mean square, m.
+        joint_part: Part of the mean squared distance that each joint answers for; they add up to 1,
+            one below 0 cancels others.
+    """
+
+    tip_rms_m: float
+    joint_rms_m: dict[str, float]
+    joint_part: dict[str, float]
+
+
+@dataclass(frozen=True)
+class TipErrorBudget:
+    """The gap at the tool before and after the effects that were found, and the floor; `None` where there is no such simulator.
+
+    Attributes:
+        before: Of the simulator as it was.
+        after: With the selected effects.
+        floor: Of the simulator on reference recordings.
+        stages_m: Root mean square of what other stages add, by stage, m.
+    """
+
+    before: TipError
+    after: TipError | None
+    floor: TipError | None
+    stages_m: dict[str, float]
+
+    def plain(self) -> dict[str, Any]:
+        """Returns it as plain JSON data, in mm as its name says."""
+
+        def account(one: TipError | None) -> dict[str, Any] | None:
+            return one and {
+                "tip_rms_mm": 1e3 * one.tip_rms_m,
+                "joint_rms_mm": {name: 1e3 * value for name, value in one.joint_rms_m.items()},
+                "joint_part": one.joint_part,
+            }
+
+        stages = {name: 1e3 * value for name, value in self.stages_m.items()}
+        return {name: account(getattr(self, name)) for name in ("before", "after", "floor")} | {
+            "stages_mm": stages
+        }
+
+
+def measure_tip_error(runs: WindowedRuns, machine: Machine) -> TipError:
+    """Returns the error of the tip over free runs.
+
+    Raises:
+        ConfigError: the machine's geometry is not known.
+    """
+    given = np.isfinite(runs.error).all(2)
+    measured, error = runs.measured[given], runs.error[given]
+    kinematics = Kinematics(machine)
+    pose, jacobian = kinematics.pose_and_jacobian(torch.as_tensor(measured, dtype=torch.float32))
+    simulated = kinematics.pose(torch.as_tensor(measured + error, dtype=torch.float32))
+    distance = (simulated.tip_in_base_m - pose.tip_in_base_m).numpy().astype(float)
+    moved = jacobian.tip.numpy().astype(float) * error[:, None, :]  # (S, 3, J)
+    whole = moved.sum(2)
+    along = np.einsum("sij,si->j", moved, whole)
+    part = along / max(float((whole**2).sum()), np.finfo(float).tiny)
+    alone = np.sqrt((moved**2).sum(1).mean(0))
+    names = machine.joint_names
+    return TipError(
+        float(np.sqrt((distance**2).sum(1).mean())),
+        dict(zip(names, alone.tolist(), strict=True)),
+        dict(zip(names, part.tolist(), strict=True)),
+    )
+
 
 STAGE_OF: dict[str, Stage] = {
     "dead_time": "timing", "delay_jitter": "timing", "frame_loss": "timing", "clock_offset": "timing",
@@ -33,13 +114,13 @@ STAGE_OF: dict[str, Stage] = {
 CONTACT_N = 200.0
 """More than this at the tool is contact, not the noise of a force that is computed from
 pressures."""
-EXPLAINED, FAR = 0.05, 1.5
+MIN_EXPLAINED, MIN_EXCESS_RATIO = 0.05, 1.5
 """Poses differ, and with them what a measured tool point has of noise: only what one error of
 geometry explains so much of, or what is so many times the reference's, counts as an error of
 kinematics."""
-NEAR_M = 0.5
+MAX_TARGET_DISTANCE_M = 0.5
 """A hole further than this from the tip is not the one that is touched."""
-TARGET = ("target_x_m", "target_y_m", "target_z_m")
+TARGET_COLUMNS = ("target_x_m", "target_y_m", "target_z_m")
 
 
 @dataclass(frozen=True)
@@ -64,29 +145,36 @@ class StageFinding:
 
 
 @dataclass(frozen=True)
-class Known:
+class StageEvidence:
     """What is known about the stages before they are weighed; see the modules that the types come from."""
 
-    location: Location
+    location: GapLocation
     probes: Sequence[Probe]
-    budget: Budget | None
-    field_geometry: Geometry | None
-    reference_geometry: Geometry | None
+    budget: TipErrorBudget | None
+    field_geometry: ToolPointErrors | None
+    reference_geometry: ToolPointErrors | None
 
 
-def stages(
-    known: Known, runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine
+def attribute_to_stages(
+    known: StageEvidence, runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine
 ) -> list[StageFinding]:
     """Returns what each stage has to do with the gap, those about which something can be said."""
-    whole_m = _beyond(known.budget) if known.budget else None
-    found = _of_joints(known, runs, reference, machine, whole_m)
+    whole_m = _compute_tip_excess(known.budget) if known.budget else None
+    found = _split_joint_gap(known, runs, reference, machine, whole_m)
     found += list(
-        filter(None, (_kinematics(known), perception(runs.recordings, machine), _contact(runs)))
+        filter(
+            None,
+            (
+                _assess_kinematics(known),
+                assess_perception(runs.recordings, machine),
+                _assess_contact(runs),
+            ),
+        )
     )
     return found
 
 
-def foremost(findings: Sequence[StageFinding], has_gap: bool) -> Stage | None:
+def select_stage(findings: Sequence[StageFinding], has_gap: bool) -> Stage | None:
     """Returns the stage that matters most at the tool (without geometry: by its part of the gap); `None` without a gap."""
     those = [
         f
@@ -99,22 +187,22 @@ def foremost(findings: Sequence[StageFinding], has_gap: bool) -> Stage | None:
     return max(weighed)[1] if weighed else None  # type: ignore[return-value]
 
 
-def _beyond(budget: Budget) -> float:
+def _compute_tip_excess(budget: TipErrorBudget) -> float:
     """Returns what the tip's error exceeds the floor by, as root mean square, m."""
     floor_m = budget.floor.tip_rms_m if budget.floor else 0.0
     return float(np.sqrt(max(budget.before.tip_rms_m**2 - floor_m**2, 0.0)))
 
 
-def _of_joints(
-    known: Known,
+def _split_joint_gap(
+    known: StageEvidence,
     runs: WindowedRuns,
     reference: WindowedRuns | None,
     machine: Machine,
     whole_m: float | None,
 ) -> list[StageFinding]:
     noise, floor = (
-        measurement_noise(runs.recordings),
-        measurement_noise(reference.recordings) if reference else None,
+        estimate_sensor_noise(runs.recordings),
+        estimate_sensor_noise(reference.recordings) if reference else None,
     )
     parts, texts = {"timing": 0.0, "sensing": 0.0}, {"timing": [], "sensing": []}
     late = {
@@ -159,7 +247,7 @@ def _of_joints(
     ]
 
 
-def measurement_noise(recordings: Sequence[Recording]) -> np.ndarray:
+def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:
     """Returns the noise of each sensor, standard deviation, `(J,)`: from third differences, which smooth motion hardly has.
 
     The median makes edges of motions, which are few, count little. White noise of 1 has third
@@ -171,7 +259,7 @@ def measurement_noise(recordings: Sequence[Recording]) -> np.ndarray:
     return np.median(np.abs(third), 0) / 0.6745 / np.sqrt(20.0)
 
 
-def _kinematics(known: Known) -> StageFinding | None:
+def _assess_kinematics(known: StageEvidence) -> StageFinding | None:
     field, reference = known.field_geometry, known.reference_geometry
     if field is None:
         return None
@@ -180,8 +268,10 @@ def _kinematics(known: Known) -> StageFinding | None:
     by_cause_m = field.rms_m * float(np.sqrt(field.explained))
     text = f"measured tool points lie {1e3 * field.rms_m:.1f} mm from forward kinematics"
     text += f" ({1e3 * floor_m:.1f} mm on the reference)" if reference else ""
-    is_explained = field.explained > max(EXPLAINED, 2.0 * reference.explained if reference else 0.0)
-    if is_explained or field.rms_m > FAR * floor_m:
+    is_explained = field.explained > max(
+        MIN_EXPLAINED, 2.0 * reference.explained if reference else 0.0
+    )
+    if is_explained or field.rms_m > MIN_EXCESS_RATIO * floor_m:
         scale, unit = (1e3, f"m{field.unit}") if field.unit else (1e2, "%")
         text += f"; {100 * field.explained:.0f} % of it is explained by {field.cause} of {scale * field.size:+.1f} {unit}"
     else:
@@ -189,17 +279,17 @@ def _kinematics(known: Known) -> StageFinding | None:
     return StageFinding("kinematics", None, by_cause_m if is_explained else excess_m, text)
 
 
-def perception(recordings: Sequence[Recording], machine: Machine) -> StageFinding | None:
+def assess_perception(recordings: Sequence[Recording], machine: Machine) -> StageFinding | None:
     """Returns how far estimated boreholes lie from where the tool touched, `None` where recordings do not carry both."""
     if not machine.has_bodies:
         return None
     off = []
     for recording in recordings:
-        if not all(column in recording.extra for column in (*TARGET, "force_n")):
+        if not all(column in recording.extra for column in (*TARGET_COLUMNS, "force_n")):
             continue
-        target = np.stack([recording.extra[column] for column in TARGET], 1).astype(float)
-        if all(column in recording.extra for column in COLUMNS):
-            tip = np.stack([recording.extra[column] for column in COLUMNS], 1).astype(float)
+        target = np.stack([recording.extra[column] for column in TARGET_COLUMNS], 1).astype(float)
+        if all(column in recording.extra for column in TOOL_COLUMNS):
+            tip = np.stack([recording.extra[column] for column in TOOL_COLUMNS], 1).astype(float)
         else:
             tip = (
                 Kinematics(machine)
@@ -209,7 +299,7 @@ def perception(recordings: Sequence[Recording], machine: Machine) -> StageFindin
         touches = recording.extra["force_n"] > CONTACT_N
         first = touches & ~np.append(False, touches[:-1])
         distance = np.linalg.norm(tip - target, axis=1)[first]
-        off += distance[distance < NEAR_M].tolist()
+        off += distance[distance < MAX_TARGET_DISTANCE_M].tolist()
     if not off:
         return None
     rms_m = float(np.sqrt(np.mean(np.square(off))))
@@ -219,7 +309,7 @@ def perception(recordings: Sequence[Recording], machine: Machine) -> StageFindin
     return StageFinding("perception", None, rms_m, text)
 
 
-def _contact(runs: WindowedRuns) -> StageFinding | None:
+def _assess_contact(runs: WindowedRuns) -> StageFinding | None:
     if not all("force_n" in recording.extra for recording in runs.recordings):
         return None
     force = runs.cut([recording.extra["force_n"] for recording in runs.recordings])
@@ -234,4 +324,100 @@ def _contact(runs: WindowedRuns) -> StageFinding | None:
         None,
         None,
         f"{100 * part:.0f} % of the squared error lies in contact, {100 * time:.0f} % of the time",
+    )
+
+
+MAX_LISTED = 12
+"""Regimes and probes that are told, the foremost ones."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What was seen; the parts are explained in the modules that their types come from."""
+
+    remarks: Sequence[RecordingRemark]
+    location: GapLocation
+    probes: Sequence[Probe]
+    stages: Sequence[StageFinding]
+    budget: TipErrorBudget | None
+    geometry: ToolPointErrors | None
+    machine: Machine
+
+    def where(self) -> Where:
+        """Returns the fields `where` of `diagnosis.json`: shares are those of what exceeds the floor."""
+        joints = {
+            name: JointGap(j.rmse, j.floor, j.gap) for name, j in self.location.joints.items()
+        }
+        regimes = [
+            RegimeGap(p.joint, p.category, p.gap) for p in self.location.largest() if p.gap > 0.0
+        ]
+        stage = select_stage(self.stages, self.location.has_gap)
+        return Where(
+            joints,
+            tuple(regimes[:MAX_LISTED]),
+            stage,
+            {joint.name: joint.unit for joint in self.machine.joints},
+        )
+
+    def more(self) -> dict[str, Any]:
+        """Returns further fields of `diagnosis.json`, plain JSON data."""
+        return {
+            "sanity": [remark.plain() for remark in self.remarks],
+            "location": self.location.plain(),
+            "probes": [probe.plain() for probe in self.probes[:MAX_LISTED]],
+            "stages": [stage.plain() for stage in self.stages],
+            "budget": self.budget and self.budget.plain(),
+            "geometry": self.geometry and self.geometry.plain(),
+        }
+
+
+def survey_gap(
+    before: WindowedRuns,
+    floor: WindowedRuns | None,
+    after: WindowedRuns | None,
+    machine: Machine,
+    thresholds: InspectionThresholds,
+    dead_time_s: np.ndarray,
+    generator: np.random.Generator,
+    whole: WindowedRuns | None = None,
+) -> Survey:
+    """Returns what is to be said.
+
+    Args:
+        before: Free runs of the simulator as it was through field recordings.
+        floor: The same through reference recordings that it was not fitted to; `None`: there is no
+            floor.
+        after: Free runs with the selected effects, for the budget; `None` without.
+        machine: The machine.
+        thresholds: When a stretch of a recording is worth telling.
+        dead_time_s: Time from command to motion of each joint, `(J,)`.
+        generator: Draws the permutations.
+        whole: Free runs through whole field recordings.
+    """
+    location = locate_gap(before, floor, machine, dead_time_s, generator, whole)
+    clues = probe_residuals(before, floor, machine, dead_time_s)
+    shapes = [
+        compare_tool_points(runs.recordings, machine) if runs else None for runs in (before, floor)
+    ]
+    accounts = [
+        measure_tip_error(runs, machine) if runs and machine.has_bodies else None
+        for runs in (before, after, floor)
+    ]
+    budget = TipErrorBudget(accounts[0], accounts[1], accounts[2], {}) if accounts[0] else None
+    rows = attribute_to_stages(
+        StageEvidence(location, clues, budget, shapes[0], shapes[1]), before, floor, machine
+    )
+    if budget:
+        of_geometry = {
+            row.stage: row.rms_m for row in rows if row.part is None and row.rms_m is not None
+        }
+        budget = TipErrorBudget(budget.before, budget.after, budget.floor, of_geometry)
+    return Survey(
+        examine_recordings(before.recordings, machine, thresholds),
+        location,
+        clues,
+        rows,
+        budget,
+        shapes[0],
+        machine,
     )

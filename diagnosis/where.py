@@ -1,30 +1,166 @@
-"""Where the gap lies: error of free runs beyond the floor, by joint, regime, direction, load, frequency and time, with tests.
+"""Location of the gap: error beyond the floor by joint, regime, direction, load, frequency and time.
 
-The floor is the error of the same simulator on reference recordings that it was not fitted to; what
-exceeds it,
-beyond one standard error, is the gap. Each way of sorting splits error and gap completely: parts
-add up to 1 over joints and categories.
-Axes: `W` windows, `J` joints, `C` categories.
+The floor is the error of the same simulator on reference recordings that it was not fitted to. The
+gap is the error beyond the floor and beyond one standard error. Each grouping splits error and gap
+completely: parts add up to 1 over joints and categories.
+
+An error of position stays after its cause is over, so it is traced to its origin: the error of a
+window is the sum of its increments, `e = Σ_c e_c` with `e_c` those of the samples in category `c`,
+and `Σ_t e_c(t) e(t)` is the part of the squared error of category `c`. The parts add up exactly; a
+negative part works against the others. Frequency bands add up by Parseval's theorem, recordings and
+running time by windows.
+Axes: `W` windows, `K` steps, `J` joints, `C` categories.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from brokk_rl.machine import Machine
-from diagnosis.blocks import FALSE_DISCOVERIES, adjusted, blocks, excess_p, standard_error, summed
+from diagnosis.error_growth import ErrorGrowth, measure_growth
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.growth import Growth, growth
-from diagnosis.tracing import Sums, by_joint, by_occasion, by_time
+from diagnosis.permutation_test import (
+    FALSE_DISCOVERY_RATE,
+    adjust_p_values,
+    assign_blocks,
+    compute_excess_p,
+    estimate_standard_error,
+    sum_by_block,
+)
+from diagnosis.regimes import SampleGrouping, group_samples
+from diagnosis.sanity import name_recording
+
+BANDS_HZ = (0.3, 1.0, 3.0)
+"""Bounds of the frequency bands."""
+NUM_AGES = 4
+"""Parts into which the running time is cut."""
+INCREMENT_S = 0.25
+"""Tests look at what is added to the error within this time: it hangs together less than the error
+itself, which stays."""
+
+
+@dataclass(frozen=True)
+class GroupSums:
+    """What each window adds to each joint and category, all `(W, J, C)`.
+
+    Attributes:
+        categories: Their names.
+        square: Part of the squared error.
+        tested: By what field and reference are compared: of a band, its part of the squared error;
+            else what was added to the error
+            within `SPAN_S`: within a category its size (a few windows would decide its square), of
+                a joint as a whole its square
+            (in the mean size a short regime would drown).
+        count: Samples.
+    """
+
+    categories: tuple[str, ...]
+    square: np.ndarray
+    tested: np.ndarray
+    count: np.ndarray
+
+
+def trace_to_origin(error: np.ndarray, label: np.ndarray, num_categories: int) -> np.ndarray:
+    """Returns the error by the category in which it arose, `(C, W, K, J)`; it adds up to `error`, with 0 in place of NaN.
+
+    Args:
+        error: Errors of free runs, `(W, K, J)`, NaN after the end of a recording.
+        label: Number of the category of each sample, `(W, K, J)`.
+        num_categories: `C`.
+    """
+    given = np.isfinite(error)
+    added = np.diff(np.where(given, error, 0.0), axis=1, prepend=0.0) * given
+    return np.stack([np.cumsum(added * (label == c), 1) for c in range(num_categories)]) * given
+
+
+def sum_by_joint(runs: WindowedRuns, machine: Machine) -> GroupSums:
+    """Returns the sums of each joint as a single category."""
+    count = np.isfinite(runs.error).sum(1)[..., None].astype(float)
+    return GroupSums(
+        ("",),
+        np.nansum(runs.error**2, 1)[..., None],
+        (_measure_increments(runs, machine) ** 2).sum(1)[..., None],
+        count,
+    )
+
+
+def sum_by_condition(
+    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
+) -> dict[str, GroupSums]:
+    """Returns the sums by regime, direction, load (where masses are known) and frequency."""
+    every = group_samples(list(runs.recordings), machine, dead_time_s)
+    return {dimension.name: _sum_by_origin(runs, dimension, machine) for dimension in every} | {
+        "frequency": _sum_by_band(runs, machine)
+    }
+
+
+def sum_by_time(runs: WindowedRuns, machine: Machine) -> dict[str, GroupSums]:
+    """Returns the sums by recording and by running time, which are those of whole windows."""
+    edges = np.linspace(runs.elapsed_s.min(), runs.elapsed_s.max(), NUM_AGES + 1)
+    age = np.clip(np.searchsorted(edges, runs.elapsed_s, "right") - 1, 0, NUM_AGES - 1)
+    whole = sum_by_joint(runs, machine)
+
+    def sums(names: tuple[str, ...], label: np.ndarray) -> GroupSums:
+        belongs = label[:, None, None] == np.arange(len(names))
+        return GroupSums(
+            names, whole.square * belongs, whole.tested * belongs, whole.count * belongs
+        )
+
+    ages = tuple(f"{low:.0f} to {high:.0f} s" for low, high in pairwise(edges))
+    return {
+        "running time": sums(ages, age),
+        "recording": sums(tuple(map(name_recording, runs.recordings)), runs.source),
+    }
+
+
+def _measure_increments(runs: WindowedRuns, machine: Machine) -> np.ndarray:
+    """Returns the size of what was added to the error within the last `SPAN_S`, `(W, K, J)`, 0 after the end of a recording."""
+    span = max(1, round(INCREMENT_S / machine.period_s))
+    before = np.pad(runs.error, ((0, 0), (span, 0), (0, 0)))[:, : runs.error.shape[1]]
+    return np.nan_to_num(np.abs(runs.error - before))
+
+
+def _sum_by_origin(runs: WindowedRuns, dimension: SampleGrouping, machine: Machine) -> GroupSums:
+    label, error, added = (
+        runs.cut(dimension.label),
+        np.nan_to_num(runs.error),
+        _measure_increments(runs, machine),
+    )
+    names = dimension.categories
+    square = (trace_to_origin(runs.error, label, len(names)) * error).sum(2)
+    belongs = np.stack([label == c for c in range(len(names))])
+    sums = (square, (added * belongs).sum(2), belongs.sum(2).astype(float))
+    return GroupSums(names, *(np.moveaxis(values, 0, 2) for values in sums))
+
+
+def _sum_by_band(runs: WindowedRuns, machine: Machine) -> GroupSums:
+    """Splits by Parseval's theorem; after the end of a recording the error counts as 0, which adds nothing."""
+    error = np.nan_to_num(runs.error)
+    power = np.abs(np.fft.rfft(error, axis=1)) ** 2 / error.shape[1]
+    hertz = np.fft.rfftfreq(error.shape[1], machine.period_s)
+    power[:, (hertz > 0) & (hertz < 0.5 / machine.period_s - 1e-9)] *= 2.0  # the mirrored half
+    edges = (0.0, *BANDS_HZ, np.inf)
+    square = np.stack(
+        [power[:, (hertz >= low) & (hertz < high)].sum(1) for low, high in pairwise(edges)], 2
+    )
+    names = (
+        f"below {BANDS_HZ[0]:g} Hz",
+        *(f"{a:g} to {b:g} Hz" for a, b in pairwise(BANDS_HZ)),
+        f"above {BANDS_HZ[-1]:g} Hz",
+    )
+    count = np.repeat(np.isfinite(runs.error).sum(1)[..., None].astype(float), len(names), 2)
+    return GroupSums(names, square, square, count)
+
 
 TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
-class Part:
+class GapPart:
     """What one category of one joint answers for.
 
     Attributes:
@@ -77,7 +213,7 @@ class JointError:
 
 
 @dataclass(frozen=True)
-class Location:
+class GapLocation:
     """Where the gap lies.
 
     Attributes:
@@ -91,8 +227,8 @@ class Location:
     """
 
     joints: dict[str, JointError]
-    parts: dict[str, list[Part]]
-    growth: dict[str, Growth]
+    parts: dict[str, list[GapPart]]
+    growth: dict[str, ErrorGrowth]
     blocks: str
     has_gap: bool
 
@@ -103,7 +239,7 @@ class Location:
             found[part.category] = found.get(part.category, 0.0) + part.gap
         return found
 
-    def largest(self, dimension: str = "regime") -> list[Part]:
+    def largest(self, dimension: str = "regime") -> list[GapPart]:
         """Returns the parts of one dimension, the largest of the gap first."""
         return sorted(self.parts[dimension], key=lambda part: -part.gap)
 
@@ -118,14 +254,14 @@ class Location:
         }
 
 
-def locate(
+def locate_gap(
     runs: WindowedRuns,
     reference: WindowedRuns | None,
     machine: Machine,
     dead_time_s: np.ndarray,
     generator: np.random.Generator,
     whole: WindowedRuns | None = None,
-) -> Location:
+) -> GapLocation:
     """Returns where the gap lies.
 
     Args:
@@ -137,16 +273,18 @@ def locate(
         generator: Draws the permutations.
         whole: Free runs through whole field recordings, for the growth beyond the windows.
     """
-    judge = _Judge(runs, reference, machine, generator)
+    judge = _GapTest(runs, reference, machine, generator)
     joints = judge.joints()
-    own = {**by_occasion(runs, machine, dead_time_s), **by_time(runs, machine)}
-    floor = by_occasion(reference, machine, dead_time_s) if reference else {}
+    own = {**sum_by_condition(runs, machine, dead_time_s), **sum_by_time(runs, machine)}
+    floor = sum_by_condition(reference, machine, dead_time_s) if reference else {}
     parts = {name: judge.parts(sums, floor.get(name), joints) for name, sums in own.items()}
     has_gap = reference is None or any(joint.is_sure for joint in joints.values())
-    return Location(joints, parts, growth(runs, reference, machine, whole), judge.unit, has_gap)
+    return GapLocation(
+        joints, parts, measure_growth(runs, reference, machine, whole), judge.unit, has_gap
+    )
 
 
-class _Judge:
+class _GapTest:
     """Holds both sides against each other: what exceeds the floor, and how sure that is."""
 
     def __init__(
@@ -161,31 +299,35 @@ class _Judge:
         self._weight = (
             np.ones(machine.num_joints) if alike else (machine.upper - machine.lower) ** -2.0
         )
-        self._mine = by_joint(runs, machine)
-        self._floor = by_joint(reference, machine) if reference else None
-        self._blocks = blocks(runs, reference) if reference else None
+        self._mine = sum_by_joint(runs, machine)
+        self._floor = sum_by_joint(reference, machine) if reference else None
+        self._blocks = assign_blocks(runs, reference) if reference else None
         self.unit = self._blocks.unit if self._blocks else ""
 
     def joints(self) -> dict[str, JointError]:
         """Returns the error of each joint."""
-        mean, base = _mean(self._mine), self._floor_mean()
+        mean, base = _average_square(self._mine), self._floor_mean()
         rmse, floor = np.sqrt(mean).tolist(), np.sqrt(base).tolist()
         count = self._mine.count.sum(0)[:, 0]
         error = mean * count * self._weight
         error = error / max(error.sum(), TINY)
         chance = self._chance(self._mine, self._floor)[:, 0]
-        excess = _first_positive(mean - base - chance, mean - base, mean) * count * self._weight
+        excess = (
+            _take_first_positive(mean - base - chance, mean - base, mean) * count * self._weight
+        )
         gap = excess / max(excess.sum(), TINY)
         p = self._p(self._mine, self._floor)[:, 0]
-        sure = adjusted(p) <= FALSE_DISCOVERIES
+        sure = adjust_p_values(p) <= FALSE_DISCOVERY_RATE
         return {
             name: JointError(
-                rmse[j], floor[j], float(error[j]), float(gap[j]), _known(p[j]), bool(sure[j])
+                rmse[j], floor[j], float(error[j]), float(gap[j]), _drop_nan(p[j]), bool(sure[j])
             )
             for j, name in enumerate(self._machine.joint_names)
         }
 
-    def parts(self, sums: Sums, floor: Sums | None, joints: dict[str, JointError]) -> list[Part]:
+    def parts(
+        self, sums: GroupSums, floor: GroupSums | None, joints: dict[str, JointError]
+    ) -> list[GapPart]:
         """Returns the parts of one way of sorting; where the reference never was, the joint's own floor counts."""
         square, count = sums.square.sum(0), sums.count.sum(0)
         expected = self._floor_mean()[:, None] * count
@@ -196,22 +338,22 @@ class _Judge:
             )
         chance = self._chance(sums, floor) * count
         rows = zip(square - expected - chance, square - expected, square, strict=True)
-        excess = np.stack([_first_positive(*row) for row in rows])
+        excess = np.stack([_take_first_positive(*row) for row in rows])
         within = excess / np.maximum(excess.sum(1, keepdims=True), TINY)
         gap = within * np.array([joint.gap for joint in joints.values()])[:, None]
         error = square * self._weight[:, None]
         error = error / max(self._mine.square.sum((0, 2)) @ self._weight, TINY)
         time = count / np.maximum(self._mine.count.sum(0), 1.0)
         p = self._p(sums, floor)
-        sure = adjusted(p) <= FALSE_DISCOVERIES
+        sure = adjust_p_values(p) <= FALSE_DISCOVERY_RATE
         return [
-            Part(
+            GapPart(
                 name,
                 category,
                 float(time[j, c]),
                 float(error[j, c]),
                 float(gap[j, c]),
-                _known(p[j, c]),
+                _drop_nan(p[j, c]),
                 bool(sure[j, c]),
             )
             for j, name in enumerate(self._machine.joint_names)
@@ -219,9 +361,9 @@ class _Judge:
         ]
 
     def _floor_mean(self) -> np.ndarray:
-        return _mean(self._floor) if self._floor else np.zeros(self._machine.num_joints)
+        return _average_square(self._floor) if self._floor else np.zeros(self._machine.num_joints)
 
-    def _chance(self, mine: Sums, floor: Sums | None) -> np.ndarray:
+    def _chance(self, mine: GroupSums, floor: GroupSums | None) -> np.ndarray:
         """Returns the standard error of what exceeds the floor, per sample, `(J, C)`; 0 without a floor to exceed."""
         shape = mine.square.shape[1:]
         if floor is None or self._blocks is None:
@@ -229,28 +371,28 @@ class _Judge:
         square = np.zeros(shape)
         for sums, block in ((mine, self._blocks.field), (floor, self._blocks.reference)):
             totals = (
-                summed(values.reshape(len(block), -1), block)
+                sum_by_block(values.reshape(len(block), -1), block)
                 for values in (sums.square, sums.count)
             )
-            square += np.nan_to_num(standard_error(*totals).reshape(shape)) ** 2
+            square += np.nan_to_num(estimate_standard_error(*totals).reshape(shape)) ** 2
         return np.sqrt(square)
 
-    def _p(self, mine: Sums, floor: Sums | None) -> np.ndarray:
+    def _p(self, mine: GroupSums, floor: GroupSums | None) -> np.ndarray:
         """Returns p of each joint and category, `(J, C)`; NaN without a floor."""
         shape = mine.square.shape[1:]
         if floor is None or self._blocks is None:
             return np.full(shape, np.nan)
         field, reference = (
             (
-                summed(sums.tested.reshape(len(block), -1), block),
-                summed(sums.count.reshape(len(block), -1), block),
+                sum_by_block(sums.tested.reshape(len(block), -1), block),
+                sum_by_block(sums.count.reshape(len(block), -1), block),
             )
             for sums, block in ((mine, self._blocks.field), (floor, self._blocks.reference))
         )
-        return excess_p(field, reference, self._generator).reshape(shape)
+        return compute_excess_p(field, reference, self._generator).reshape(shape)
 
 
-def _first_positive(*choices: np.ndarray) -> np.ndarray:
+def _take_first_positive(*choices: np.ndarray) -> np.ndarray:
     """Returns the positive part of the first choice that has any."""
     return next(
         (np.maximum(choice, 0.0) for choice in choices if (choice > 0).any()),
@@ -258,10 +400,10 @@ def _first_positive(*choices: np.ndarray) -> np.ndarray:
     )
 
 
-def _mean(sums: Sums) -> np.ndarray:
+def _average_square(sums: GroupSums) -> np.ndarray:
     """Returns the mean squared error of each joint, `(J,)`."""
     return sums.square.sum(0)[:, 0] / np.maximum(sums.count.sum(0)[:, 0], 1.0)
 
 
-def _known(value: float) -> float | None:
+def _drop_nan(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None

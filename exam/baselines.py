@@ -1,17 +1,30 @@
-"""Candidates that hardly look: what an exam gives for nothing."""
+"""Baselines of an exam: a constant answer, and forward selection by a textbook rule.
+
+Forward selection sees the same errors, noise and simulated effects as the diagnosis. It lacks the
+penalty from the reference, sets that do not grow from their best member, and the verdict `unknown`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
+
+from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from diagnosis.answer import FILE, Answer, Ranked, Selected, Verdict, Where
+from diagnosis import responses
+from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Verdict, Where
+from diagnosis.residuals import compute_loss
+from exam import oracle
+from exam.oracle import JointErrors
 
 
 @spec
-class Always:
+class ConstantAnswer:
     """Gives the same answer to every case: an effect on all joints, or no gap.
 
     Attributes:
@@ -29,10 +42,12 @@ class Always:
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
         """Writes it."""
         out.mkdir(parents=True, exist_ok=True)
-        named(self.effect, machine.joint_names, self.probability).write(out / FILE)
+        build_single_answer(self.effect, machine.joint_names, self.probability).write(
+            out / ANSWER_FILE
+        )
 
 
-def named(effect: str | None, joints: tuple[str, ...], probability: float) -> Answer:
+def build_single_answer(effect: str | None, joints: tuple[str, ...], probability: float) -> Answer:
     """Returns an answer that names one effect, or `none`, and nothing else."""
     verdict: Verdict = "effects" if effect else "none"
     selected = (
@@ -46,6 +61,107 @@ def named(effect: str | None, joints: tuple[str, ...], probability: float) -> An
         verdict=verdict,
         selected=(selected,) if selected else (),
         ranking=(Ranked(effect or "none", joints if effect else (), probability),),
+        where=Where({}, (), None),
+        gap=None,
+        next_experiment=None,
+    )
+
+
+SetScore = Callable[[JointErrors, frozenset[str]], float]
+MAX_EFFECTS = 4
+"""Effects that a joint gets at most."""
+
+
+@spec
+class ForwardSelection:
+    """Adds the best effect to each joint as long as it pays.
+
+    Attributes:
+        fit: How the simulator is made from the reference.
+        rule: `held_out`: log likelihood on the half of the recordings that was not fitted to,
+            `bic`: on all of them, less half the logarithm of their number for each parameter.
+    """
+
+    fit: ActuatorFit
+    rule: Literal["held_out", "bic"]
+
+    def answer(self, case: Path, out: Path, machine: Machine) -> None:
+        """Writes the answer.
+
+        Raises:
+            RecordingError: the simulator cannot be fitted.
+        """
+        gains: dict[str, dict[str, float]] = {}
+        for joint, errors in zip(
+            machine.joint_names,
+            oracle.load_case_evidence(case, self.fit, machine).errors,
+            strict=True,
+        ):
+            for name, gain in select_forward(
+                errors, score_held_out if self.rule == "held_out" else score_bic
+            ).items():
+                gains.setdefault(name, {})[joint] = gain
+        out.mkdir(parents=True, exist_ok=True)
+        _build_answer(gains).write(out / ANSWER_FILE)
+
+
+def select_forward(errors: JointErrors, worth: SetScore) -> dict[str, float]:
+    """Returns the effects that a joint gets, and how much each was worth when it came."""
+    chosen: frozenset[str] = frozenset()
+    found: dict[str, float] = {}
+    before = 0.0
+    while len(chosen) < MAX_EFFECTS:
+        worths = {
+            name: worth(errors, chosen | {name}) for name in errors.shapes if name not in chosen
+        }
+        best = max(worths, key=worths.__getitem__, default=None)
+        if best is None or worths[best] <= before:
+            break
+        chosen, found[best], before = chosen | {best}, worths[best] - before, worths[best]
+    return found
+
+
+def score_held_out(errors: JointErrors, names: frozenset[str]) -> float:
+    """Returns the gain in log likelihood on the half that was not fitted to."""
+    return float(
+        compute_loss(errors.z)
+        - compute_loss(
+            errors.z - responses.cross_validate_change(errors.z, errors.rays(names), errors.fold)
+        )
+    )
+
+
+def score_bic(errors: JointErrors, names: frozenset[str]) -> float:
+    """Returns the gain in log likelihood on all entries, less the price of the parameters."""
+    rays = errors.rays(names)
+    left = errors.z - responses.sum_responses(rays, responses.fit_sizes(errors.z, rays))
+    return float(compute_loss(errors.z) - compute_loss(left)) - 0.5 * len(rays) * float(
+        np.log(len(errors.z))
+    )
+
+
+def _build_answer(gains: dict[str, dict[str, float]]) -> Answer:
+    """Returns the answer: an effect is as probable as its worth in log likelihood makes it."""
+    chances = {
+        name: 1.0 / (1.0 + float(np.exp(-min(sum(by_joint.values()), 50.0))))
+        for name, by_joint in gains.items()
+    }
+    order = sorted(gains, key=lambda name: -sum(gains[name].values()))
+    selected = [
+        Selected(
+            effect=name,
+            joints=tuple(gains[name]),
+            probability=chances[name],
+            parameters={},
+            gap_closed=None,
+        )
+        for name in order
+    ]
+    return Answer(
+        verdict="effects" if selected else "none",
+        selected=tuple(selected),
+        ranking=tuple(Ranked(one.effect, one.joints, one.probability) for one in selected)
+        or (Ranked("none", (), 0.5),),
         where=Where({}, (), None),
         gap=None,
         next_experiment=None,

@@ -1,8 +1,9 @@
-"""Prices and certainty of the diagnosis, from development exams: what was weighed is chosen from again at other prices.
+"""Fit of the diagnosis' penalties and probability weights to development exams.
 
-Nothing is simulated, so hundreds of prices are tried in minutes. Exams of several plants go in at
-once: what is right for one machine only is not found. What is left after a choice is taken from the
-run that weighed; it hardly depends on prices.
+A run of the diagnosis stores its candidate sets, so another penalty is tried without simulation:
+hundreds of trials take minutes. Exams of several plants are used at once, so that the result is not
+specific to one machine. The remainder after a choice is that of the stored run; it hardly depends on
+penalties.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from diagnosis.answer import Answer, Selected, Where
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.detection import Penalties
 from diagnosis.effect_library import EffectType
-from exam import marking, seal
-from exam.marking import QUIET, Mark, Number
+from exam import dataset, score
+from exam.score import QUIET_KINDS, CaseScore, ParameterScore
 
 log = logging.getLogger(__name__)
 
@@ -37,21 +38,21 @@ RANGES = {
     "tool": (1.5, 3.0),
 }  # fmt: skip
 """Prices that are tried, log-uniform."""
-NEAR = 0.25
+TRIAL_SIGMA = 0.25
 """Around the best so far the second half of the trials is drawn: standard deviation of the
 logarithm."""
 QUIET_WEIGHT = 2.0
 """A false alarm costs as much as so many effects that are missed."""
-PULL = 10.0
+PRIOR_PRECISION = 10.0
 """Precision of a weight about where it begins, which earlier answers told; signs are of about unit
 size."""
-FORMS = np.linspace(0.0, 0.3, 61)
-COVERED = 0.9
+FORM_ERRORS = np.linspace(0.0, 0.3, 61)
+TARGET_COVERAGE = 0.9
 """Share of true sizes that 90 % intervals should hold."""
 
 
 @dataclass(frozen=True)
-class Item:
+class WeighedCase:
     """One case: its label, what was weighed, and what was said."""
 
     label: Mapping[str, Any]
@@ -65,7 +66,7 @@ class Item:
         return outside["ailment"] if outside else effects[0]["effect"] if effects else "none"
 
 
-def items(folders: Sequence[Path]) -> list[Item]:
+def load_weighed_cases(folders: Sequence[Path]) -> list[WeighedCase]:
     """Returns the cases whose answers lie in `folders`, each a run folder of `exam.do=run` on a development exam.
 
     Raises:
@@ -75,17 +76,17 @@ def items(folders: Sequence[Path]) -> list[Item]:
     found = []
     for folder in folders:
         exam = folder.parent  # answers may lie in the folder of their exam
-        if not (exam / seal.LABELS).is_file():
+        if not (exam / dataset.LABELS_FILE).is_file():
             exam = Path(yaml.safe_load((folder / "resolved.yaml").read_text())["exam"]["folder"])
         if json.loads((exam / "exam.json").read_text())["sealed"]:
             raise ConfigError(
                 f"exam.answers: {exam} is a sealed exam; prices are fitted to development exams only"
             )
-        for label in seal.opened(exam)["cases"]:
-            place = folder / label["case"] / answer.FILE
-            said = answer.read(place) if place.is_file() else None
+        for label in dataset.open_labels(exam)["cases"]:
+            place = folder / label["case"] / answer.ANSWER_FILE
+            said = answer.read_answer(place) if place.is_file() else None
             told = said.more.get("weighed") if said else None
-            found += [Item(label, told, said)] if told else []
+            found += [WeighedCase(label, told, said)] if told else []
     if not found:
         raise RecordingError(
             f"{', '.join(map(str, folders))}: no answer says what was weighed; expected run folders of exam.do=run"
@@ -93,7 +94,7 @@ def items(folders: Sequence[Path]) -> list[Item]:
     return found
 
 
-def halves(cases: Sequence[Item]) -> tuple[list[Item], list[Item]]:
+def split_by_family(cases: Sequence[WeighedCase]) -> tuple[list[WeighedCase], list[WeighedCase]]:
     """Returns two halves of the cases; what the cases of one are about is not what those of the other are about."""
     families = sorted({item.family for item in cases} - {"none"})
     side = {name: number % 2 for number, name in enumerate(families)}
@@ -106,7 +107,7 @@ def halves(cases: Sequence[Item]) -> tuple[list[Item], list[Item]]:
 
 
 @dataclass(frozen=True)
-class Claims:
+class ClaimSigns:
     """Signs of what an answer states, as `certainty` has them, and of what the label knows whether it is true."""
 
     outside: dict[str, float]
@@ -114,13 +115,13 @@ class Claims:
     none: dict[str, float]
 
 
-def answered(
-    item: Item,
+def answer_case(
+    item: WeighedCase,
     prices: Penalties,
     weights: ProbabilityModel,
     kinds: Sequence[EffectType],
     machine: Machine,
-) -> tuple[Answer, Claims]:
+) -> tuple[Answer, ClaimSigns]:
     """Returns what the diagnosis would say at these prices, without numbers, and why it is so sure."""
     found = decision.drop_unlikely_effects(
         decision.restore_result(item.told, prices, kinds), prices, weights
@@ -162,16 +163,16 @@ def answered(
     said = Answer(
         verdict=told, selected=tuple(selected), ranking=ranked, where=Where({}, (), None), gap=None, next_experiment=None
     )  # fmt: skip
-    return said, Claims(
+    return said, ClaimSigns(
         certainty.collect_outside_signs(found),
         signs,
         decision.read_none_signs(found, prices, weights),
     )
 
 
-def worth(mark: Mark) -> tuple[float, float]:
+def value_answer(mark: CaseScore) -> tuple[float, float]:
     """Returns what an answer is worth, of what could be."""
-    if mark.kind in QUIET:
+    if mark.kind in QUIET_KINDS:
         return QUIET_WEIGHT * (mark.verdict == "none"), QUIET_WEIGHT
     if mark.kind == "outside":
         return float(mark.verdict == "unknown"), 1.0
@@ -185,7 +186,7 @@ def worth(mark: Mark) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class PenaltyFit:
     """Fits prices to cases.
 
     Attributes:
@@ -207,28 +208,30 @@ class Calibration:
     workers: int
 
     def marks(
-        self, cases: Sequence[Item], prices: Penalties, weights: ProbabilityModel
-    ) -> list[Mark]:
+        self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
+    ) -> list[CaseScore]:
         """Returns the marks of all cases at these prices, with these weights."""
         return [mark for mark, _ in self._marked(cases, prices, weights)]
 
     def _marked(
-        self, cases: Sequence[Item], prices: Penalties, weights: ProbabilityModel
-    ) -> list[tuple[Mark, Claims]]:
-        said = [answered(item, prices, weights, self.kinds, self.machine) for item in cases]
+        self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
+    ) -> list[tuple[CaseScore, ClaimSigns]]:
+        said = [answer_case(item, prices, weights, self.kinds, self.machine) for item in cases]
         return [
-            (marking.mark(i.label, one, self.classes, self.of_machine), claims)
+            (score.score_answer(i.label, one, self.classes, self.of_machine), claims)
             for i, (one, claims) in zip(cases, said, strict=True)
         ]
 
-    def value(self, cases: Sequence[Item], prices: Penalties, weights: ProbabilityModel) -> float:
+    def value(
+        self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
+    ) -> float:
         """Returns the mean worth of the answers."""
-        pairs = np.array([worth(mark) for mark in self.marks(cases, prices, weights)])
+        pairs = np.array([value_answer(mark) for mark in self.marks(cases, prices, weights)])
         return float(pairs[:, 0].sum() / pairs[:, 1].sum())
 
     def fitted(
         self,
-        cases: Sequence[Item],
+        cases: Sequence[WeighedCase],
         start: Penalties,
         weights: ProbabilityModel,
         advance: Callable[[], None],
@@ -240,42 +243,44 @@ class Calibration:
             (self.value(cases, start, weights), start),
         )
         with ProcessPoolExecutor(
-            self.workers, initializer=_begin, initargs=(self, cases, weights)
+            self.workers, initializer=_start_worker, initargs=(self, cases, weights)
         ) as pool:
             for half in (0, 1):
                 trials = [self._drawn(best[1], half, generator) for _ in range(self.trials // 2)]
-                for prices, value in zip(trials, pool.map(_value, trials), strict=True):
+                for prices, value in zip(trials, pool.map(_evaluate_trial, trials), strict=True):
                     advance()
                     if value > best[0]:
                         best = value, prices
         return best[1], self.weighed(cases, best[1], weights)
 
     def weighed(
-        self, cases: Sequence[Item], prices: Penalties, start: ProbabilityModel
+        self, cases: Sequence[WeighedCase], prices: Penalties, start: ProbabilityModel
     ) -> ProbabilityModel:
         """Returns the weights under which what is true of these cases is most probable, and what forms add to errors."""
         is_outside = [item.label["kind"] == "outside" for item in cases]
-        outside = logistic(
+        outside = fit_logistic(
             [claims.outside for _, claims in self._marked(cases, prices, start)],
             is_outside,
             start.outside,
         )
         weights = replace(start, outside=outside)
         named, true = self._named(cases, prices, weights)
-        found = {"right": logistic(named, true, start.right) if len(set(true)) > 1 else start.right}
+        found = {
+            "right": fit_logistic(named, true, start.right) if len(set(true)) > 1 else start.right
+        }
         silent = [
-            (claims.none, mark.kind in QUIET)
+            (claims.none, mark.kind in QUIET_KINDS)
             for mark, claims in self._marked(cases, prices, weights)
             if mark.verdict == "none"
         ]
         if len({quiet for _, quiet in silent}) > 1:
-            found["none"] = logistic(
+            found["none"] = fit_logistic(
                 [signs for signs, _ in silent], [quiet for _, quiet in silent], start.none
             )
         return replace(weights, form=self.forms(cases, weights.form), **found)
 
     def _named(
-        self, cases: Sequence[Item], prices: Penalties, weights: ProbabilityModel
+        self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
     ) -> tuple[list[dict[str, float]], list[bool]]:
         """Returns the signs of all effects that are named, and whether they are there."""
         signs, true = [], []
@@ -286,7 +291,7 @@ class Calibration:
                 true += [name in stand for name, _ in claims.right]
         return signs, true
 
-    def forms(self, cases: Sequence[Item], now: Mapping[str, float]) -> dict[str, float]:
+    def forms(self, cases: Sequence[WeighedCase], now: Mapping[str, float]) -> dict[str, float]:
         """Returns the smallest errors of form, by stage, with which 90 % intervals hold nine in ten true sizes.
 
         What moves the machine (timing, actuation) has one, what measures it (sensing, kinematics)
@@ -296,7 +301,7 @@ class Calibration:
         for group in (("timing", "actuation"), ("sensing", "kinematics", "perception")):
             errors = []
             for item in cases:
-                mark = marking.mark(item.label, item.said, self.classes, self.of_machine)
+                mark = score.score_answer(item.label, item.said, self.classes, self.of_machine)
                 errors += [
                     (one, now[stages[one.effect]])
                     for one in mark.numbers
@@ -304,8 +309,9 @@ class Calibration:
                 ]
             holds = [
                 form
-                for form in FORMS
-                if errors and np.mean([_holds(one, was, form) for one, was in errors]) >= COVERED
+                for form in FORM_ERRORS
+                if errors
+                and np.mean([_is_covered(one, was, form) for one, was in errors]) >= TARGET_COVERAGE
             ]
             found |= dict.fromkeys(group, round(float(holds[0]), 3)) if holds else {}
         return found
@@ -314,7 +320,7 @@ class Calibration:
         drawn = {}
         for name, (low, high) in RANGES.items():
             at = (
-                np.log(getattr(near, name)) + NEAR * generator.standard_normal()
+                np.log(getattr(near, name)) + TRIAL_SIGMA * generator.standard_normal()
                 if half
                 else generator.uniform(*np.log([low, high]))
             )
@@ -326,16 +332,18 @@ _work: list[Any] = []
 """What a process values: a calibration, its cases and weights, sent once."""
 
 
-def _begin(calibration: Calibration, cases: Sequence[Item], weights: ProbabilityModel) -> None:
+def _start_worker(
+    calibration: PenaltyFit, cases: Sequence[WeighedCase], weights: ProbabilityModel
+) -> None:
     _work[:] = [calibration, cases, weights]
 
 
-def _value(prices: Penalties) -> float:
+def _evaluate_trial(prices: Penalties) -> float:
     calibration, cases, weights = _work
     return calibration.value(cases, prices, weights)
 
 
-def logistic(
+def fit_logistic(
     signs: Sequence[Mapping[str, float]], true: Sequence[bool], start: Mapping[str, float]
 ) -> dict[str, float]:
     """Returns the weights of a logistic regression, pulled towards those at which it begins but for the constant."""
@@ -344,7 +352,7 @@ def logistic(
         np.array([[one[name] for name in names] for one in signs]),
         np.array([start[name] for name in names]),
     )
-    pull = np.array([0.0 if name == "constant" else PULL for name in names])
+    pull = np.array([0.0 if name == "constant" else PRIOR_PRECISION for name in names])
 
     def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
         at, off = x @ w, w - begin
@@ -355,7 +363,7 @@ def logistic(
     return {name: round(float(value), 3) for name, value in zip(names, found.x, strict=True)}
 
 
-def _holds(number: Number, was: float, form: float) -> bool:
+def _is_covered(number: ParameterScore, was: float, form: float) -> bool:
     """Says whether the 90 % interval would hold the truth if forms added `form` to the error, and not `was`."""
     own = np.sqrt(max(number.deviation**2 - (was * number.said) ** 2, 0.0))
     return bool(number.error <= 1.645 * np.hypot(own, form * number.said))

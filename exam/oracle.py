@@ -1,26 +1,107 @@
-"""The oracle: it is told which effects a case has on which joints, fits only their sizes, and so closes what there is to close."""
+"""The oracle: it knows the effects and joints of a case, fits only their sizes, and closes the gap.
+
+Its share of the gap is an upper bound for candidates. `CaseEvidence` holds the inputs of the
+diagnosis for one case; textbook baselines use it too.
+"""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.machine import Machine
-from diagnosis import gap
+from diagnosis import baseline, case, effect_library, gap
+from diagnosis.baseline import Baseline
 from diagnosis.refine import fit_set
-from diagnosis.responses import fit_sizes
-from exam import ground
-from exam.ground import Errors
+from diagnosis.residuals import ParameterRay, build_rays
+from diagnosis.responses import Response, fit_sizes
 
-NO_GAP = 1.1
+MIN_RESPONSE = 1e-3
+"""Change of an error, over its noise, below which an effect does nothing to a joint."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointErrors:
+    """What the simulator errs by on one joint.
+
+    Attributes:
+        z: Errors over their noise, `(E,)`.
+        shapes: What each effect would change about them, one shape a ray; effects that do nothing
+            to the joint are absent.
+        fold: Half of the recordings of each entry.
+    """
+
+    z: np.ndarray
+    shapes: dict[str, list[Response]]
+    fold: np.ndarray
+
+    def build_rays(self, names: frozenset[str]) -> list[Response]:
+        """Returns the shapes of several effects, in the order of their names."""
+        return [shape for name in sorted(names) for shape in self.shapes[name]]
+
+
+@dataclass(frozen=True)
+class CaseEvidence:
+    """All that is known before anything is chosen.
+
+    Attributes:
+        base: The simulator, against field and reference.
+        rays: Ways in which each effect grows.
+        errors: Of each joint.
+    """
+
+    base: Baseline
+    build_rays: dict[str, Sequence[ParameterRay]]
+    errors: list[JointErrors]
+
+
+def load_case_evidence(
+    folder: Path, fit: ActuatorFit, machine: Machine, names: Sequence[str] | None = None
+) -> CaseEvidence:
+    """Returns the ground of a case, for the effects `names`, or for all that a free run can show.
+
+    Raises:
+        RecordingError: the simulator cannot be fitted.
+    """
+    with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
+        base = baseline.fit_baseline(
+            case.load_case(folder, machine), fit, Path(scratch), 0, torch.device("cpu")
+        )
+    residuals, grown = base.field.residuals, {}
+    shapes: list[dict[str, list[Response]]] = [{} for _ in range(machine.num_joints)]
+    for kind in effect_library.load_effects(machine, None if names is None else tuple(names)):
+        if kind.target.stochastic or kind.target.side == "kinematics":
+            continue
+        rays = grown[kind.name] = build_rays(kind)
+        responses = [residuals.response(ray) for ray in rays]
+        for j, mine in enumerate(shapes):
+            if (
+                max((np.abs(response[j]).max() for response in responses), default=0.0)
+                > MIN_RESPONSE
+            ):
+                mine[kind.name] = [
+                    Response(ray.sizes, response[j])
+                    for ray, response in zip(rays, responses, strict=True)
+                ]
+    return CaseEvidence(
+        base,
+        grown,
+        [JointErrors(z, mine, residuals.fold) for z, mine in zip(residuals.z, shapes, strict=True)],
+    )
+
+
+MIN_GAP_RATIO = 1.1
 """Error over floor below which nobody can say what share of the gap is closed."""
 
 
-def closed_by(
+def close_gap(
     folder: Path, effects: Mapping[str, Sequence[str]], fit: ActuatorFit, machine: Machine
 ) -> float | None:
     """Returns the share of the gap of a case that its true effects close, on windows that their sizes were not fitted to.
@@ -37,7 +118,7 @@ def closed_by(
     Raises:
         RecordingError: the simulator cannot be fitted.
     """
-    found = ground.of_case(folder, fit, machine, tuple(effects))
+    found = load_case_evidence(folder, fit, machine, tuple(effects))
     residuals = found.base.field.residuals
     subsets = [
         frozenset(
@@ -52,9 +133,11 @@ def closed_by(
         for one in found.base.left_out
     ]
     floor = np.concatenate(floors)
-    if not any(subsets) or gap.compute_rmse(before) < NO_GAP * gap.compute_rmse(floor):
+    if not any(subsets) or gap.compute_rmse(before) < MIN_GAP_RATIO * gap.compute_rmse(floor):
         return None
-    start = [_start(errors, subset) for errors, subset in zip(found.errors, subsets, strict=True)]
+    start = [
+        _fit_start(errors, subset) for errors, subset in zip(found.errors, subsets, strict=True)
+    ]
     after = gap.compute_squares(
         fit_set(residuals, subsets, found.rays, start).after, measured, machine
     )
@@ -63,11 +146,11 @@ def closed_by(
     )  # as an answer says it: no repair is better than the floor
 
 
-def of_label(
+def close_labelled_gap(
     cases: Path, fit: ActuatorFit, machine: Machine, label: Mapping[str, Any]
 ) -> float | None:
     """Returns the same for the case of a label, in the folder `cases`."""
-    return closed_by(
+    return close_gap(
         cases / label["case"],
         {one["effect"]: one["joints"] for one in label["effects"]},
         fit,
@@ -75,7 +158,7 @@ def of_label(
     )
 
 
-def _start(errors: Errors, names: frozenset[str]) -> dict[str, np.ndarray]:
+def _fit_start(errors: JointErrors, names: frozenset[str]) -> dict[str, np.ndarray]:
     """Returns the sizes along the rays of each effect that explain the errors best, as far as effects add up."""
     if not names:
         return {}

@@ -1,24 +1,27 @@
-"""What the simulator knows: a finder that needs no picture."""
+"""A finder that returns a configured borehole, for simulation and rehearsals."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from brokk_rl.contracts.vision import FrameDetections, HolePose
 from brokk_rl.errors import ConfigError
-from brokk_rl.signals import Borehole, Frame
+from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 
 
 @spec
 class TruthPerception:
-    """Returns a configured borehole for every frame; stands in for a camera in the simulator and in rehearsals.
+    """Return the configured borehole for every frame; stands in for a camera in rehearsals.
 
     Attributes:
         center_in_base_m: Centre of the rim.
         axis_in_base: Unit axis, pointing out of the hole.
         radius_m: Radius of the hole.
-        std_m: Standard deviation that is claimed for each coordinate of the centre; 0 for a hole
-            known exactly.
+        std_m: Claimed standard deviation of each coordinate of the centre; 0 for a hole known
+            exactly.
     """
 
     center_in_base_m: tuple[float, float, float]
@@ -31,33 +34,35 @@ class TruthPerception:
             raise ConfigError(f"perception.axis_in_base: {self.axis_in_base} is not a unit vector")
         if self.radius_m <= 0 or self.std_m < 0:
             raise ConfigError(
-                f"perception: expected radius_m > 0 and std_m >= 0, got {self.radius_m} and {self.std_m}"
+                "perception: expected radius_m > 0 and std_m >= 0, got "
+                f"{self.radius_m} and {self.std_m}"
             )
 
     def build(self) -> TruthFinder:
-        """Returns a finder that always finds this borehole."""
-        covariance = np.eye(3) * self.std_m**2
-        return TruthFinder(
-            Borehole(
-                np.array(self.center_in_base_m),
-                np.array(self.axis_in_base),
-                self.radius_m,
-                covariance,
-            )
+        """Return a finder that always finds this borehole."""
+        hole = HolePose(
+            center_m=np.array(self.center_in_base_m),
+            axis=np.array(self.axis_in_base),
+            radius_m=self.radius_m,
+            cov_m2=np.eye(3) * self.std_m**2,
+            axis_cov_rad2=np.zeros((3, 3)),
+            frame="base",
+            score=1.0,
+            t_s=0.0,
         )
+        return TruthFinder(hole)
 
 
 class TruthFinder:
     """A finder that has the answer.
 
     Args:
-        borehole: The borehole; whoever moves the hole sets it anew, or to `None` when there is
-            none.
+        hole: The borehole in the base frame; `None` for no hole.
     """
 
-    def __init__(self, borehole: Borehole | None) -> None:
-        self.borehole = borehole
+    def __init__(self, hole: HolePose | None) -> None:
+        self._hole = hole
 
-    def find(self, frame: Frame) -> Borehole | None:
-        """Returns the borehole, whatever the frame shows."""
-        return self.borehole
+    def find(self, frame: Frame) -> FrameDetections:
+        """Return the borehole, whatever the frame shows."""
+        return FrameDetections([] if self._hole is None else [replace(self._hole, t_s=frame.t_s)])

@@ -8,7 +8,7 @@ first of it arrives. With them the dead times of machine and person are one.
 import torch
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.follower import moved_levers
+from brokk_rl.follower import select_levers
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -48,7 +48,7 @@ class AdviceConfig:
                 )
 
     def build(self, machine: Machine, device: torch.device) -> "LeverAdviser":
-        """Returns the adviser for `machine` on `device`."""
+        """Return the adviser for `machine` on `device`."""
         return LeverAdviser(self, machine, device)
 
 
@@ -66,7 +66,7 @@ class LeverAdviser:
         self._future = _predict_levers(advice, machine).to(device)
 
     def coming(self, proposed: torch.Tensor, given: torch.Tensor) -> torch.Tensor:
-        """Returns the commands that hands will yet give, `(N, F, J)`, if nothing more is proposed.
+        """Return the commands that hands will yet give, `(N, F, J)`, if nothing more is proposed.
 
         Args:
             proposed: What was proposed, oldest first, `(N, H, J)`.
@@ -81,7 +81,7 @@ class LeverAdviser:
         )
 
     def proposal(self, wanted: torch.Tensor, proposed: torch.Tensor) -> torch.Tensor:
-        """Returns what to propose, `(N, J)`, where the commands `wanted`, `(N, J)`, are to be given.
+        """Return what to propose, `(N, J)`, where the commands `wanted`, `(N, J)`, are to be given.
 
         Args:
             wanted: Commands under the masks.
@@ -94,10 +94,10 @@ class LeverAdviser:
         # `hold_s`
         lately = ((proposed == 0).float().flip(1).cumsum(1) < 0.5).sum(1)
         kept = (lately > 0) & (lately < self._hold) & (shown != 0)
-        return torch.where(moved_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
+        return torch.where(select_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
 
     def _shown(self, command: torch.Tensor) -> torch.Tensor:
-        """Returns the deflection that commands `command`."""
+        """Return the deflection that commands `command`."""
         return torch.where(
             command == 0,
             0.0,
@@ -106,7 +106,7 @@ class LeverAdviser:
 
 
 def _predict_levers(advice: AdviceConfig, machine: Machine) -> torch.Tensor:
-    """Returns what makes levers of the coming periods, `(F, H + 1)`, of `H` proposals, oldest first, and the hand as it is."""
+    """Return what makes levers of the coming periods, `(F, H + 1)`, of `H` proposals, oldest first, and the hand as it is."""
     num, period_s = machine.num_history, machine.period_s
     delay, lag = (
         _take_middle(advice.delay_s) / period_s,

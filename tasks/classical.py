@@ -61,7 +61,7 @@ class ClassicalConfig:
     brake_s: float
 
     def build(self, machine: Machine, device: torch.device) -> "ClassicalController":
-        """Returns the controller for `machine` on `device`."""
+        """Return the controller for `machine` on `device`."""
         return ClassicalController(self, machine, device)
 
 
@@ -121,12 +121,12 @@ class ClassicalController:
         self._damping = config.damping**2 * torch.eye(4, device=device)
 
     def rate(self, u: torch.Tensor) -> torch.Tensor:
-        """Returns the joint speed that the static valve map gives to commands `u`, `(…, J)`, rad/s or m/s."""
+        """Return the joint speed that the static valve map gives to commands `u`, `(…, J)`, rad/s or m/s."""
         band = self.config.dead_band
         return self.speed * u.sign() * (u.abs() - band).clamp(min=0.0) / (1.0 - band)
 
     def valve(self, rate: torch.Tensor) -> torch.Tensor:
-        """Inverts `rate`: returns the commands for joint speeds given as a share of the full speed, clipped to [-1, 1].
+        """Invert `rate`: returns the commands for joint speeds given as a share of the full speed, clipped to [-1, 1].
 
         Speeds too small for the valve are given as pulses of `creep`: the prediction counts a pulse
         as soon as it is sent, so that no more of them are sent than are needed.
@@ -140,7 +140,7 @@ class ClassicalController:
         )
 
     def _opening(self, share: torch.Tensor) -> torch.Tensor:
-        """Returns the largest command that is no faster than this share of full speed, `(N, J)` in [0, 1]; 0 for none."""
+        """Return the largest command that is no faster than this share of full speed, `(N, J)` in [0, 1]; 0 for none."""
         band = self.config.dead_band
         return (band + (1.0 - band) * share) * (share > 0)
 
@@ -153,7 +153,7 @@ class ClassicalController:
         reach_m: tuple[float, float],
         coming: torch.Tensor | None = None,
     ) -> ControllerGuidance:
-        """Returns commands and errors.
+        """Return commands and errors.
 
         Args:
             q: Measured positions, oldest first, `(N, H, J)`.
@@ -208,7 +208,7 @@ class ClassicalController:
         )
 
     def reach(self, q: torch.Tensor, target_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the reach at `q`, `(N, J)`, and its slope over joint positions: `(N,)` and `(N, J)`."""
+        """Return the reach at `q`, `(N, J)`, and its slope over joint positions: `(N,)` and `(N, J)`."""
         reach, slope, _ = self._reach(self.kinematics.pose(q[None]), target_m)
         return reach[0], slope
 
@@ -220,7 +220,7 @@ class ClassicalController:
         up: torch.Tensor,
         turn: torch.Tensor,
     ) -> torch.Tensor:
-        """Returns joint speeds as a share of full speed that bring the tool closer, `(N, J)` in [-1, 1]; exclusive joints rest."""
+        """Return joint speeds as a share of full speed that bring the tool closer, `(N, J)` in [-1, 1]; exclusive joints rest."""
         config = self.config
         wanted = torch.cat((error[:, :2], up[:, None]), 1) * config.gain_1_s
         wanted = wanted * (
@@ -242,7 +242,7 @@ class ClassicalController:
         )
 
     def _reach(self, pose: ToolPose, target_m: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns reach `(M, N)`, the slope of its first row over joint positions `(N, J)`, and the distance in space `(M, N)`."""
+        """Return reach `(M, N)`, the slope of its first row over joint positions `(N, J)`, and the distance in space `(M, N)`."""
         origins = pose.joints_in_base_m
         joint = origins[:, :, self._reach_joint]
         radius = joint[..., :2].norm(dim=-1).clamp(min=1e-3)
@@ -256,7 +256,7 @@ class ClassicalController:
 
 
 def _solve_4(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Solves symmetric positive definite 4 x 4 systems, `(N, 4, 4)` and `(N, 4, 1)`, by 2 x 2 blocks (Schur complement).
+    """Solve symmetric positive definite 4 x 4 systems, `(N, 4, 4)` and `(N, 4, 1)`, by 2 x 2 blocks (Schur complement).
 
     Own code because LAPACK calls neither export to ONNX nor fit into a captured CUDA graph.
     """

@@ -92,7 +92,7 @@ class RewardTerm:
             )
 
     def __call__(self, state: ToolState) -> torch.Tensor:
-        """Returns the weighted term, `(N,)`."""
+        """Return the weighted term, `(N,)`."""
         return self.weight * resolve_name(self.function)(state)
 
 

@@ -66,7 +66,7 @@ def draw_starts(
     depth_m: float,
     what: str,
 ) -> dict[str, torch.Tensor]:
-    """Returns `count` starts from which the target can be reached: `q`, `scene`, `target_m`, `target_pitch_rad`.
+    """Return `count` starts from which the target can be reached: `q`, `scene`, `target_m`, `target_pitch_rad`.
 
     Args:
         count: Number of starts.
@@ -113,7 +113,7 @@ def draw_arms(
     object_z_m: torch.Tensor,
     generator: torch.Generator,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draws one arm configuration per row of `object_z_m`: returns `q` `(M, J)` and whether it is in the open `(M,)` bool."""
+    """Draw one arm configuration per row of `object_z_m`: returns `q` `(M, J)` and whether it is in the open `(M,)` bool."""
     lower = torch.as_tensor(machine.lower, dtype=torch.float32) + arms.margin_rad
     upper = torch.as_tensor(machine.upper, dtype=torch.float32) - arms.margin_rad
     q = lower + (upper - lower) * torch.rand(
@@ -136,7 +136,7 @@ def check_reachable(
     reach_m: tuple[float, float],
     margin_rad: float,
 ) -> torch.Tensor:
-    """Returns from which `q`, `(M, J)`, the target pose can be reached under the masks, `(M,)` bool.
+    """Return from which `q`, `(M, J)`, the target pose can be reached under the masks, `(M,)` bool.
 
     First the exclusive joints move until the reach lies well inside the good working range, then
     the others by damped least squares.
@@ -169,7 +169,7 @@ def check_reachable(
 def join_starts(
     count: int, drawn: list[dict[str, torch.Tensor]], what: str
 ) -> dict[str, torch.Tensor]:
-    """Joins batches of accepted starts and cuts them to `count`.
+    """Join batches of accepted starts and cuts them to `count`.
 
     Raises:
         ConfigError: If too few were accepted.

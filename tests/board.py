@@ -12,12 +12,12 @@ from composed import option
 from scipy.spatial.transform import Rotation
 
 from brokk_rl.machine import Machine
-from perception.calibrate import arm, rigid
-from perception.calibrate.views import Views
+from perception.calibrate import arm, transforms
+from perception.calibrate.hand_eye import HandEyeViews
 
 SIZE_PX = (1280, 720)
 MATRIX = np.array([[700.0, 0.0, 639.5], [0.0, 700.0, 359.5], [0.0, 0.0, 1.0]])
-CAMERA = rigid.pose(
+CAMERA = transforms.make_transform(
     np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     @ Rotation.from_euler("xyz", [-0.5, 0.15, 0.05]).as_matrix(),
     np.array([0.3, 0.45, 1.9]),
@@ -55,19 +55,23 @@ def posed(
         wobble_m: By how much, and by as many rad, the link is elsewhere.
     """
     chance = np.random.default_rng(seed)
-    facing = rigid.pose(
+    facing = transforms.make_transform(
         Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix(), np.array([-0.35, -0.2, 2.1])
     )
-    board = rigid.inverse(arm.links(machine, MIDDLE[None]).base_from_link[0]) @ CAMERA @ facing
+    board = (
+        transforms.invert(arm.compute_link_poses(machine, MIDDLE[None]).base_from_link[0])
+        @ CAMERA
+        @ facing
+    )
     zeros = zero_rad * chance.standard_normal(5) * [0, 1, 1, 1, 0]
     kept, seen = [], []
     while len(kept) < count:
         q = MIDDLE + chance.uniform(-1, 1, 5) * [0.35, 0.2, 0.35, 0.4, 0.45]
-        link = arm.links(
+        link = arm.compute_link_poses(
             machine, (q + zeros + own_rad * chance.standard_normal(5))[None]
         ).base_from_link[0]
-        link = rigid.moved(link, wobble_m * chance.standard_normal(6))
-        there = rigid.inverse(CAMERA) @ link @ board
+        link = transforms.apply_motion(link, wobble_m * chance.standard_normal(6))
+        there = transforms.invert(CAMERA) @ link @ board
         corners = corners_m() @ there[:3, :3].T + there[:3, 3]
         pixel = corners @ MATRIX.T / np.maximum(corners[:, 2:], 1e-3)
         inside = (pixel[:, :2] > 5).all() and (pixel[:, :2] < np.array(SIZE_PX) - 5).all()
@@ -91,27 +95,27 @@ def corners_m() -> np.ndarray:
 
 def views(
     machine: Machine, poses: Posed, cov: np.ndarray, seed: int, wrong: float = 0.0
-) -> tuple[Views, np.ndarray]:
+) -> tuple[HandEyeViews, np.ndarray]:
     """Returns sights with noise of covariance `cov`, `(6, 6)`, and which of them, a share `wrong`, are of something else."""
     chance = np.random.default_rng(seed + 1000)
-    count, links = len(poses.q), arm.links(machine, poses.q)
+    count, links = len(poses.q), arm.compute_link_poses(machine, poses.q)
     seen = np.array(
         [
-            rigid.moved(one, chance.multivariate_normal(np.zeros(6), cov))
+            transforms.apply_motion(one, chance.multivariate_normal(np.zeros(6), cov))
             for one in poses.camera_from_board
         ]
     )
     bad = np.zeros(count, bool)
     bad[chance.permutation(count)[: int(wrong * count)]] = True
     for k in np.flatnonzero(bad):
-        seen[k] = rigid.moved(
+        seen[k] = transforms.apply_motion(
             seen[k], np.concatenate([chance.normal(0, 0.3, 3), chance.normal(0, 0.6, 3)])
         )
     shared, std = links.joints[:, 1:4], np.full(3, 0.0087)
     slack = np.concatenate(
-        [0.0017 * links.joints, arm.wobble(links.base_from_link, 0.001, 0.001)], 1
+        [0.0017 * links.joints, arm.build_wobble_motions(links.base_from_link, 0.001, 0.001)], 1
     )
-    found = Views(
+    found = HandEyeViews(
         links.base_from_link, seen[:, None], np.broadcast_to(cov, (count, 1, 6, 6)), slack, shared, std,
         tuple(str(k) for k in range(count)), machine.joint_names[1:4],
     )  # fmt: skip

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from actuators.excite.plan.drive import NominalMachine
+from actuators.excite.player import NominalMachine
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.bus.can_bus import CanBus

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from composed import option
 
-from actuators.excite.plan.drive import NominalMachine
+from actuators.excite.player import NominalMachine
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session

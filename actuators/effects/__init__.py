@@ -19,6 +19,6 @@ measurement from the first to the last: `effect=[encoder_bias,quantisation]` rou
 angle, and `effect=[dead_band,saturation]` cuts the command before the valve's dead band sees it.
 
 The formula of an effect is a pure function of parameters, memory and the present moment;
-`actuators.effects.wrapped` does the rest: parameters per environment, memory in place, reset,
+`actuators.effects.effect` does the rest: parameters per environment, memory in place, reset,
 randomness from a counter in the state.
 """

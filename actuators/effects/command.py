@@ -4,10 +4,10 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.ranges import Joints, Number, Value
-from actuators.effects.timing import with_newest
-from actuators.effects.wrapped import EffectSpec, Memory, Moment
-from actuators.models.transport import opened
+from actuators.effects.effect import EffectSpec, Memory, StepInputs
+from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.timing import append_command
+from actuators.models.transport import open_valve
 from brokk_rl.spec import spec
 
 
@@ -26,15 +26,15 @@ class DeadBand(EffectSpec):
     retract: Value
     side = "command"
     numbers: ClassVar = {
-        "extend": Number(
+        "extend": EffectNumber(
             "1", none=0.0, typical=0.06, bounds=(0.0, 0.85)
         ),  # servo-driven rotary valves reach 0.75
-        "retract": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.85)),
+        "retract": EffectNumber("1", none=0.0, typical=0.06, bounds=(0.0, 0.85)),
     }
 
-    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`(|u| - band) / (1 - band)` beyond the band of its side, else 0."""
-        return opened(
+        return open_valve(
             now.history.u, now.value["extend"][:, None], now.value["retract"][:, None]
         ), {}
 
@@ -51,9 +51,9 @@ class Saturation(EffectSpec):
     joints: Joints
     level: Value
     side = "command"
-    numbers: ClassVar = {"level": Number("1", none=1.0, typical=0.75, bounds=(0.05, 1.0))}
+    numbers: ClassVar = {"level": EffectNumber("1", none=1.0, typical=0.75, bounds=(0.05, 1.0))}
 
-    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`u` cut off at plus and minus `level`."""
         level = now.value["level"][:, None]
         return torch.minimum(torch.maximum(now.history.u, -level), level), {}
@@ -71,19 +71,19 @@ class RateLimit(EffectSpec):
     joints: Joints
     stroke_s: Value
     side = "command"
-    numbers: ClassVar = {"stroke_s": Number("s", none=0.0, typical=0.4, bounds=(0.0, 5.0))}
+    numbers: ClassVar = {"stroke_s": EffectNumber("s", none=0.0, typical=0.4, bounds=(0.0, 5.0))}
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """Commands so far have been slow enough."""
         return {"sent": now.history.u[:, :-1]}
 
-    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """The command, no further than `period / stroke` from the one before."""
         before, reach = (
             now.memory["sent"][:, -1],
             now.plant.period_s / now.value["stroke_s"].clamp(min=1e-6),
         )
-        return with_newest(
+        return append_command(
             now, torch.minimum(torch.maximum(now.history.u[:, -1], before - reach), before + reach)
         )
 
@@ -104,11 +104,11 @@ class Stiction(EffectSpec):
     side = "command"
     smooth = False
     numbers: ClassVar = {
-        "start": Number("1", none=0.0, typical=0.14, bounds=(0.0, 0.6)),
-        "stop": Number("1", none=0.0, typical=0.06, bounds=(0.0, 0.6)),
+        "start": EffectNumber("1", none=0.0, typical=0.14, bounds=(0.0, 0.6)),
+        "stop": EffectNumber("1", none=0.0, typical=0.06, bounds=(0.0, 0.6)),
     }
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """A joint whose command was beyond `start` is moving."""
         before = now.history.u[:, -2]
         return {
@@ -116,12 +116,12 @@ class Stiction(EffectSpec):
             "moving": before.sign() * (before.abs() > now.value["start"]),
         }
 
-    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """The command while the joint moves, else 0; a reversal is a new start."""
         u, start = now.history.u[:, -1], now.value["start"]
         goes_on = (now.memory["moving"] == u.sign()) & (
             u.abs() > torch.minimum(now.value["stop"], start)
         )
         moving = u.sign() * ((u.abs() > start) | goes_on)
-        sent, memory = with_newest(now, u * moving.abs())
+        sent, memory = append_command(now, u * moving.abs())
         return sent, memory | {"moving": moving}

@@ -4,17 +4,17 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.ranges import Joints, Number, Value
-from actuators.effects.wrapped import EffectSpec, Plant
+from actuators.effects.effect import EffectSpec, MachineTensors
+from actuators.effects.ranges import EffectNumber, Joints, Value
 from brokk_rl.spec import spec
 
 
-def _angle(typical_rad: float) -> Number:
-    return Number("rad", none=0.0, typical=typical_rad, bounds=(-0.3, 0.3), per_joint=False)
+def _describe_angle(typical_rad: float) -> EffectNumber:
+    return EffectNumber("rad", none=0.0, typical=typical_rad, bounds=(-0.3, 0.3), per_joint=False)
 
 
-def _shift(typical_m: float) -> Number:
-    return Number("m", none=0.0, typical=typical_m, bounds=(-0.5, 0.5), per_joint=False)
+def _describe_shift(typical_m: float) -> EffectNumber:
+    return EffectNumber("m", none=0.0, typical=typical_m, bounds=(-0.5, 0.5), per_joint=False)
 
 
 @spec
@@ -31,10 +31,14 @@ class LinkLength(EffectSpec):
     extra_m: Value
     side = "kinematics"
     stage = "kinematics"
-    numbers: ClassVar = {"extra_m": Number("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3))}
+    numbers: ClassVar = {"extra_m": EffectNumber("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3))}
 
     def tool(
-        self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant
+        self,
+        point_m: torch.Tensor,
+        q: torch.Tensor,
+        value: dict[str, torch.Tensor],
+        plant: MachineTensors,
     ) -> torch.Tensor:
         """Moves the point along each link by what the link is too long."""
         pose = plant.kinematics.pose(q)
@@ -60,21 +64,25 @@ class BaseTilt(EffectSpec):
     pitch_rad: Value
     side = "kinematics"
     stage = "kinematics"
-    numbers: ClassVar = {"roll_rad": _angle(0.03), "pitch_rad": _angle(0.03)}
+    numbers: ClassVar = {"roll_rad": _describe_angle(0.03), "pitch_rad": _describe_angle(0.03)}
 
     def tool(
-        self, point_m: torch.Tensor, q: torch.Tensor, value: dict[str, torch.Tensor], plant: Plant
+        self,
+        point_m: torch.Tensor,
+        q: torch.Tensor,
+        value: dict[str, torch.Tensor],
+        plant: MachineTensors,
     ) -> torch.Tensor:
         """Turns the point with the base."""
-        return turned(
+        return rotate_points(
             point_m, value["roll_rad"], value["pitch_rad"], torch.zeros_like(value["roll_rad"])
         )
 
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
         """Turns it back: the camera stands on the base."""
         none = torch.zeros_like(value["roll_rad"])
-        return turned(
-            turned(point_m, none, -value["pitch_rad"], none), -value["roll_rad"], none, none
+        return rotate_points(
+            rotate_points(point_m, none, -value["pitch_rad"], none), -value["roll_rad"], none, none
         )
 
 
@@ -99,28 +107,31 @@ class Extrinsics(EffectSpec):
     yaw_rad: Value
     side = "kinematics"
     stage = "perception"
-    numbers: ClassVar = {name: _shift(0.02) for name in ("x_m", "y_m", "z_m")} | {
-        name: _angle(0.01) for name in ("roll_rad", "pitch_rad", "yaw_rad")
+    numbers: ClassVar = {name: _describe_shift(0.02) for name in ("x_m", "y_m", "z_m")} | {
+        name: _describe_angle(0.01) for name in ("roll_rad", "pitch_rad", "yaw_rad")
     }
 
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
         """Turns the point about the base and displaces it."""
         shift_m = torch.cat((value["x_m"], value["y_m"], value["z_m"]), 1)
-        return turned(point_m, value["roll_rad"], value["pitch_rad"], value["yaw_rad"]) + shift_m
+        return (
+            rotate_points(point_m, value["roll_rad"], value["pitch_rad"], value["yaw_rad"])
+            + shift_m
+        )
 
 
-def turned(
+def rotate_points(
     point_m: torch.Tensor, roll_rad: torch.Tensor, pitch_rad: torch.Tensor, yaw_rad: torch.Tensor
 ) -> torch.Tensor:
     """Returns points `(N, 3)` turned about the fixed axes x, then y, then z, by angles `(N, 1)`; exact for angles of zero."""
     x, y, z = point_m.split(1, 1)
-    y, z = _turn(y, z, roll_rad)
-    z, x = _turn(z, x, pitch_rad)
-    x, y = _turn(x, y, yaw_rad)
+    y, z = _rotate_plane(y, z, roll_rad)
+    z, x = _rotate_plane(z, x, pitch_rad)
+    x, y = _rotate_plane(x, y, yaw_rad)
     return torch.cat((x, y, z), 1)
 
 
-def _turn(
+def _rotate_plane(
     a: torch.Tensor, b: torch.Tensor, angle_rad: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     cos, sin = torch.cos(angle_rad), torch.sin(angle_rad)

@@ -5,9 +5,9 @@ from dataclasses import fields, replace
 
 import torch
 
-from actuators.effects.ranges import Joints, Number, Ranges, Value
+from actuators.effects.effect import EffectSpec, MachineTensors, Memory, StepInputs, broadcast_rows
+from actuators.effects.ranges import EffectNumber, Joints, ParameterRanges, Value
 from actuators.effects.timing import DelayJitter
-from actuators.effects.wrapped import EffectSpec, Memory, Moment, Plant, per_row
 from actuators.models.parameters import OTHER, PerJoint
 from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.errors import ConfigError, list_choices
@@ -101,7 +101,7 @@ class LibraryModel:
     ) -> None:
         self.inner = inner
         given: dict[str, Value] = {}
-        numbers: dict[str, Number] = {}
+        numbers: dict[str, EffectNumber] = {}
         joints: dict[str, Joints] = {}
         for name, effect in library.effects.items():
             values = {field.name: getattr(effect, field.name) for field in fields(effect)}  # pyright: ignore[reportArgumentType]
@@ -112,7 +112,7 @@ class LibraryModel:
         chance = any(effect.stochastic for effect in effects.values())
         salt = zlib.crc32(b"library") + len(inner.state)
         where = "effect.library.effects"
-        self._ranges = Ranges(
+        self._ranges = ParameterRanges(
             given, numbers, joints, machine, num_envs, device, chance, salt, where, shares
         )
         self.parameters = self._ranges.value
@@ -139,7 +139,7 @@ class LibraryModel:
             name: effect for name, effect in effects.items() if effect.side == "measurement"
         }
         self._weighed = any(effect.weighed for effect in self._motions.values())
-        self._plant = Plant(machine, device, weighed=self._weighed)
+        self._plant = MachineTensors(machine, device, weighed=self._weighed)
         rest = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._state = {"fresh": self._fresh, "shift": rest.clone(), "valve": rest.clone()}
@@ -217,7 +217,7 @@ class LibraryModel:
 
     def measure(self, q: torch.Tensor) -> torch.Tensor:
         """Returns what the sensors say at the true positions `q`, `(N, J)`; to be called once a control period."""
-        q = getattr(self.inner, "measure", _unchanged)(q)
+        q = getattr(self.inner, "measure", _keep_unchanged)(q)
         counter = self._ranges.advance() if self._salt else None
         for name, effect in self._measured.items():
             q = effect.measured(
@@ -229,15 +229,15 @@ class LibraryModel:
         """Returns the likeliest true positions where the sensors say `q`, `(N, J)` or `(N, H, J)`."""
         for name, effect in reversed(self._measured.items()):
             q = effect.truth(q, self._value[name])
-        return getattr(self.inner, "truth", _unchanged)(q)
+        return getattr(self.inner, "truth", _keep_unchanged)(q)
 
     def tool(self, point_m: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Returns where an outside instrument finds the tool that the model has at `point_m`, `(N, 3)`: nothing here moves it."""
-        return getattr(self.inner, "tool", _unchanged)(point_m, q)
+        return getattr(self.inner, "tool", _keep_unchanged)(point_m, q)
 
     def target(self, point_m: torch.Tensor) -> torch.Tensor:
         """Returns where the camera sees a point, `(N, 3)`: nothing here moves it."""
-        return getattr(self.inner, "target", _unchanged)(point_m)
+        return getattr(self.inner, "target", _keep_unchanged)(point_m)
 
     def misplacement(self, q: torch.Tensor) -> torch.Tensor:
         """Returns how far off the controller believes a target near the tool, `(N, 3)` in m, at the positions `q`."""
@@ -252,12 +252,14 @@ class LibraryModel:
         moved: torch.Tensor,
         counter: torch.Tensor | None,
         weight: torch.Tensor | None,
-    ) -> Moment:
+    ) -> StepInputs:
         """Returns the moment as an effect sees it, with what it remembers; after a reset with what it begins with."""
         now = self._moment(name, {}, history, moved, counter, weight)
         begun = effect.begin(now)
         memory = {
-            key: torch.where(per_row(self._fresh, value), value, self._state[f"{name}.{key}"])
+            key: torch.where(
+                broadcast_rows(self._fresh, value), value, self._state[f"{name}.{key}"]
+            )
             for key, value in begun.items()
         }
         return replace(now, memory=memory)
@@ -270,9 +272,9 @@ class LibraryModel:
         moved: torch.Tensor,
         counter: torch.Tensor | None,
         weight: torch.Tensor | None,
-    ) -> Moment:
+    ) -> StepInputs:
         own = counter + self._salt[name] if counter is not None and name in self._salt else None
-        return Moment(self._value[name], memory, history, self._plant, moved, own, weight)
+        return StepInputs(self._value[name], memory, history, self._plant, moved, own, weight)
 
     def _after(self, name: str, result: tuple[torch.Tensor, Memory]) -> torch.Tensor:
         """Keeps the memory of an effect; returns what it made."""
@@ -281,5 +283,5 @@ class LibraryModel:
         return result[0]
 
 
-def _unchanged(value: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+def _keep_unchanged(value: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
     return value

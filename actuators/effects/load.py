@@ -4,8 +4,8 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.ranges import Joints, Number, Value
-from actuators.effects.wrapped import EffectSpec, Memory, Moment
+from actuators.effects.effect import EffectSpec, Memory, StepInputs
+from actuators.effects.ranges import EffectNumber, Joints, Value
 from brokk_rl.spec import spec
 
 LEAST_HEAD, MOST_HEAD = 0.05, 2.0
@@ -27,9 +27,9 @@ class LoadDependence(EffectSpec):
     sensitivity: Value
     side = "speed"
     weighed = True
-    numbers: ClassVar = {"sensitivity": Number("1", none=0.0, typical=0.5, bounds=(0.0, 1.5))}
+    numbers: ClassVar = {"sensitivity": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 1.5))}
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`moved (sqrt(1 + sensitivity sign(moved) weight / yield_force) - 1)`: the orifice equation."""
         head = 1.0 + now.value["sensitivity"] * now.moved.sign() * _weight(now)
         return now.moved * (head.clamp(LEAST_HEAD, MOST_HEAD).sqrt() - 1.0), {}
@@ -49,9 +49,11 @@ class Creep(EffectSpec):
     sink_rad_s: Value
     side = "speed"
     weighed = True
-    numbers: ClassVar = {"sink_rad_s": Number("rad/s", none=0.0, typical=0.004, bounds=(0.0, 0.1))}
+    numbers: ClassVar = {
+        "sink_rad_s": EffectNumber("rad/s", none=0.0, typical=0.004, bounds=(0.0, 0.1))
+    }
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`sink weight / yield_force period`, in the direction of the weight, moving or not."""
         return now.value["sink_rad_s"] * _weight(now) * now.plant.period_s, {}
 
@@ -68,15 +70,15 @@ class FlowSharing(EffectSpec):
     joints: Joints
     demand: Value
     side = "joints"
-    numbers: ClassVar = {"demand": Number("1", none=0.0, typical=0.7, bounds=(0.0, 2.0))}
+    numbers: ClassVar = {"demand": EffectNumber("1", none=0.0, typical=0.7, bounds=(0.0, 2.0))}
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`moved (1 / max(1, sum of demands) - 1)`: all are slowed in proportion."""
         demand = now.value["demand"]
         asked = (demand * (now.moved / now.plant.full_step).abs()).sum(1, keepdim=True)
         return now.moved * (1.0 / asked.clamp(min=1.0) - 1.0) * (demand > 0), {}
 
 
-def _weight(now: Moment) -> torch.Tensor:
+def _weight(now: StepInputs) -> torch.Tensor:
     """Returns the force with which the weight pushes each joint in its positive direction, over its yield force, `(N, J)`."""
     return now.plant.weight(now.history.q[:, -1]) if now.weight is None else now.weight

@@ -4,9 +4,9 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.ranges import CHANCE, Joints, Number, Value
-from actuators.effects.wrapped import EffectSpec
-from actuators.models import draw
+from actuators.effects.effect import EffectSpec
+from actuators.effects.ranges import CHANCE, EffectNumber, Joints, Value
+from actuators.models import random_draws
 from brokk_rl.spec import spec
 
 
@@ -24,7 +24,9 @@ class Quantisation(EffectSpec):
     side = "measurement"
     stage = "sensing"
     smooth = False
-    numbers: ClassVar = {"step_rad": Number("rad", none=0.0, typical=0.003, bounds=(0.0, 0.1))}
+    numbers: ClassVar = {
+        "step_rad": EffectNumber("rad", none=0.0, typical=0.003, bounds=(0.0, 0.1))
+    }
 
     def measured(
         self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
@@ -48,14 +50,16 @@ class SensorNoise(EffectSpec):
     side = "measurement"
     stage = "sensing"
     stochastic = True
-    numbers: ClassVar = {"sigma_rad": Number("rad", none=0.0, typical=0.002, bounds=(0.0, 0.1))}
+    numbers: ClassVar = {
+        "sigma_rad": EffectNumber("rad", none=0.0, typical=0.002, bounds=(0.0, 0.1))
+    }
 
     def measured(
         self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
     ) -> torch.Tensor:
         """`q + sigma N(0, 1)`."""
         assert counter is not None, "noise is stochastic"
-        return q + value["sigma_rad"] * draw.normal(counter, CHANCE, q.shape[1])
+        return q + value["sigma_rad"] * random_draws.draw_normal(counter, CHANCE, q.shape[1])
 
 
 @spec
@@ -71,7 +75,9 @@ class EncoderBias(EffectSpec):
     bias_rad: Value
     side = "measurement"
     stage = "sensing"
-    numbers: ClassVar = {"bias_rad": Number("rad", none=0.0, typical=0.015, bounds=(-0.3, 0.3))}
+    numbers: ClassVar = {
+        "bias_rad": EffectNumber("rad", none=0.0, typical=0.015, bounds=(-0.3, 0.3))
+    }
 
     def measured(
         self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
@@ -81,7 +87,7 @@ class EncoderBias(EffectSpec):
 
     def truth(self, q: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
         """`q - bias`."""
-        return q - _along(value["bias_rad"], q)
+        return q - _broadcast_over_history(value["bias_rad"], q)
 
 
 @spec
@@ -97,7 +103,7 @@ class EncoderScale(EffectSpec):
     scale: Value
     side = "measurement"
     stage = "sensing"
-    numbers: ClassVar = {"scale": Number("1", none=1.0, typical=1.015, bounds=(0.7, 1.4))}
+    numbers: ClassVar = {"scale": EffectNumber("1", none=1.0, typical=1.015, bounds=(0.7, 1.4))}
 
     def measured(
         self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
@@ -107,9 +113,9 @@ class EncoderScale(EffectSpec):
 
     def truth(self, q: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
         """`q / scale`."""
-        return q / _along(value["scale"], q)
+        return q / _broadcast_over_history(value["scale"], q)
 
 
-def _along(value: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+def _broadcast_over_history(value: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     """Returns parameters `(N, J)` so that they broadcast over `(N, J)` or `(N, H, J)`."""
     return value if q.dim() == 2 else value[:, None]

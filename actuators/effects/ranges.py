@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from actuators.models import draw
-from actuators.models.parameters import per_joint
+from actuators.models import random_draws
+from actuators.models.parameters import expand_per_joint
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 
@@ -26,7 +26,7 @@ PRESENT = 192
 
 
 @dataclass(frozen=True)
-class Number:
+class EffectNumber:
     """What is known about one number of an effect.
 
     Attributes:
@@ -45,7 +45,7 @@ class Number:
     per_joint: bool = True
 
 
-class Ranges:
+class ParameterRanges:
     """Parameters of one effect or of several for all environments; what is drawn is drawn in one go.
 
     Attributes:
@@ -73,7 +73,7 @@ class Ranges:
     def __init__(
         self,
         fields: Mapping[str, Value],
-        numbers: Mapping[str, Number],
+        numbers: Mapping[str, EffectNumber],
         joints: Joints | Mapping[str, Joints],
         machine: Machine,
         num_envs: int,
@@ -88,8 +88,10 @@ class Ranges:
         for column, (name, number) in enumerate(numbers.items()):
             effect, _, _ = name.rpartition(".")
             acted_on = joints[effect] if isinstance(joints, Mapping) else joints
-            chosen = _chosen(acted_on, machine, ".".join(filter(None, (where, effect, "joints"))))
-            low, high = _sides(fields[name], number, chosen, machine, f"{where}.{name}")
+            chosen = _select_joints(
+                acted_on, machine, ".".join(filter(None, (where, effect, "joints")))
+            )
+            low, high = _resolve_range(fields[name], number, chosen, machine, f"{where}.{name}")
             neutral = low if number.none is None else np.full_like(low, number.none)
             if (low < high).any() or (shares.get(effect, 1.0) < 1 and (low != neutral).any()):
                 drawn[name] = _Column(
@@ -101,7 +103,9 @@ class Ranges:
                     .expand(num_envs, -1)
                     .clone()
                 )
-        self._draw = draw.counter(num_envs, salt, device) if stochastic or drawn else None
+        self._draw = (
+            random_draws.start_counter(num_envs, salt, device) if stochastic or drawn else None
+        )
         self.state = {} if self._draw is None else {"draw": self._draw}
         self._drawn = _Drawn(list(drawn.values()), shares, device) if drawn else None
         if self._drawn is not None:
@@ -166,15 +170,16 @@ class _Drawn:
         """Returns fresh values, `(N, W)`, for the counter `(N,)`."""
         counter = counter[:, None] * 65_536
         value = torch.minimum(
-            self.low + (self.high - self.low) * draw.hashed(counter + self._key), self.high
+            self.low + (self.high - self.low) * random_draws.hash_uniform(counter + self._key),
+            self.high,
         )
         if not self._some:
             return value
-        there = draw.hashed(counter + self._share_key) < self._share
+        there = random_draws.hash_uniform(counter + self._share_key) < self._share
         return torch.where(there.index_select(1, self._effect), value, self._none)
 
 
-def _chosen(joints: Joints, machine: Machine, where: str) -> np.ndarray:
+def _select_joints(joints: Joints, machine: Machine, where: str) -> np.ndarray:
     """Returns which joints an effect acts on, `(J,)` bool."""
     if joints == "all":
         return np.ones(machine.num_joints, dtype=bool)
@@ -186,8 +191,8 @@ def _chosen(joints: Joints, machine: Machine, where: str) -> np.ndarray:
     return np.array([name in joints for name in machine.joint_names])
 
 
-def _sides(
-    value: Value, number: Number, chosen: np.ndarray, machine: Machine, where: str
+def _resolve_range(
+    value: Value, number: EffectNumber, chosen: np.ndarray, machine: Machine, where: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the lower and upper ends of a number, each `(J,)`, or `(1,)` for one that joints do not have."""
     if not number.per_joint:
@@ -195,11 +200,13 @@ def _sides(
             raise ConfigError(
                 f"{where}: expected a number or a range [low, high], got {dict(value)}: joints do not differ in it"
             )
-        ends = tuple(np.array([side]) for side in _ends(value))
+        ends = tuple(np.array([side]) for side in _as_range(value))
     else:
         tables = value if isinstance(value, Mapping) else {"other": value}
         ends = tuple(
-            per_joint({name: _ends(v)[side] for name, v in tables.items()}, machine, where)
+            expand_per_joint(
+                {name: _as_range(v)[side] for name, v in tables.items()}, machine, where
+            )
             for side in (0, 1)
         )
         if number.none is not None:
@@ -216,5 +223,5 @@ def _sides(
     return low, high
 
 
-def _ends(value: float | tuple[float, float]) -> tuple[float, float]:
+def _as_range(value: float | tuple[float, float]) -> tuple[float, float]:
     return value if isinstance(value, tuple) else (value, value)

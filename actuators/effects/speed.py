@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.ranges import Joints, Number, Value
-from actuators.effects.wrapped import EffectSpec, Memory, Moment
+from actuators.effects.effect import EffectSpec, Memory, StepInputs
+from actuators.effects.ranges import EffectNumber, Joints, Value
 from brokk_rl.spec import spec
 
 
@@ -22,9 +22,9 @@ class FlowGain(EffectSpec):
     joints: Joints
     gain: Value
     side = "speed"
-    numbers: ClassVar = {"gain": Number("1", none=1.0, typical=0.85, bounds=(0.1, 3.0))}
+    numbers: ClassVar = {"gain": EffectNumber("1", none=1.0, typical=0.85, bounds=(0.1, 3.0))}
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`(gain - 1) moved`."""
         return (now.value["gain"] - 1.0) * now.moved, {}
 
@@ -44,11 +44,11 @@ class Asymmetry(EffectSpec):
     retract_gain: Value
     side = "speed"
     numbers: ClassVar = {
-        "extend_gain": Number("1", none=1.0, typical=0.8, bounds=(0.1, 3.0)),
-        "retract_gain": Number("1", none=1.0, typical=0.8, bounds=(0.1, 3.0)),
+        "extend_gain": EffectNumber("1", none=1.0, typical=0.8, bounds=(0.1, 3.0)),
+        "retract_gain": EffectNumber("1", none=1.0, typical=0.8, bounds=(0.1, 3.0)),
     }
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`(gain of the direction - 1) moved`."""
         gain = torch.where(now.moved > 0, now.value["extend_gain"], now.value["retract_gain"])
         return (gain - 1.0) * now.moved, {}
@@ -66,13 +66,15 @@ class Lag(EffectSpec):
     joints: Joints
     time_constant_s: Value
     side = "speed"
-    numbers: ClassVar = {"time_constant_s": Number("s", none=0.0, typical=0.12, bounds=(0.0, 2.0))}
+    numbers: ClassVar = {
+        "time_constant_s": EffectNumber("s", none=0.0, typical=0.12, bounds=(0.0, 2.0))
+    }
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """The joint goes on as fast as it moved last."""
-        return {"speed": last_step(now)}
+        return {"speed": measure_last_step(now)}
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """Exact solution of `time_constant v' + v = v_inner` over the period; `speed` is way in one period."""
         periods = now.value["time_constant_s"] / now.plant.period_s
         decay, behind = torch.exp(-1.0 / periods.clamp(min=1e-6)), now.memory["speed"] - now.moved
@@ -91,14 +93,14 @@ class Backlash(EffectSpec):
     joints: Joints
     gap_rad: Value
     side = "speed"
-    numbers: ClassVar = {"gap_rad": Number("rad", none=0.0, typical=0.01, bounds=(0.0, 0.2))}
+    numbers: ClassVar = {"gap_rad": EffectNumber("rad", none=0.0, typical=0.01, bounds=(0.0, 0.2))}
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """A moving joint lies against the side towards which it moves, a resting one in the middle."""
         q = now.history.q
         return {"slack": 0.5 * now.value["gap_rad"] * (1.0 - (q[:, -1] - q[:, 0]).sign())}
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`slack` is the way to go in the positive direction before the joint follows."""
         before = torch.minimum(now.memory["slack"], now.value["gap_rad"])
         slack = torch.minimum((before - now.moved).clamp(min=0.0), now.value["gap_rad"])
@@ -120,16 +122,20 @@ class Compliance(EffectSpec):
     damping: Value
     side = "speed"
     numbers: ClassVar = {
-        "ringing_s": Number("s", none=0.0, typical=0.3, bounds=(0.0, 2.0)),
-        "damping": Number("1", none=None, typical=0.12, bounds=(0.02, 0.95)),
+        "ringing_s": EffectNumber("s", none=0.0, typical=0.3, bounds=(0.0, 2.0)),
+        "damping": EffectNumber("1", none=None, typical=0.12, bounds=(0.02, 0.95)),
     }
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """The joint moves steadily."""
         still = torch.zeros_like(now.moved)
-        return {"deflection": still, "rate": still, "speed": last_step(now) / now.plant.period_s}
+        return {
+            "deflection": still,
+            "rate": still,
+            "speed": measure_last_step(now) / now.plant.period_s,
+        }
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`d'' + 2 damping w d' + w^2 d = -v'`, where the inner speed `v` changes at the beginning of each period; exact."""
         period_s, damping = now.plant.period_s, now.value["damping"]
         w = (
@@ -167,16 +173,16 @@ class ThermalDrift(EffectSpec):
     running = "elapsed_s"
     shared = True
     numbers: ClassVar = {
-        "change": Number("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
-        "time_s": Number("s", none=None, typical=1200.0, bounds=(1.0, 36_000.0)),
-        "elapsed_s": Number("s", none=None, typical=0.0, bounds=(0.0, 360_000.0)),
+        "change": EffectNumber("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
+        "time_s": EffectNumber("s", none=None, typical=1200.0, bounds=(1.0, 36_000.0)),
+        "elapsed_s": EffectNumber("s", none=None, typical=0.0, bounds=(0.0, 360_000.0)),
     }
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """The clock starts."""
         return {"running_s": torch.zeros_like(now.moved)}
 
-    def extra(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`change (1 - exp(-t / time)) moved`, `t` at the middle of the period."""
         running_s, period_s = now.memory["running_s"], now.plant.period_s
         t_s = now.value["elapsed_s"] + running_s + 0.5 * period_s
@@ -184,6 +190,6 @@ class ThermalDrift(EffectSpec):
         return now.value["change"] * warm * now.moved, {"running_s": running_s + period_s}
 
 
-def last_step(now: Moment) -> torch.Tensor:
+def measure_last_step(now: StepInputs) -> torch.Tensor:
     """Returns how far the joints moved in the last period, `(N, J)`."""
     return now.history.q[:, -1] - now.history.q[:, -2]

@@ -4,8 +4,8 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.ranges import Joints, Number, Value
-from actuators.effects.wrapped import EffectSpec, Memory, Moment
+from actuators.effects.effect import EffectSpec, Memory, StepInputs
+from actuators.effects.ranges import EffectNumber, Joints, Value
 from brokk_rl.spec import spec
 
 
@@ -21,15 +21,15 @@ class _Delayed(EffectSpec):
     stage = "timing"
     delays = True
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """Before the history the command was what it is at its beginning."""
         u = now.history.u
         return {"older": u[:, :1].expand(-1, u.shape[1] - 1, -1)}
 
-    def _shifted(self, now: Moment, shift_s: torch.Tensor) -> tuple[torch.Tensor, Memory]:
+    def _shifted(self, now: StepInputs, shift_s: torch.Tensor) -> tuple[torch.Tensor, Memory]:
         u = now.history.u
         known = torch.cat((now.memory["older"], u), 1)
-        return _late(known, shift_s / now.plant.period_s, u.shape[1]), {
+        return _delay_commands(known, shift_s / now.plant.period_s, u.shape[1]), {
             "older": known[:, 1 : u.shape[1]]
         }
 
@@ -46,9 +46,11 @@ class DeadTime(_Delayed):
 
     joints: Joints
     dead_time_s: Value
-    numbers: ClassVar = {"dead_time_s": Number("s", none=0.0, typical=0.1, bounds=(-0.3, 0.5))}
+    numbers: ClassVar = {
+        "dead_time_s": EffectNumber("s", none=0.0, typical=0.1, bounds=(-0.3, 0.5))
+    }
 
-    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`u(t - dead_time)`."""
         return self._shifted(now, now.value["dead_time_s"])
 
@@ -68,9 +70,9 @@ class ClockOffset(_Delayed):
     joints: Joints
     offset_s: Value
     shared = True
-    numbers: ClassVar = {"offset_s": Number("s", none=0.0, typical=0.05, bounds=(-0.3, 0.3))}
+    numbers: ClassVar = {"offset_s": EffectNumber("s", none=0.0, typical=0.05, bounds=(-0.3, 0.3))}
 
-    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`u(t - offset)`."""
         return self._shifted(now, now.value["offset_s"])
 
@@ -90,20 +92,20 @@ class DelayJitter(EffectSpec):
     stage = "timing"
     stochastic = True
     shared = True
-    numbers: ClassVar = {"jitter_s": Number("s", none=0.0, typical=0.03, bounds=(0.0, 0.5))}
+    numbers: ClassVar = {"jitter_s": EffectNumber("s", none=0.0, typical=0.03, bounds=(0.0, 0.5))}
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """Frames have been in time."""
         return {"sent": now.history.u[:, :-1], "delay": torch.zeros_like(now.moved)}
 
-    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`u(t - delay)`, in which the delay grows by no more than one period a period."""
         u = now.history.u
         delay = torch.minimum(
             now.value["jitter_s"] / now.plant.period_s * now.chance, now.memory["delay"] + 1.0
         )
-        newest = _late(u, delay, 1)[:, 0]
-        sent, memory = with_newest(now, newest)
+        newest = _delay_commands(u, delay, 1)[:, 0]
+        sent, memory = append_command(now, newest)
         return sent, memory | {"delay": delay}
 
 
@@ -123,25 +125,29 @@ class FrameLoss(EffectSpec):
     stochastic = True
     smooth = False
     shared = True
-    numbers: ClassVar = {"probability": Number("1", none=0.0, typical=0.02, bounds=(0.0, 0.95))}
+    numbers: ClassVar = {
+        "probability": EffectNumber("1", none=0.0, typical=0.02, bounds=(0.0, 0.95))
+    }
 
-    def begin(self, now: Moment) -> Memory:
+    def begin(self, now: StepInputs) -> Memory:
         """All frames have arrived."""
         return {"sent": now.history.u[:, :-1]}
 
-    def commands(self, now: Moment) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """The newest command, or where it is lost the one before as the valve saw it."""
         lost = now.chance < now.value["probability"]
-        return with_newest(now, torch.where(lost, now.memory["sent"][:, -1], now.history.u[:, -1]))
+        return append_command(
+            now, torch.where(lost, now.memory["sent"][:, -1], now.history.u[:, -1])
+        )
 
 
-def with_newest(now: Moment, newest: torch.Tensor) -> tuple[torch.Tensor, Memory]:
+def append_command(now: StepInputs, newest: torch.Tensor) -> tuple[torch.Tensor, Memory]:
     """Returns what the inner model has seen so far, `sent` of the memory, with `newest`, `(N, J)`, behind it; and the memory."""
     u = torch.cat((now.memory["sent"], newest[:, None]), 1)
     return u, {"sent": u[:, 1:]}
 
 
-def _late(u: torch.Tensor, periods: torch.Tensor, count: int) -> torch.Tensor:
+def _delay_commands(u: torch.Tensor, periods: torch.Tensor, count: int) -> torch.Tensor:
     """Returns the newest `count` of commands `(N, T, J)` as they are `periods`, `(N, J)`, later; held beyond both ends."""
     last = u.shape[1] - 1
     # half a millionth of a period forgives 0.15 / 0.05 = 2.9999998

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from actuators.excite.poses import poses
+from actuators.excite.poses import draw_start_poses
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
@@ -69,7 +69,7 @@ class Levels:
         """Returns segments of about `pose_s` each, which fill the time."""
         total = max(1, int(duration_s / machine.period_s))
         count = min(max(1, round(duration_s / self.pose_s)), total)
-        starts = poses(machine, self.stop_margin, generator)
+        starts = draw_start_poses(machine, self.stop_margin, generator)
         return [
             Segment(
                 name=f"levels_{i:02d}",

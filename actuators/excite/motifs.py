@@ -6,7 +6,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import ArrayLike
 
-from actuators.excite.poses import poses
+from actuators.excite.poses import draw_start_poses
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -37,13 +37,13 @@ class Motif:
         before: Sequence[Segment],
     ) -> list[Segment]:
         """Returns as many segments as fit into `duration_s`."""
-        return filled(
+        return fill_duration(
             type(self).__name__.lower(), self._candidates(machine, generator), duration_s, machine
         )
 
     def _candidates(self, machine: Machine, generator: np.random.Generator) -> Iterator[Segment]:
         number = count()
-        for start in poses(machine, self.stop_margin, generator):
+        for start in draw_start_poses(machine, self.stop_margin, generator):
             found = self.programs(machine, generator)
             for i in generator.permutation(len(found)):
                 name, u = found[i]
@@ -52,7 +52,7 @@ class Motif:
                 )  # fmt: skip
 
 
-def filled(
+def fill_duration(
     name: str, candidates: Iterable[Segment], duration_s: float, machine: Machine
 ) -> list[Segment]:
     """Returns segments as long as they fit into `duration_s`.
@@ -74,7 +74,7 @@ def filled(
     return found
 
 
-def for_each_joint(
+def build_joint_programs(
     name: str, machine: Machine, program: Callable[[int], np.ndarray]
 ) -> list[tuple[str, np.ndarray]]:
     """Returns name and `(T, J)` of `program(joint)`, `(T,)`, for each joint, the others at rest."""
@@ -87,7 +87,7 @@ def for_each_joint(
     return found
 
 
-def held(levels: ArrayLike, holds_s: ArrayLike, period_s: float) -> np.ndarray:
+def hold_levels(levels: ArrayLike, holds_s: ArrayLike, period_s: float) -> np.ndarray:
     """Returns each level held for its time, `(T,)`."""
     return np.repeat(
         np.asarray(levels, dtype=float),
@@ -143,7 +143,7 @@ class Ramps(Motif):
         return [
             found
             for slope_per_s in self.slopes_per_s
-            for found in for_each_joint("ramps", machine, ramp(slope_per_s))
+            for found in build_joint_programs("ramps", machine, ramp(slope_per_s))
         ]
 
 
@@ -197,13 +197,13 @@ class Reversals(Motif):
         parts = []
         for level in self.levels:
             for hold_s in self.holds_s:
-                cycle = held([level, -level], [hold_s, hold_s], machine.period_s)
+                cycle = hold_levels([level, -level], [hold_s, hold_s], machine.period_s)
                 parts += [
                     np.tile(cycle, self.num_cycles),
-                    held([0.0], [self.pause_s], machine.period_s),
+                    hold_levels([0.0], [self.pause_s], machine.period_s),
                 ]
         commands = np.concatenate(parts)
-        return for_each_joint("reversals", machine, lambda joint: commands)
+        return build_joint_programs("reversals", machine, lambda joint: commands)
 
 
 @spec
@@ -250,8 +250,8 @@ class Staircase(Motif):
                 / stairs
             )
             holds_s = np.minimum(self.hold_s, way_s)
-            return held(
+            return hold_levels(
                 np.stack([stairs, -stairs], 1).ravel(), np.repeat(holds_s, 2), machine.period_s
             )
 
-        return for_each_joint("staircase", machine, program)
+        return build_joint_programs("staircase", machine, program)

@@ -15,7 +15,9 @@ NUM_CANDIDATES = 128
 """Random poses among which the next one is chosen."""
 
 
-def poses(machine: Machine, margin: float, generator: np.random.Generator) -> Iterator[np.ndarray]:
+def draw_start_poses(
+    machine: Machine, margin: float, generator: np.random.Generator
+) -> Iterator[np.ndarray]:
     """Yields start poses `(J,)` without end, each the one of many random ones whose load best opposes the sum of those before.
 
     So the weight on each joint takes both signs, in turn, where it can. Where masses are not known
@@ -37,7 +39,7 @@ def poses(machine: Machine, margin: float, generator: np.random.Generator) -> It
         if not machine.has_bodies:
             yield candidates[0]
             continue
-        pull = load(machine, candidates)
+        pull = compute_load(machine, candidates)
         pull /= np.maximum(np.abs(pull).max(0), 1e-9)
         heavy = np.abs(pull).sum(1)
         best = (
@@ -49,7 +51,7 @@ def poses(machine: Machine, margin: float, generator: np.random.Generator) -> It
         yield candidates[best]
 
 
-def load(machine: Machine, q: np.ndarray) -> np.ndarray:
+def compute_load(machine: Machine, q: np.ndarray) -> np.ndarray:
     """Returns the force with which gravity pushes each joint in its positive direction at `q`, `(N, J)`: Nm or N, shape of `q`.
 
     The slope of the potential energy of a machine that stands level, by central differences.
@@ -60,13 +62,13 @@ def load(machine: Machine, q: np.ndarray) -> np.ndarray:
     step = 1e-5
     shifts = step * np.eye(machine.num_joints)
     down, up = (
-        _potential_j(machine, (q[:, None] + side * shifts).reshape(-1, machine.num_joints))
+        _compute_potential_j(machine, (q[:, None] + side * shifts).reshape(-1, machine.num_joints))
         for side in (-1.0, 1.0)
     )
     return ((down - up) / (2.0 * step)).reshape(q.shape)
 
 
-def _potential_j(machine: Machine, q: np.ndarray) -> np.ndarray:
+def _compute_potential_j(machine: Machine, q: np.ndarray) -> np.ndarray:
     """Returns the potential energy at `q`, `(N, J)`: J, `(N,)`."""
     rotation, origin_m, energy_j = (
         np.broadcast_to(np.eye(3), (len(q), 3, 3)),

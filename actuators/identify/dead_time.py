@@ -12,7 +12,7 @@ import numpy as np
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.split import by_run
+from brokk_rl.split import group_by_run
 
 KNOTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7)
 """Commands at which the static curve bends, on either side."""
@@ -31,7 +31,7 @@ MIN_MOVING = 100
 
 
 @dataclass(frozen=True)
-class Delay:
+class DeadTimeEstimate:
     """A dead time with its interval.
 
     Attributes:
@@ -54,9 +54,9 @@ class Delay:
         return self.value_s < float(self.tried_s[-1]) - RESOLUTION_S / 2
 
 
-def delays(
+def estimate_dead_times(
     recordings: Sequence[Recording], machine: Machine, generator: np.random.Generator
-) -> dict[str, Delay | None]:
+) -> dict[str, DeadTimeEstimate | None]:
     """Returns the dead time of each joint; `None` for a joint that is hardly commanded.
 
     Raises:
@@ -67,18 +67,18 @@ def delays(
         raise RecordingError(f"too little data: no recording is longer than {2.0 * LONGEST_S:g} s")
     grid_s = np.arange(0.0, LONGEST_S + 1e-9, RESOLUTION_S)
     return {
-        name: _delay(usable, joint, grid_s, machine, generator)
+        name: _estimate_dead_time(usable, joint, grid_s, machine, generator)
         for joint, name in enumerate(machine.joint_names)
     }
 
 
-def _delay(
+def _estimate_dead_time(
     recordings: Sequence[Recording],
     joint: int,
     grid_s: np.ndarray,
     machine: Machine,
     generator: np.random.Generator,
-) -> Delay | None:
+) -> DeadTimeEstimate | None:
     moving = [
         recording for recording in recordings if (np.abs(recording.u[:, joint]) > KNOTS[1]).any()
     ]
@@ -87,21 +87,24 @@ def _delay(
         < MIN_MOVING
     ):
         return None
-    runs = by_run(moving).values()
+    runs = group_by_run(moving).values()
     moments = np.stack(
-        [np.sum([_moments(part, joint, grid_s, machine) for part in parts], 0) for parts in runs]
+        [
+            np.sum([_compute_moments(part, joint, grid_s, machine) for part in parts], 0)
+            for parts in runs
+        ]
     )  # (R, D, F + 1, F + 1)
-    value = _best(moments.sum(0))
+    value = _find_best_delay(moments.sum(0))
     picks = (generator.integers(len(moments), size=len(moments)) for _ in range(RESAMPLED))
-    again = grid_s[[_best(moments[pick].sum(0)) for pick in picks]]
+    again = grid_s[[_find_best_delay(moments[pick].sum(0)) for pick in picks]]
     low, high = np.percentile(again, (2.5, 97.5))
     total = moments.sum(0)
-    left = _residual(total) / total[:, -1, -1]
+    left = _compute_residual(total) / total[:, -1, -1]
     interval = (
         max(0.0, min(low, grid_s[value] - RESOLUTION_S / 2)),
         max(high, grid_s[value] + RESOLUTION_S / 2),
     )
-    return Delay(
+    return DeadTimeEstimate(
         float(grid_s[value]),
         (float(interval[0]), float(interval[1])),
         float(1.0 - left[value]),
@@ -110,7 +113,9 @@ def _delay(
     )
 
 
-def _moments(recording: Recording, joint: int, grid_s: np.ndarray, machine: Machine) -> np.ndarray:
+def _compute_moments(
+    recording: Recording, joint: int, grid_s: np.ndarray, machine: Machine
+) -> np.ndarray:
     """Returns, for each delay, the sums of products of the curve's features and the increment, shape `(D, F + 1, F + 1)`."""
     u, q = recording.u[:, joint].astype(np.float64), recording.q[:, joint].astype(np.float64)
     knots, reach = np.array(KNOTS), int(LONGEST_S / machine.period_s) + 1
@@ -137,7 +142,7 @@ def _moments(recording: Recording, joint: int, grid_s: np.ndarray, machine: Mach
     return np.stack(found)
 
 
-def _residual(moments: np.ndarray) -> np.ndarray:
+def _compute_residual(moments: np.ndarray) -> np.ndarray:
     """Returns the sum of squares that the best curve leaves, for each delay, shape `(D,)`."""
     gram, cross, total = moments[:, :-1, :-1], moments[:, :-1, -1], moments[:, -1, -1]
     ridge = 1e-6 * np.trace(gram, axis1=1, axis2=2)[:, None, None] / gram.shape[1] + 1e-12
@@ -145,5 +150,5 @@ def _residual(moments: np.ndarray) -> np.ndarray:
     return total - 2.0 * (weight * cross).sum(1) + np.einsum("di,dij,dj->d", weight, gram, weight)
 
 
-def _best(moments: np.ndarray) -> int:
-    return int(np.argmin(_residual(moments)))
+def _find_best_delay(moments: np.ndarray) -> int:
+    return int(np.argmin(_compute_residual(moments)))

@@ -32,7 +32,7 @@ DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Levenberg-Marquardt dampings tried side by side, relative to the diagonal."""
 
 
-class Parametric(ActuatorModel, Protocol):
+class ParametricModel(ActuatorModel, Protocol):
     """An actuator model whose numbers can be set environment by environment."""
 
     parameters: dict[str, torch.Tensor]
@@ -50,7 +50,7 @@ class _Candidates:
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
         """Returns the model with the numbers written into it."""
         model = self.actuator.build(machine, num_envs, device)
-        parameters = parameters_of(model, self.names)
+        parameters = get_parameters(model, self.names)
         for p, name in enumerate(self.names):
             parameters[name].copy_(
                 torch.as_tensor(self.values[:, p], dtype=torch.float32, device=device)
@@ -58,7 +58,7 @@ class _Candidates:
         return model
 
 
-def parameters_of(model: ActuatorModel, names: tuple[str, ...]) -> dict[str, torch.Tensor]:
+def get_parameters(model: ActuatorModel, names: tuple[str, ...]) -> dict[str, torch.Tensor]:
     """Returns the numbers that can be set.
 
     Raises:
@@ -77,7 +77,7 @@ def parameters_of(model: ActuatorModel, names: tuple[str, ...]) -> dict[str, tor
     return parameters
 
 
-class FreeRuns:
+class CandidateRuns:
     """Errors of free runs as a function of the free numbers.
 
     Args:
@@ -97,7 +97,7 @@ class FreeRuns:
         free: Mapping[str, tuple[float, float]],
         coupled: bool,
         machine: Machine,
-        cut: open_loop.Windows,
+        cut: open_loop.FreeRunWindows,
         active: np.ndarray,
         device: torch.device,
     ) -> None:
@@ -131,7 +131,7 @@ class FreeRuns:
             rows = window[start : start + WORLDS]
             part = replace(self.cut, u=self.cut.u[rows], q=self.cut.q[rows], run=self.cut.run[rows])
             values = self.values(x[start : start + WORLDS])
-            path = open_loop.free_run(
+            path = open_loop.roll_out(
                 _Candidates(self._actuator, self.names, values), self._machine, part, self._device
             )
             scaled = (path - part.measured) / np.sqrt(self._ahead * len(self._ahead))
@@ -197,7 +197,7 @@ class FreeRuns:
 
 
 @dataclass(frozen=True)
-class Loss:
+class SoftL1Loss:
     """Soft-L1 loss of each window's mean square, so that a stop that was hit or a frame that was lost pulls no more than its size.
 
     Attributes:
@@ -207,7 +207,7 @@ class Loss:
     scale: np.ndarray
 
     @classmethod
-    def around(cls, squares: np.ndarray, active: np.ndarray, robust: float) -> "Loss":
+    def around(cls, squares: np.ndarray, active: np.ndarray, robust: float) -> "SoftL1Loss":
         """Returns the loss whose scale is `robust` times the typical (median) error of the active windows, `squares` `(W, J)`."""
         typical = [
             np.median(column[rows]) if rows.any() else 0.0
@@ -224,14 +224,14 @@ class Loss:
         return 2.0 * (np.sqrt(1.0 + squares / self.scale) - 1.0).sum(-2)
 
 
-def improve(runs: FreeRuns, x: np.ndarray, robust: float) -> tuple[np.ndarray, float]:
+def take_step(runs: CandidateRuns, x: np.ndarray, robust: float) -> tuple[np.ndarray, float]:
     """Returns the best of some damped Gauss-Newton steps from `x` `(P, J)`, and by how much, relative, the loss fell.
 
     Each joint takes its own best step where joints do not influence each other.
     """
     error, slopes = runs.jacobian(x)
     squares = np.square(error, dtype=np.float64).sum(1)
-    loss = Loss.around(squares, runs.active, robust)
+    loss = SoftL1Loss.around(squares, runs.active, robust)
     root = np.sqrt(loss.weights(squares))[:, None, :]
     flat = (slopes * root[..., None]).reshape(-1, x.size).astype(np.float64)
     gradient, curvature = flat.T @ (error * root).reshape(-1), flat.T @ flat
@@ -252,7 +252,7 @@ def improve(runs: FreeRuns, x: np.ndarray, robust: float) -> tuple[np.ndarray, f
 
 
 @dataclass(frozen=True)
-class Certainty:
+class ParameterUncertainty:
     """How well the recordings determine the numbers, in units of their ranges.
 
     Attributes:
@@ -268,7 +268,7 @@ class Certainty:
     runs: np.ndarray
 
 
-def certainty(runs: FreeRuns, x: np.ndarray, robust: float) -> Certainty:
+def estimate_uncertainty(runs: CandidateRuns, x: np.ndarray, robust: float) -> ParameterUncertainty:
     """Returns standard errors by the sandwich of whole runs, whose windows are not independent, at the fitted `x` `(P, J)`.
 
     The errors of a model that is not quite right are no white noise: the spread of the runs' own
@@ -278,7 +278,7 @@ def certainty(runs: FreeRuns, x: np.ndarray, robust: float) -> Certainty:
     """
     error, slopes = runs.jacobian(x, SECANT)
     squares = np.square(error, dtype=np.float64).sum(1)
-    weights = Loss.around(squares, runs.active, robust).weights(squares)
+    weights = SoftL1Loss.around(squares, runs.active, robust).weights(squares)
     flat = slopes.astype(np.float64)
     scores = np.einsum("wkjd,wkj,wj->wd", flat, error, weights, optimize=True)
     root = (flat * np.sqrt(weights)[:, None, :, None]).reshape(-1, x.size)
@@ -293,4 +293,6 @@ def certainty(runs: FreeRuns, x: np.ndarray, robust: float) -> Certainty:
     deviation = np.sqrt(np.maximum(np.diag(sandwich), np.diag(inverse))).reshape(x.shape)
     spread = np.sqrt(np.diag(inverse))
     quantile = stats.t.ppf(0.5 + CONFIDENCE / 2, np.maximum(1, count - 1))
-    return Certainty(deviation, deviation * quantile, inverse / np.outer(spread, spread), count)
+    return ParameterUncertainty(
+        deviation, deviation * quantile, inverse / np.outer(spread, spread), count
+    )

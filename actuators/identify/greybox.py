@@ -1,4 +1,4 @@
-"""Grey boxes: the physical numbers of an actuator model, fitted to recordings by free runs, with intervals."""
+"""What a grey-box fit leaves: its numbers with intervals, what the recordings do not tell, and a config option to run it again."""
 
 import dataclasses
 import hashlib
@@ -12,12 +12,18 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from rich.progress import Progress
 from scipy.stats import qmc
 
-from actuators.identify import parameter_report
-from actuators.identify.dataset import COMMANDED
-from actuators.identify.gauss_newton import FreeRuns, certainty, improve, parameters_of
+from actuators.identify.gauss_newton import (
+    CandidateRuns,
+    ParameterUncertainty,
+    estimate_uncertainty,
+    get_parameters,
+    take_step,
+)
+from actuators.identify.training_data import COMMANDED
 from brokk_rl import open_loop, record
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
@@ -27,6 +33,105 @@ from brokk_rl.session import write_json, write_text
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
+
+
+TOLD = 0.5
+"""A number whose interval is wider than this part of its range is one that the recordings do not
+tell."""
+TANGLED = 0.95
+"""Correlation from which on two numbers stand for each other."""
+
+
+def tabulate_parameters(
+    found: dict[str, dict[str, float]],
+    runs: CandidateRuns,
+    x: np.ndarray,
+    sure: ParameterUncertainty,
+) -> dict[str, Any]:
+    """Returns each number `found` by name and joint with its standard error, its interval, and whether the recordings tell it."""
+    low, high = (
+        runs.values(np.clip(x - sure.half, 0.0, 1.0)),
+        runs.values(np.clip(x + sure.half, 0.0, 1.0)),
+    )
+    width = runs.values(np.ones_like(x)) - runs.values(np.zeros_like(x))
+    return {
+        name: {
+            joint: {
+                "value": value,
+                "standard_error": float(sure.deviation[p, j] * width[p, j]),
+                "ci95": [float(low[p, j]), float(high[p, j])],
+                "told": bool(2.0 * sure.half[p, j] <= TOLD),
+                "at_bound": bool(x[p, j] <= 0.0 or x[p, j] >= 1.0),
+                "runs": int(sure.runs[j]),
+            }
+            for j, (joint, value) in enumerate(row.items())
+        }
+        for p, (name, row) in enumerate(found.items())
+    }
+
+
+def find_correlated_pairs(
+    machine: Machine, runs: CandidateRuns, sure: ParameterUncertainty
+) -> list[dict[str, Any]]:
+    """Returns the pairs of numbers that stand for each other: their correlation exceeds `TANGLED`."""
+    labels = [f"{name} {joint}" for name in runs.names for joint in machine.joint_names]
+    pairs = np.argwhere(np.triu(np.abs(sure.correlation), 1) > TANGLED)
+    return [
+        {"pair": [labels[a], labels[b]], "correlation": round(float(sure.correlation[a, b]), 3)}
+        for a, b in pairs
+    ]
+
+
+def format_option(fitted: Any, facts: dict[str, Any]) -> str:
+    """Returns the text of a config option of the group `actuator`."""
+    kind = type(fitted)
+    node = {"_target_": f"{kind.__module__}.{kind.__qualname__}", **dataclasses.asdict(fitted)}
+    lines = [
+        f"# {kind.__name__} fitted to {facts['recordings']} recordings ({facts['runs']} runs, {facts['minutes']:g} min) of machine "
+        f"'{facts['machine']}', {facts['created']}.",
+        "# Use: actuator=@<this file>. A number that the recordings do not tell has its whole range as interval.",
+        f"# Error of free runs of {facts['horizon_s']:g} s on the validation recordings, at their end, rad or m: "
+        + ", ".join(
+            f"{joint} {'-' if value is None else f'{value:.4f}'}"
+            for joint, value in facts["validation_rmse"].items()
+        ),
+        "# 95 % intervals:",
+    ]
+    for name, row in facts["parameters"].items():
+        cells = [
+            f"{joint} {cell['ci95'][0]:.4g} to {cell['ci95'][1]:.4g}{'' if cell['told'] else ' (not told)'}"
+            for joint, cell in row.items()
+        ]
+        lines.append(f"#   {name}: {', '.join(cells)}")
+    return (
+        "\n".join(lines)
+        + "\n"
+        + yaml.safe_dump(node, sort_keys=False, default_flow_style=None, width=132)
+    )
+
+
+def log_undetermined(facts: dict[str, Any]) -> None:
+    """Logs what the recordings do not determine."""
+    for name, row in facts["parameters"].items():
+        if vague := [joint for joint, cell in row.items() if not cell["told"]]:
+            log.warning(
+                "%s: the recordings do not tell it for %s (interval over half of fit.free.%s)",
+                name,
+                ", ".join(vague),
+                name,
+            )
+        if stuck := [joint for joint, cell in row.items() if cell["at_bound"]]:
+            log.warning(
+                "%s: at the end of fit.free.%s for %s; widen it if that makes sense",
+                name,
+                name,
+                ", ".join(stuck),
+            )
+    for pair in facts["tangled"]:
+        log.warning(
+            "%s and %s stand for each other (correlation %.2f)", *pair["pair"], pair["correlation"]
+        )
+
 
 ACTIVE_SHARE = 0.1
 """A window says something about a joint that is commanded for so much of it."""
@@ -127,9 +232,9 @@ class GreyBoxFit:
             )
         held = self._free_runs(machine, validation, self.validation_windows, random, device)
         place = folder / f"{self.name}.progress.json"
-        search = _Search(self, runs, place, _digest(self, machine, runs, held, seed))
+        search = _Search(self, runs, place, _hash_fit(self, machine, runs, held, seed))
         x = search.choose(search.run(nominal, seed), held)
-        sure = certainty(runs, x, self.robust)
+        sure = estimate_uncertainty(runs, x, self.robust)
         found = self._rounded(machine, runs, x)
         fitted: Any = dataclasses.replace(self.actuator, **found)  # pyright: ignore[reportArgumentType, reportCallIssue]
         facts = {
@@ -142,25 +247,25 @@ class GreyBoxFit:
             "horizon_s": self.horizon_s,
             "validation_rmse": dict(zip(machine.joint_names, held.end_rmse(x), strict=True)),
             "seconds": round(search.before_s + time.monotonic() - began, 1),
-            "created": record.now(),
-            "parameters": parameter_report.table(found, runs, x, sure),
-            "tangled": parameter_report.tangled(machine, runs, sure),
+            "created": record.format_now(),
+            "parameters": tabulate_parameters(found, runs, x, sure),
+            "tangled": find_correlated_pairs(machine, runs, sure),
         }
         try:
             write_json(folder / f"{self.name}.json", facts)
-            write_text(folder / f"{self.name}.yaml", parameter_report.option(fitted, facts))
+            write_text(folder / f"{self.name}.yaml", format_option(fitted, facts))
             place.unlink(missing_ok=True)
         except OSError as failure:
             raise StorageError(
                 f"cannot write into {folder}: {failure.strerror or failure}"
             ) from failure
-        parameter_report.tell(facts)
+        log_undetermined(facts)
         return fitted
 
     def _nominal(self, machine: Machine, device: torch.device) -> np.ndarray:
         """Returns the actuator's own numbers in units of their ranges, `(P, J)`, and sees that the bounds make sense."""
         names = tuple(self.free)
-        parameters = parameters_of(self.actuator.build(machine, 1, device), names)
+        parameters = get_parameters(self.actuator.build(machine, 1, device), names)
         for side in (0, 1):
             ends: Any = {name: bounds[side] for name, bounds in self.free.items()}
             try:
@@ -180,15 +285,17 @@ class GreyBoxFit:
         num_windows: int,
         random: np.random.Generator,
         device: torch.device,
-    ) -> FreeRuns:
-        cut = open_loop.windows(recordings, machine, self.horizon_s, self.horizon_s)
+    ) -> CandidateRuns:
+        cut = open_loop.cut_windows(recordings, machine, self.horizon_s, self.horizon_s)
         active = (np.abs(cut.u) > COMMANDED).mean(1) >= ACTIVE_SHARE
-        rows = _spread_over_runs(active, cut.run, num_windows, random)
+        rows = _select_windows(active, cut.run, num_windows, random)
         cut = dataclasses.replace(cut, u=cut.u[rows], q=cut.q[rows], run=cut.run[rows])
-        return FreeRuns(self.actuator, self.free, self.coupled, machine, cut, active[rows], device)
+        return CandidateRuns(
+            self.actuator, self.free, self.coupled, machine, cut, active[rows], device
+        )
 
     def _rounded(
-        self, machine: Machine, runs: FreeRuns, x: np.ndarray
+        self, machine: Machine, runs: CandidateRuns, x: np.ndarray
     ) -> dict[str, dict[str, float]]:
         return {
             name: {
@@ -204,7 +311,7 @@ class _Search:
     """The search at work; what it has found so far lies in `place` after each step, for an interrupted fit to go on from."""
 
     config: GreyBoxFit
-    runs: FreeRuns
+    runs: CandidateRuns
     place: Path
     digest: str
     before_s: float = 0.0
@@ -230,7 +337,7 @@ class _Search:
                     completed=len(done) * config.iterations + iteration,
                     description=f"{config.name}: start {len(done) + 1} of {config.starts}, step {iteration + 1}",
                 )
-                waiting[0], gain = improve(self.runs, waiting[0], config.robust)
+                waiting[0], gain = take_step(self.runs, waiting[0], config.robust)
                 iteration += 1
                 if gain < config.tolerance or iteration >= config.iterations:
                     log.info(
@@ -241,11 +348,11 @@ class _Search:
                 self._keep(done, iteration, waiting, self.before_s + time.monotonic() - began)
         return done
 
-    def choose(self, found: list[np.ndarray], held: FreeRuns) -> np.ndarray:
+    def choose(self, found: list[np.ndarray], held: CandidateRuns) -> np.ndarray:
         """Returns the numbers that run freely best on the validation windows, joint by joint where joints are independent."""
         stacked = np.stack(found)
         score, fallback = (
-            _typical(runs.squares(stacked), runs.active) for runs in (held, self.runs)
+            _average_rmse(runs.squares(stacked), runs.active) for runs in (held, self.runs)
         )
         score = np.where(
             np.isfinite(score), score, fallback
@@ -262,9 +369,9 @@ class _Search:
         )
         candidates = np.concatenate([np.repeat(points[:, :, None], joints, 2), nominal[None]])
         some = np.arange(0, len(self.runs.active), 4 if len(self.runs.active) >= 16 * joints else 1)
-        order = _typical(self.runs.squares(candidates, some), self.runs.active[some]).argsort(0)[
-            : self.config.starts
-        ]  # (S, J)
+        order = _average_rmse(self.runs.squares(candidates, some), self.runs.active[some]).argsort(
+            0
+        )[: self.config.starts]  # (S, J)
         return np.stack([candidates[order[:, j], :, j] for j in range(joints)], 2)
 
     def _left(self) -> dict[str, Any] | None:
@@ -293,7 +400,7 @@ class _Search:
             raise StorageError(f"cannot write {self.place}: {error.strerror or error}") from error
 
 
-def _spread_over_runs(
+def _select_windows(
     active: np.ndarray, run: np.ndarray, count: int, random: np.random.Generator
 ) -> np.ndarray:
     """Returns rows such that each joint is active in about `count` of them, taken in turn from the runs that move it."""
@@ -310,13 +417,15 @@ def _spread_over_runs(
     return np.flatnonzero(chosen)
 
 
-def _typical(squares: np.ndarray, active: np.ndarray) -> np.ndarray:
+def _average_rmse(squares: np.ndarray, active: np.ndarray) -> np.ndarray:
     """Returns the mean over active windows of the root mean square error, `(C, J)`; NaN where a joint is never active."""
     count = np.where(active.any(0), active.sum(0), np.nan)
     return np.sqrt(squares).sum(1) / count
 
 
-def _digest(config: GreyBoxFit, machine: Machine, runs: FreeRuns, held: FreeRuns, seed: int) -> str:
+def _hash_fit(
+    config: GreyBoxFit, machine: Machine, runs: CandidateRuns, held: CandidateRuns, seed: int
+) -> str:
     """Returns a hash of all that the result depends on."""
     told = hashlib.sha256(
         repr((config, machine.fingerprint(), machine.max_speed.tolist(), seed)).encode()

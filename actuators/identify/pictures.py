@@ -10,23 +10,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, NullFormatter
 
-from actuators.identify.dead_time import Delay
-from actuators.identify.regimes import REGIMES
-from actuators.identify.scores import TAILS, Scores
+from actuators.identify.dead_time import DeadTimeEstimate
+from actuators.identify.scores import REGIMES, TAILS, FreeRunScores
 from brokk_rl.machine import Machine
-from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, clean, legend, panels
+from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, add_legend, make_joint_panels, remove_frame
 from brokk_rl.split import COMMANDED
 
 COLOURS = {"hold": GREY, "arx": ORANGE}
 
 
-def colours(names: Sequence[str], model: str) -> dict[str, str]:
+def assign_colours(names: Sequence[str], model: str) -> dict[str, str]:
     """Returns the colour of each model: the same in all pictures."""
     others = iter(OTHERS * len(names))
     return {name: BLUE if name == model else COLOURS.get(name) or next(others) for name in names}
 
 
-def prediction(scores: Scores, model: str) -> Figure:
+def draw_prediction(scores: FreeRunScores, model: str) -> Figure:
     """Draws measured and predicted positions over commands, joint by joint: a typical, the liveliest and the worst window.
 
     Typical: the window of median error among those in which the joint is commanded; liveliest: of
@@ -49,9 +48,9 @@ def prediction(scores: Scores, model: str) -> Figure:
         wspace=0.17,
         hspace=0.28,
     )
-    colour = colours(list(scores.predicted), model)
+    colour = assign_colours(list(scores.predicted), model)
     for j, joint in enumerate(machine.joints):
-        chosen = _windows_to_show(scores, model, j)
+        chosen = _select_windows(scores, model, j)
         for column, (title, window) in enumerate(chosen.items()):
             grid = rows[j, column].subgridspec(2, 1, height_ratios=[3.2, 1.0], hspace=0.12)
             above = figure.add_subplot(grid[0])
@@ -75,7 +74,7 @@ def prediction(scores: Scores, model: str) -> Figure:
                 lw=1.6,
                 label=model,
             )
-            _frame(above, measured, scores.predicted[model][window, :, j], machine, j)
+            _frame_axis(above, measured, scores.predicted[model][window, :, j], machine, j)
             above.tick_params(labelbottom=False)
             run = str(cut.run[window]).rsplit("/", 1)[-1].removesuffix(".parquet")
             above.set_title(f"{title}: {run}", fontsize=8.5, loc="left")
@@ -93,16 +92,16 @@ def prediction(scores: Scores, model: str) -> Figure:
             if j == machine.num_joints - 1:
                 below.set_xlabel("time of the free run [s]")
             for axis in (above, below):
-                clean(axis)
-    legend(figure, figure.axes[0])
+                remove_frame(axis)
+    add_legend(figure, figure.axes[0])
     return figure
 
 
-def error_over_horizon(scores: Scores, model: str) -> Figure:
+def draw_error_over_horizon(scores: FreeRunScores, model: str) -> Figure:
     """Draws the error of all models over the time of the free run, one panel a joint, with 95 % bands."""
     machine = scores.machine
-    figure, axes = panels(machine, "xy")
-    colour = colours(list(scores.predicted), model)
+    figure, axes = make_joint_panels(machine, "xy")
+    colour = assign_colours(list(scores.predicted), model)
     t_s = machine.period_s * np.arange(1, scores.cut.measured.shape[1] + 1)
     for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
         for name in sorted(scores.predicted, key=lambda name: name == model):
@@ -126,17 +125,19 @@ def error_over_horizon(scores: Scores, model: str) -> Figure:
         axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
         axis.set_xlim(t_s[0], t_s[-1])
         axis.grid(which="major", alpha=0.3)
-        clean(axis)
+        remove_frame(axis)
     figure.supxlabel("time of the free run [s]; the left end is the one-step error", fontsize=10)
     figure.supylabel("RMSE [% of travel]", fontsize=10)
-    legend(figure, axes[0])
+    add_legend(figure, axes[0])
     return figure
 
 
-def regimes(table: Mapping[str, Any], machine: Machine, model: str, names: Sequence[str]) -> Figure:
+def draw_regimes(
+    table: Mapping[str, Any], machine: Machine, model: str, names: Sequence[str]
+) -> Figure:
     """Draws how fast each model drifts in each regime, one panel a joint."""
-    figure, axes = panels(machine, "x")
-    colour = colours(names, model)
+    figure, axes = make_joint_panels(machine, "x")
+    colour = assign_colours(names, model)
     travel = machine.upper - machine.lower
     for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
         rows = table[joint.name]
@@ -156,7 +157,7 @@ def regimes(table: Mapping[str, Any], machine: Machine, model: str, names: Seque
                     "o",
                     color=colour[name],
                     ms=size,
-                    label=name if regime == _first(rows) else None,
+                    label=name if regime == _find_first_regime(rows) else None,
                 )
                 if cell["ci95"]:
                     low, high = (max(100.0 * bound / travel[j], 1e-4) for bound in cell["ci95"])
@@ -175,22 +176,22 @@ def regimes(table: Mapping[str, Any], machine: Machine, model: str, names: Seque
         axis.set_ylim(len(REGIMES) - 0.5, -0.5)
         axis.grid(axis="x", which="major", alpha=0.3)
         axis.set_title(joint.name, loc="left", fontsize=10)
-        clean(axis)
+        remove_frame(axis)
     figure.supxlabel(
         "drift: RMS of the error added within a second [% of travel]; in brackets the part of the time",
         fontsize=10,
     )
-    legend(figure, axes[0])
+    add_legend(figure, axes[0])
     return figure
 
 
-def dead_times(delays: Mapping[str, Delay | None], machine: Machine) -> Figure:
+def draw_dead_times(delays: Mapping[str, DeadTimeEstimate | None], machine: Machine) -> Figure:
     """Draws what each delay leaves unexplained, one panel a joint; the band is the interval of the best one."""
-    figure, axes = panels(machine, "xy")
+    figure, axes = make_joint_panels(machine, "xy")
     history_s = machine.num_history * machine.period_s
     for axis, (joint, delay) in zip(axes, delays.items(), strict=True):
         axis.set_title(joint, loc="left", fontsize=10)
-        clean(axis)
+        remove_frame(axis)
         if delay is None:
             axis.text(0.5, 0.5, "hardly commanded", transform=axis.transAxes, ha="center")
             continue
@@ -219,11 +220,11 @@ def dead_times(delays: Mapping[str, Delay | None], machine: Machine) -> Figure:
     figure.supylabel("variance of the motion left unexplained [%]", fontsize=10)
     drawn = [axis for axis, delay in zip(axes, delays.values(), strict=True) if delay is not None]
     if drawn:
-        legend(figure, drawn[0])
+        add_legend(figure, drawn[0])
     return figure
 
 
-def _windows_to_show(scores: Scores, model: str, joint: int) -> dict[str, int]:
+def _select_windows(scores: FreeRunScores, model: str, joint: int) -> dict[str, int]:
     measured, u = (
         scores.cut.measured[..., joint],
         scores.cut.u[:, scores.cut.num_before - 1 :, joint],
@@ -242,7 +243,7 @@ def _windows_to_show(scores: Scores, model: str, joint: int) -> dict[str, int]:
     }
 
 
-def _frame(
+def _frame_axis(
     axis: Axes, measured: np.ndarray, predicted: np.ndarray, machine: Machine, joint: int
 ) -> None:
     """Bounds the axis by what was measured and what the model says, so that a rival that runs away does not flatten them."""
@@ -260,5 +261,5 @@ def _frame(
             axis.axhline(limit, color="#b3261e", lw=1.0, ls=":")
 
 
-def _first(rows: Mapping[str, Any]) -> str:
+def _find_first_regime(rows: Mapping[str, Any]) -> str:
     return next(name for name in REGIMES if name in rows)

@@ -15,7 +15,8 @@ import numpy as np
 
 from brokk_rl.intervals import CONFIDENCE
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import Windows
+from brokk_rl.open_loop import FreeRunWindows
+from brokk_rl.split import COMMANDED
 
 RESAMPLED = 1000
 TAILS = (50.0 * (1.0 - CONFIDENCE), 50.0 * (1.0 + CONFIDENCE))
@@ -23,7 +24,7 @@ TAILS = (50.0 * (1.0 - CONFIDENCE), 50.0 * (1.0 + CONFIDENCE))
 
 
 @dataclass
-class Scores:
+class FreeRunScores:
     """Free runs of several models through the same windows.
 
     Attributes:
@@ -34,7 +35,7 @@ class Scores:
     """
 
     predicted: Mapping[str, np.ndarray]
-    cut: Windows
+    cut: FreeRunWindows
     machine: Machine
     generator: np.random.Generator
     weights: np.ndarray = field(init=False)
@@ -100,7 +101,7 @@ class Scores:
         return [
             {
                 "rmse": float(rmse[step, j]),
-                "ci95": interval(resampled[:, step, j]),
+                "ci95": bound_interval(resampled[:, step, j]),
                 "percent": float(100.0 * rmse[step, j] / self.travel[j]),
                 "path_rmse": float(np.sqrt(np.mean(path[..., j] ** 2))),
                 "path_mean": float(np.abs(path[..., j]).mean()),
@@ -130,7 +131,7 @@ class Scores:
                 for values in (mine, other, mine_again, other_again)
             ]
         )
-        return [_difference(*row) for row in rows]
+        return [_compare_errors(*row) for row in rows]
 
     def _by_run(self, values: np.ndarray) -> np.ndarray:
         """Returns sums over the windows of each run, `(R, …)`."""
@@ -139,7 +140,7 @@ class Scores:
         return sums
 
 
-def interval(resampled: np.ndarray) -> list[float] | None:
+def bound_interval(resampled: np.ndarray) -> list[float] | None:
     """Returns the interval of a figure from its resamples, `(B,)`; `None` where there are too few runs for one."""
     given = resampled[np.isfinite(resampled)]
     if len(given) < RESAMPLED // 2:
@@ -147,7 +148,7 @@ def interval(resampled: np.ndarray) -> list[float] | None:
     return [float(bound) for bound in np.percentile(given, TAILS)]
 
 
-def overall(rows: Sequence[dict[str, Any]], units: Sequence[str]) -> dict[str, float]:
+def average_joints(rows: Sequence[dict[str, Any]], units: Sequence[str]) -> dict[str, float]:
     """Returns means over joints; those in rad or m only where all joints have the same unit."""
     keys = (
         ("rmse", "percent", "path_rmse", "path_mean", "end_mean")
@@ -157,13 +158,121 @@ def overall(rows: Sequence[dict[str, Any]], units: Sequence[str]) -> dict[str, f
     return {key: float(np.mean([row[key] for row in rows])) for key in keys}
 
 
-def _difference(
+def _compare_errors(
     mine: np.ndarray, other: np.ndarray, mine_again: np.ndarray, other_again: np.ndarray
 ) -> dict[str, Any]:
     floor = np.finfo(float).tiny  # a rival without any error cannot be bettered
     return {
         "difference": float(mine - other),
-        "ci95": interval(mine_again - other_again),
+        "ci95": bound_interval(mine_again - other_again),
         "reduction_percent": float(100.0 * (1.0 - mine / np.maximum(other, floor))),
-        "reduction_ci95": interval(100.0 * (1.0 - mine_again / np.maximum(other_again, floor))),
+        "reduction_ci95": bound_interval(
+            100.0 * (1.0 - mine_again / np.maximum(other_again, floor))
+        ),
     }
+
+
+SECOND_S = 1.0
+NEAR_STOP = 0.05
+"""Part of the travel that counts as near a stop."""
+SMALL, LARGE = 0.3, 0.7
+"""Largest command of a second below which it is small, and above which it is large."""
+REGIMES = (
+    "at rest",
+    "alone",
+    "with others",
+    "after a reversal",
+    "near a stop",
+    "small commands",
+    "medium commands",
+    "large commands",
+)
+
+
+def classify_seconds(scores: FreeRunScores, delay_s: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns which seconds belong to each regime, `(W, S, J)` bool.
+
+    Args:
+        scores: Holds windows and machine.
+        delay_s: Dead time of each joint, `(J,)`.
+    """
+    cut, machine = scores.cut, scores.machine
+    steps = _count_steps(scores)
+    num_seconds = cut.measured.shape[1] // steps
+    shape = (len(cut.q), num_seconds, steps, machine.num_joints)
+    acting, turned = np.zeros(shape), np.zeros(shape, dtype=bool)
+    for j in range(machine.num_joints):
+        back = min(round(delay_s[j] / machine.period_s), cut.num_before - 2)
+        begin = cut.num_before - 1 - back
+        u = cut.u[..., j]
+        acting[..., j] = u[:, begin : begin + num_seconds * steps].reshape(shape[:-1])
+        turned[..., j] = _find_reversals(u)[:, begin : begin + num_seconds * steps].reshape(
+            shape[:-1]
+        )
+    size = np.abs(acting).max(2)
+    q = cut.measured[:, : num_seconds * steps].reshape(shape)
+    margin = NEAR_STOP * scores.travel
+    with np.errstate(invalid="ignore"):
+        near = ((q < machine.lower + margin) | (q > machine.upper - margin)).any(2)
+    moving = size > COMMANDED
+    others = moving.sum(2, keepdims=True) - moving > 0
+    found = (
+        ~moving, moving & ~others, moving & others, turned.any(2), moving & near,
+        moving & (size < SMALL), moving & (size >= SMALL) & (size <= LARGE), moving & (size > LARGE),
+    )  # fmt: skip
+    whole = np.isfinite(q).all(2)
+    return {name: np.asarray(members & whole) for name, members in zip(REGIMES, found, strict=True)}
+
+
+def score_regimes(
+    scores: FreeRunScores, delay_s: np.ndarray
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Returns, by joint and regime, the part of the `time` spent in it and, by model, the drift.
+
+    Drift: root mean square of the error added within a second, `drift_per_s` in rad/s or m/s with
+    `ci95`, and `share` of all that the model's squared drift amounts to. Regimes overlap (a large
+    command can also be a reversal), so shares do not add up to 1.
+    """
+    members = classify_seconds(scores, delay_s)
+    steps = _count_steps(scores)
+    squares = {}
+    for name, error in scores.error.items():
+        at_end = np.concatenate([np.zeros_like(error[:, :1]), error[:, steps - 1 :: steps]], 1)
+        squares[name] = (np.diff(at_end, axis=1) / SECOND_S) ** 2
+    whole = np.any(list(members.values()), axis=0)
+    table: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in scores.machine.joint_names}
+    for regime, inside in members.items():
+        drift = {}
+        for name, square in squares.items():
+            within = np.where(inside, square, 0.0).sum(1)
+            every = np.where(whole, square, 0.0).sum((0, 1))
+            share = within.sum(0) / np.maximum(every, np.finfo(float).tiny)
+            drift[name] = scores.ratio(within, inside.sum(1)), share
+        for j, joint in enumerate(scores.machine.joint_names):
+            if not inside[..., j].any():
+                continue
+            table[joint][regime] = {
+                "time": float(inside[..., j].sum() / whole[..., j].sum()),
+                "models": {
+                    name: {
+                        "drift_per_s": float(np.sqrt(mean[j])),
+                        "ci95": bound_interval(np.sqrt(again[:, j])),
+                        "share": float(share[j]),
+                    }
+                    for name, ((mean, again), share) in drift.items()
+                },
+            }
+    return table
+
+
+def _count_steps(scores: FreeRunScores) -> int:
+    return max(1, round(SECOND_S / scores.machine.period_s))
+
+
+def _find_reversals(u: np.ndarray) -> np.ndarray:
+    """Says at which samples a command, `(W, T)`, has just changed its sign, whatever time it rested in between."""
+    sign = np.where(np.abs(u) > COMMANDED, np.sign(u), 0.0)
+    place = np.where(sign != 0, np.arange(u.shape[1]), 0)
+    last = np.take_along_axis(sign, np.maximum.accumulate(place, 1), 1)
+    before = np.pad(last[:, :-1], ((0, 0), (1, 0)))
+    return (sign * before) < 0

@@ -32,7 +32,7 @@ FREE_RUNS = "free_runs"
 
 
 @dataclass(frozen=True)
-class Stage:
+class FitStage:
     """Recordings by run for one fit, and where what it learns is written.
 
     Attributes:
@@ -57,13 +57,13 @@ class Stage:
         state = hashlib.sha256(str(self.seed).encode())
         for part in (self.train, self.validation, self.test):
             state.update(b"part")
-            for recording in members(part):
+            for recording in list_recordings(part):
                 state.update(recording.u.tobytes() + recording.q.tobytes())
         return state.hexdigest()
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedModel:
     """What is left of a fit.
 
     Attributes:
@@ -78,20 +78,20 @@ class Fitted:
     use: str
 
 
-def members(part: Mapping[str, Sequence[Recording]]) -> list[Recording]:
+def list_recordings(part: Mapping[str, Sequence[Recording]]) -> list[Recording]:
     """Returns the recordings of all runs."""
     return [recording for recordings in part.values() for recording in recordings]
 
 
-def fitted(
-    stage: Stage,
+def fit_or_restore(
+    stage: FitStage,
     name: str,
     fit: ActuatorFit,
     folder: Path,
     machine: Machine,
-    cut: open_loop.Windows | None,
+    cut: open_loop.FreeRunWindows | None,
     device: torch.device,
-) -> Fitted:
+) -> FittedModel:
     """Fits a model and lets it run freely through windows, or returns what an earlier process left of the same fit.
 
     Raises:
@@ -104,22 +104,27 @@ def fitted(
         repr((fit, machine.fingerprint(), stage.digest, shape)).encode()
     ).hexdigest()
     if path.exists():
-        return _remembered(path, key)
+        return _restore(path, key)
     log.info(
         "%sfitting %s to %d runs", f"{stage.name}: " if stage.name else "", name, len(stage.train)
     )
     folder.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     actuator = fit.fit(
-        machine, members(stage.train), members(stage.validation), folder, stage.seed, device
+        machine,
+        list_recordings(stage.train),
+        list_recordings(stage.validation),
+        folder,
+        stage.seed,
+        device,
     )
     seconds = time.monotonic() - began
     predicted = (
         np.zeros((0, 0, machine.num_joints))
         if cut is None
-        else open_loop.free_run(actuator, machine, cut, device)
+        else open_loop.roll_out(actuator, machine, cut, device)
     )
-    found = Fitted(predicted, seconds, use(actuator, folder, name))
+    found = FittedModel(predicted, seconds, find_overrides(actuator, folder, name))
     part = path.with_name(f".{path.name}.{os.getpid()}.npz")
     try:
         path.parent.mkdir(exist_ok=True)
@@ -134,7 +139,7 @@ def fitted(
     return found
 
 
-def use(actuator: Actuator, folder: Path, name: str) -> str:
+def find_overrides(actuator: Actuator, folder: Path, name: str) -> str:
     """Returns the overrides with which `mode=train` and others use a fitted actuator; empty where there are none."""
     if (folder / f"{name}.yaml").exists():
         return f"actuator=@{folder / f'{name}.yaml'}"
@@ -151,7 +156,7 @@ def use(actuator: Actuator, folder: Path, name: str) -> str:
     return ""
 
 
-def _remembered(path: Path, key: str) -> Fitted:
+def _restore(path: Path, key: str) -> FittedModel:
     try:
         with np.load(path) as stored:
             values = {name: stored[name] for name in stored.files}
@@ -160,7 +165,7 @@ def _remembered(path: Path, key: str) -> Fitted:
                 f"{path} is of another fit, or of other recordings or windows. To go on, give the settings of the interrupted run; "
                 "for others choose another session.out"
             )
-        return Fitted(values["predicted"], float(values["seconds"]), str(values["use"]))
+        return FittedModel(values["predicted"], float(values["seconds"]), str(values["use"]))
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise StorageError(
             f"{path} cannot be read ({error}); delete it, and this fit is done again"

@@ -26,8 +26,8 @@ import math
 import numpy as np
 import torch
 
-from actuators.models.parameters import Parameters, PerJoint, per_joint
-from actuators.models.transport import check_dead_time, commands_in_force, opened
+from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
+from actuators.models.transport import check_dead_time, open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
@@ -134,13 +134,15 @@ class HydraulicModel:
         self, config: Hydraulic, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
         nominal = {
-            name: per_joint(getattr(config, name), machine, f"actuator.{name}")
+            name: expand_per_joint(getattr(config, name), machine, f"actuator.{name}")
             for name in PER_JOINT
         }
         _check(nominal)
         longest_s = nominal["transport_s"].max() * (1.0 + config.spread.get("transport_s", 0.0))
         check_dead_time(float(longest_s), machine, "actuator.transport_s")
-        self._parameters = Parameters(nominal, config.spread, num_envs, device, "actuator.spread")
+        self._parameters = SpreadParameters(
+            nominal, config.spread, num_envs, device, "actuator.spread"
+        )
         self.parameters = self._parameters.value
         self._config = config
         self._period_s = machine.period_s
@@ -182,7 +184,9 @@ class HydraulicModel:
         q, dt = history.q[:, -1], self._period_s / self._num_substeps
         weight = self._gravity.load(q)
         warm = 1.0 + config.thermal_gain * (state["oil_c"] - config.oil_reference_c)[:, None]
-        earlier, later, part = commands_in_force(history.u, p["transport_s"] / self._period_s)
+        earlier, later, part = select_commands_in_force(
+            history.u, p["transport_s"] / self._period_s
+        )
 
         supply = p["supply_ratio"] * self._yield_force
         inertia = self._stiffness / (2.0 * math.pi * p["mode_hz"]) ** 2
@@ -209,7 +213,9 @@ class HydraulicModel:
         # a free run may begin in the middle of a motion, which the history shows; the spool trails
         # its command by 2 damping / omega
         trail_s = p["spool_damping"] / (math.pi * p["spool_hz"])
-        trailing, _, _ = commands_in_force(history.u, (p["transport_s"] + trail_s) / self._period_s)
+        trailing, _, _ = select_commands_in_force(
+            history.u, (p["transport_s"] + trail_s) / self._period_s
+        )
         measured = (q - history.q[:, -2]) / self._period_s
         begun = {
             "pilot": earlier,
@@ -230,7 +236,7 @@ class HydraulicModel:
             pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
             spool_rate = spool_rate + pull[0] * (pilot - spool) - pull[1] * spool_rate
             spool = (spool + dt * spool_rate).clamp(-1.0, 1.0)
-            opening = opened(spool, p["overlap_extend"], p["overlap_retract"])
+            opening = open_valve(spool, p["overlap_extend"], p["overlap_retract"])
             opening = opening * (1.0 - p["notch"] + p["notch"] * opening.abs())
             demand = opening.abs() * p["flow_share"]
             opening = opening / demand.sum(1, keepdim=True).clamp(min=1.0)

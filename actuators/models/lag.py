@@ -1,9 +1,11 @@
-"""Dead time, dead band, gain and a first-order lag: the smallest model in which a hydraulic arm is recognisable."""
+"""The actuator without any imperfection: what a simulator assumes that knows nothing of hydraulics."""
+
+from typing import ClassVar
 
 import torch
 
-from actuators.models.parameters import Parameters, PerJoint, per_joint
-from actuators.models.transport import check_dead_time, commands_in_force, opened
+from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
+from actuators.models.transport import check_dead_time, open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -11,7 +13,49 @@ from brokk_rl.spec import spec
 
 
 @spec
-class Lag:
+class Ideal:
+    """Moves at once at the machine's full speed times the command.
+
+    Attributes:
+        speed_scale: Speed at full command over the machine's `max_speed`.
+    """
+
+    speed_scale: float
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "IdealModel":
+        """Returns a model for `num_envs` environments on `device`."""
+        return IdealModel(self, machine, device)
+
+
+class IdealModel:
+    """`q' = q + period * speed_scale * max_speed * u`, held at the ends of travel. Has no memory."""
+
+    def __init__(self, config: Ideal, machine: Machine, device: torch.device) -> None:
+        self._step_at_full = torch.as_tensor(
+            machine.max_speed * machine.period_s * config.speed_scale,
+            dtype=torch.float32,
+            device=device,
+        )
+        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
+        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Nothing."""
+        return {}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Does nothing."""
+
+    def step(self, history: History) -> torch.Tensor:
+        """Returns the joint positions one control period later, shape `(N, J)`."""
+        return (history.q[:, -1] + history.u[:, -1] * self._step_at_full).clamp(
+            self._lower, self._upper
+        )
+
+
+@spec
+class FirstOrderLag:
     """Dead time, dead band on each side, gain and first-order lag, joint by joint.
 
     Attributes:
@@ -25,6 +69,8 @@ class Lag:
             reset.
     """
 
+    label: ClassVar = "lag"
+
     dead_time_s: PerJoint | None
     dead_band_extend: PerJoint
     dead_band_retract: PerJoint
@@ -32,17 +78,17 @@ class Lag:
     time_constant_s: PerJoint
     spread: dict[str, float]
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "LagModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "FirstOrderLagModel":
         """Returns a model for `num_envs` environments on `device`.
 
         Raises:
             ConfigError: the dead time does not fit the machine's history, or a number makes no
                 sense.
         """
-        return LagModel(self, machine, num_envs, device)
+        return FirstOrderLagModel(self, machine, num_envs, device)
 
 
-class LagModel:
+class FirstOrderLagModel:
     """Exact solution of `time_constant * v' + v = v_full * opened(u(t - dead_time))` over each part of the control period.
 
     Attributes:
@@ -51,13 +97,16 @@ class LagModel:
             `reset`.
     """
 
-    def __init__(self, config: Lag, machine: Machine, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self, config: FirstOrderLag, machine: Machine, num_envs: int, device: torch.device
+    ) -> None:
         names = ("dead_band_extend", "dead_band_retract", "gain", "time_constant_s")
         nominal = {
-            name: per_joint(getattr(config, name), machine, f"actuator.{name}") for name in names
+            name: expand_per_joint(getattr(config, name), machine, f"actuator.{name}")
+            for name in names
         }
         dead_time_s = machine.dead_time_s if config.dead_time_s is None else config.dead_time_s
-        nominal["dead_time_s"] = per_joint(dead_time_s, machine, "actuator.dead_time_s")
+        nominal["dead_time_s"] = expand_per_joint(dead_time_s, machine, "actuator.dead_time_s")
         for name in names[:2]:
             if ((nominal[name] < 0) | (nominal[name] >= 1)).any():
                 raise ConfigError(
@@ -69,7 +118,9 @@ class LagModel:
             )
         longest_s = nominal["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
         check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
-        self._parameters = Parameters(nominal, config.spread, num_envs, device, "actuator.spread")
+        self._parameters = SpreadParameters(
+            nominal, config.spread, num_envs, device, "actuator.spread"
+        )
         self.parameters = self._parameters.value
         self._period_s = machine.period_s
         self._max_speed = torch.as_tensor(machine.max_speed, dtype=torch.float32, device=device)
@@ -95,7 +146,9 @@ class LagModel:
     def step(self, history: History) -> torch.Tensor:
         """Returns the joint positions one control period later, shape `(N, J)`."""
         value = self.parameters
-        earlier, later, part = commands_in_force(history.u, value["dead_time_s"] / self._period_s)
+        earlier, later, part = select_commands_in_force(
+            history.u, value["dead_time_s"] / self._period_s
+        )
         q = history.q[:, -1]
         # a free run may begin in the middle of a motion; at rest the history is level
         speed = torch.where(
@@ -106,7 +159,7 @@ class LagModel:
             (later, (1.0 - part) * self._period_s),
         ):
             target = (
-                opened(u, value["dead_band_extend"], value["dead_band_retract"])
+                open_valve(u, value["dead_band_extend"], value["dead_band_retract"])
                 * value["gain"]
                 * self._max_speed
             )

@@ -79,8 +79,8 @@ class Arx:
             CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
                 NaN.
         """
-        path = checkpoint.found(self.checkpoint)
-        tensors, _ = checkpoint.read(path, "arx", machine)
+        path = checkpoint.find_checkpoint(self.checkpoint)
+        tensors, _ = checkpoint.read_checkpoint(path, "arx", machine)
         expected = (machine.num_joints, 3 * machine.num_history - 1)
         if "weight" not in tensors or tuple(tensors["weight"].shape) != expected:
             raise CheckpointError(f"{path}: expected a tensor 'weight' of shape {expected}")
@@ -168,7 +168,7 @@ class ArxFit:
             gram = (x / scale).T @ (x / scale) / len(x) + self.ridge * np.eye(x.shape[1])
             weight[j] = np.linalg.solve(gram, (x / scale).T @ target[:, j] / len(x)) / scale
         path = folder / f"{self.name}.safetensors"
-        checkpoint.write(
+        checkpoint.write_checkpoint(
             path,
             "arx",
             machine,

@@ -15,6 +15,12 @@ from itertools import pairwise
 import torch
 from torch import nn
 
+from actuators.models import checkpoint
+from brokk_rl.errors import CheckpointError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
 COUPLING_WIDTH = 16
 """Hidden units a joint of `SharedFlow` and `Load`: a delayed curve of the command and a smooth
 function of the pose need few."""
@@ -41,10 +47,12 @@ class SharedFlow(nn.Module):
     ) -> None:
         super().__init__()
         self.weight = nn.Parameter(
-            _uniform(num_joints, num_history, COUPLING_WIDTH, generator=generator)
+            _initialise_weights(num_joints, num_history, COUPLING_WIDTH, generator=generator)
         )
         self.bias = nn.Parameter(
-            _uniform(num_joints, 1, COUPLING_WIDTH, fan_in=num_history, generator=generator)
+            _initialise_weights(
+                num_joints, 1, COUPLING_WIDTH, fan_in=num_history, generator=generator
+            )
         )
         # summed up, a full command asks for about half of the pump: close enough to a shortage to
         # learn from it
@@ -62,7 +70,7 @@ class SharedFlow(nn.Module):
         return torch.exp(-nn.functional.softplus(sharpness * torch.log(demand + 1e-3)) / sharpness)
 
 
-class Load(nn.Module):
+class PoseLoad(nn.Module):
     """How much faster or slower each joint moves each way in a pose, because of the weight it carries there.
 
     A factor, so that no pose can move a joint that rests.
@@ -75,10 +83,12 @@ class Load(nn.Module):
     def __init__(self, num_joints: int, generator: torch.Generator | None = None) -> None:
         super().__init__()
         self.weight = nn.Parameter(
-            _uniform(num_joints, num_joints, COUPLING_WIDTH, generator=generator)
+            _initialise_weights(num_joints, num_joints, COUPLING_WIDTH, generator=generator)
         )
         self.bias = nn.Parameter(
-            _uniform(num_joints, 1, COUPLING_WIDTH, fan_in=num_joints, generator=generator)
+            _initialise_weights(
+                num_joints, 1, COUPLING_WIDTH, fan_in=num_joints, generator=generator
+            )
         )
         self.out = nn.Parameter(torch.zeros(num_joints, COUPLING_WIDTH, 2))
 
@@ -129,14 +139,17 @@ class JointNetworks(nn.Module):
         super().__init__()
         self.num_history, self.coupled = num_history, coupled
         sizes = (2 * num_history, width, width, 1)
-        weight = [_uniform(num_joints, m, n, generator=generator) for m, n in pairwise(sizes)]
+        weight = [
+            _initialise_weights(num_joints, m, n, generator=generator) for m, n in pairwise(sizes)
+        ]
         bias = [
-            _uniform(num_joints, 1, n, fan_in=m, generator=generator) for m, n in pairwise(sizes)
+            _initialise_weights(num_joints, 1, n, fan_in=m, generator=generator)
+            for m, n in pairwise(sizes)
         ]
         self.weight = nn.ParameterList([nn.Parameter(value) for value in weight])
         self.bias = nn.ParameterList([nn.Parameter(value) for value in bias])
         self.flow = SharedFlow(num_joints, num_history, generator) if coupled else None
-        self.load = Load(num_joints, generator) if coupled else None
+        self.load = PoseLoad(num_joints, generator) if coupled else None
         for name in (
             "command_scale",
             "increment_scale",
@@ -234,10 +247,100 @@ class JointNetworks(nn.Module):
         return (q - self.position_center[:, None]) / self.position_scale[:, None]
 
 
-def _uniform(
+def _initialise_weights(
     num_joints: int, *shape: int, fan_in: int | None = None, generator: torch.Generator | None
 ) -> torch.Tensor:
     """Draws weights `(J, …)` as `torch.nn.Linear` does."""
     return (torch.rand(num_joints, *shape, generator=generator) * 2.0 - 1.0) / (
         fan_in or shape[0]
     ) ** 0.5
+
+
+@spec
+class Mlp:
+    """One perceptron a joint, 2 x 32 ReLU, from 13 commands and 13 positions to the next increment (the paper's model).
+
+    Attributes:
+        checkpoint: A file, or the name of one that ships with the package.
+    """
+
+    checkpoint: str
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "NetworkModel":
+        """Returns a model for any number of environments on `device`.
+
+        Raises:
+            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
+                NaN.
+        """
+        return NetworkModel(
+            load_networks(self.checkpoint, "mlp", machine).to(device), machine, device
+        )
+
+
+class NetworkModel:
+    """Actuator networks at work, separate or coupled. Has no memory beyond the history."""
+
+    def __init__(self, networks: JointNetworks, machine: Machine, device: torch.device) -> None:
+        self._networks = networks.requires_grad_(False)
+        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
+        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """Nothing."""
+        return {}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Does nothing."""
+
+    def step(self, history: History) -> torch.Tensor:
+        """Returns the joint positions one control period later, shape `(N, J)`."""
+        networks = self._networks
+        output = networks(networks.inputs(history.u.permute(2, 0, 1), history.q.permute(2, 0, 1)))
+        return (history.q[:, -1] + networks.increment(output).T).clamp(self._lower, self._upper)
+
+
+def load_networks(name: str, kind: str, machine: Machine) -> JointNetworks:
+    """Returns the networks of a checkpoint, on the CPU; `kind` is `mlp` (separate) or `coupled`.
+
+    Raises:
+        CheckpointError: as for `Mlp.build`.
+    """
+    path = checkpoint.find_checkpoint(name)
+    tensors, header = checkpoint.read_checkpoint(path, kind, machine)
+    networks = JointNetworks(
+        machine.num_joints,
+        machine.num_history,
+        int(header.get("width", 0)),
+        coupled=kind == "coupled",
+    )
+    try:
+        networks.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise CheckpointError(
+            f"{path}: the tensors do not fit the network that its header describes ({error})"
+        ) from error
+    return networks
+
+
+@spec
+class Coupled:
+    """A perceptron a joint, slowed down where joints ask for more than the pump gives and by the load of the pose (`mlp`: neither).
+
+    Attributes:
+        checkpoint: A file, or the name of one that ships with the package.
+    """
+
+    checkpoint: str
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> NetworkModel:
+        """Returns a model for any number of environments on `device`.
+
+        Raises:
+            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
+                NaN.
+        """
+        return NetworkModel(
+            load_networks(self.checkpoint, "coupled", machine).to(device), machine, device
+        )

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from actuators.models.draw import hashed
+from actuators.models.random_draws import hash_uniform
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 
@@ -17,7 +17,7 @@ PerJoint = float | dict[str, float]
 name."""
 
 
-def per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarray:
+def expand_per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarray:
     """Returns `value` for every joint of `machine`, shape `(J,)`.
 
     A table that has `other` may name joints that this machine lacks, so that one file serves
@@ -43,7 +43,7 @@ def per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarray:
     return np.array([float(value.get(name, value.get(OTHER, 0.0))) for name in known])
 
 
-class Parameters:
+class SpreadParameters:
     """Numbers of an actuator for all environments: tensors `(N, J)` of fixed address, in `value` by name.
 
     With a `spread` a number is `nominal * (1 + spread * U(-1, 1))`, drawn per environment and joint
@@ -106,6 +106,6 @@ class Parameters:
             return
         self._draw.add_(mask.to(torch.int64))
         for column, (name, width) in enumerate(self._width.items()):
-            uniform = hashed(self._draw[:, None] * 7_919 + self._joint + column * 104_729)
+            uniform = hash_uniform(self._draw[:, None] * 7_919 + self._joint + column * 104_729)
             drawn = self._nominal[name] * (1.0 + width * (2.0 * uniform - 1.0))
             self.value[name].copy_(torch.where(mask[:, None], drawn, self.value[name]))

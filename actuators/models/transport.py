@@ -16,7 +16,7 @@ def check_dead_time(longest_s: float, machine: Machine, where: str) -> None:
         )
 
 
-def commands_in_force(
+def select_commands_in_force(
     u: torch.Tensor, delay_periods: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Splits the coming control period at the moment when the delayed command changes.
@@ -44,7 +44,7 @@ def commands_in_force(
     return earlier, later, part
 
 
-def opened(
+def open_valve(
     u: torch.Tensor, dead_band_extend: torch.Tensor, dead_band_retract: torch.Tensor
 ) -> torch.Tensor:
     """Returns how far the valve is open, shape of `u`, in [-1, 1]: zero inside the dead band, one at full command each way."""

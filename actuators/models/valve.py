@@ -15,11 +15,13 @@ The curve takes in dead bands, gain, asymmetry, notches and saturation; load and
 cylinder are in the pose.
 """
 
+from typing import ClassVar
+
 import numpy as np
 import torch
 
-from actuators.models.parameters import Parameters, PerJoint, per_joint
-from actuators.models.transport import check_dead_time, commands_in_force
+from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
+from actuators.models.transport import check_dead_time, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
@@ -35,7 +37,7 @@ BEYOND = 1.2
 
 
 @spec
-class Valve:
+class ValveActuator:
     """Dead time, play, spool lag, a measured flow curve on each side, one pump, dependence on pose, and a second lag.
 
     Attributes:
@@ -54,6 +56,8 @@ class Valve:
         spread: Relative half width, by field name, of what is drawn per environment and joint at
             reset.
     """
+
+    label: ClassVar = "valve"
 
     dead_time_s: PerJoint | None
     play: PerJoint
@@ -89,7 +93,7 @@ class Valve:
         return ValveModel(self, machine, num_envs, device)
 
 
-class Pose:
+class PoseFeatures:
     """What the speed depends on besides the command: weight over yield force, its square, and all positions.
 
     The weight on the joints of a planar arm is linear in the sines and cosines of the sums of its
@@ -156,21 +160,24 @@ class ValveModel:
     """
 
     def __init__(
-        self, config: Valve, machine: Machine, num_envs: int, device: torch.device
+        self, config: ValveActuator, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
         given = {name: getattr(config, name) for name in NUMBERS}
         given["dead_time_s"] = (
             machine.dead_time_s if config.dead_time_s is None else config.dead_time_s
         )
         nominal = {
-            name: per_joint(value, machine, f"actuator.{name}") for name, value in given.items()
+            name: expand_per_joint(value, machine, f"actuator.{name}")
+            for name, value in given.items()
         }
         for name, value in nominal.items():
             if (value < 0).any():
                 raise ConfigError(f"actuator.{name}: expected 0 or more, got {value.tolist()}")
         longest_s = nominal["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
         check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
-        self._parameters = Parameters(nominal, config.spread, num_envs, device, "actuator.spread")
+        self._parameters = SpreadParameters(
+            nominal, config.spread, num_envs, device, "actuator.spread"
+        )
         self.parameters = self._parameters.value
         self._period_s = machine.period_s
 
@@ -180,18 +187,24 @@ class ValveModel:
         self._full_step = tensor(machine.max_speed * machine.period_s)
         self._lower, self._upper = tensor(machine.lower), tensor(machine.upper)
         curves = [
-            _rows(value, machine, len(config.knots), f"actuator.{name}")
-            for name, value in _curves(config)
+            _expand_rows(value, machine, len(config.knots), f"actuator.{name}")
+            for name, value in _list_curves(config)
         ]
-        self._table = tensor(tabulated(np.array(config.knots), *curves)).reshape(-1)
+        self._table = tensor(tabulate_curves(np.array(config.knots), *curves)).reshape(-1)
         full = tensor(np.maximum(np.stack([curve[:, -1] for curve in curves]), 1e-3))
         self._full_extend, self._full_retract = full[0], full[1]
         self._row = torch.arange(machine.num_joints, device=device) * (CELLS + 1)
-        self._pose = Pose(machine, device) if config.pose_extend or config.pose_retract else None
+        self._pose = (
+            PoseFeatures(machine, device) if config.pose_extend or config.pose_retract else None
+        )
         if self._pose:
             names = ("pose_extend", "pose_retract")
             self._slopes = [
-                tensor(_rows(getattr(config, n) or {}, machine, self._pose.size, f"actuator.{n}"))
+                tensor(
+                    _expand_rows(
+                        getattr(config, n) or {}, machine, self._pose.size, f"actuator.{n}"
+                    )
+                )
                 for n in names
             ]
         shape = (num_envs, machine.num_joints)
@@ -215,14 +228,14 @@ class ValveModel:
     def step(self, history: History) -> torch.Tensor:
         """Returns the joint positions one control period later, shape `(N, J)`."""
         value, state, dt = self.parameters, self._state, self._period_s
-        earlier, later, part = commands_in_force(history.u, value["dead_time_s"] / dt)
+        earlier, later, part = select_commands_in_force(history.u, value["dead_time_s"] / dt)
         q, fresh = history.q[:, -1], self._fresh[:, None]
         u = torch.lerp(later, earlier, part)
         play = 0.5 * value["play"]
         pilot = torch.where(fresh, earlier, state["pilot"])
         pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
         spool = torch.lerp(
-            pilot, torch.where(fresh, earlier, state["spool"]), _kept(dt, value["spool_s"])
+            pilot, torch.where(fresh, earlier, state["spool"]), _compute_decay(dt, value["spool_s"])
         )
         flow = self._flow(spool)
         full = torch.where(spool > 0, self._full_extend, self._full_retract)
@@ -233,7 +246,7 @@ class ValveModel:
             slopes = [(features * slope).sum(2) for slope in self._slopes]
             wanted = wanted * (1.0 + torch.where(spool > 0, *slopes)).clamp(min=0.0)
         before = torch.where(fresh, q - history.q[:, -2], state["step"])
-        step = torch.lerp(wanted, before, _kept(dt, value["speed_s"]))
+        step = torch.lerp(wanted, before, _compute_decay(dt, value["speed_s"]))
         moved = q + step
         held = torch.minimum(
             torch.maximum(moved, torch.minimum(self._lower, q)), torch.maximum(self._upper, q)
@@ -254,7 +267,7 @@ class ValveModel:
         return torch.lerp(self._table[at], self._table[at + 1], place - cell)
 
 
-def tabulated(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) -> np.ndarray:
+def tabulate_curves(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) -> np.ndarray:
     """Returns signed speeds at `CELLS + 1` equal steps of the spool from -1 to 1, `(J, CELLS + 1)`; curves are `(J, K)`."""
     half = np.linspace(0.0, 1.0, CELLS // 2 + 1)
     rows = []
@@ -265,16 +278,16 @@ def tabulated(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) -> np.
     return np.stack(rows)
 
 
-def _kept(period_s: float, time_constant_s: torch.Tensor) -> torch.Tensor:
+def _compute_decay(period_s: float, time_constant_s: torch.Tensor) -> torch.Tensor:
     """Returns the part of a first-order lag's state that is left after a period."""
     return torch.exp(-period_s / time_constant_s.clamp(min=1e-6))
 
 
-def _curves(config: Valve) -> tuple[tuple[str, object], tuple[str, object]]:
+def _list_curves(config: ValveActuator) -> tuple[tuple[str, object], tuple[str, object]]:
     return ("curve_extend", config.curve_extend), ("curve_retract", config.curve_retract)
 
 
-def _rows(value: object, machine: Machine, size: int, where: str) -> np.ndarray:
+def _expand_rows(value: object, machine: Machine, size: int, where: str) -> np.ndarray:
     """Returns the table `value` as `(J, size)`; zeros for joints without a row in a table by joint that is empty."""
     if isinstance(value, tuple):
         value = dict.fromkeys(machine.joint_names, value)

@@ -9,18 +9,23 @@ from pathlib import Path
 import numpy as np
 from rich.progress import Progress
 
-from actuators.excite.plan import account, picture
-from actuators.excite.plan.account import Track
-from actuators.excite.plan.drive import Nominal, Sample, drive
-from actuators.excite.plan.guard import Guards, predicted_tool_speed
-from actuators.excite.plan.runner import Runner
-from actuators.excite.plan.schedule import Approach, Plan, schedule
+from actuators.excite import plan_report
+from actuators.excite.plan_report import PlanTrack
+from actuators.excite.player import (
+    CommandGuards,
+    NominalLink,
+    PlanPlayer,
+    Sample,
+    drive,
+    predict_tool_speed,
+)
+from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.contracts.link import Connection
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.recording_validation import RATE_TOLERANCE
+from brokk_rl.record import RATE_TOLERANCE
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 
@@ -52,7 +57,7 @@ class Collection:
     flush_s: float
     only_plan: bool
     approach: Approach
-    guards: Guards
+    guards: CommandGuards
 
     def check(self) -> None:
         if self.num_runs < 1:
@@ -85,7 +90,7 @@ class Collect:
         """
         self.session.seed_all()
         settings, run_s = self.collect, self.collect.run_minutes * 60.0
-        plan = schedule(
+        plan = plan_runs(
             self.excitation,
             self.machine,
             settings.approach,
@@ -119,22 +124,22 @@ class Collect:
     def _folder(self) -> Path:
         return self.session.folder / FOLDER
 
-    def _runner(self, plan: Plan) -> Runner:
-        return Runner(plan, self.machine, self.collect.approach, self.collect.guards)
+    def _runner(self, plan: ExcitationPlan) -> PlanPlayer:
+        return PlanPlayer(plan, self.machine, self.collect.approach, self.collect.guards)
 
-    def _show(self, plan: Plan) -> None:
+    def _show(self, plan: ExcitationPlan) -> None:
         """Tries the plan out on a nominal machine; writes picture and figures."""
         machine, count = self.machine, self.collect.num_runs
-        track = Track(
-            drive(Nominal(machine, count), self._runner(plan), machine, count, plan.run_s)
+        track = PlanTrack(
+            drive(NominalLink(machine, count), self._runner(plan), machine, count, plan.run_s)
         )
-        summary = account.summary(plan, track, machine)
+        summary = plan_report.summarise_plan(plan, track, machine)
         write_json(self.session.folder / "plan.json", summary)
-        picture.draw_plan(
+        plan_report.draw_plan(
             plan,
             track,
             machine,
-            predicted_tool_speed(machine, track.q[:, 0]),
+            predict_tool_speed(machine, track.q[:, 0]),
             self.session.folder / "plan.png",
         )
         unplayed = {
@@ -155,10 +160,10 @@ class Collect:
             self.session.folder / "plan.png",
         )
 
-    def _metadata(self, plan: Plan) -> dict[str, str]:
+    def _metadata(self, plan: ExcitationPlan) -> dict[str, str]:
         return {
             "source": f"{self.link.source}, excitation: {', '.join(plan.names)}",
-            "fingerprint": record.stamp(self.machine),
+            "fingerprint": record.format_fingerprint(self.machine),
             "seed": str(self.session.seed),
         }
 
@@ -174,7 +179,7 @@ class Writer:
     def __init__(
         self,
         machine: Machine,
-        plan: Plan,
+        plan: ExcitationPlan,
         folder: Path,
         settings: Collection,
         metadata: dict[str, str],
@@ -187,7 +192,7 @@ class Writer:
         )
         self._per_file = max(2, round(settings.file_minutes * 60.0 / machine.period_s))
         self._names = [f"{'-'.join(plan.names)}_{n:02d}" for n in range(len(plan.runs))]
-        self._created, self._begin_s = record.now(), 0.0
+        self._created, self._begin_s = record.format_now(), 0.0
         self._template = record.Recording(
             machine=machine.name,
             joints=machine.joint_names,
@@ -232,16 +237,16 @@ class Writer:
         if len(self._samples) < 2:
             return
         samples = self._samples
-        track, begin_s = Track(samples), samples[0].t_s
+        track, begin_s = PlanTrack(samples), samples[0].t_s
         extra = {
             name: np.stack([sample.extra[name] for sample in samples], 1)
             for name in samples[0].extra
         }
         for n, name in enumerate(self._names):
-            notes = account.notes(track, n, self._plan.runs[n], self._period_s)
+            notes = plan_report.describe_run(track, n, self._plan.runs[n], self._period_s)
             metadata = {
                 **self._template.metadata,
-                "created": record.later(self._created, begin_s - self._begin_s),
+                "created": record.add_seconds(self._created, begin_s - self._begin_s),
                 "run": f"{name} {self._created}",
                 "excitation": json.dumps(notes),
             }
@@ -254,4 +259,4 @@ class Writer:
                 extra=columns,
                 metadata=metadata,
             )
-            record.write(recording, self._folder / f"{name}_{self._part:02d}.parquet")
+            record.write_recording(recording, self._folder / f"{name}_{self._part:02d}.parquet")

@@ -55,7 +55,7 @@ class Convert:
             RecordingError: no log matches, one of them cannot be used, or two have the same name.
             StorageError: a file could not be written.
         """
-        logs = record.matching(self.convert.input, "log")
+        logs = record.find_files(self.convert.input, "log")
         by_name: dict[str, Path] = {}
         for path in logs:
             if (other := by_name.setdefault(path.stem, path)) is not path:
@@ -66,7 +66,7 @@ class Convert:
         folder = self.session.folder / FOLDER
         for path, recordings in pieces.items():
             for number, recording in enumerate(recordings):
-                record.write(recording, folder / f"{path.stem}_{number:02d}.parquet")
+                record.write_recording(recording, folder / f"{path.stem}_{number:02d}.parquet")
             minutes = sum(recording.duration_s for recording in recordings) / 60.0
             log.info("%s: %d recordings, %.1f minutes", path, len(recordings), minutes)
         count = sum(map(len, pieces.values()))

@@ -12,9 +12,14 @@ from rich.console import Console
 from rich.table import Table
 
 from actuators.identify import page
-from actuators.identify.findings import Identified, gather
-from actuators.identify.stages import Fitted, Stage, fitted, members
-from actuators.identify.verdict import HOLD, LINEAR, Finding
+from actuators.identify.results import (
+    HOLD,
+    LINEAR,
+    IdentificationRun,
+    VerdictSentence,
+    build_results,
+)
+from actuators.identify.stages import FitStage, FittedModel, fit_or_restore, list_recordings
 from brokk_rl import open_loop, record
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.errors import ConfigError, RecordingError
@@ -22,7 +27,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.spec import spec
-from brokk_rl.split import by_run, check_commanded, split
+from brokk_rl.split import check_commanded, group_by_run, split_runs
 
 log = logging.getLogger(__name__)
 
@@ -120,15 +125,17 @@ class Identify:
         self._check_resume()
         self.session.seed_all()
         stages = self._stages()
-        judged = [recording for stage in stages for recording in members(stage.test)]
+        judged = [recording for stage in stages for recording in list_recordings(stage.test)]
         horizons_s = [
-            h for h in HORIZONS_S if h <= open_loop.longest_s(judged, self.machine) + 1e-9
+            h
+            for h in HORIZONS_S
+            if h <= open_loop.find_longest_horizon_s(judged, self.machine) + 1e-9
         ]
         cuts = [self._cut(stage, horizons_s) for stage in stages]
         models = {self.fit.name: self.fit, **self.baselines}
-        done: list[dict[str, Fitted]] = []
+        done: list[dict[str, FittedModel]] = []
         device = self.session.torch_device()
-        with _threads(self.identify.threads):
+        with _limit_threads(self.identify.threads):
             for stage, cut in zip(stages, cuts, strict=True):
                 chosen = models if cut or not self.identify.folds else {self.fit.name: self.fit}
                 done.append(
@@ -137,17 +144,17 @@ class Identify:
                         for name, fit in chosen.items()
                     }
                 )
-        identified = Identified(
+        identified = IdentificationRun(
             self.machine, self.fit.name, stages, cuts, done, tuple(horizons_s), HORIZONS_S
         )
-        result, findings, drawings = gather(
+        result, findings, drawings = build_results(
             identified, self.session.generator("resample"), self.session.generator("delay")
         )
         result |= {"device": str(device), "seed": self.session.seed, "folds": self.identify.folds}
         folder = self.session.folder
         write_json(folder / "identification.json", result)
-        page.write(folder, result, findings, drawings, self.machine)
-        _show(result, findings, folder)
+        page.write_page(folder, result, findings, drawings, self.machine)
+        _print_results(result, findings, folder)
         return result["overall"][self.fit.name][f"{horizons_s[-1]:g}"]["percent"]
 
     def _check_resume(self) -> None:
@@ -162,10 +169,10 @@ class Identify:
                 f"resume={self.resume}: there is no run to go on with; leave resume away to begin one"
             )
 
-    def _stages(self) -> list[Stage]:
+    def _stages(self) -> list[FitStage]:
         """Returns the fits to do, each with whole runs to fit to, to stop by, and to judge by."""
         options, folder = self.identify, self.session.folder
-        runs = by_run(record.read_all(options.recordings, self.machine))
+        runs = group_by_run(record.read_recordings(options.recordings, self.machine))
         if options.folds:
             check_commanded(
                 runs, self.machine, 3, "for every fold to have one to fit to and one to stop by"
@@ -176,7 +183,7 @@ class Identify:
                 )
             stages = []
             for number, tested in enumerate(
-                split(
+                split_runs(
                     runs, dict.fromkeys(map(str, range(options.folds)), 1.0 / options.folds)
                 ).values()
             ):
@@ -188,7 +195,7 @@ class Identify:
                 stages.append(self._stage(name, folder / "folds" / str(number + 1), rest, test))
             return [*stages, self._stage("all runs", folder, runs, {})]
         if options.test is not None:
-            test = by_run(record.read_all(options.test, self.machine))
+            test = group_by_run(record.read_recordings(options.test, self.machine))
             self._check_unseen(runs, test)
             check_commanded(runs, self.machine, 2, "one to fit to and one to stop the fit by")
             return [self._stage("", folder, runs, test)]
@@ -199,11 +206,11 @@ class Identify:
             "one to fit to, one to stop the fit by and one to judge by (identify.test, or folds)",
         )
         share = 1.0 / options.hold_out
-        parts = split(runs, {"rest": 1.0 - share, "test": share})
+        parts = split_runs(runs, {"rest": 1.0 - share, "test": share})
         rest, test = ({name: runs[name] for name in parts[part]} for part in ("rest", "test"))
         return [self._stage("", folder, rest, test)]
 
-    def _stage(self, name: str, folder: Path, rest: Runs, test: Runs) -> Stage:
+    def _stage(self, name: str, folder: Path, rest: Runs, test: Runs) -> FitStage:
         check_commanded(
             rest,
             self.machine,
@@ -211,45 +218,47 @@ class Identify:
             f"{f'in {name} ' if name else ''}one to fit to and one to stop the fit by",
         )
         share = 1.0 / self.identify.hold_out
-        parts = split(rest, {"train": 1.0 - share, "validation": share})
+        parts = split_runs(rest, {"train": 1.0 - share, "validation": share})
         train, validation = (
             {key: rest[key] for key in parts[part]} for part in ("train", "validation")
         )
-        return Stage(
+        return FitStage(
             name, folder, self.session.stream(f"fit {name}".strip()), train, validation, test
         )
 
     def _check_unseen(self, runs: Runs, test: Runs) -> None:
-        files = [{r.path.resolve() for r in members(part) if r.path} for part in (runs, test)]
+        files = [
+            {r.path.resolve() for r in list_recordings(part) if r.path} for part in (runs, test)
+        ]
         if shared := {*map(str, files[0] & files[1]), *(runs.keys() & test.keys())}:
             raise RecordingError(
                 f"identify.test: {min(shared)} is also among identify.recordings; judge by runs that were not fitted to"
             )
 
-    def _cut(self, stage: Stage, horizons_s: Sequence[float]) -> open_loop.Windows | None:
+    def _cut(self, stage: FitStage, horizons_s: Sequence[float]) -> open_loop.FreeRunWindows | None:
         if not stage.test and self.identify.folds:
             return None
         shortest, longest = (
             (horizons_s[0], horizons_s[-1]) if horizons_s else (HORIZONS_S[0], HORIZONS_S[0])
         )
-        return open_loop.windows(
-            members(stage.test), self.machine, longest, self.identify.stride_s, shortest
+        return open_loop.cut_windows(
+            list_recordings(stage.test), self.machine, longest, self.identify.stride_s, shortest
         )
 
     def _fitted(
         self,
-        stage: Stage,
+        stage: FitStage,
         name: str,
         fit: ActuatorFit,
-        cut: open_loop.Windows | None,
+        cut: open_loop.FreeRunWindows | None,
         device: torch.device,
-    ) -> Fitted:
+    ) -> FittedModel:
         folder = stage.folder if name == self.fit.name else stage.folder / "baselines" / name
-        return fitted(stage, name, fit, folder, self.machine, cut, device)
+        return fit_or_restore(stage, name, fit, folder, self.machine, cut, device)
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[None]:
+def _limit_threads(count: int) -> Iterator[None]:
     """Limits torch to `count` CPU threads within the block."""
     before = torch.get_num_threads()
     torch.set_num_threads(min(count, before))
@@ -259,7 +268,7 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _show(result: Mapping, findings: Sequence[Finding], folder: Path) -> None:
+def _print_results(result: Mapping, findings: Sequence[VerdictSentence], folder: Path) -> None:
     horizons = list(result["overall"][result["model"]])
     table = Table(
         title="error at the end of free runs on unseen runs (RMSE, rad or m; last rows: % of travel)",

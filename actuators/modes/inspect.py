@@ -18,11 +18,10 @@ from actuators.identify import dead_time
 from actuators.recordings import inspection_picture
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError
-from brokk_rl.inspection import KINDS, Inspection, Thresholds, inspect
+from brokk_rl.inspection import KINDS, Inspection, InspectionThresholds, inspect_recording
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
-from brokk_rl.recording_validation import Breach
-from brokk_rl.report import Page
+from brokk_rl.record import Breach, Recording
+from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 
@@ -32,7 +31,7 @@ FILES = ["file", "minutes", "rate", "jitter", "breaches", "findings"]
 
 
 @spec
-class Subject:
+class InspectionRequest:
     """What to inspect.
 
     Attributes:
@@ -50,7 +49,7 @@ class Subject:
 
 
 @dataclass(frozen=True)
-class Inspected:
+class InspectedFile:
     """One file: what could be read of it, what breaks the format, and what is in it."""
 
     path: Path
@@ -72,7 +71,7 @@ class Inspected:
             "num_samples": self.recording.num_samples if self.recording else None,
             "source": metadata.get("source"),
             "created": metadata.get("created"),
-            "oil_c": _range(self.recording.extra.get("oil_c")) if self.recording else None,
+            "oil_c": _find_range(self.recording.extra.get("oil_c")) if self.recording else None,
             "breaches": [asdict(breach) for breach in self.breaches],
             **(
                 asdict(self.inspection)
@@ -88,8 +87,8 @@ class Inspect:
 
     session: Session
     machine: Machine
-    inspect: Subject
-    thresholds: Thresholds
+    inspect: InspectionRequest
+    thresholds: InspectionThresholds
 
     def run(self) -> None:
         """Writes `inspection.json`, `inspection.html` and pictures into the run folder, and prints the tables.
@@ -98,7 +97,7 @@ class Inspect:
             RecordingError: no recording matches; a broken one is no error here.
             StorageError: a file could not be written.
         """
-        paths = record.matching(self.inspect.recordings, "recording")
+        paths = record.find_files(self.inspect.recordings, "recording")
         inspected = [self._look(path) for path in track(paths, "inspecting", transient=True)]
         folder = self.session.folder
         result = {
@@ -108,18 +107,18 @@ class Inspect:
                 [one.recording for one in inspected if one.recording and not one.breaches]
             ),
             "joints": self._overall(inspected),
-            "remarks": [*_resampled(inspected), *_clocks(inspected)],
+            "remarks": [*_list_resampled(inspected), *_check_clocks(inspected)],
             "recordings": [one.plain() for one in inspected],
         }
         write_json(folder / "inspection.json", result)
         pictures = {"overview": folder / "overview.png"}
-        inspection_picture.overview(
-            pictures["overview"], {one.path.stem: _drawn(one) for one in inspected}
+        inspection_picture.draw_overview(
+            pictures["overview"], {one.path.stem: _make_overview_row(one) for one in inspected}
         )
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
             if one.recording and one.inspection:
                 pictures[one.path.name] = folder / f"{one.path.stem}.png"
-                inspection_picture.recording(
+                inspection_picture.draw_recording(
                     pictures[one.path.name],
                     one.recording,
                     self.machine,
@@ -130,18 +129,20 @@ class Inspect:
         self._show(result, inspected)
         log.info("report: %s", folder / "inspection.html")
 
-    def _look(self, path: Path) -> Inspected:
-        recording, breaches = record.examine(path, self.machine)
+    def _look(self, path: Path) -> InspectedFile:
+        recording, breaches = record.examine_recording(path, self.machine)
         if recording is None or recording.num_samples < 2:
-            return Inspected(path, None, breaches, None)
-        return Inspected(
-            path, recording, breaches, inspect(recording, self.machine, self.thresholds)
+            return InspectedFile(path, None, breaches, None)
+        return InspectedFile(
+            path, recording, breaches, inspect_recording(recording, self.machine, self.thresholds)
         )
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
         """Returns the dead time of each joint from all sound recordings, `None` where they do not tell."""
         try:
-            found = dead_time.delays(recordings, self.machine, self.session.generator("delay"))
+            found = dead_time.estimate_dead_times(
+                recordings, self.machine, self.session.generator("delay")
+            )
         except RecordingError:
             return dict.fromkeys(self.machine.joint_names)
         return {
@@ -151,7 +152,7 @@ class Inspect:
             for name, delay in found.items()
         }
 
-    def _overall(self, inspected: Sequence[Inspected]) -> dict[str, dict[str, float | None]]:
+    def _overall(self, inspected: Sequence[InspectedFile]) -> dict[str, dict[str, float | None]]:
         """Returns the figures of each joint over all recordings: extremes, and means weighted by duration."""
         table = {}
         known = [one for one in inspected if one.inspection]
@@ -213,10 +214,10 @@ class Inspect:
             entry, delay = result["joints"][joint.name], result["delay_s"][joint.name]
             rows.append([
                 joint.name,
-                f"{_number(entry.get('lowest'), 2)} … {_number(entry.get('highest'), 2)} {joint.unit}",
-                f"{_number(entry['lower_limit'], 2)} … {_number(entry['upper_limit'], 2)}",
-                *(_percent(entry.get(key)) for key in ("commanded", "at_limit")),
-                *(_number(entry.get(key), 2) for key in ("noise", "step")),
+                f"{_format_number(entry.get('lowest'), 2)} … {_format_number(entry.get('highest'), 2)} {joint.unit}",
+                f"{_format_number(entry['lower_limit'], 2)} … {_format_number(entry['upper_limit'], 2)}",
+                *(_format_percent(entry.get(key)) for key in ("commanded", "at_limit")),
+                *(_format_number(entry.get(key), 2) for key in ("noise", "step")),
                 "–" if delay is None else f"{delay['value']:.2f} s",
             ])  # fmt: skip
         return head, rows
@@ -232,10 +233,10 @@ class Inspect:
             for name in names
         ]
 
-    def _show(self, result: dict[str, Any], inspected: Sequence[Inspected]) -> None:
+    def _show(self, result: dict[str, Any], inspected: Sequence[InspectedFile]) -> None:
         console = Console()
         tables = {
-            "recordings": (FILES, [_file_row(one) for one in inspected]),
+            "recordings": (FILES, [_format_file_row(one) for one in inspected]),
             "joints, all recordings": self._figures(result),
             "findings": self._counts(result),
         }
@@ -257,8 +258,8 @@ class Inspect:
             console.print(remark, markup=False, highlight=False, soft_wrap=True)
 
     def _page(
-        self, result: dict[str, Any], inspected: Sequence[Inspected], pictures: dict[str, Path]
-    ) -> Page:
+        self, result: dict[str, Any], inspected: Sequence[InspectedFile], pictures: dict[str, Path]
+    ) -> Report:
         broken = sum(bool(one.breaches) for one in inspected)
         minutes = (
             sum((one.inspection.timing["duration_s"] or 0.0) for one in inspected if one.inspection)
@@ -272,27 +273,27 @@ class Inspect:
             or "nothing that wants an explanation"
         )
         summary = f"{len(inspected)} recordings, {minutes:.1f} minutes; {broken} break the format. Found: {told}."
-        page = Page(f"Recordings of {self.machine.name}", summary, "bad" if broken else "plain")
-        page.heading("Joints")
-        page.table(
+        page = Report(f"Recordings of {self.machine.name}", summary, "bad" if broken else "plain")
+        page.add_heading("Joints")
+        page.add_table(
             *self._figures(result),
             "Shares are of the time; noise and step in the unit of the joint.",
         )
-        page.heading("Findings")
-        page.table(*self._counts(result))
-        page.items([f"{kind}: {meaning}" for kind, meaning in KINDS.items()])
-        page.heading("Recordings")
-        page.table(FILES, [_file_row(one) for one in inspected])
+        page.add_heading("Findings")
+        page.add_table(*self._counts(result))
+        page.add_list([f"{kind}: {meaning}" for kind, meaning in KINDS.items()])
+        page.add_heading("Recordings")
+        page.add_table(FILES, [_format_file_row(one) for one in inspected])
         if result["remarks"]:
-            page.items(result["remarks"])
+            page.add_list(result["remarks"])
         for name, path in pictures.items():
             lines = "" if name == "overview" else ", breaches of the format are vertical lines"
-            page.picture(path, f"{name}: findings are shaded{lines}")
+            page.add_picture(path, f"{name}: findings are shaded{lines}")
         for one in inspected:
             if one.num_remarks:
-                page.heading(one.path.name, 3)
+                page.add_heading(one.path.name, 3)
             if one.breaches:
-                page.items([str(breach) for breach in one.breaches])
+                page.add_list([str(breach) for breach in one.breaches])
             if one.inspection and one.inspection.findings:
                 rows = [
                     [
@@ -306,12 +307,14 @@ class Inspect:
                     ]
                     for f in one.inspection.findings
                 ]
-                with page.details(f"{len(rows)} findings"):
-                    page.table(["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows)
+                with page.add_details(f"{len(rows)} findings"):
+                    page.add_table(
+                        ["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows
+                    )
         return page
 
 
-def _resampled(inspected: Sequence[Inspected]) -> list[str]:
+def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:
     """Returns at what rates logs of other programs were, whose recordings have even periods only since they were converted."""
     rates = {
         one.recording.run: one.recording.metadata.get("resampled_from")
@@ -321,7 +324,7 @@ def _resampled(inspected: Sequence[Inspected]) -> list[str]:
     return [f"run {run}: resampled from {rate}" for run, rate in rates.items() if rate]
 
 
-def _clocks(inspected: Sequence[Inspected]) -> list[str]:
+def _check_clocks(inspected: Sequence[InspectedFile]) -> list[str]:
     """Returns what the start times of the parts of each run say against them."""
     remarks, parts = [], {}
     for one in inspected:
@@ -356,14 +359,14 @@ def _clocks(inspected: Sequence[Inspected]) -> list[str]:
     return remarks
 
 
-def _drawn(one: Inspected) -> inspection_picture.Line:
+def _make_overview_row(one: InspectedFile) -> inspection_picture.OverviewRow:
     duration_s = one.recording.duration_s if one.recording else 0.0
-    return inspection_picture.Line(
+    return inspection_picture.OverviewRow(
         duration_s, one.inspection.findings if one.inspection else [], len(one.breaches)
     )
 
 
-def _file_row(one: Inspected) -> list[str]:
+def _format_file_row(one: InspectedFile) -> list[str]:
     timing = one.inspection.timing if one.inspection else {}
     rate_hz, jitter_s = timing.get("rate_hz"), timing.get("jitter_s")
     return [
@@ -376,14 +379,14 @@ def _file_row(one: Inspected) -> list[str]:
     ]
 
 
-def _range(values: np.ndarray | None) -> list[float] | None:
+def _find_range(values: np.ndarray | None) -> list[float] | None:
     there = values[np.isfinite(values)] if values is not None else np.empty(0)
     return [float(there.min()), float(there.max())] if len(there) else None
 
 
-def _number(value: float | None, digits: int = 3) -> str:
+def _format_number(value: float | None, digits: int = 3) -> str:
     return "–" if value is None else f"{value:.{digits}g}"
 
 
-def _percent(value: float | None) -> str:
+def _format_percent(value: float | None) -> str:
     return "–" if value is None else f"{100.0 * value:.1f} %"

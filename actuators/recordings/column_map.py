@@ -136,7 +136,7 @@ class ColumnMap:
             )
         table = _Table(path, self.delimiter, self.decimal)
         t_s = table.numbers(self.time)
-        if (row := _first(np.diff(t_s) <= 0)) is not None:
+        if (row := _find_first(np.diff(t_s) <= 0)) is not None:
             where = table.where(row + 1, self.time.column)
             raise RecordingError(
                 f"{where}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)"
@@ -168,13 +168,13 @@ class ColumnMap:
                 self.shortest_s,
             )
         return [
-            _resampled(t_s[p], u[p], q[p], {k: v[p] for k, v in extra.items()}, path, machine)
+            _resample(t_s[p], u[p], q[p], {k: v[p] for k, v in extra.items()}, path, machine)
             for p in kept
         ]
 
     def _commands(self, table: "_Table", column: CommandColumn) -> np.ndarray:
         u = column.command(table.numbers(Column(column=column.column, scale=1.0, offset=0.0)))
-        if (row := _first(np.abs(u) > 1.0 + self.overrun)) is not None:
+        if (row := _find_first(np.abs(u) > 1.0 + self.overrun)) is not None:
             raise RecordingError(
                 f"{table.where(row, column.column)}: command {u[row]:g} is beyond full by more than {self.overrun:g}; "
                 "mend full_plus, full_minus or neutral of the column map, or the log"
@@ -202,7 +202,7 @@ class _Table:
 
     def __init__(self, path: Path, delimiter: str, decimal: str) -> None:
         self._path, self._decimal = path, decimal
-        self._cells = _cells(path, delimiter)
+        self._cells = _read_cells(path, delimiter)
 
     def where(self, row: int, column: str) -> str:
         """Returns file, line, row and column for a message."""
@@ -234,13 +234,13 @@ class _Table:
         return column.scale * values + column.offset
 
 
-def _first(condition: np.ndarray) -> int | None:
+def _find_first(condition: np.ndarray) -> int | None:
     """Returns the first row where `condition` holds, or `None`."""
     rows = np.flatnonzero(condition)
     return int(rows[0]) if len(rows) else None
 
 
-def _cells(path: Path, delimiter: str) -> Cells:
+def _read_cells(path: Path, delimiter: str) -> Cells:
     """Reads a CSV file; a last line that a crash may have cut off is left out with a warning."""
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -278,7 +278,7 @@ def _cells(path: Path, delimiter: str) -> Cells:
     return Cells(header, [cells for _, cells in body], [number for number, _ in body])
 
 
-def _resampled(
+def _resample(
     t_s: np.ndarray,
     u: np.ndarray,
     q: np.ndarray,
@@ -307,7 +307,7 @@ def _resampled(
         metadata={
             "source": f"log: {path.name}",
             "run": path.stem,
-            "fingerprint": record.stamp(machine),
+            "fingerprint": record.format_fingerprint(machine),
             "resampled_from": was,
         },
     )

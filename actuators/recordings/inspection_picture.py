@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brokk_rl.inspection import KINDS, Finding, Inspection
+from brokk_rl.inspection import KINDS, Inspection, RecordingFinding
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
-from brokk_rl.recording_validation import Breach
+from brokk_rl.record import Breach, Recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,7 +25,7 @@ seen."""
 
 
 @dataclass(frozen=True)
-class Line:
+class OverviewRow:
     """One recording in the overview.
 
     Attributes:
@@ -36,11 +35,11 @@ class Line:
     """
 
     duration_s: float
-    findings: Sequence[Finding]
+    findings: Sequence[RecordingFinding]
     num_breaches: int
 
 
-def recording(
+def draw_recording(
     path: Path,
     recording: Recording,
     machine: Machine,
@@ -87,7 +86,7 @@ def recording(
     axes[-1].set_xlim(begin_s, begin_s + span_s)
     name = recording.path.name if recording.path else "recording"
     figure.suptitle(f"{name}: measured position (black), command in [-1, 1] (grey)", fontsize=11)
-    _legend(
+    _add_legend(
         figure,
         {finding.kind for finding in inspection.findings},
         any(breach.row is not None for breach in breaches),
@@ -95,7 +94,7 @@ def recording(
     figure.savefig(path, dpi=100)
 
 
-def overview(path: Path, lines: Mapping[str, Line]) -> None:
+def draw_overview(path: Path, lines: Mapping[str, OverviewRow]) -> None:
     """Draws one line a recording with its findings; writes a PNG."""
     from matplotlib.figure import Figure
 
@@ -122,11 +121,13 @@ def overview(path: Path, lines: Mapping[str, Line]) -> None:
         0.0, longest_s * (1.25 if any(line.num_breaches for line in lines.values()) else 1.0)
     )
     axis.set_xlabel("time [s]")
-    _legend(figure, {finding.kind for line in lines.values() for finding in line.findings}, False)
+    _add_legend(
+        figure, {finding.kind for line in lines.values() for finding in line.findings}, False
+    )
     figure.savefig(path, dpi=100)
 
 
-def _legend(figure: "Figure", kinds: set[str], has_breaches: bool) -> None:
+def _add_legend(figure: "Figure", kinds: set[str], has_breaches: bool) -> None:
     """Explains the colours that occur."""
     from matplotlib.patches import Patch
 

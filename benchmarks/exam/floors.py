@@ -17,7 +17,7 @@ import torch
 from hydra.utils import instantiate
 
 from brokk_rl import open_loop, record
-from brokk_rl.split import by_run
+from brokk_rl.split import group_by_run
 
 
 def main(exam: Path, fit_name: str, cases: list[str], *overrides: str) -> None:
@@ -30,15 +30,15 @@ def main(exam: Path, fit_name: str, cases: list[str], *overrides: str) -> None:
     for case in cases:
         begun = time.monotonic()
         reference, field = (
-            record.read_all(str(exam / "cases" / case / half / "*.parquet"), machine)
+            record.read_recordings(str(exam / "cases" / case / half / "*.parquet"), machine)
             for half in ("reference", "field")
         )
-        runs = list(by_run(reference).values())
+        runs = list(group_by_run(reference).values())
         train, validation = [recording for run in runs[:-1] for recording in run], runs[-1]
         with tempfile.TemporaryDirectory() as folder:
             actuator = fit.fit(machine, train, validation, Path(folder), 0, torch.device("cpu"))
-            cut = open_loop.windows(field, machine, 5.0, 1.0)
-            error = open_loop.free_run(actuator, machine, cut, torch.device("cpu")) - cut.measured
+            cut = open_loop.cut_windows(field, machine, 5.0, 1.0)
+            error = open_loop.roll_out(actuator, machine, cut, torch.device("cpu")) - cut.measured
         over, end = (
             1000.0 * np.sqrt((part**2).mean((0, 1) if part.ndim == 3 else 0))
             for part in (error, error[:, -1])

@@ -22,10 +22,16 @@ from rich.progress import track
 from rich.table import Table
 
 from brokk_rl.contracts.vision import EllipseDetector
-from perception.benchmark.hidden import SHAPES, hidden, shapes
-from perception.benchmark.hidden import STYLES as HIDDEN
-from perception.benchmark.patterns import CONDITIONS, NEGATIVES, matches, negative, pattern
-from perception.benchmark.photographs import STYLES, photograph
+from perception.benchmark.calibration_patterns import (
+    CONDITIONS,
+    NEGATIVES,
+    count_matches,
+    draw_negative,
+    draw_pattern,
+)
+from perception.benchmark.occluded_ellipses import SHAPES, draw_lookalikes, draw_occluded_ellipses
+from perception.benchmark.occluded_ellipses import STYLES as HIDDEN
+from perception.benchmark.photographs import STYLES, draw_photograph
 
 NONE = np.empty((0, 5))
 
@@ -67,16 +73,28 @@ def kinds() -> Iterator[tuple[str, Callable[[np.random.Generator], tuple[np.ndar
     for condition in CONDITIONS:
         yield (
             f"pattern, {condition}",
-            lambda generator, condition=condition: pattern(generator, condition),
+            lambda generator, condition=condition: draw_pattern(generator, condition),
         )
     for style in STYLES:
-        yield f"photograph, {style}", lambda generator, style=style: photograph(generator, style)
+        yield (
+            f"photograph, {style}",
+            lambda generator, style=style: draw_photograph(generator, style),
+        )
     for style in HIDDEN:
-        yield f"hidden, {style}", lambda generator, style=style: hidden(generator, style)
+        yield (
+            f"hidden, {style}",
+            lambda generator, style=style: draw_occluded_ellipses(generator, style),
+        )
     for kind in NEGATIVES:
-        yield f"nothing, {kind}", lambda generator, kind=kind: (negative(kind, generator), NONE)
+        yield (
+            f"nothing, {kind}",
+            lambda generator, kind=kind: (draw_negative(kind, generator), NONE),
+        )
     for kind in SHAPES:
-        yield f"nothing, {kind}", lambda generator, kind=kind: (shapes(generator, kind), NONE)
+        yield (
+            f"nothing, {kind}",
+            lambda generator, kind=kind: (draw_lookalikes(generator, kind), NONE),
+        )
 
 
 def build(option: str) -> EllipseDetector:
@@ -102,7 +120,7 @@ def judged(
         seen = detector.detect(picture, None, None)
         ms.append(1000 * (time.perf_counter() - start))
         hits, found, there = (
-            hits + (matches(seen, truth) if len(truth) else 0),
+            hits + (count_matches(seen, truth) if len(truth) else 0),
             found + len(seen),
             there + len(truth),
         )

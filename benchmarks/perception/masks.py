@@ -25,7 +25,7 @@ from rich.table import Table
 from brokk_rl.contracts.vision import FrameSource, Segmenter
 from perception import dataset
 from perception.segment.network import THRESHOLD
-from perception.train.report import pieces
+from perception.train.evaluation import match_pieces
 
 FIGURES = ("block", "mouth", "found", "false", "ms")
 
@@ -94,7 +94,7 @@ def judged(segmenter: Segmenter, source: FrameSource, name: str) -> dict[str, fl
                 shared[channel] += (said & known).sum()
                 either[channel] += (said | known).sum()
                 real[channel] += known.sum()
-            counts += pieces(mouth, label.hole_mask)
+            counts += match_pieces(mouth, label.hole_mask)
     block, mouth = (
         float(a / b) if any_real else None
         for a, b, any_real in zip(shared, either, real, strict=True)

@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.progress import track
 
 from brokk_rl.signals import Frame
-from perception.render.drawing import compose
+from perception.render.scene_sampler import compose_scene
 
 CONDITIONS, DISTANCES_M, TIMES = ("clean", "haze", "hidden"), (1.0, 2.0, 3.0, 4.0), 7
 STAGES = ("segment", "ellipse", "pose", "total", "processor_time")
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     given = parser.parse_args()
     cv2.setNumThreads(given.threads)
-    observer = configured(
+    finder = configured(
         "perception", "mode=perceive", "perceive.input=.", f"perception={given.option}"
     ).build()
     shortest = []
@@ -54,7 +54,7 @@ def main() -> None:
         looks = []
         for _ in range(TIMES):
             start, busy = time.perf_counter(), time.process_time()
-            ms = observer.look(frame).ms
+            ms = finder.find(frame).ms
             total, spent = time.perf_counter() - start, time.process_time() - busy
             looks.append(
                 [ms.get(stage, 0.0) for stage in STAGES[:-2]] + [1000.0 * total, 1000.0 * spent]
@@ -77,7 +77,7 @@ def rendered(condition: str, distance_m: float, number: int) -> Frame:
         f"scene.sight.distance_m=[{distance_m},{distance_m}]",
     )
     generator = np.random.default_rng((7, number))
-    shot = studio.shot(compose(studio.scene, studio.rig, generator), generator)
+    shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
     return Frame(
         color=shot.color, depth_m=shot.depth_m, camera_matrix=studio.rig.left.matrix, base_from_camera=studio.rig.base_from_camera,
         t_s=0.0, right=shot.right, baseline_m=studio.rig.baseline_m,

@@ -32,12 +32,13 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from brokk_rl.contracts.vision import FrameDetections, Observer, Overlay
+from brokk_rl.contracts.vision import FrameDetections, Overlay
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from perception.benchmark.cells import Tally, judge
-from perception.render.drawing import compose
-from perception.render.studio import Studio
+from perception.benchmark.scoring import FinderScore, score_frame
+from perception.finder import StagedFinder
+from perception.render.frame_renderer import FrameRenderer
+from perception.render.scene_sampler import compose_scene
 
 CONDITIONS = ("clean", "haze", "dark", "hidden", "decoy", "empty")
 SHOWN = (
@@ -150,15 +151,15 @@ def look(task: Task) -> list[dict[str, Any]]:
     """Returns what each option makes of one scene."""
     studio = renderer(task.condition, task.distance_m)
     generator = scenes(task.seed).generator(f"scene/{task.number}")
-    shot = studio.shot(compose(studio.scene, studio.rig, generator), generator)
+    shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
     frame = Frame(
         color=shot.color, depth_m=shot.depth_m, camera_matrix=studio.rig.left.matrix, base_from_camera=studio.rig.base_from_camera,
         t_s=0.0, right=shot.right, baseline_m=studio.rig.baseline_m,
     )  # fmt: skip
     lines = []
     for option in task.options:
-        seer = observer(option)
-        tally, sighting = judge(seer, frame, shot.truth)
+        finder = build_finder(option)
+        tally, found = score_frame(finder, frame, shot.truth)
         place = {
             "condition": task.condition,
             "distance_m": task.distance_m,
@@ -168,27 +169,27 @@ def look(task: Task) -> list[dict[str, Any]]:
         lines.append({**place, "tally": asdict(tally)})
         if not tally.is_perfect and option == task.shown:
             name = f"{option.replace(' ', '_').replace('/', '-')}_{task.condition}_{task.distance_m:g}m"
-            show_failure(task, name, frame, sighting, seer)
+            show_failure(task, name, frame, found, finder)
     return lines
 
 
 def show_failure(
-    task: Task, name: str, frame: Frame, sighting: FrameDetections, seer: Observer
+    task: Task, name: str, frame: Frame, found: FrameDetections, finder: StagedFinder
 ) -> None:
     """Writes the picture of what went wrong and why, unless there are enough of its kind."""
     task.failures.mkdir(parents=True, exist_ok=True)
     if len(list(task.failures.glob(f"{name}_*.png"))) < task.pictures:
-        drawing().write(task.failures / f"{name}_{task.number:04d}.png", frame, sighting)
+        drawing().write(task.failures / f"{name}_{task.number:04d}.png", frame, found)
         told = [
             f"score {hole.score:.2f}, radius {hole.radius_m:.4f} m at {hole.center_m.round(4).tolist()}"
-            for hole in sighting.holes
+            for hole in found.holes
         ]
-        told += [seer.explain(one) for one in sighting.rejected]
+        told += [finder.explain(one) for one in found.rejected]
         (task.failures / f"{name}_{task.number:04d}.txt").write_text("\n".join(told) + "\n")
 
 
 @functools.cache
-def renderer(condition: str, distance_m: float) -> Studio:
+def renderer(condition: str, distance_m: float) -> FrameRenderer:
     return composed(
         "studio",
         "mode=render",
@@ -198,7 +199,7 @@ def renderer(condition: str, distance_m: float) -> Studio:
 
 
 @functools.cache
-def observer(option: str) -> Observer:
+def build_finder(option: str) -> StagedFinder:
     name, *overrides = option.split()
     return composed(
         "perception", "mode=perceive", f"perception={name}", "perceive.input=.", *overrides
@@ -232,10 +233,12 @@ def read(path: Path) -> Iterator[dict[str, Any]]:
 
 def rows(path: Path, options: list[str]) -> list[dict[str, Any]]:
     """Returns the rows of the table, each with how many times smaller its median error is than that of the baseline."""
-    tallies: dict[tuple, Tally] = defaultdict(Tally)
+    tallies: dict[tuple, FinderScore] = defaultdict(FinderScore)
     for line in read(path):
         if line["option"] in options:
-            tallies[line["option"], line["condition"], line["distance_m"]] += Tally(**line["tally"])
+            tallies[line["option"], line["condition"], line["distance_m"]] += FinderScore(
+                **line["tally"]
+            )
     order = {name: number for number, name in enumerate((*options, *CONDITIONS))}
     found = []
     for option, condition, distance_m in sorted(

@@ -6,15 +6,15 @@ import torch
 
 from brokk_rl.checks.exercise import (
     NUM_ENVS,
-    copies,
-    in_place,
-    own_randomness,
-    places,
+    build_rest_history,
+    copy_tensors,
+    is_in_place,
+    is_same,
+    isolate_randomness,
     require,
     require_memory_in_state,
     require_rows,
-    rest_history,
-    same,
+    view_tensors,
 )
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel, Effect
 from brokk_rl.history import History
@@ -27,7 +27,7 @@ def check_actuator(
     actuator: Actuator, machine: Machine, device: torch.device | str = "cpu"
 ) -> None:
     """Checks what `Actuator.build` returns against `ActuatorModel`."""
-    with own_randomness():
+    with isolate_randomness():
         check_actuator_model(
             actuator.build(machine, NUM_ENVS, torch.device(device)), machine, torch.device(device)
         )
@@ -35,7 +35,7 @@ def check_actuator(
 
 def check_effect(effect: Effect, machine: Machine, device: torch.device | str = "cpu") -> None:
     """Checks that an effect around the simplest actuator model is again an actuator model."""
-    with own_randomness():
+    with isolate_randomness():
         inner = _Proportional(machine, torch.device(device))
         check_actuator_model(
             effect.wrap(inner, machine, NUM_ENVS, torch.device(device)),
@@ -49,8 +49,8 @@ def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.d
     everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=device)
     model.reset(everywhere)
     require_rows(model.state, "state")
-    place = places(model.state)
-    begin = copies(model.state)
+    place = view_tensors(model.state)
+    begin = copy_tensors(model.state)
 
     first = _drive(model, machine, device)
     require(
@@ -66,7 +66,7 @@ def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.d
         "step: positions are not finite under full and random commands",
     )
     require(
-        in_place(model.state, place),
+        is_in_place(model.state, place),
         "state: a tensor moved or changed its shape; write it in place",
     )
 
@@ -75,7 +75,7 @@ def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.d
     )
 
     model.reset(everywhere)
-    history = rest_history(machine, device)
+    history = build_rest_history(machine, device)
     moved = (model.step(history) - history.q[:, -1]).abs().amax(0).cpu().numpy()
     limit = machine.max_speed * machine.period_s
     require(
@@ -105,17 +105,17 @@ def _drive(
 ) -> torch.Tensor:
     """Returns the positions under random and full commands, `(T, N, J)`; `alter_first` changes those of environment 0."""
     generator = torch.Generator().manual_seed(0)
-    history, found = rest_history(machine, device), []
+    history, found = build_rest_history(machine, device), []
     for step in range(NUM_STEPS):
         u = torch.rand((NUM_ENVS, machine.num_joints), generator=generator) * 2 - 1
         u = u.sign() if step % 4 == 0 else u
         if alter_first:
             u[0] = -u[0]
         history.push_u(u.to(device))
-        kept = copies(vars(history))
+        kept = copy_tensors(vars(history))
         q = model.step(history).clone()
         require(
-            all(same(value, kept[name]) for name, value in vars(history).items()),
+            all(is_same(value, kept[name]) for name, value in vars(history).items()),
             "step: changed the history",
         )
         history.push_q(q)

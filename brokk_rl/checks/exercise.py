@@ -14,7 +14,9 @@ from brokk_rl.machine import Machine
 NUM_ENVS = 4
 
 
-def rest_history(machine: Machine, device: torch.device, q: torch.Tensor | None = None) -> History:
+def build_rest_history(
+    machine: Machine, device: torch.device, q: torch.Tensor | None = None
+) -> History:
     """Returns a history at rest at `q`, or in the middle of the travel."""
     if q is None:
         q = torch.as_tensor(
@@ -27,7 +29,7 @@ def rest_history(machine: Machine, device: torch.device, q: torch.Tensor | None 
 
 
 @contextmanager
-def own_randomness() -> Iterator[None]:
+def isolate_randomness() -> Iterator[None]:
     """Leaves torch's global generators as they were."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -49,12 +51,12 @@ def require_rows(tensors: Mapping[str, torch.Tensor], what: str) -> None:
         )
 
 
-def places(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def view_tensors(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Returns views of all tensors, which keep their memory from being given to others."""
     return {name: value.view_as(value) for name, value in tensors.items()}
 
 
-def in_place(tensors: Mapping[str, torch.Tensor], before: Mapping[str, torch.Tensor]) -> bool:
+def is_in_place(tensors: Mapping[str, torch.Tensor], before: Mapping[str, torch.Tensor]) -> bool:
     """Says whether all tensors lie where `places` saw them, in the same shape."""
     return tensors.keys() == before.keys() and all(
         value.data_ptr() == before[name].data_ptr() and value.shape == before[name].shape
@@ -62,7 +64,7 @@ def in_place(tensors: Mapping[str, torch.Tensor], before: Mapping[str, torch.Ten
     )
 
 
-def copies(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def copy_tensors(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Returns copies of all tensors."""
     return {name: value.clone() for name, value in tensors.items()}
 
@@ -73,7 +75,7 @@ def restore(tensors: Mapping[str, torch.Tensor], kept: Mapping[str, torch.Tensor
         value.copy_(kept[name])
 
 
-def same(a: torch.Tensor, b: torch.Tensor, tolerance: float = 0.0) -> bool:
+def is_same(a: torch.Tensor, b: torch.Tensor, tolerance: float = 0.0) -> bool:
     """Says whether two tensors hold the same numbers; NaN equals NaN."""
     return bool(torch.allclose(a.float(), b.float(), rtol=0.0, atol=tolerance, equal_nan=True))
 
@@ -105,22 +107,22 @@ def require_memory_in_state(
         first: What came of it, `(T, N, …)`.
         run: Does it again; told whether to treat environment 0 otherwise.
     """
-    end = copies(model.state)
+    end = copy_tensors(model.state)
     some = torch.zeros(NUM_ENVS, dtype=torch.bool, device=first.device)
     some[0] = True
     model.reset(some)
     for name, value in model.state.items():
         require(
-            same(value[1:], end[name][1:]),
+            is_same(value[1:], end[name][1:]),
             f"reset: state '{name}' changed in environments outside the mask",
         )
     restore(model.state, begin)
     require(
-        same(run(False), first),
+        is_same(run(False), first),
         "step: from the same state the same commands lead elsewhere; all memory belongs in state",
     )
     restore(model.state, begin)
     require(
-        same(run(True)[:, 1:], first[:, 1:]),
+        is_same(run(True)[:, 1:], first[:, 1:]),
         "step: what happens in environment 0 changes the others",
     )

@@ -6,14 +6,14 @@ import torch
 
 from brokk_rl.checks.exercise import (
     NUM_ENVS,
-    copies,
-    in_place,
-    own_randomness,
-    places,
+    copy_tensors,
+    is_in_place,
+    is_same,
+    isolate_randomness,
     require,
     require_memory_in_state,
     require_rows,
-    same,
+    view_tensors,
 )
 from brokk_rl.contracts.actuator import Follower, FollowerModel
 from brokk_rl.machine import Machine, mask_exclusive_joints
@@ -26,7 +26,7 @@ def check_follower(
 ) -> None:
     """Checks what `Follower.build` returns against `FollowerModel`."""
     place = torch.device(device)
-    with own_randomness():
+    with isolate_randomness():
         _check_model(follower.build(machine, NUM_ENVS, place), machine, place)
 
 
@@ -34,7 +34,7 @@ def _check_model(model: FollowerModel, machine: Machine, device: torch.device) -
     everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=device)
     model.reset(everywhere)
     require_rows(model.state, "state")
-    place, begin = places(model.state), copies(model.state)
+    place, begin = view_tensors(model.state), copy_tensors(model.state)
 
     first = _follow(model, machine, device)
     shape = (NUM_STEPS, NUM_ENVS, machine.num_joints)
@@ -50,7 +50,7 @@ def _check_model(model: FollowerModel, machine: Machine, device: torch.device) -
     require(not bool(both.any()), "step: an exclusive joint moves together with others")
     require(bool((first != 0).any()), "step: nothing is ever given")
     require(
-        in_place(model.state, place),
+        is_in_place(model.state, place),
         "state: a tensor moved or changed its shape; write it in place",
     )
 
@@ -84,5 +84,5 @@ def _follow(
         proposed = proposed.to(device)
         kept = proposed.clone()
         found.append(model.step(proposed).clone())
-        require(same(proposed, kept), "step: changed the proposal")
+        require(is_same(proposed, kept), "step: changed the proposal")
     return torch.stack(found)

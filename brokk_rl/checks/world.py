@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from brokk_rl.checks.exercise import NUM_ENVS, in_place, places, require, same
+from brokk_rl.checks.exercise import NUM_ENVS, is_in_place, is_same, require, view_tensors
 from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.machine import Machine
 
@@ -12,7 +12,7 @@ from brokk_rl.machine import Machine
 def check_world(
     simulator: Simulator, machine: Machine, scenes: torch.Tensor, device: torch.device | str = "cpu"
 ) -> None:
-    """Checks what `Simulator.build` returns against `World`.
+    """Check what `Simulator.build` returns against `World`.
 
     Args:
         simulator: The spec.
@@ -38,7 +38,7 @@ def check_world(
     require(
         world.num_worlds == NUM_ENVS, f"num_worlds: expected {NUM_ENVS}, got {world.num_worlds}"
     )
-    place = places(tensors)
+    place = view_tensors(tensors)
     home = torch.as_tensor(machine.home, dtype=torch.float32, device=device).repeat(NUM_ENVS, 1)
     everywhere, scenes = torch.ones(NUM_ENVS, dtype=torch.bool, device=device), scenes.to(device)
     steps = torch.as_tensor(
@@ -53,26 +53,26 @@ def check_world(
     require(bool(first.isfinite().all()), "step: q is not finite")
     require(bool((first[-1] != home).any()), "step: the arm does not move")
     seen = {"q": world.q, "contact_force_n": world.contact_force_n, "faults": world.faults}
-    require(in_place(seen, place), "step: a tensor moved; refresh it in place")
+    require(is_in_place(seen, place), "step: a tensor moved; refresh it in place")
     tolerance = (
         0.0 if device.type == "cpu" else 1e-5
     )  # the order of additions on a GPU is not fixed
     world.load_state_dict(stored)
     require(
-        same(_push_joints(world, steps), first, tolerance),
+        is_same(_push_joints(world, steps), first, tolerance),
         "load_state_dict: the same steps from the same state lead elsewhere",
     )
     world.load_state_dict(stored)
     altered = steps.clone()
     altered[0] = 0.0
     require(
-        same(_push_joints(world, altered)[:, 1:], first[:, 1:], tolerance),
+        is_same(_push_joints(world, altered)[:, 1:], first[:, 1:], tolerance),
         "step: what happens in world 0 changes the others",
     )
     before, some = world.q.clone(), everywhere.clone()
     some[1:] = False
     world.reset(some, home, scenes)
-    require(same(world.q[1:], before[1:]), "reset: q changed in worlds outside the mask")
+    require(is_same(world.q[1:], before[1:]), "reset: q changed in worlds outside the mask")
     require(
         bool(torch.allclose(world.q[0], home[0], atol=1e-4)),
         "reset: the world of the mask is not where it was put",
@@ -80,7 +80,7 @@ def check_world(
 
 
 def _push_joints(world: World, steps: torch.Tensor) -> torch.Tensor:
-    """Returns the positions over some control periods in which every joint advances, `(T, N, J)`."""
+    """Return the positions over some control periods in which every joint advances, `(T, N, J)`."""
     found = []
     for _ in range(5):
         world.step(steps)

@@ -1,22 +1,25 @@
-"""What the parts of perception promise each other: sources, segmenters, ellipses, poses, targets.
+"""Contracts of perception: frame sources, segmenters, ellipse detectors, pose estimators, finders.
 
-Every part is an option of a config group
-(`conf/perception/{source,segmenter,ellipse,pose,filter}`): a spec with `build()`, which returns
-what the Protocols here describe. Pictures are `(h, w)` or `(h, w, 3)`, RGB, uint8; pixel centres
-lie at whole numbers. Camera coordinates follow the optical convention (x right, y down, z forward);
-depth is z, in m, `NaN` where it is unknown and never 0 or infinite. Times `t_s` are of one clock,
-in s.
+A finder is an option of `conf/perception`: a spec whose `build()` returns a `BoreholeFinder`. Its
+one method is `find(frame) -> FrameDetections`. `mode=perceive` and the camera process call nothing
+else; both hand the holes of each frame to one `HoleTracker`. The shipped finder
+(`perception.finder`) is built from a segmenter, an ellipse detector and a pose estimator, which are
+options of `conf/perception/{segmenter,ellipse,pose}`.
+
+Pictures are `(h, w)` or `(h, w, 3)`, RGB, uint8; pixel centres lie at whole numbers. Camera
+coordinates follow the optical convention (x right, y down, z forward). Depth is z in m, `NaN` where
+it is unknown, never 0 or infinite. Times `t_s` are in s, of one clock.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from brokk_rl.signals import Borehole, Frame
+from brokk_rl.signals import Frame
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,12 +27,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Masks:
-    """Where the block and the mouths of its holes are.
+    """Masks of one frame: the block, and the inside of its holes.
 
     Attributes:
         block: Probability that a pixel shows the block, `(h, w)` float32 in [0, 1].
         hole_mask: Probability that a pixel shows the inside of a hole, `(h, w)` float32 in [0, 1];
-            `None` where nobody has looked.
+            `None` from a segmenter that does not look for holes.
     """
 
     block: np.ndarray
@@ -48,7 +51,7 @@ class Ellipse:
         theta_rad: Direction of the major axis from +x towards +y, in [0, pi).
         rms_px: Root mean square distance of its edge points.
         coverage: Part of its circumference that has edge points, in [0, 1].
-        score: How much it is one, in [0, 1].
+        score: Confidence in [0, 1].
     """
 
     x: float
@@ -63,7 +66,7 @@ class Ellipse:
 
 @dataclass(frozen=True)
 class SizePrior:
-    """How large the ellipse that is looked for may be: its major semi-axis in px."""
+    """Range of the major semi-axis of the ellipses to look for, px."""
 
     lowest_px: float
     highest_px: float
@@ -71,19 +74,19 @@ class SizePrior:
 
 @dataclass(frozen=True)
 class HolePose:
-    """A borehole as seen in one frame, or in many.
+    """A borehole as seen in one frame, or averaged over several.
 
     Attributes:
         center_m: Centre of the rim, `(3,)`.
         axis: Unit axis, pointing out of the hole, `(3,)`.
-        radius_m: Measured radius of the rim.
+        radius_m: Radius of the rim.
         cov_m2: Covariance of the centre, `(3, 3)`.
         axis_cov_rad2: Covariance of the axis, `(3, 3)`, singular along it.
-        frame: In which coordinates all of it stands: `camera` (optical) or `base`.
-        score: How sure it is a hole, in [0, 1].
-        t_s: When it was seen.
-        shared_m2: Part of `cov_m2` that no further frame takes away, since the camera's pose is off
-            by the same in all of them; `None` for none.
+        frame: Coordinates of all of it: `camera` (optical) or `base`.
+        score: Confidence that it is a hole, in [0, 1].
+        t_s: Time of the frame.
+        shared_m2: Part of `cov_m2` that all frames share: the error of the camera's pose. Averaging
+            over frames does not reduce it. `None` for none.
         shared_rad2: The same part of `axis_cov_rad2`.
     """
 
@@ -99,11 +102,11 @@ class HolePose:
     shared_rad2: np.ndarray | None = None
 
     def moved(self, base_from_camera: np.ndarray, camera_cov: np.ndarray | None = None) -> HolePose:
-        """Returns the pose in the base frame.
+        """Return the pose in the base frame.
 
         Args:
             base_from_camera: Pose of the camera, `(4, 4)`.
-            camera_cov: How uncertain that is, see `Frame`; it adds to the covariances.
+            camera_cov: Covariance of that pose, see `Frame`; it adds to the covariances.
         """
         rotation, shift = base_from_camera[:3, :3], base_from_camera[:3, 3]
         shared_m2 = shared_rad2 = None
@@ -131,27 +134,23 @@ class HolePose:
             shared_rad2=shared_rad2,
         )
 
-    def borehole(self) -> Borehole:
-        """Returns it as the word that the rest of the framework knows; for a pose in the base frame."""
-        return Borehole(self.center_m, self.axis, self.radius_m, self.cov_m2)
-
 
 def _build_cross_matrix(vector: np.ndarray) -> np.ndarray:
-    """Returns the matrix that takes the cross product with a vector from the left, `(3, 3)`."""
+    """Return the matrix that takes the cross product with a vector from the left, `(3, 3)`."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """Why something was refused.
+    """A refused candidate and the limit that it missed.
 
     Attributes:
-        stage: `frame`, `segment`, `ellipse`, `pose` or `filter`.
-        reason: What was judged, a noun: `radius`, `axis ratio`, `face normal`, …
-        value: What it was, in the unit of `limit`.
-        limit: What was allowed.
-        ellipse: The ellipse that was refused, `None` where there was none.
+        stage: `frame`, `segment`, `ellipse` or `pose`.
+        reason: Quantity that was judged: `radius, m`, `axis ratio on the face`, …
+        value: Its value, in the unit of `limit`.
+        limit: Allowed value.
+        ellipse: The refused ellipse, `None` where there was none.
     """
 
     stage: str
@@ -162,40 +161,113 @@ class Rejection:
 
 
 @dataclass(frozen=True)
-class Target:
-    """What the filter holds to be true after several frames.
-
-    Attributes:
-        pose: The hole; its covariance counts what the frames agree on.
-        num_frames: Frames that speak for it.
-        age_s: Since it was last seen.
-        stale: It has not been seen for so long that nobody should act on it.
-    """
-
-    pose: HolePose
-    num_frames: int
-    age_s: float
-    stale: bool
-
-
-@dataclass(frozen=True)
 class FrameDetections:
-    """Everything that came out of one frame.
+    """Result of a finder for one frame; only `holes` is required.
 
     Attributes:
         holes: Holes, the surest first.
-        rejected: All that was refused, in the order of the stages.
-        ellipses: Ellipses that were judged, one for each hole and then those refused by the pose
-            stage.
-        masks: What the segmenter said, `None` where it was not asked.
-        ms: Time of each stage in ms.
+        rejected: Refused candidates, in the order of the stages.
+        ellipses: Judged ellipses: one for each hole, then those that the pose stage refused.
+        masks: Masks of the segmenter, `None` without one.
+        ms: Duration of each stage, ms.
     """
 
     holes: Sequence[HolePose]
-    rejected: Sequence[Rejection]
-    ellipses: Sequence[Ellipse]
-    masks: Masks | None
+    rejected: Sequence[Rejection] = ()
+    ellipses: Sequence[Ellipse] = ()
+    masks: Masks | None = None
     ms: dict[str, float] = field(default_factory=dict)
+
+    def in_base_frame(self, frame: Frame) -> FrameDetections:
+        """Return the same with all holes in the base frame, as they are if the camera's pose is unknown."""
+        if frame.base_from_camera is None:
+            return self
+        holes = []
+        for hole in self.holes:
+            in_camera = hole.frame == "camera"
+            holes.append(
+                hole.moved(frame.base_from_camera, frame.camera_cov) if in_camera else hole
+            )
+        return replace(self, holes=holes)
+
+
+@dataclass(frozen=True)
+class TrackedHole:
+    """A borehole over many frames.
+
+    Attributes:
+        name: Number that it keeps from the first frame on, counted from 1.
+        pose: Its pose; the covariance of the centre takes all frames into account.
+        std_m: Standard deviation of one coordinate of the centre.
+        num_frames: Detections that it is made of.
+        seen_s: Time of its last detection.
+        confirmed: It was detected often enough to be no accident.
+        stale: Its last detection is too old to act on.
+    """
+
+    name: int
+    pose: HolePose
+    std_m: float
+    num_frames: int
+    seen_s: float
+    confirmed: bool
+    stale: bool
+
+
+class BoreholeFinder(Protocol):
+    """Finds boreholes in frames, as `mode=perceive` and the camera process call it."""
+
+    def find(self, frame: Frame) -> FrameDetections:
+        """Return the holes of one frame, in camera coordinates or in the base frame.
+
+        The frame is read-only, and the same frame gives the same answer. No hole is no error.
+
+        Raises:
+            FrameError: the frame cannot be used; its message says why.
+        """
+        ...
+
+
+class FinderSpec(Protocol):
+    """A spec in `conf/perception`."""
+
+    def build(self) -> BoreholeFinder:
+        """Return a finder."""
+        ...
+
+
+@runtime_checkable
+class WholePictureFinder(Protocol):
+    """Optional ability of a finder, for `perceive.until=ellipses`."""
+
+    def find_ellipses(self, frame: Frame) -> list[Ellipse]:
+        """Return the ellipses of the whole picture, of any size, the best first; needs no depth."""
+        ...
+
+
+@runtime_checkable
+class RejectionExplainer(Protocol):
+    """Optional ability of a finder, for `explain.txt` of `mode=perceive`."""
+
+    def explain(self, rejection: Rejection) -> str:
+        """Return a sentence: the refused candidate, the reason, and a remedy."""
+        ...
+
+
+class HoleTracker(Protocol):
+    """Associates the holes of successive frames."""
+
+    def update(self, holes: Sequence[HolePose], t_s: float) -> Sequence[TrackedHole]:
+        """Take the holes of the frame at `t_s`, possibly none; return all known ones by name."""
+        ...
+
+
+class TrackerSpec(Protocol):
+    """A spec in `conf/perception/tracker`."""
+
+    def build(self) -> HoleTracker:
+        """Return a tracker that has seen nothing yet."""
+        ...
 
 
 class FrameSource(Protocol):
@@ -203,11 +275,11 @@ class FrameSource(Protocol):
 
     @property
     def num_frames(self) -> int | None:
-        """How many frames there are in all; `None` for a live source."""
+        """Number of frames; `None` for a live source."""
         ...
 
     def read_latest(self) -> Frame | None:
-        """Returns the newest frame that has not been returned yet, from disk the next one; `None` when there is none left.
+        """Return the newest frame not returned yet, from disk the next one; `None` at the end.
 
         Raises:
             FrameError: this frame cannot be used, its message says which and why; the next call
@@ -220,11 +292,27 @@ class FrameSource(Protocol):
     def __exit__(self, *exc: Any) -> None: ...
 
 
+class FrameSourceSpec(Protocol):
+    """A spec in `conf/perception/source`."""
+
+    def build(self) -> FrameSource:
+        """Return a source, not yet opened."""
+        ...
+
+
 class Segmenter(Protocol):
-    """Says which pixels show the block and the mouths of its holes."""
+    """Marks the pixels of the block and of its holes."""
 
     def segment(self, frame: Frame) -> Masks:
-        """Returns masks of the size of the frame."""
+        """Return masks of the size of the frame."""
+        ...
+
+
+class SegmenterSpec(Protocol):
+    """A spec in `conf/perception/segmenter`."""
+
+    def build(self) -> Segmenter:
+        """Return a segmenter."""
         ...
 
 
@@ -234,89 +322,13 @@ class EllipseDetector(Protocol):
     def detect(
         self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None
     ) -> list[Ellipse]:
-        """Returns ellipses, the best first.
+        """Return ellipses, the best first.
 
         Args:
             gray: Picture, `(h, w)` uint8.
-            roi: Where to look, `(h, w)` bool; `None` for everywhere.
-            prior: How large they may be; `None` for any size.
+            roi: Region to search, `(h, w)` bool; `None` for everywhere.
+            prior: Range of their size; `None` for any size.
         """
-        ...
-
-
-class PoseEstimator(Protocol):
-    """Makes a hole in space of an ellipse in a picture."""
-
-    def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Returns the hole in camera coordinates, or why it is none. `frame` is free of lens distortion."""
-        ...
-
-
-class HoleTracker(Protocol):
-    """Makes one target of what is seen frame after frame."""
-
-    def update(self, poses: Sequence[HolePose], t_s: float) -> Target | None:
-        """Takes the holes seen at `t_s`, none at all too; returns what is held to be true now, `None` as long as nothing is."""
-        ...
-
-    def reset(self) -> None:
-        """Forgets everything."""
-        ...
-
-
-class Observer(Protocol):
-    """A finder that shows its work: what `build` of an option of `conf/perception` returns when it looks at pictures."""
-
-    def find(self, frame: Frame) -> Borehole | None:
-        """Returns the borehole in the base frame, or `None` when there is none to be sure of."""
-        ...
-
-    def look(self, frame: Frame) -> FrameDetections:
-        """Returns everything that one frame says.
-
-        Raises:
-            FrameError: nothing can be made of the frame.
-        """
-        ...
-
-    def follow(self, sighting: FrameDetections, t_s: float) -> Target | None:
-        """Returns what the filter holds to be true after this sighting as well."""
-        ...
-
-    def ellipses(self, frame: Frame) -> list[Ellipse]:
-        """Returns the ellipses of the whole picture, the best first, of any size; needs no depth."""
-        ...
-
-    def explain(self, rejection: Rejection) -> str:
-        """Returns in words what was refused, why, and what could be done."""
-        ...
-
-
-class Overlay(Protocol):
-    """Draws what was seen into the picture in which it was seen."""
-
-    def write(self, path: Path, frame: Frame, sighting: FrameDetections) -> None:
-        """Writes a picture file.
-
-        Raises:
-            StorageError: it could not be written.
-        """
-        ...
-
-
-class FrameSourceSpec(Protocol):
-    """A spec in `conf/perception/source`."""
-
-    def build(self) -> FrameSource:
-        """Returns a source, not yet opened."""
-        ...
-
-
-class SegmenterSpec(Protocol):
-    """A spec in `conf/perception/segmenter`."""
-
-    def build(self) -> Segmenter:
-        """Returns a segmenter."""
         ...
 
 
@@ -324,7 +336,15 @@ class EllipseDetectorSpec(Protocol):
     """A spec in `conf/perception/ellipse`."""
 
     def build(self) -> EllipseDetector:
-        """Returns a detector."""
+        """Return a detector."""
+        ...
+
+
+class PoseEstimator(Protocol):
+    """Turns an ellipse of a picture into a hole in space."""
+
+    def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
+        """Return the hole in camera coordinates, or why it is refused; `frame` has no distortion."""
         ...
 
 
@@ -332,29 +352,17 @@ class PoseEstimatorSpec(Protocol):
     """A spec in `conf/perception/pose`."""
 
     def build(self) -> PoseEstimator:
-        """Returns an estimator."""
+        """Return an estimator."""
         ...
 
 
-class TrackerSpec(Protocol):
-    """A spec in `conf/perception/filter`."""
+class Overlay(Protocol):
+    """Draws detections into their picture."""
 
-    def build(self) -> HoleTracker:
-        """Returns a filter without memory yet."""
-        ...
+    def write(self, path: Path, frame: Frame, detections: FrameDetections) -> None:
+        """Write a picture file.
 
-
-class BoreholeFinder(Protocol):
-    """Finds the borehole in a frame."""
-
-    def find(self, frame: Frame) -> Borehole | None:
-        """Returns the borehole in the base frame, or `None` when there is none to be sure of."""
-        ...
-
-
-class FinderSpec(Protocol):
-    """A spec in `conf/perception`: builds a finder."""
-
-    def build(self) -> BoreholeFinder:
-        """Returns a finder."""
+        Raises:
+            StorageError: it could not be written.
+        """
         ...

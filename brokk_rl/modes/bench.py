@@ -137,7 +137,7 @@ class Benchmark:
         for num_envs in self.bench.num_envs:
             self.session.seed_all()
             loop = plant.build(device, num_envs, self.rl.num_starts, self.session.stream("starts"))
-            rows.append(_sum_over_ranks(group.all(self._measure(loop, device, group))))
+            rows.append(_sum_over_ranks(group.gather(self._measure(loop, device, group))))
             log.info(
                 "%d environments: %s",
                 num_envs,
@@ -192,7 +192,7 @@ class Benchmark:
     def _in_turn(
         self, steps: dict[str, Callable[[], object]], loop: ControlLoop, device: torch.device
     ) -> dict[str, float]:
-        """Returns the seconds that one call of each takes, the median over at least `bench.seconds`.
+        """Return the seconds that one call of each takes, the median over at least `bench.seconds`.
 
         A few calls of each at a time, so that what else the computer does meets all alike. What is
         no control step moves arms at rest at their starts, and the control loop finds its worlds as
@@ -218,7 +218,7 @@ class Benchmark:
 
 
 def _sum_over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Returns the row of all processes: rates add up; what each of them reached stands in `per_rank`."""
+    """Return the row of all processes: rates add up; what each of them reached stands in `per_rank`."""
     if len(rows) == 1:
         return rows[0]
     rates = [name for name in rows[0] if name.endswith("_per_s")]
@@ -231,7 +231,7 @@ def _sum_over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _read_single_process(sizes: BenchmarkSizes) -> dict[int, dict[str, Any]]:
-    """Returns the rows of the one process that is compared with, by number of environments."""
+    """Return the rows of the one process that is compared with, by number of environments."""
     if sizes.against is None:
         return {}
     try:
@@ -251,7 +251,7 @@ def _read_single_process(sizes: BenchmarkSizes) -> dict[int, dict[str, Any]]:
 
 
 def _add_comparisons(row: dict[str, Any], alone: dict[str, Any] | None) -> dict[str, Any]:
-    """Returns the row with what its rates are of those of MuJoCo's own batch, and of as many times one process alone."""
+    """Return the row with what its rates are of those of MuJoCo's own batch, and of as many times one process alone."""
     if batch := row.get("batch_env_steps_per_s"):
         row = row | {"of_batch": {name: row[name] / batch for name in RATES[1:]}}
     if alone is None:

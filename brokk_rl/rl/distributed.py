@@ -66,41 +66,41 @@ class TrainingGroup:
             ) from error
 
     def wait(self) -> None:
-        """Waits until all have come here."""
+        """Wait until all have come here."""
         if self.together:
             dist.barrier()
 
-    def from_first(self, value: Any) -> Any:
-        """Returns the first process's `value`: where a clock decides, one clock must decide for all."""
+    def broadcast_first(self, value: Any) -> Any:
+        """Return the first process's `value`: where a clock decides, one clock must decide for all."""
         if not self.together:
             return value
         box = [value]
         dist.broadcast_object_list(box, src=0)
         return box[0]
 
-    def all(self, value: Any) -> list[Any]:
-        """Returns everyone's `value` (plain numbers and text), in the order of ranks."""
+    def gather(self, value: Any) -> list[Any]:
+        """Return everyone's `value` (plain numbers and text), in the order of ranks."""
         if not self.together:
             return [value]
         found: list[Any] = [None] * self.rank.count
         dist.all_gather_object(found, value)
         return found
 
-    def gathered(self, state: Any) -> list[Any]:
-        """Returns everyone's `state` (mappings of tensors, on the host) to the first process, to the others an empty list."""
+    def gather_on_first(self, state: Any) -> list[Any]:
+        """Return everyone's `state` (mappings of tensors, on the host) to the first process, to the others an empty list."""
         if not self.together:
             return [state]
         found: list[Any] = [None] * self.rank.count
         dist.gather_object(_copy_to_host(state), found if self.rank.first else None, dst=0)
         return found if self.rank.first else []
 
-    def pooled(self, figures: Mapping[str, float]) -> dict[str, float]:
-        """Returns the figures of all environments of all processes; see `ControlLoop.statistics`.
+    def pool_statistics(self, figures: Mapping[str, float]) -> dict[str, float]:
+        """Return the figures of all environments of all processes; see `ControlLoop.statistics`.
 
         Means over episodes weigh by the number of episodes; the fault rate by control steps, which
         are as many everywhere.
         """
-        parts = self.all(dict(figures))
+        parts = self.gather(dict(figures))
         episodes = sum(part["episodes"] for part in parts)
         pooled = {
             name: sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes)
@@ -112,14 +112,14 @@ class TrainingGroup:
         }
 
     def check_same(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Proves that all processes hold the same numbers, bit for bit.
+        """Prove that all processes hold the same numbers, bit for bit.
 
         Raises:
             DistributedError: They do not; the message says which ranks differ from the first.
         """
         if not self.together:
             return
-        found = self.all(hash_tensors(state))
+        found = self.gather(hash_tensors(state))
         other = [index for index, value in enumerate(found) if value != found[0]]
         if other:
             raise DistributedError(
@@ -129,7 +129,7 @@ class TrainingGroup:
 
 
 def hash_tensors(state: Mapping[str, torch.Tensor]) -> str:
-    """Returns the SHA-256 of names and bytes of tensors."""
+    """Return the SHA-256 of names and bytes of tensors."""
     digest = hashlib.sha256()
     for name, value in state.items():
         digest.update(name.encode())

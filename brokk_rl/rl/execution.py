@@ -18,7 +18,7 @@ recorded."""
 def capture_graph(
     step: Callable[[], None], device: torch.device, gradients: bool = False
 ) -> torch.cuda.CUDAGraph:
-    """Returns a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses.
+    """Return a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses.
 
     Args:
         step: What to capture; called `WARM_UP` times before.
@@ -58,7 +58,7 @@ def report_compile_errors() -> Iterator[None]:
 
 @contextlib.contextmanager
 def limit_to_one_thread(device: torch.device | str) -> Iterator[None]:
-    """Keeps torch to one thread meanwhile; nothing changes where `device` is a GPU.
+    """Keep torch to one thread meanwhile; nothing changes where `device` is a GPU.
 
     The tensors of a control step are too small to share. Torch's other threads would only wait for
     the next one, and they wait spinning, on the cores on which the physics runs; where the computer

@@ -13,11 +13,11 @@ class Tracker(Protocol):
     """An open tracking run."""
 
     def log(self, figures: dict[str, float], step: int) -> None:
-        """Stores the figures of one iteration."""
+        """Store the figures of one iteration."""
         ...
 
     def close(self) -> None:
-        """Ends the tracking run; called on success, failure and interruption alike."""
+        """End the tracking run; called on success, failure and interruption alike."""
         ...
 
 
@@ -25,7 +25,7 @@ class Tracking(Protocol):
     """A spec in `conf/tracking`: opens a tracking run."""
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Returns an open tracking run for the run in `folder`."""
+        """Return an open tracking run for the run in `folder`."""
         ...
 
 
@@ -34,7 +34,7 @@ class NoTracking:
     """No tracker: `progress.csv` and the pictures of the run folder only."""
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Returns a tracker that does nothing."""
+        """Return a tracker that does nothing."""
         return _NoTracker()
 
 
@@ -43,7 +43,7 @@ class TensorBoardTracking:
     """TensorBoard event files in the run folder."""
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Returns a tracker that writes `folder/tensorboard`."""
+        """Return a tracker that writes `folder/tensorboard`."""
         return _TensorBoardTracker(folder)
 
 
@@ -64,7 +64,7 @@ class WandbTracking:
     mode: str
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Returns a tracker with a run of its own, named after the run folder."""
+        """Return a tracker with a run of its own, named after the run folder."""
         return _WandbTracker(self, folder, config)
 
 

@@ -134,7 +134,7 @@ class OperatorLevers(FollowerModel):
         """A trial that is over stays over; see `brokk_rl.contracts.actuator.FollowerModel`."""
 
     def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        """Returns what the operators give, `(N, J)`, where `proposed`, `(N, J)`, is advised."""
+        """Return what the operators give, `(N, J)`, where `proposed`, `(N, J)`, is advised."""
         assert self.loop is not None
         q = self.loop.history.q[:, -1].numpy().astype(float)
         rim_m = self.loop.task.state["start.target_m"].numpy().astype(float)
@@ -146,7 +146,7 @@ class OperatorLevers(FollowerModel):
 
 
 def _make_starts(machine: Machine, trials: TrialBatch) -> dict[str, torch.Tensor]:
-    """Returns starts of the control loop for the study's places; the block stands with its side to the machine."""
+    """Return starts of the control loop for the study's places; the block stands with its side to the machine."""
     num, rim = len(trials.q), trials.rim_in_base_m
     scene = np.column_stack((rim, np.arctan2(rim[:, 1], rim[:, 0]), np.ones(num), trials.radius_m))
     made: dict[str, Any] = {

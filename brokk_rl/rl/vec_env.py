@@ -56,7 +56,7 @@ class ControlLoopConfig:
     def build(
         self, device: torch.device, num_envs: int | None, pool: int, seed: int
     ) -> ControlLoop:
-        """Returns the control loop on `device`.
+        """Return the control loop on `device`.
 
         Args:
             device: Where to simulate.
@@ -167,7 +167,7 @@ class ControlLoop(VecEnv):
         self.task.state["steps"].copy_(value)
 
     def begin(self, starts: Starts | None = None) -> None:
-        """Starts a new episode everywhere: from `starts`, each entry `(N, …)`, else from random rows of the pool."""
+        """Start a new episode everywhere: from `starts`, each entry `(N, …)`, else from random rows of the pool."""
         with self._always_alike():
             start = starts or self._draw()
             self.done.fill_(True)
@@ -176,7 +176,7 @@ class ControlLoop(VecEnv):
             self.done.fill_(False)
 
     def capture(self, fuse: bool = False) -> None:
-        """Captures the control step in a CUDA graph where device and world allow it; a few steps are simulated on the way.
+        """Capture the control step in a CUDA graph where device and world allow it; a few steps are simulated on the way.
 
         Args:
             fuse: First have `torch.compile` fuse the small operations around the physics, on a GPU
@@ -202,14 +202,14 @@ class ControlLoop(VecEnv):
         self.begin()
 
     def get_observations(self) -> TensorDict:
-        """Returns the current observation groups; asking twice gives the same."""
+        """Return the current observation groups; asking twice gives the same."""
         return TensorDict(
             {name: value.clone() for name, value in self._groups.items()},
             batch_size=[self.num_envs],
         )
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
-        """Advances one control period; see `rsl_rl.env.VecEnv.step`."""
+        """Advance one control period; see `rsl_rl.env.VecEnv.step`."""
         with self._always_alike():
             self._action.copy_(actions)
             self._steps += 1
@@ -220,7 +220,7 @@ class ControlLoop(VecEnv):
             return self.get_observations(), self.reward, self.done, {"time_outs": self.timed_out}
 
     def statistics(self) -> dict[str, float]:
-        """Returns means over the episodes finished since the last call, shares of their endings, and their number.
+        """Return means over the episodes finished since the last call, shares of their endings, and their number.
 
         Reads back from the device once.
         """
@@ -236,7 +236,7 @@ class ControlLoop(VecEnv):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns copies of everything that must be stored to go on exactly; random generators are the session's."""
+        """Return copies of everything that must be stored to go on exactly; random generators are the session's."""
         state: dict[str, torch.Tensor] = {
             "history.q": self.history.q,
             "history.u": self.history.u,
@@ -253,7 +253,7 @@ class ControlLoop(VecEnv):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what `state_dict` returned."""
+        """Restore what `state_dict` returned."""
         tensors = state["tensors"]
         self.history.q.copy_(tensors["history.q"])
         self.history.u.copy_(tensors["history.u"])
@@ -284,7 +284,7 @@ class ControlLoop(VecEnv):
         self._perceive(start)
 
     def _command(self) -> torch.Tensor:
-        """Puts what is given of the action into force; returns how far the drive shall move each joint, `(N, J)`."""
+        """Put what is given of the action into force; return how far the drive shall move each joint, `(N, J)`."""
         # histories hold what was given, as the machine's log does: it is all that policy and
         # actuator model can know
         self.end_u.copy_(self.follower.step(self.task.command(self._action)))
@@ -294,7 +294,7 @@ class ControlLoop(VecEnv):
         return self.actuator.step(self.truth) - self.truth.q[:, -1]
 
     def _judge(self) -> Starts:
-        """Judges what the world has done; returns where the finished environments start anew."""
+        """Judge what the world has done; return where the finished environments start anew."""
         # a world that became NaN is a fault and starts anew; its numbers must not poison the sums
         # over all worlds
         self.truth.push_q(self.world.q.nan_to_num())
@@ -315,7 +315,7 @@ class ControlLoop(VecEnv):
         return self._draw()
 
     def _perceive(self, start: Starts) -> None:
-        """Resets finished environments and observes all of them."""
+        """Reset finished environments and observes all of them."""
         self.truth.reset(self.done, start["q"])
         self.actuator.reset(self.done)
         self.follower.reset(self.done)

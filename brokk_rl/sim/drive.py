@@ -27,7 +27,7 @@ machine can do."""
 
 
 def add_drive(spec: mujoco.MjSpec, machine: Machine, inertia: np.ndarray) -> None:
-    """Adds one servo per joint, in machine order.
+    """Add one servo per joint, in machine order.
 
     Args:
         spec: Model with the joints.
@@ -81,7 +81,7 @@ class DriveReferences:
     def step(
         self, q: torch.Tensor, increment: torch.Tensor, act: torch.Tensor, ctrl: torch.Tensor
     ) -> None:
-        """Moves the references on by one control period.
+        """Move the references on by one control period.
 
         The reference never leads the joint by more than what opens the relief valve, so a blocked
         joint does not wind up.
@@ -99,7 +99,7 @@ class DriveReferences:
         reference.add_(increment)
 
     def diverged(self, qvel: torch.Tensor) -> torch.Tensor:
-        """Returns the worlds, `(N,)` bool, that are beyond use: absurd or NaN joint speeds, `(N, J)`, or references not finite.
+        """Return the worlds, `(N,)` bool, that are beyond use: absurd or NaN joint speeds, `(N, J)`, or references not finite.
 
         The references count because the cut-off at the yield force turns NaN into a force that
         looks sound.
@@ -107,5 +107,5 @@ class DriveReferences:
         return (self.reference.mul(0.0).add_(qvel).abs_().amax(1) <= MAX_SPEED).logical_not_()
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor) -> None:
-        """Puts the references of the worlds of `mask`, `(N,)` bool, to `q`, `(N, J)`."""
+        """Put the references of the worlds of `mask`, `(N,)` bool, to `q`, `(N, J)`."""
         torch.where(mask[:, None], q.to(self.reference.dtype), self.reference, out=self.reference)

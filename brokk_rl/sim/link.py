@@ -48,7 +48,7 @@ class SimulatedMachines:
         return "simulator: " + " + ".join([type(inner).__name__, *effects])
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> SimulatedMachinesLink:
-        """Returns a link to `num_runs` machines."""
+        """Return a link to `num_runs` machines."""
         # a few dozen machines are faster on a CPU
         device = torch.device("cpu") if session.device == "auto" else session.torch_device()
         return SimulatedMachinesLink(self, machine, num_runs, session, device)
@@ -91,11 +91,11 @@ class SimulatedMachinesLink:
         self._measure()
 
     def read(self) -> JointState:
-        """Returns the state after the last control period; reading twice gives the same."""
+        """Return the state after the last control period; reading twice gives the same."""
         return JointState(self._steps * self._machine.period_s, self._measured.reshape(self._form))
 
     def send(self, command: Command) -> Command:
-        """Drives the machines for one control period; what is no number is a standstill."""
+        """Drive the machines for one control period; what is no number is a standstill."""
         u = np.nan_to_num(
             np.asarray(command.u, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0
         ).clip(-1.0, 1.0)
@@ -110,7 +110,7 @@ class SimulatedMachinesLink:
         return Command(u)
 
     def extra(self) -> dict[str, np.ndarray]:
-        """Returns what the sensors show besides, each `(N,)`: the oil's temperature where the model knows one."""
+        """Return what the sensors show besides, each `(N,)`: the oil's temperature where the model knows one."""
         state = self._model.state if self._logged else {}
         return {name: state[path].cpu().numpy().copy() for name, path in self._logged.items()}
 
@@ -153,7 +153,7 @@ class SimulatedWorksite:
         return "simulated site"
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> SimulatedWorksiteLink:
-        """Returns a link to the machine.
+        """Return a link to the machine.
 
         Raises:
             ConfigError: more than one machine is asked for, or the start does not fit the machine.
@@ -194,11 +194,11 @@ class SimulatedWorksiteLink:
         )
 
     def read(self) -> JointState:
-        """Returns the state after the last control period; reading twice gives the same."""
+        """Return the state after the last control period; reading twice gives the same."""
         return JointState(self._steps * self._machine.period_s, self._measured.copy())
 
     def send(self, command: Command) -> Command:
-        """Drives the machine for one control period; what is no number is a standstill."""
+        """Drive the machine for one control period; what is no number is a standstill."""
         u = np.nan_to_num(
             np.asarray(command.u, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0
         ).clip(-1.0, 1.0)
@@ -211,7 +211,7 @@ class SimulatedWorksiteLink:
         return Command(u)
 
     def place(self, q: np.ndarray, hole_in_base_m: np.ndarray) -> None:
-        """Puts the machine, at rest, at `q`, `(J,)`, and the block with the rim of its hole at `hole_in_base_m`, its side to it."""
+        """Put the machine, at rest, at `q`, `(J,)`, and the block with the rim of its hole at `hole_in_base_m`, its side to it."""
         everywhere = torch.ones(1, dtype=torch.bool)
         start, scene = torch.as_tensor(q[None], dtype=torch.float32), make_nominal_scenes(1)
         x, y, z = hole_in_base_m.tolist()
@@ -224,7 +224,7 @@ class SimulatedWorksiteLink:
         self._measure()
 
     def extra(self) -> dict[str, np.ndarray]:
-        """Returns the contact force, and the oil's temperature where the model knows one, each `(1,)`."""
+        """Return the contact force, and the oil's temperature where the model knows one, each `(1,)`."""
         found = {
             name: self._model.state[path].numpy().copy() for name, path in self._logged.items()
         }

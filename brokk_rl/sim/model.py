@@ -21,7 +21,7 @@ VISUAL_GROUP = 2
 
 
 def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> mujoco.MjModel:
-    """Returns the model of `machine` at a work site with a block.
+    """Return the model of `machine` at a work site with a block.
 
     Args:
         machine: The machine.
@@ -43,7 +43,7 @@ def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> 
 
 
 def mask_contact_sensors(model: mujoco.MjModel) -> np.ndarray:
-    """Returns 1 for the touch sensors among `sensordata` and 0 for all others; the touch sensors' sum is the contact force."""
+    """Return 1 for the touch sensors among `sensordata` and 0 for all others; the touch sensors' sum is the contact force."""
     chosen = np.zeros(model.nsensordata)
     chosen[model.sensor_adr[model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH]] = 1.0
     return chosen
@@ -81,7 +81,7 @@ def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
 
 
 def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
-    """Writes origins, axes, limits, masses and the tool point into `spec`."""
+    """Write origins, axes, limits, masses and the tool point into `spec`."""
     drawn = spec.copy().compile()
     links = [spec.joint(name).parent for name in machine.joint_names]
     ends = [_read_values(body.origin_m) for body in machine.bodies[1:]] + [machine.tip_m]
@@ -113,7 +113,7 @@ def _read_values(dimensions: tuple) -> np.ndarray:
 
 
 def _scale_geoms(link: mujoco.MjsBody, drawn_end: np.ndarray, end: np.ndarray) -> None:
-    """Scales the geoms of a link along it when its length differs from the one drawn in the MJCF."""
+    """Scale the geoms of a link along it when its length differs from the one drawn in the MJCF."""
     drawn_length, length = np.linalg.norm(drawn_end), np.linalg.norm(end)
     if drawn_length < 1e-9 or abs(length - drawn_length) < 1e-9:
         return
@@ -136,7 +136,7 @@ def _scale_geoms(link: mujoco.MjsBody, drawn_end: np.ndarray, end: np.ndarray) -
 def _write_inertia(
     link: mujoco.MjsBody, drawn: mujoco.MjModel, mass_kg: float, com_m: tuple[float, float, float]
 ) -> None:
-    """Gives the link its mass and centre of mass; its inertia is that of the MJCF, scaled with the mass."""
+    """Give the link its mass and centre of mass; its inertia is that of the MJCF, scaled with the mass."""
     body = drawn.body(link.name)
     if body.mass[0] <= 0.0:
         raise ConfigError(
@@ -160,7 +160,7 @@ def _write_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
 
 
 def _remove_visuals(spec: mujoco.MjSpec) -> None:
-    """Removes what only pictures need."""
+    """Remove what only pictures need."""
     for geom in [g for g in spec.geoms if g.group == VISUAL_GROUP]:
         spec.delete(geom)
     for thing in [*spec.cameras, *spec.lights]:
@@ -168,7 +168,7 @@ def _remove_visuals(spec: mujoco.MjSpec) -> None:
 
 
 def _compute_joint_inertia(model: mujoco.MjModel, machine: Machine) -> np.ndarray:
-    """Returns the diagonal of the mass matrix at home, `(J,)`."""
+    """Return the diagonal of the mass matrix at home, `(J,)`."""
     data = mujoco.MjData(model)
     data.qpos[:] = machine.home
     mujoco.mj_forward(model, data)

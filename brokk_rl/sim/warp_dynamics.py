@@ -48,7 +48,7 @@ class JointAlgebra(NamedTuple):
 
 @functools.cache
 def compile_algebra(num_dofs: int) -> JointAlgebra:
-    """Returns the types and functions for `num_dofs` degrees of freedom."""
+    """Return the types and functions for `num_dofs` degrees of freedom."""
     n = num_dofs
     Vector = wp.types.vector(n, wp.float32)
     Matrix = wp.types.matrix((n, n), wp.float32)
@@ -117,7 +117,7 @@ class _Pose:
 
 @functools.cache
 def _compile_kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """Returns the kernels for what comes before and after the contacts, for `num_dofs` degrees of freedom."""
+    """Return the kernels for what comes before and after the contacts, for `num_dofs` degrees of freedom."""
     n = num_dofs
     Vector, Matrix, inertia_at, solved = compile_algebra(n)
     Columns = wp.types.matrix((n, 3), wp.float32)
@@ -313,12 +313,12 @@ class ArmDynamics:
         wp.launch(self._kernels[0], self._num_worlds, self._before, block_dim=_BLOCK)
 
     def after_contacts(self) -> None:
-        """Advances the state by a substep with the accelerations found."""
+        """Advance the state by a substep with the accelerations found."""
         wp.launch(self._kernels[1], self._num_worlds, self._after, block_dim=_BLOCK)
 
 
 def _find_last_dof(model: mujoco.MjModel, body: int) -> int:
-    """Returns the last degree of freedom that moves `body`, -1 for none."""
+    """Return the last degree of freedom that moves `body`, -1 for none."""
     welded = model.body_weldid[body]
     return (
         int(model.body_dofadr[welded] + model.body_dofnum[welded] - 1)

@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 from rich.progress import track
 
 from brokk_rl.errors import RecordingError
-from brokk_rl.record import matching
+from brokk_rl.record import find_files
 from brokk_rl.spec import spec
 from deploy.recorder.capture import FACTS, DurableBlfWriter
 
@@ -249,7 +249,7 @@ class CaptureRecovery:
             RecordingError: nothing matches, two would have the same name, or nothing can be read of
                 one.
         """
-        candidates = matching(self.input, "capture")
+        candidates = find_files(self.input, "capture")
         paths = [path for path in candidates if path.suffix in KINDS]
         if not paths:
             raise RecordingError(

@@ -114,7 +114,7 @@ class CaptureLogReader:
             q=np.stack(columns_q, 1).astype(np.float32),
             extra=_build_extra_columns(contents, grid_s, machine),
             metadata={
-                "source": f"capture: {contents.facts.get('source', path.name)}", "fingerprint": record.stamp(machine),
+                "source": f"capture: {contents.facts.get('source', path.name)}", "fingerprint": record.format_fingerprint(machine),
                 "run": f"{path.resolve().parent.name}/{path.stem}", "created": created.isoformat(timespec="milliseconds"),
             },
             path=None,

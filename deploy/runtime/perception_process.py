@@ -1,7 +1,7 @@
-"""The perception process: the camera's newest frame for page and log, and the boreholes that are seen in it.
+"""Camera process: publishes the newest frame, and the boreholes that a finder sees in it.
 
-It waits for the camera and for nobody else, and nobody waits for it: if it dies, the last frame
-grows old where it is shown.
+It waits only for the camera, and no other process waits for it. If it dies, the last frame shown
+grows old.
 """
 
 from __future__ import annotations
@@ -10,12 +10,21 @@ import json
 import logging
 import math
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 
-from brokk_rl.contracts.vision import FinderSpec, FrameSource, FrameSourceSpec, HolePose, Observer
+from brokk_rl.contracts.vision import (
+    BoreholeFinder,
+    FinderSpec,
+    FrameSource,
+    FrameSourceSpec,
+    HolePose,
+    TrackedHole,
+    TrackerSpec,
+)
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
@@ -24,61 +33,56 @@ from deploy.runtime.bus_process import TEXT
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import MOST_HOLES, LoopMemory
-from deploy.runtime.target import NEAR_M
 
 log = logging.getLogger(__name__)
 
-MEMORY = 10
-"""Sightings, at most, that count against a new one: a base that was moved is noticed within
-seconds."""
-QUIET_S = 10.0
-"""Between two messages about frames that cannot be used."""
+MESSAGE_INTERVAL_S = 10.0
+"""Shortest time between two messages about frames that cannot be used."""
+SMALLEST_PICTURE_PX = 256
+"""Pixels below which a handed-on frame shows nothing."""
 
 
 @spec
 class CameraConfig:
-    """A camera beside the loop, and what is looked for in its frames.
+    """A camera beside the loop, and the finder that searches its frames.
 
     Attributes:
-        source: Where frames come from.
-        finder: Finds boreholes in them; `null`: nobody looks, a person at the page can still point
-            at one.
+        source: Source of the frames.
+        finder: Finds boreholes in them; `null`: none, a person at the page can still point at one.
+        tracker: Follows the boreholes over the frames.
         rate_hz: Frames a second at most.
-        num_px: Pixels of a frame that are handed on; larger ones are shrunk, perception has them
+        num_px: Pixels of a frame that are handed on; larger ones are shrunk. The finder gets them
             whole.
-        forget_s: Time after which a borehole that is not seen any more is forgotten.
         stale_s: Age from which the picture is shown as old.
         record_hz: Pictures a second that are recorded; 0: none.
     """
 
     source: FrameSourceSpec
     finder: FinderSpec | None
+    tracker: TrackerSpec
     rate_hz: float
     num_px: int
-    forget_s: float
     stale_s: float
     record_hz: float
 
     def check(self) -> None:
-        if (
-            min(self.rate_hz, self.forget_s, self.stale_s) <= 0
-            or self.record_hz < 0
-            or self.num_px < 256
-        ):
+        is_positive = min(self.rate_hz, self.stale_s) > 0 and self.record_hz >= 0
+        if not is_positive or self.num_px < SMALLEST_PICTURE_PX:
             raise ConfigError(
-                "camera: expected rate_hz, forget_s and stale_s above 0, record_hz of 0 or more, num_px of 256 or more"
+                "camera: expected rate_hz and stale_s above 0, record_hz of 0 or more, "
+                f"num_px of {SMALLEST_PICTURE_PX} or more"
             )
 
 
-def run(stop: Stop, camera: CameraConfig, exchange: LoopMemory) -> None:
-    """Runs until it is asked to stop, or the source is at its end.
+def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
+    """Run until asked to stop, or until the source is at its end.
 
     Raises:
         FrameError: there is no such camera.
     """
-    assert exchange.frame is not None
+    assert memory.frame is not None
     finder = camera.finder.build() if camera.finder else None
-    known, complained_s = KnownHoles(camera.forget_s), -math.inf
+    tracker, complained_s = camera.tracker.build(), -math.inf
     with ExitStack() as stack:
         source: FrameSource = stack.enter_context(camera.source.build())
         while not stop():
@@ -86,65 +90,81 @@ def run(stop: Stop, camera: CameraConfig, exchange: LoopMemory) -> None:
             try:
                 frame = source.read_latest()
             except FrameError as error:
-                if began_s - complained_s > QUIET_S:
+                if began_s - complained_s > MESSAGE_INTERVAL_S:
                     log.warning("%s", error)
                     complained_s = began_s
                 time.sleep(0.5 / camera.rate_hz)
                 continue
             if frame is None:
-                log.warning("the camera is at its end; nothing new is seen any more")
+                log.warning("the camera has delivered its last frame")
                 return
             now_s = time.monotonic()
-            _publish(exchange.frame, frame, camera.num_px, now_s)
+            _publish_frame(memory.frame, frame, camera.num_px, now_s)
             if finder is not None and frame.base_from_camera is not None:
-                known.take(_look(finder, frame), now_s)
-                known.write(exchange.holes, now_s)
-                text = {"topic": "holes", "t_s": now_s, "holes": known.plain()}
-                exchange.sight_log.put(TEXT + json.dumps(text).encode())
+                tracked = tracker.update(_find_holes(finder, frame), now_s)
+                write_holes(memory.holes, tracked, now_s)
+                text = {"topic": "holes", "t_s": now_s, "holes": _list_holes(tracked)}
+                memory.sight_log.put(TEXT + json.dumps(text).encode())
             time.sleep(max(0.0, began_s + 1.0 / camera.rate_hz - time.monotonic()))
 
 
-def _look(finder: Any, frame: Frame) -> list[HolePose]:
-    """Returns the boreholes in the base frame that one frame shows."""
-    observer: Observer = finder
+def _find_holes(finder: BoreholeFinder, frame: Frame) -> Sequence[HolePose]:
+    """Return the boreholes of one frame in the base frame, none if it cannot be used."""
     try:
-        found = observer.look(frame).holes
+        return finder.find(frame).in_base_frame(frame).holes
     except FrameError as error:
         log.debug("%s", error)
         return []
-    assert frame.base_from_camera is not None
+
+
+def write_holes(slot: Slot, tracked: Sequence[TrackedHole], t_s: float) -> None:
+    """Publish the known boreholes; the surest ones where there are too many for the record."""
+    surest = sorted(tracked, key=lambda hole: -hole.pose.score)[:MOST_HOLES]
+    record = slot.new()
+    record["t_s"], record["count"] = t_s, len(surest)
+    for row, hole in enumerate(sorted(surest, key=lambda hole: hole.name)):
+        entry = record["holes"][row]
+        entry["name"], entry["std_m"], entry["t_s"] = hole.name, hole.std_m, hole.seen_s
+        entry["center_in_base_m"], entry["axis_in_base"] = hole.pose.center_m, hole.pose.axis
+        entry["radius_m"], entry["score"] = hole.pose.radius_m, hole.pose.score
+    slot.write(record)
+
+
+def _list_holes(tracked: Sequence[TrackedHole]) -> list[dict[str, Any]]:
+    """Return the known boreholes as plain data for the log."""
     return [
-        hole if hole.frame == "base" else hole.moved(frame.base_from_camera, frame.camera_cov)
-        for hole in found
+        {
+            "name": hole.name,
+            "center_in_base_m": np.round(hole.pose.center_m, 4).tolist(),
+            "std_m": round(hole.std_m, 5),
+            "score": round(float(hole.pose.score), 3),
+            "seen_t_s": hole.seen_s,
+        }
+        for hole in tracked
     ]
 
 
-def _publish(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:
-    """Hands a frame on, shrunk to what there is room for."""
+def _publish_frame(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:
+    """Publish a frame, shrunk to the room that there is."""
     height, width = frame.color.shape[:2]
-    part = min(1.0, math.sqrt(num_px / (width * height)))
-    size = int(part * width), int(part * height)
-    color, depth_m = (
-        (frame.color, frame.depth_m)
-        if part == 1.0
-        else (shrink_picture(frame.color, *size), shrink_picture(frame.depth_m, *size))
-    )
+    scale = min(1.0, math.sqrt(num_px / (width * height)))
+    size = int(scale * width), int(scale * height)
+    color, depth_m = frame.color, frame.depth_m
+    if scale < 1.0:
+        color, depth_m = shrink_picture(color, *size), shrink_picture(depth_m, *size)
     count = size[0] * size[1]
     record = slot.new()
     record["t_s"], record["width"], record["height"] = t_s, *size
-    record["color"][:count], record["depth_m"][:count] = (
-        color.reshape(count, 3),
-        depth_m.reshape(count),
-    )
-    record["camera_matrix"] = frame.camera_matrix * np.array([[part], [part], [1.0]])
-    record["base_from_camera"] = (
-        math.nan if frame.base_from_camera is None else frame.base_from_camera
-    )
+    record["color"][:count] = color.reshape(count, 3)
+    record["depth_m"][:count] = depth_m.reshape(count)
+    record["camera_matrix"] = frame.camera_matrix * np.array([[scale], [scale], [1.0]])
+    pose = frame.base_from_camera
+    record["base_from_camera"] = math.nan if pose is None else pose
     slot.write(record)
 
 
 def read_frame(record: Any) -> Frame:
-    """Returns the frame that a record of `frame_fields` holds."""
+    """Return the frame that a record of `frame_fields` holds."""
     width, height = int(record["width"]), int(record["height"])
     pose = np.array(record["base_from_camera"])
     return Frame(
@@ -154,73 +174,3 @@ def read_frame(record: Any) -> Frame:
         base_from_camera=pose if np.isfinite(pose).all() else None,
         t_s=float(record["t_s"]),
     )
-
-
-class KnownHoles:
-    """Boreholes over many frames, each under the name that it got when it was first seen.
-
-    What a new frame says counts by its variance against what was known, of which no more than
-    `MEMORY` sightings count. What the camera's pose is wrong by is the same in all of them: it is
-    no reason to trust one frame more than another, and it stays.
-
-    Args:
-        forget_s: Time after which one that is not seen any more is forgotten.
-    """
-
-    def __init__(self, forget_s: float) -> None:
-        self._forget_s, self._names = forget_s, 0
-        self._holes: dict[int, dict[str, Any]] = {}
-
-    def take(self, found: list[HolePose], now_s: float) -> None:
-        """Takes in what one frame shows."""
-        for pose in found:
-            shared = 0.0 if pose.shared_m2 is None else float(np.trace(pose.shared_m2)) / 3
-            weight = 1.0 / max(1e-8, float(np.trace(pose.cov_m2)) / 3 - shared)
-            name = min(self._holes, key=lambda one: self._apart_m(one, pose), default=None)
-            if name is None or self._apart_m(name, pose) > NEAR_M:
-                self._names += 1
-                name, before, center_m = self._names, 0.0, pose.center_m
-            else:
-                old = self._holes[name]
-                before = min(old["weight"], MEMORY * weight)
-                center_m = (before * old["center_in_base_m"] + weight * pose.center_m) / (
-                    before + weight
-                )
-            self._holes[name] = {
-                "center_in_base_m": center_m, "axis_in_base": pose.axis, "radius_m": pose.radius_m, "score": pose.score,
-                "weight": before + weight, "shared_m2": shared, "t_s": now_s,
-            }  # fmt: skip
-        self._holes = {
-            name: hole
-            for name, hole in self._holes.items()
-            if now_s - hole["t_s"] <= self._forget_s
-        }
-
-    def write(self, slot: Slot, now_s: float) -> None:
-        """Makes what is known the newest; the surest where there are too many."""
-        record = slot.new()
-        surest = sorted(
-            sorted(self._holes, key=lambda name: -self._holes[name]["score"])[:MOST_HOLES]
-        )
-        record["t_s"], record["count"] = now_s, len(surest)
-        for row, name in enumerate(surest):
-            for field, value in self._holes[name].items():
-                if field not in ("weight", "shared_m2"):
-                    record["holes"][row][field] = value
-            record["holes"][row]["name"], record["holes"][row]["std_m"] = name, self._std_m(name)
-        slot.write(record)
-
-    def plain(self) -> list[dict[str, Any]]:
-        """Returns what is known as plain data."""
-        return [
-            {"name": name, "center_in_base_m": np.round(hole["center_in_base_m"], 4).tolist(), "std_m": round(self._std_m(name), 5),
-             "score": round(float(hole["score"]), 3), "seen_t_s": hole["t_s"]}
-            for name, hole in self._holes.items()
-        ]  # fmt: skip
-
-    def _std_m(self, name: int) -> float:
-        hole = self._holes[name]
-        return math.sqrt(1.0 / hole["weight"] + hole["shared_m2"])
-
-    def _apart_m(self, name: int, pose: HolePose) -> float:
-        return float(np.linalg.norm(self._holes[name]["center_in_base_m"] - pose.center_m))

@@ -165,7 +165,7 @@ def _measured(
     if trial.get("recording_problem"):
         remarks.append(Remark(name, f"{trial['recording_problem']}; it counts"))
     try:
-        recording: Recording = record.read(folder / trial["recording"], machine)
+        recording: Recording = record.read_recording(folder / trial["recording"], machine)
         hole = Hole(
             center_in_base_m=tuple(where["center_in_base_m"]), radius_m=float(where["radius_m"])
         )

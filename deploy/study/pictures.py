@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brokk_rl.intervals import compute_student_interval
-from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, clean, legend
+from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, add_legend, remove_frame
 from deploy.study import tlx
 from deploy.study.analysis import Analysis, MeasuredTrial
 from deploy.study.crossover import Effect
@@ -41,7 +41,7 @@ def paths(found: Analysis) -> Figure:
             if not column:
                 axis.set_ylabel("height, m" if vertical == 2 else "y, m")
     if figure.axes:
-        legend(figure, figure.axes[0])
+        add_legend(figure, figure.axes[0])
     return figure
 
 
@@ -70,7 +70,7 @@ def radar(found: Analysis) -> Figure:
     axis.tick_params(axis="x", pad=16)
     axis.set_ylim(0, 100)
     axis.set_yticks([20, 40, 60, 80], ["20", "40", "60", "80"], fontsize=7, color=GREY)
-    legend(figure, axis)
+    add_legend(figure, axis)
     return figure
 
 
@@ -105,9 +105,9 @@ def pairs(found: Analysis, names: Sequence[str]) -> Figure:
         if (effect := found.effects.get(name)) and effect.p is not None:
             title += "\np < 0.001" if effect.p < 0.001 else f"\np = {effect.p:.3f}"
         axis.set_title(title, fontsize=9)
-        clean(axis)
+        remove_frame(axis)
     if figure.axes:
-        legend(figure, figure.axes[0])
+        add_legend(figure, figure.axes[0])
     return figure
 
 
@@ -128,7 +128,7 @@ def effects(found: Analysis, names: Sequence[str]) -> Figure:
     axis.set_yticks(range(len(names)), [title_of(name) for name in names], fontsize=8)
     axis.invert_yaxis()
     axis.set_xlabel("guided minus unguided, dz (blue: better with guidance, red: worse)")
-    clean(axis)
+    remove_frame(axis)
     return figure
 
 
@@ -166,7 +166,7 @@ def _paths(
     at = math.hypot(center[0], center[1]) if horizontal is None else center[horizontal]
     axis.plot([at], [center[vertical]], "o", color="black", markersize=9)
     axis.set_aspect("equal", adjustable="datalim")
-    clean(axis)
+    remove_frame(axis)
 
 
 def _hole(trial: MeasuredTrial) -> str:

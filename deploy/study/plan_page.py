@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from brokk_rl.report import Cell, Page
+from brokk_rl.report import Cell, Report
 from deploy.study import sample_size
 from deploy.study.design import Design, Trial
 
@@ -26,7 +26,7 @@ def page(
     planned: list[Trial],
     errors: dict[str, Any],
     notice: str = "",
-) -> Page:
+) -> Report:
     """Returns the page.
 
     Args:
@@ -56,9 +56,9 @@ def page(
         summary = f"{num} participants find an effect of dz 0.8 in {100 * can.power[1]:.0f} of 100 studies."
         tone = "good" if can.power[1] >= 0.8 else "warn"
         summary += "" if tone == "good" else f" {wanted} would find it in four of five."
-    found = Page(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
-    found.text(notice, "warn")
-    found.facts(
+    found = Report(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
+    found.add_text(notice, "warn")
+    found.add_facts(
         {
             "participants": num,
             "trials each": f"{num_trials} with guidance, {num_trials} without, {design.practice_trials} of practice before",
@@ -71,28 +71,28 @@ def page(
     )
     _numbers(found, design, paired_least, sequence_least)
     _errors(found, errors)
-    found.heading("Rules")
+    found.add_heading("Rules")
     found.items(RULES)
-    found.heading("Places")
-    found.table(
+    found.add_heading("Places")
+    found.add_table(
         ["hole", "x, m", "y, m", "rim z, m", "radius, m"],
         [[n, *h.center_in_base_m, h.radius_m] for n, h in design.holes.items()],
     )
-    found.table(
+    found.add_table(
         ["start", *(f"joint {i + 1}" for i in range(len(next(iter(design.starts.values())))))],
         [[n, *q] for n, q in design.starts.items()],
     )
-    found.heading("Order of trials")
-    found.text(
+    found.add_heading("Order of trials")
+    found.add_text(
         "A hole and a start a trial, in this order; tick what is done, write down what went otherwise."
     )
     _sheets(found, planned)
     return found
 
 
-def _numbers(found: Page, design: Design, paired_least: int, sequence_least: int) -> None:
-    found.heading("How many participants")
-    found.text(
+def _numbers(found: Report, design: Design, paired_least: int, sequence_least: int) -> None:
+    found.add_heading("How many participants")
+    found.add_text(
         "An exact paired test cannot go below p = 0.0625 with five participants: such a study can never be significant at 0.05. "
         f"It takes {paired_least} for that, and {sequence_least} for the test that keeps practice apart from guidance. "
         f"Power is the share of up to {sample_size.STUDIES} simulated studies that find the effect; dz is the mean difference in "
@@ -117,14 +117,14 @@ def _numbers(found: Page, design: Design, paired_least: int, sequence_least: int
                 *(f"{power:.2f}" for power in size.power),
             ]
         )
-    found.table(
+    found.add_table(
         columns, rows, "smallest possible p of both tests, and power with the period in the model"
     )
 
 
-def _errors(found: Page, errors: dict[str, Any]) -> None:
-    found.heading("How such a study errs")
-    found.text(
+def _errors(found: Report, errors: dict[str, Any]) -> None:
+    found.add_heading("How such a study errs")
+    found.add_text(
         "Studies drawn from a fast model of people at work (skill, practice by the power law, holes, chance; no machine), "
         "analysed as this one will be."
     )
@@ -139,17 +139,17 @@ def _errors(found: Page, errors: dict[str, Any]) -> None:
                 Cell(f"{entry['share']:.3f}", f"{low:.3f} to {high:.3f}"),
             ]
         )
-    found.table(
+    found.add_table(
         ["study", "participants", "true dz", "called significant"],
         rows,
         f"{errors['studies'][0]['studies']} studies each; below: 95 % interval",
     )
 
 
-def _sheets(found: Page, planned: list[Trial]) -> None:
+def _sheets(found: Report, planned: list[Trial]) -> None:
     for participant in dict.fromkeys(trial.participant for trial in planned):
         mine = [trial for trial in planned if trial.participant == participant]
-        found.heading(participant, 3)
+        found.add_heading(participant, 3)
         columns = [
             "",
             *(str(number) for number in range(1, max(trial.number for trial in mine) + 1)),
@@ -165,4 +165,4 @@ def _sheets(found: Page, planned: list[Trial]) -> None:
                 ]
             rows.append([title, *cells, *[""] * (len(columns) - 1 - len(here))])
             rows.append(["notes", *[""] * (len(columns) - 1)])
-        found.table(columns, rows)
+        found.add_table(columns, rows)

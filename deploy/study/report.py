@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from brokk_rl.errors import StorageError
-from brokk_rl.report import Cell, Page
+from brokk_rl.report import Cell, Report
 from brokk_rl.session import write_json, write_text
 from deploy.study import pictures, tlx
 from deploy.study.analysis import Analysis
@@ -99,23 +99,23 @@ def verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str]:
     )
 
 
-def _page(folder: Path, data: StudyData, found: Analysis) -> Page:
+def _page(folder: Path, data: StudyData, found: Analysis) -> Report:
     summary, tone = verdict(found, data.is_simulated)
     title = "Does guidance help?" + (" (simulated operators)" if data.is_simulated else "")
-    page = Page(title, summary, tone)  # type: ignore[arg-type]
+    page = Report(title, summary, tone)  # type: ignore[arg-type]
     if data.is_simulated:
-        page.text(f"{NOTICE[0].upper()}{NOTICE[1:]}.", "warn")
+        page.add_text(f"{NOTICE[0].upper()}{NOTICE[1:]}.", "warn")
     num, num_first = len(found.participants), int(found.guided_first.sum())
     least = max(
         smallest_paired_p(num), smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0
     )
     if least > found.alpha:
-        page.text(
+        page.add_text(
             f"With {num} participants no test here can reach p = {found.alpha:g}: the smallest possible is {least:.3g}.",
             "bad",
         )
     counted = [trial for trial in found.trials if trial.counts]
-    page.facts(
+    page.add_facts(
         {
             "participants": f"{num}, {num_first} of them guided first",
             "trials that count": f"{len(counted)}, {sum(trial.values['success'] > 0 for trial in counted)} inserted",
@@ -124,46 +124,48 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Page:
             "level": found.alpha,
         }
     )
-    page.heading("What guidance does")
-    page.text(
+    page.add_heading("What guidance does")
+    page.add_text(
         "Guided minus unguided, with the period in the model: what practice does between the first and the second period is not "
         "counted as guidance. p is exact, over all ways in which the order could have been drawn. The primary measure decides; the "
         "others are corrected for looking at many (Holm, within the measures and within the six scales). dz is in standard "
         "deviations of a person's difference. Means of a participant are over trials; a trial without insertion has the limit as "
         "its time and no efficiency."
     )
-    page.table(*_table(found, COMPARED), "of recordings; below each figure its 95 % interval")
-    page.picture(folder / "effects.png", "Effect of guidance on every measure, with 95 % intervals")
-    page.picture(folder / "pairs.png", "Every participant, and means with 95 % intervals")
-    page.heading("Tool paths")
-    page.picture(
+    page.add_table(*_table(found, COMPARED), "of recordings; below each figure its 95 % interval")
+    page.add_picture(
+        folder / "effects.png", "Effect of guidance on every measure, with 95 % intervals"
+    )
+    page.add_picture(folder / "pairs.png", "Every participant, and means with 95 % intervals")
+    page.add_heading("Tool paths")
+    page.add_picture(
         folder / "paths.png",
         "Paths of the tool, guided solid and unguided dotted; stars: starts, spheres: holes",
     )
-    page.heading("Workload (NASA-TLX)")
-    page.table(
+    page.add_heading("Workload (NASA-TLX)")
+    page.add_table(
         *_table(found, LOADS), "0 to 100, more is more load; below each figure its 95 % interval"
     )
-    page.picture(folder / "tlx.png", "Means of the six scales with 95 % intervals")
-    page.heading("Without the period in the model")
-    page.text(
+    page.add_picture(folder / "tlx.png", "Means of the six scales with 95 % intervals")
+    page.add_heading("Without the period in the model")
+    page.add_text(
         "The usual paired tests, for comparison; practice is part of the differences here, though not of their mean where as many "
         "had one order as the other."
     )
-    page.table(
+    page.add_table(
         *_paired_table(found),
         "guided minus unguided; period: second minus first, with guidance in the model",
     )
-    page.heading("How the advice was followed")
-    page.table(
+    page.add_heading("How the advice was followed")
+    page.add_table(
         ["measure", "mean, guided"],
         [[pictures.title_of(name), _mean(found, name)] for name in GUIDED_ONLY],
     )
-    page.heading("What to beware of")
+    page.add_heading("What to beware of")
     if found.remarks:
-        page.table(["where", "what"], [[remark.where, remark.text] for remark in found.remarks])
+        page.add_table(["where", "what"], [[remark.where, remark.text] for remark in found.remarks])
     else:
-        page.text("Nothing is missing, doubled or half filled.")
+        page.add_text("Nothing is missing, doubled or half filled.")
     return page
 
 

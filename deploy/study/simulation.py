@@ -80,7 +80,7 @@ def simulate(
     loads: dict[tuple[str, int], list[float]] = {}
     for trial, recording in zip(todo, ground.run(machine, session, batch, operators), strict=True):
         path = folder / folders.RECORDINGS / f"{trial.name}.parquet"
-        record.write(recording, path)
+        record.write_recording(recording, path)
         found = measure(
             recording, machine, design.holes[trial.hole], design.success, design.limit_s
         )

@@ -256,7 +256,7 @@ def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
     try:
         found = stage.keep(folder.resolve() / trial["capture"], *trial["window_s"])
         name = f"{folders.RECORDINGS}/{path.stem}.parquet"
-        record.write(_told(found, trial), folder / name)
+        record.write_recording(_told(found, trial), folder / name)
         changes["recording"] = name
         if FILLED in found.metadata:
             changes["recording_problem"] = found.metadata[FILLED]

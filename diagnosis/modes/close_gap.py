@@ -24,8 +24,8 @@ from brokk_rl.rl.runner import TrainingConfig
 from brokk_rl.rl.tracking import Tracking
 from brokk_rl.rl.vec_env import ControlLoopConfig
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
-from diagnosis import downstream, downstream_page
+from brokk_rl.spec import name_spec, spec
+from diagnosis import retraining
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ class CloseGap:
                 "close_gap: there is no effect to retrain with; give 'effect@found=[@<effects.yaml of mode=diagnose>]'. "
                 "A diagnosis that says none or unknown leaves nothing to repair."
             )
-        for name in (downstream.BEFORE, downstream.AFTER):
+        for name in (retraining.BEFORE, retraining.AFTER):
             if name in self.panel:
                 raise ConfigError(f"panel.{name}: this name is taken; give another")
         for one, other in (("effect", self.effect), ("randomisation", self.randomisation)):
@@ -116,8 +116,8 @@ class CloseGap:
         """
         folder = self.session.folder
         policies: dict[str, PolicySpec] = {
-            downstream.BEFORE: self.policy,
-            downstream.AFTER: TrainedPolicy(folder=str(self._retrained())),
+            retraining.BEFORE: self.policy,
+            retraining.AFTER: TrainedPolicy(folder=str(self._retrained())),
             **self.panel,
         }
         plants = self._plants()
@@ -125,19 +125,19 @@ class CloseGap:
             name: self._evaluated(name, plant, policies) for name, plant in plants.items()
         }
         trained = json.loads((folder / RETRAINED / CONTRACT).read_text())["trained"]
-        found = downstream.compare(evaluations) | {
-            "plants": {name: _described(plant) for name, plant in plants.items()},
+        found = retraining.compare_policies(evaluations) | {
+            "plants": {name: _describe_plant(plant) for name, plant in plants.items()},
             "retraining": {
                 "began with": self.policy.folder if self.warm else "a fresh network",
-                "trained with": _described(self._training_plant()),
+                "trained with": _describe_plant(self._training_plant()),
                 "control steps": trained["env_steps"],
                 "seconds": trained["seconds"],
                 "device": trained["device"],
                 "seed": self.session.seed,
             },
         }
-        write_json(folder / downstream.FILE, found)
-        downstream_page.write(found, folder)
+        write_json(folder / retraining.COMPARISON_FILE, found)
+        retraining.write_report(found, folder)
         _show(found, folder)
         return float(found["achieved"]["mean"])
 
@@ -186,24 +186,24 @@ class CloseGap:
         if (place / EVALUATION).exists():
             return json.loads((place / EVALUATION).read_text())
         place.mkdir(exist_ok=True)
-        log.info("on the %s", downstream_page.WORDS[name])
+        log.info("on the %s", retraining.PLANT_NAMES[name])
         return evaluate_policies(
             plant, self.evaluation, replace(self.session, out=str(place)), policies
         )[0]
 
 
-def _described(plant: ControlLoopConfig) -> str:
-    return " + ".join([type(plant.actuator).__name__.lower(), *plant.effects])
+def _describe_plant(plant: ControlLoopConfig) -> str:
+    return " + ".join([name_spec(plant.actuator), *plant.effects])
 
 
 def _show(found: dict[str, Any], folder: Path) -> None:
     console = Console()
     view = Table(
-        "strict success", *(downstream_page.WORDS[plant] for plant in downstream.PLANTS), box=None
+        "strict success", *(retraining.PLANT_NAMES[plant] for plant in retraining.PLANTS), box=None
     )
     for policy, shares in found["success"].items():
-        name = downstream_page.NAMES.get(policy, policy)
-        view.add_row(name, *(downstream.said(shares[plant]) for plant in downstream.PLANTS))
-    console.print(downstream.headline(found)[0], style="bold", highlight=False)
+        name = retraining.POLICY_NAMES.get(policy, policy)
+        view.add_row(name, *(retraining.format_rate(shares[plant]) for plant in retraining.PLANTS))
+    console.print(retraining.write_headline(found)[0], style="bold", highlight=False)
     console.print(view)
-    console.print(f"report: {folder / downstream_page.PAGE}", highlight=False)
+    console.print(f"report: {folder / retraining.REPORT_FILE}", highlight=False)

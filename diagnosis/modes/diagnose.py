@@ -14,11 +14,11 @@ from rich.table import Table
 
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import answer, baseline, case, effect_library, page, pipeline
+from diagnosis import answer, baseline, case, effect_library, pipeline, report
 from diagnosis.answer import Answer
 from diagnosis.baseline import Baseline
 from diagnosis.calibration import ProbabilityModel
@@ -78,7 +78,7 @@ class Diagnose:
     machine: Machine
     fit: ActuatorFit
     actuator: Actuator | None
-    thresholds: Thresholds
+    thresholds: InspectionThresholds
     excitation: dict[str, Excitation]
     diagnosis: DiagnosisSubject
 
@@ -109,7 +109,7 @@ class Diagnose:
         folder = self.session.folder
         outcome.save(folder)
         pipeline.write_effects(outcome.answer, kinds, folder / pipeline.EFFECTS_FILE)
-        page.write(outcome, folder, self.machine)
+        report.write_report(outcome, folder, self.machine)
         _print_answer(outcome.answer, folder)
 
     def _case(self) -> GapCase:
@@ -166,4 +166,7 @@ def _print_answer(found: Answer, folder: Path) -> None:
     console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False)
     if found.selected:
         console.print(table)
-    console.print(f"report: {folder / page.PAGE}, answer: {folder / answer.FILE}", highlight=False)
+    console.print(
+        f"report: {folder / report.REPORT_FILE}, answer: {folder / answer.ANSWER_FILE}",
+        highlight=False,
+    )

@@ -1,11 +1,18 @@
-"""`brokk mode=rehearse`: a story of several modes in one command, on a machine with effects that nobody is told of."""
+"""`brokk mode=rehearse`: run several modes in a row on a machine with withheld effects, and report.
+
+The report is `story.html`. It is made from the files of the stages; parts of unfinished stages are
+left out.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +22,233 @@ from rich.console import Console
 from brokk_rl.contracts.actuator import Effect
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import BrokkError, ConfigError, list_choices
+from brokk_rl.errors import BrokkError, ConfigError, RecordingError, list_choices
 from brokk_rl.modes.evaluate import Evaluation
+from brokk_rl.report import Cell, Report, Tone
 from brokk_rl.rl.runner import TrainingConfig
 from brokk_rl.session import RESOLVED, Session, read_record, write_text
 from brokk_rl.spec import spec
-from diagnosis import story_page
+from diagnosis import answer, plots, report, retraining
+from diagnosis.answer import Answer
+from diagnosis.retraining import format_rate
+
+STORY_FILE = "story.html"
+EVALUATED = {
+    "policy": "in the simulator, machines drawn at random",
+    "believed": "on the machine as it is believed to be",
+    "changed": "on the machine that has changed",
+}
+"""Stages that leave an `evaluation.json`, and where it was."""
+
+
+def write_story(folder: Path, stages: Mapping[str, str], withheld: Mapping[str, Any]) -> None:
+    """Writes `story.html`.
+
+    Args:
+        folder: Run folder of the story, with one folder a stage.
+        stages: What each is for.
+        withheld: The effects that nobody was told of, as configured.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    found, repair = (
+        _read_diagnosis(folder / "diagnosis"),
+        _read_json(folder / "repair" / retraining.COMPARISON_FILE),
+    )
+    text, tone = _summarize_story(found, repair, withheld)
+    page = Report("A gap, found and closed", text, tone)
+    if repair:
+        figure = retraining.draw_success(repair)
+        page.add_picture(
+            figure,
+            "Strict success with Wilson's 95 % intervals; all policies meet the same starts.",
+        )
+    _add_stages(page, folder, stages)
+    _add_simulator(page, _read_json(folder / "simulator" / "identification.json"))
+    _add_policy(page, {name: _read_json(folder / name / "evaluation.json") for name in EVALUATED})
+    if found:
+        _add_diagnosis(page, found, withheld)
+    if repair:
+        page.add_heading("What it is worth")
+        retraining.add_success_table(page, repair)
+        page.add_text(
+            "The repaired simulator predicted for the retrained policy a success of "
+            f"{format_rate(repair['predicted'])}. On the machine it succeeds in "
+            f"{format_rate(repair['achieved'])}. More in the reports of the stages: "
+            "simulator/identification.html, diagnosis/report.html, "
+            f"repair/{retraining.REPORT_FILE}."
+        )
+    page.write(folder / STORY_FILE)
+
+
+def _summarize_story(
+    found: Answer | None, repair: Mapping[str, Any] | None, withheld: Mapping[str, Any]
+) -> tuple[str, Tone]:
+    if found is None:
+        return "The story goes on.", "plain"
+    if not found.selected:
+        verdict = "nothing" if found.verdict == "none" else "something that it does not know"
+        return (
+            f"The diagnosis found {verdict}; the machine has {_list_withheld(withheld)}. {found.reason}",
+            "bad",
+        )
+    named = {name for one in found.selected for name in (one.effect, *one.same_as)}
+    right = (
+        "as it is"
+        if set(withheld) <= named and len(found.selected) == len(withheld)
+        else f"but the machine has {_list_withheld(withheld)}"
+    )
+    told = f"The diagnosis names {report.join_words([report.describe_selected(one) for one in found.selected])}, {right}."
+    if repair is None:
+        return told, "plain"
+    text, tone = retraining.write_headline(repair)
+    return f"{text} {told}", tone
+
+
+def _list_withheld(withheld: Mapping[str, Any]) -> str:
+    return report.join_words(
+        [
+            report.name_effect(name) + report.list_on_joints(_get_joints(node))
+            for name, node in withheld.items()
+        ]
+    )
+
+
+def _get_joints(node: Mapping[str, Any]) -> list[str]:
+    joints = node.get("joints", [])
+    return [] if isinstance(joints, str) else list(joints)
+
+
+def _add_stages(page: Report, folder: Path, stages: Mapping[str, str]) -> None:
+    page.add_heading("Stages")
+    rows, whole_s = [], 0.0
+    for name, title in stages.items():
+        record = read_record(folder / name)
+        if record is None:
+            rows.append([name, title, None])
+            continue
+        seconds = _measure_seconds(record)
+        whole_s += seconds or 0.0
+        rows.append(
+            [
+                name,
+                Cell(title, f"{record['outcome']}; {record['mode']}"),
+                None if seconds is None else f"{seconds / 60:.1f}",
+            ]
+        )
+    rows.append(["", "all", f"{whole_s / 60:.1f}"])
+    page.add_table(["stage", "what for", "minutes"], rows)
+    with page.add_details("The commands"):
+        records = (read_record(folder / name) for name in stages)
+        page.add_code(
+            "\n\n".join(f"brokk {' '.join(record['command'][1:])}" for record in records if record)
+        )
+
+
+def _measure_seconds(record: Mapping[str, Any]) -> float | None:
+    if not record.get("ended"):
+        return None
+    begun, ended = (datetime.fromisoformat(record[key]) for key in ("started", "ended"))
+    return (ended - begun).total_seconds()
+
+
+def _add_simulator(page: Report, found: Mapping[str, Any] | None) -> None:
+    if not found:
+        return
+    page.add_heading("The simulator")
+    models = list(next(iter(found["joints"].values())))
+    rows = [
+        [joint, *(f"{1e3 * one[model]['5']['rmse']:.1f}" for model in models)]
+        for joint, one in found["joints"].items()
+    ]
+    page.add_table(
+        ["joint", *models],
+        rows,
+        f"Error after 5 s in a free run through recordings that it was not fitted to, RMS, mrad; {models[0]} is the simulator, "
+        f"fitted in {found['fit_seconds']:.0f} s, the others are baselines",
+    )
+
+
+def _add_policy(page: Report, evaluations: Mapping[str, Mapping[str, Any] | None]) -> None:
+    rows = []
+    for name, found in evaluations.items():
+        if found:
+            time_s = found["time_to_insert_s"]["median"]
+            classical = found["policies"].get("classical")
+            rows.append(
+                [
+                    EVALUATED[name],
+                    format_rate(found["success_strict"]),
+                    None if time_s is None else f"{time_s:.1f} s",
+                    None if classical is None else format_rate(classical["success_strict"]),
+                ]
+            )
+    if rows:
+        page.add_heading("The policy")
+        page.add_table(["", "strict success", "time to insert", "classical controller"], rows)
+
+
+def _add_diagnosis(page: Report, found: Answer, withheld: Mapping[str, Any]) -> None:
+    page.add_heading("The diagnosis")
+    page.add_text(*report.write_headline(found))
+    rows = []
+    for one in found.selected:
+        for number, by_joint in one.parameters.items():
+            for joint, value in by_joint.items():
+                size, interval = report.format_estimate(value)
+                rows.append(
+                    [
+                        report.name_effect(one.effect),
+                        joint,
+                        number,
+                        Cell(size, interval),
+                        _get_true_number(withheld, one.effect, number, joint),
+                    ]
+                )
+    if rows:
+        page.add_table(["effect", "joint", "number", "found", "withheld"], rows)
+    if figure := plots.draw_gap_bars(found):
+        page.add_picture(
+            figure, "Error over free runs of 5 s on recordings that no effect was fitted to."
+        )
+
+
+def _get_true_number(
+    withheld: Mapping[str, Any], effect: str, number: str, joint: str
+) -> str | None:
+    """Returns the number that the machine really has."""
+    node = withheld.get(effect)
+    if node is None or (_get_joints(node) and joint not in _get_joints(node)):
+        return None
+    value = node.get(number)
+    if isinstance(value, Mapping):
+        value = value.get(joint, value.get("other"))
+    return None if value is None else f"{value:g}"
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def _read_diagnosis(folder: Path) -> Answer | None:
+    try:
+        return answer.read_answer(folder / answer.ANSWER_FILE)
+    except RecordingError:  # not there yet
+        return None
+
 
 log = logging.getLogger(__name__)
 
-GIVEN = "given"
+HANDED_ON_FOLDER = "given"
 """Folder with what the stages take from the story."""
-HANDED_ON = ("sim", "task", "rl", "evaluation")
+HANDED_ON_GROUPS = ("sim", "task", "rl", "evaluation")
 """Groups that a stage can take from the story."""
-FOLDER = "{folder}"
+FOLDER_PLACEHOLDER = "{folder}"
 
 
 @spec
-class Stage:
+class StoryStage:
     """One command of a story; its run folder is `<story>/<name of the stage>`.
 
     Attributes:
@@ -54,9 +270,9 @@ class Stage:
 
     def check(self) -> None:
         for name in self.takes:
-            if name not in (*HANDED_ON, "device"):
+            if name not in (*HANDED_ON_GROUPS, "device"):
                 raise ConfigError(
-                    f"a stage takes '{name}', which the story does not have; {list_choices(name, (*HANDED_ON, 'device'))}"
+                    f"a stage takes '{name}', which the story does not have; {list_choices(name, (*HANDED_ON_GROUPS, 'device'))}"
                 )
 
 
@@ -83,7 +299,7 @@ class Rehearse:
     rl: TrainingConfig
     evaluation: Evaluation
     withheld: dict[str, Effect]
-    stages: dict[str, Stage]
+    stages: dict[str, StoryStage]
     resume: str | None
 
     def check(self) -> None:
@@ -106,7 +322,7 @@ class Rehearse:
         given = self._hand_on(folder)
         told = {name: stage.title for name, stage in self.stages.items()}
         for number, (name, stage) in enumerate(self.stages.items(), 1):
-            if stage.needs is not None and not _holds_something(folder / stage.needs):
+            if stage.needs is not None and not _has_content(folder / stage.needs):
                 log.warning("the story ends before '%s': %s holds nothing", name, stage.needs)
                 break
             if (read_record(folder / name) or {}).get("outcome") == "finished":
@@ -114,23 +330,24 @@ class Rehearse:
                 continue
             log.info("%d of %d, %s: %s", number, len(self.stages), name, stage.title)
             self._play(name, stage, folder, given)
-            story_page.write(folder, told, given["withheld"])
-        story_page.write(folder, told, given["withheld"])
-        Console().print(f"story: {self.session.folder / story_page.PAGE}", highlight=False)
+            write_story(folder, told, given["withheld"])
+        write_story(folder, told, given["withheld"])
+        Console().print(f"story: {self.session.folder / STORY_FILE}", highlight=False)
 
     def _hand_on(self, folder: Path) -> dict[str, Any]:
         """Writes what stages take from the story, as it was composed, into files that `group=@<file>` takes; returns it."""
         composed = yaml.safe_load((folder / RESOLVED).read_text())
-        given = {name: composed[name] for name in (*HANDED_ON, "withheld")}
-        (folder / GIVEN).mkdir(exist_ok=True)
+        given = {name: composed[name] for name in (*HANDED_ON_GROUPS, "withheld")}
+        (folder / HANDED_ON_FOLDER).mkdir(exist_ok=True)
         for name, node in given.items():
             head = "# @package effect\n" if name == "withheld" else ""
             write_text(
-                folder / GIVEN / f"{name}.yaml", head + yaml.safe_dump(node, sort_keys=False)
+                folder / HANDED_ON_FOLDER / f"{name}.yaml",
+                head + yaml.safe_dump(node, sort_keys=False),
             )
         return given
 
-    def _play(self, name: str, stage: Stage, folder: Path, given: dict[str, Any]) -> None:
+    def _play(self, name: str, stage: StoryStage, folder: Path, given: dict[str, Any]) -> None:
         """Runs one stage in a process of its own, as a person would, and waits for it."""
         place = folder / name
         for link, target in stage.links.items():
@@ -138,9 +355,11 @@ class Rehearse:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.unlink(missing_ok=True)
             path.symlink_to(folder / target)
-        words = [word.replace(FOLDER, str(folder)) for word in stage.command]
+        words = [word.replace(FOLDER_PLACEHOLDER, str(folder)) for word in stage.command]
         words += [
-            f"{group}=@{folder / GIVEN / group}.yaml" for group in stage.takes if group != "device"
+            f"{group}=@{folder / HANDED_ON_FOLDER / group}.yaml"
+            for group in stage.takes
+            if group != "device"
         ]
         words += [f"session.device={self.session.device}"] if "device" in stage.takes else []
         words += [f"session.out={place}"]
@@ -162,6 +381,6 @@ class Rehearse:
             )
 
 
-def _holds_something(path: Path) -> bool:
+def _has_content(path: Path) -> bool:
     """Says whether a YAML file holds anything but comments."""
     return path.is_file() and bool(yaml.safe_load(path.read_text()))

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from actuators.excite.plan.schedule import Approach
+from actuators.excite.schedule import Approach
 from brokk_rl import record
 from brokk_rl.contracts.actuator import ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
@@ -28,21 +28,20 @@ from brokk_rl.spec import spec
 from diagnosis import answer, effect_library
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.detection import Penalties
-from exam import ledger, marking, oracle, page, paper, seal, sitting
-from exam.calibration import Calibration, halves, items
-from exam.making import Half, Workshop
-from exam.mix import Mix, Question
-from exam.sitting import Candidate
-from exam.specimen import PlantFamily
-from exam.tally import tally
+from exam import dataset, oracle, report, run_cases, score
+from exam.calibration import PenaltyFit, load_weighed_cases, split_by_family
+from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
+from exam.generate import CaseRecorder, HalfPlan
+from exam.metrics import compute_metrics
+from exam.run_cases import Candidate
 
 log = logging.getLogger(__name__)
 
-ORACLE = "oracle.json"
+ORACLE_FILE = "oracle.json"
 
 
 @spec
-class Examination:
+class ExamSettings:
     """What to do, and with which cases.
 
     Attributes:
@@ -87,11 +86,11 @@ class Examination:
     prices: Penalties
     certainty: ProbabilityModel
     trials: int
-    mix: Mix
+    mix: CaseDistribution
     plants: PlantFamily
     roughness: str
-    reference: Half
-    field: Half
+    reference: HalfPlan
+    field: HalfPlan
     approach: Approach
     first_sealed_seed: int
     sealed: bool
@@ -132,7 +131,7 @@ class Exam:
     session: Session
     machine: Machine
     excitation: dict[str, Excitation]
-    exam: Examination
+    exam: ExamSettings
     resume: str | None
 
     def check(self) -> None:
@@ -163,13 +162,13 @@ class Exam:
             )
         salt = settings.salt or secrets.token_hex(16)
         questions = self.questions(salt)
-        workshop = Workshop(
+        workshop = CaseRecorder(
             self.machine, settings.plants, settings.roughness, self.excitation, settings.approach
         )
         total = len(questions) * (len(settings.reference.programs) + len(settings.field.programs))
         with Progress(transient=True) as progress:
             task = progress.add_task(f"{len(questions)} cases", total=total)
-            labels = paper.write(
+            labels = dataset.write_cases(
                 workshop,
                 questions,
                 settings.reference,
@@ -186,13 +185,16 @@ class Exam:
             "roughness": settings.roughness,
             "num_cases": len(labels),
         }
-        found = seal.seal(folder, {**facts, "cases": labels}, salt)
+        found = dataset.seal_labels(folder, {**facts, "cases": labels}, salt)
         write_json(folder / "exam.json", {**facts, "labels_sha256": found})
         log.info(
-            "%d cases in %s, labels sealed: sha256 %s", len(labels), folder / paper.CASES, found
+            "%d cases in %s, labels sealed: sha256 %s",
+            len(labels),
+            folder / dataset.CASES_FOLDER,
+            found,
         )
 
-    def questions(self, salt: str) -> list[Question]:
+    def questions(self, salt: str) -> list[CaseDesign]:
         """Returns the cases; those of an exam hang on the salt too, which nobody knows before the labels are opened."""
         entropy = [self.session.seed, *(salt.encode() if self.exam.sealed else b"")]
         return self.exam.mix.questions(
@@ -205,7 +207,7 @@ class Exam:
         cases = self._cases()
         with Progress(transient=True) as progress:
             task = progress.add_task(f"{len(cases)} cases", total=len(cases))
-            failed = sitting.sit(
+            failed = run_cases.answer_cases(
                 settings.candidate,
                 cases,
                 self.session.folder,
@@ -218,15 +220,17 @@ class Exam:
                 "%d of %d cases have no answer; why stands in their %s",
                 failed,
                 len(cases),
-                sitting.NOTE,
+                run_cases.NOTE_FILE,
             )
         log.info("answers in %s; exam.do=score opens the labels", self.session.folder)
 
     def _cases(self) -> list[Path]:
-        found = sorted(path for path in (self._folder / paper.CASES).glob("*") if path.is_dir())
+        found = sorted(
+            path for path in (self._folder / dataset.CASES_FOLDER).glob("*") if path.is_dir()
+        )
         if not found:
             raise RecordingError(
-                f"exam.folder={self._folder}: expected cases in {paper.CASES}/, as exam.do=make writes them"
+                f"exam.folder={self._folder}: expected cases in {dataset.CASES_FOLDER}/, as exam.do=make writes them"
             )
         return found
 
@@ -238,14 +242,19 @@ class Exam:
         """Opens the labels; writes `oracle.json`, the share of the gap that the true effects of each case close."""
         labels = [
             label
-            for label in seal.opened(self._folder)["cases"]
+            for label in dataset.open_labels(self._folder)["cases"]
             if label["kind"] in ("one", "several")
         ]
-        place, found = self.session.folder / ORACLE, {}
+        place, found = self.session.folder / ORACLE_FILE, {}
         if place.is_file():
             found = json.loads(place.read_text())  # of a run that was interrupted
         todo = [label for label in labels if label["case"] not in found]
-        job = partial(oracle.of_label, self._folder / paper.CASES, self.exam.oracle, self.machine)
+        job = partial(
+            oracle.close_labelled_gap,
+            self._folder / dataset.CASES_FOLDER,
+            self.exam.oracle,
+            self.machine,
+        )
         with Progress(transient=True) as progress, ProcessPoolExecutor(self.exam.workers) as pool:
             task = progress.add_task(
                 f"{len(labels)} cases", total=len(labels), completed=len(labels) - len(todo)
@@ -279,7 +288,7 @@ class Exam:
             for name, candidate in usable.items():
                 task = progress.add_task(name, total=len(cases))
                 folder = self.session.folder / name
-                sitting.sit(
+                run_cases.answer_cases(
                     candidate,
                     cases,
                     folder,
@@ -292,10 +301,10 @@ class Exam:
     def _calibrate(self) -> None:
         """Opens the labels of development exams; writes `prices.yaml`, `certainty.yaml`; prints what answers were and would be."""
         settings = self.exam
-        cases = items([Path(folder) for folder in settings.answers.values()])
+        cases = load_weighed_cases([Path(folder) for folder in settings.answers.values()])
         classes, of_machine = settings.mix.classes, self._of_machine()
         seed, kinds = self.session.stream("prices"), effect_library.load_effects(self.machine)
-        fit = Calibration(
+        fit = PenaltyFit(
             self.machine, kinds, classes, of_machine, settings.trials, seed, settings.workers
         )
         with Progress(transient=True) as progress:
@@ -305,16 +314,16 @@ class Exam:
             found = fit.fitted(
                 cases, settings.prices, settings.certainty, lambda: progress.advance(task)
             )
-            parts = halves(cases)
+            parts = split_by_family(cases)
             apart = [
                 fit.fitted(part, settings.prices, settings.certainty, lambda: None)
                 for part in parts
             ]
         before, after = (
-            tally(fit.marks(cases, *each))
+            compute_metrics(fit.marks(cases, *each))
             for each in ((settings.prices, settings.certainty), found)
         )
-        crosswise = tally(
+        crosswise = compute_metrics(
             [mark for half in (0, 1) for mark in fit.marks(parts[1 - half], *apart[half])]
         )
         for name, one in zip(("prices", "certainty"), found, strict=True):
@@ -343,18 +352,20 @@ class Exam:
 
     def _scored(self, answers: Mapping[str, str]) -> None:
         """Opens the labels; writes `marks.json`, `exam.html` and pictures, appends to the ledger, and prints the table."""
-        labels = seal.opened(self._folder)
+        labels = dataset.open_labels(self._folder)
         facts = json.loads((self._folder / "exam.json").read_text())
         tables = {
             name: self._table(Path(folder), labels["cases"]) for name, folder in answers.items()
         }
         write_json(self.session.folder / "marks.json", {"exam": facts, "candidates": tables})
-        page.write(self.session.folder, facts, tables)
+        report.write_report(self.session.folder, facts, tables)
         if self.exam.ledger is not None:
             for name, table in tables.items():
-                ledger.append(Path(self.exam.ledger), record.now(), facts, name, table)
+                report.append_to_ledger(
+                    Path(self.exam.ledger), record.format_now(), facts, name, table
+                )
         _show(tables)
-        log.info("report: %s", self.session.folder / page.PAGE)
+        log.info("report: %s", self.session.folder / report.REPORT_FILE)
 
     def _table(self, folder: Path, labels: list[dict[str, Any]]) -> dict[str, Any]:
         """Returns the figures of the answers in `folder`."""
@@ -362,24 +373,28 @@ class Exam:
         best = (
             {}
             if self.exam.oracles is None
-            else json.loads((Path(self.exam.oracles) / ORACLE).read_text())
+            else json.loads((Path(self.exam.oracles) / ORACLE_FILE).read_text())
         )
         of_machine = self._of_machine()
-        begun = [label for label in labels if sitting.is_begun(folder / label["case"])]
+        begun = [label for label in labels if run_cases.is_begun(folder / label["case"])]
         if len(begun) < len(labels):
             log.warning(
                 "%s: %d of %d cases sat; the others are left out", folder, len(begun), len(labels)
             )
         for label in begun:
             place = folder / label["case"]
-            said = answer.read(place / answer.FILE) if (place / answer.FILE).is_file() else None
+            said = (
+                answer.read_answer(place / answer.ANSWER_FILE)
+                if (place / answer.ANSWER_FILE).is_file()
+                else None
+            )
             marks.append(
-                marking.mark(
+                score.score_answer(
                     label,
                     said,
                     mix.classes,
                     of_machine,
-                    sitting.seconds(place),
+                    run_cases.read_seconds(place),
                     best.get(label["case"]),
                 )
             )
@@ -387,13 +402,13 @@ class Exam:
             raise RecordingError(
                 f"exam.answers: {folder} holds no answer to any case of {self._folder}"
             )
-        return tally(marks, len(labels) - len(begun))
+        return compute_metrics(marks, len(labels) - len(begun))
 
 
 def _show(tables: dict[str, dict[str, Any]]) -> None:
     shown = Table("", *tables)
     row: list[Any]
-    for row in page.rows(tables):
+    for row in report.build_rows(tables):
         words, *cells = row
         shown.add_row(
             str(words),

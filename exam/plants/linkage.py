@@ -1,4 +1,4 @@
-"""Behind the cylinder: an elastic boom, play in the pins, the weight of the arm, and where its tool is.
+"""The linkage of the plants: elastic boom, play in the pins, weight of the arm, tool point.
 
 All arrays begin with `N` runs. Each run has a base that may stand tilted and links that may differ
 from the drawing.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.anatomy import TAU_HZ, Anatomy
+from exam.plants.plant_parameters import RAD_PER_CYCLE, PlantParameters
 
 GRAVITY_M_S2 = 9.81
 RIGID_S = 0.05
@@ -27,9 +27,9 @@ class Boom:
         elastic: Whether a soft joint bends here, `(N, 1)`; a make with chambers is soft in its oil.
     """
 
-    def __init__(self, numbers: Anatomy, q: np.ndarray, elastic: np.ndarray) -> None:
+    def __init__(self, numbers: PlantParameters, q: np.ndarray, elastic: np.ndarray) -> None:
         soft_s = np.where(elastic, numbers["soft_s"], 0.0)
-        self._soft, self._omega = soft_s > RIGID_S, TAU_HZ / np.maximum(soft_s, 1e-6)
+        self._soft, self._omega = soft_s > RIGID_S, RAD_PER_CYCLE / np.maximum(soft_s, 1e-6)
         self._fade = 2.0 * numbers["soft_damping"] * self._omega
         self._half = 0.5 * numbers["gap_rad"]
         self._bent, self._rate, self._q = q.copy(), np.zeros_like(q), q.copy()
@@ -57,7 +57,7 @@ class Arm:
             first column.
     """
 
-    def __init__(self, machine: Machine, numbers: Anatomy) -> None:
+    def __init__(self, machine: Machine, numbers: PlantParameters) -> None:
         self._axes = [np.array(body.axis) for body in machine.bodies]
         self._hinge = [joint.kind == "hinge" for joint in machine.joints]
         self._mass_kg = [body.mass_kg.value for body in machine.bodies]
@@ -73,7 +73,7 @@ class Arm:
             * (1.0 + extra_m[:, j, None] / max(float(np.linalg.norm(drawn[j + 1])), 1e-9))
             for j in range(len(drawn) - 1)
         ]
-        self._base = _turn(np.array([0.0, 1.0, 0.0]), numbers["pitch_rad"][:, 0]) @ _turn(
+        self._base = _rotate(np.array([0.0, 1.0, 0.0]), numbers["pitch_rad"][:, 0]) @ _rotate(
             np.array([1.0, 0.0, 0.0]), numbers["roll_rad"][:, 0]
         )
         self._down = self._base.transpose(0, 2, 1) @ np.array([0.0, 0.0, -GRAVITY_M_S2])
@@ -110,13 +110,13 @@ class Arm:
             origins.append(at_m)
             axes.append(turned @ axis)
             if self._hinge[j]:
-                turned = turned @ _turn(axis, q[:, j])
+                turned = turned @ _rotate(axis, q[:, j])
             self._centres.append(at_m + turned @ self._com_m[j])
         tip_m = at_m + (turned @ np.broadcast_to(self._reach_m[-1], (len(q), 3))[..., None])[..., 0]
         return origins, axes, tip_m
 
 
-def _turn(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def _rotate(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Returns the rotations about a unit axis by each angle, `(N, 3, 3)`."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,4 +1,4 @@
-"""The plants of an exam at work: `N` runs of machines of one make, side by side, behind the link that a collection drives."""
+"""The plants of an exam: `N` runs of machines of one make, side by side, behind a `Link`."""
 
 from __future__ import annotations
 
@@ -8,19 +8,25 @@ from typing import Any, Self
 import numpy as np
 from scipy.signal import lfilter
 
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command, JointState
-from exam.plants.anatomy import Anatomy
-from exam.plants.chambers import Chambers
-from exam.plants.compensated import Compensated
-from exam.plants.line import Line
+from brokk_rl.spec import spec
+from exam.case_distribution import PlantRun
+from exam.plants import out_of_library_faults, plant_parameters
+from exam.plants.electronics import TRACKER_M, TRACKER_RAD, CommandBus, Encoders
+from exam.plants.faults import FAULTS, apply_faults
 from exam.plants.linkage import Arm, Boom
-from exam.plants.sensors import TRACKER_M, TRACKER_RAD, Encoders
-from exam.plants.strangers import Strangers
-from exam.plants.throttled import Throttled
-from exam.plants.valve import Valve
+from exam.plants.out_of_library_faults import OutOfLibraryFaults
+from exam.plants.plant_parameters import PlantParameters
+from exam.plants.power_stages import CompensatedValves, ThrottleValves, TwoChamberCylinders
+from exam.plants.valve import SpoolValve
 
-POWER = {"chambers": Chambers, "compensated": Compensated, "throttled": Throttled}
+POWER_STAGES = {
+    "chambers": TwoChamberCylinders,
+    "compensated": CompensatedValves,
+    "throttled": ThrottleValves,
+}
 MOVING = 0.01
 """Speed, of full speed, from which a joint moves."""
 DROOP_S = 1.5
@@ -29,7 +35,7 @@ WARM_S = 900.0
 """Time constant of the tank's temperature."""
 
 
-class Plant:
+class ExamPlant:
     """A `Link` to simulated machines of one make.
 
     Args:
@@ -48,7 +54,7 @@ class Plant:
         self,
         machine: Machine,
         make: str,
-        anatomies: Sequence[Anatomy],
+        anatomies: Sequence[PlantParameters],
         strangers: Sequence[str | None],
         seeds: Sequence[int],
         elapsed_s: np.ndarray,
@@ -61,15 +67,17 @@ class Plant:
         )
         n, count, joints = self._n, len(anatomies), machine.num_joints
         self._chance = [
-            _Chance(seed, anatomy, steps, machine)
+            _RunNoise(seed, anatomy, steps, machine)
             for seed, anatomy in zip(seeds, anatomies, strict=True)
         ]
         self._wander = np.stack([chance.wander for chance in self._chance], 1)
         self._noise = np.stack([chance.noise for chance in self._chance], 1)
         self._luck = np.stack([chance.luck for chance in self._chance], 1)
-        self._line, self._valve = Line(n, machine.period_s), Valve(n)
-        self._power = POWER[make](n, machine)
-        self._strangers = Strangers(machine, list(strangers), n["stranger"], self._luck[:, :, 2])
+        self._line, self._valve = CommandBus(n, machine.period_s), SpoolValve(n)
+        self._power = POWER_STAGES[make](n, machine)
+        self._strangers = OutOfLibraryFaults(
+            machine, list(strangers), n["stranger"], self._luck[:, :, 2]
+        )
         self._arm, self._encoders = Arm(machine, n), Encoders(n, machine.period_s)
         self._q = np.tile(machine.home, (count, 1))
         self._boom = Boom(n, self._q, np.full((count, 1), make != "chambers"))
@@ -173,10 +181,10 @@ class Plant:
         pass
 
 
-class _Chance:
+class _RunNoise:
     """All random numbers of one run, drawn beforehand, so that a run is the same whatever runs beside it."""
 
-    def __init__(self, seed: int, anatomy: Anatomy, steps: int, machine: Machine) -> None:
+    def __init__(self, seed: int, anatomy: PlantParameters, steps: int, machine: Machine) -> None:
         generator = np.random.default_rng(seed)
         shape = (steps + 1, machine.num_joints)
         keep = np.exp(-machine.period_s / anatomy["wander_s"])
@@ -192,3 +200,63 @@ class _Chance:
         self.noise = generator.standard_normal(shape, dtype=np.float32)
         self.luck = generator.random((steps + 1, 3), dtype=np.float32)
         self.tool = generator.standard_normal((steps + 1, 4), dtype=np.float32)
+
+
+@spec
+class HydraulicPlants:
+    """Hydraulic arms of three makes (chambers, compensated, throttled), each machine with numbers and nuisances of its own.
+
+    Attributes:
+        roughness: By name, how much hysteresis, waviness, wandering, droop and warm-up a machine
+            has; calibrated numbers.
+    """
+
+    roughness: dict[str, float]
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that its plants can have."""
+        return tuple(FAULTS)
+
+    @property
+    def ailments(self) -> tuple[str, ...]:
+        """Names of what its plants can have that no library knows."""
+        return out_of_library_faults.KINDS
+
+    def makes(self, machine: Machine, specimens: Sequence[PlantRun]) -> list[str]:
+        """Returns the make of each specimen."""
+        return [
+            plant_parameters.draw_plant(machine, specimen.seed, 1.0)[0] for specimen in specimens
+        ]
+
+    def build(self, machine: Machine, specimens: Sequence[PlantRun], run_s: float) -> ExamPlant:
+        """Returns specimens of one make, side by side.
+
+        Raises:
+            ConfigError: an effect, an ailment or a roughness is unknown.
+        """
+        found = []
+        for specimen in specimens:
+            if specimen.roughness not in self.roughness:
+                raise ConfigError(
+                    f"exam: no roughness '{specimen.roughness}' in exam.plants.roughness; "
+                    f"{list_choices(specimen.roughness, self.roughness)}"
+                )
+            make, numbers = plant_parameters.draw_plant(
+                machine, specimen.seed, self.roughness[specimen.roughness]
+            )
+            numbers = apply_faults(numbers, specimen.faults)
+            if specimen.ailment is not None:
+                numbers["stranger"] = specimen.ailment.severity
+            found.append((make, numbers))
+        (make,) = {make for make, _ in found}
+        return ExamPlant(
+            machine,
+            make,
+            [numbers for _, numbers in found],
+            [specimen.ailment.kind if specimen.ailment else None for specimen in specimens],
+            [specimen.chance for specimen in specimens],
+            np.array([specimen.elapsed_s for specimen in specimens]),
+            [specimen.tracked for specimen in specimens],
+            round(run_s / machine.period_s),
+        )

@@ -1,4 +1,4 @@
-"""The valve: pilot stage with hysteresis, a spool with a travel stop and a bounded slope, and the metering land.
+"""The valve: pilot stage with hysteresis, a spool with stop and bounded slope, the metering land.
 
 Commands and spool positions are parts of full stroke. All arrays `(N, J)`.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from exam.plants.anatomy import Anatomy
+from exam.plants.plant_parameters import PlantParameters
 
 TAU = 2.0 * np.pi
 LAND_LEAK = 0.08
@@ -17,14 +17,14 @@ WEIGHT_SHARE = 0.25
 """How much a load of yield force changes the pressure that a joint needs to break away."""
 
 
-class Valve:
+class SpoolValve:
     """Spools of all joints.
 
     Args:
         numbers: The machine's; see `anatomy`.
     """
 
-    def __init__(self, numbers: Anatomy) -> None:
+    def __init__(self, numbers: PlantParameters) -> None:
         self._numbers = numbers
         shape = numbers["notch"].shape
         self._pilot, self._filtered, self._spool, self._rate, self._bent = (

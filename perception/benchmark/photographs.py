@@ -1,6 +1,6 @@
 """Pictures like photographs of calibration patterns, coloured and cluttered, with the ellipses in them: styles held out of tuning.
 
-The detector's figures were set on `perception.benchmark.patterns`; these are what it is judged on
+The detector's figures were set on `perception.benchmark.calibration_patterns`; these are what it is judged on
 besides.
 """
 
@@ -9,13 +9,18 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from perception.benchmark.patterns import SUPERSAMPLING, clouds, light, moved
+from perception.benchmark.calibration_patterns import (
+    SUPERSAMPLING,
+    draw_clouds,
+    draw_light,
+    transform_circles,
+)
 
 STYLES = ("dots", "few", "rings", "targets", "board", "coded")
 SMALLEST_PX = 3.0
 
 
-def photograph(
+def draw_photograph(
     generator: np.random.Generator, style: str, width: int = 1024, height: int = 768
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns a grey picture `(height, width)` uint8, as JPEG leaves it, and its ellipses `(C, 5)`.
@@ -67,7 +72,7 @@ def photograph(
                 _code(canvas, homography, i, j, radius * 0.7, paper, generator)
     picture = (
         cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
-        * light(generator, width, height)[..., None]
+        * draw_light(generator, width, height)[..., None]
     )
     found = np.array(ellipses)
     x, y, a, b = found[:, :4].T
@@ -91,7 +96,8 @@ def _sheet(
 def _clutter(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
     """Returns a coloured table with lines and scraps on it, supersampled, `(h, w, 3)`."""
     table = [
-        clouds(generator, width, height, generator.uniform(1.0, 1.8)) * generator.uniform(5, 35)
+        draw_clouds(generator, width, height, generator.uniform(1.0, 1.8))
+        * generator.uniform(5, 35)
         + generator.uniform(30, 220)
         for _ in range(3)
     ]
@@ -120,7 +126,7 @@ def _clutter(generator: np.random.Generator, width: int, height: int) -> np.ndar
 def _disc(
     canvas: np.ndarray, homography: np.ndarray, i: float, j: float, radius: float, color: np.ndarray
 ) -> np.ndarray:
-    ellipse = moved(np.array([[i, j, radius, radius, 0.0]]), homography)[0]
+    ellipse = transform_circles(np.array([[i, j, radius, radius, 0.0]]), homography)[0]
     center, axes = _fixed(ellipse)
     cv2.ellipse(
         canvas,
@@ -147,7 +153,7 @@ def _code(
     generator: np.random.Generator,
 ) -> None:
     """Draws a piece of a ring, as coded targets have; it is no ellipse."""
-    ellipse = moved(np.array([[i, j, radius, radius, 0.0]]), homography)[0]
+    ellipse = transform_circles(np.array([[i, j, radius, radius, 0.0]]), homography)[0]
     center, axes = _fixed(ellipse)
     start, width = generator.uniform(0, 360), max(2, int(ellipse[3] * SUPERSAMPLING * 0.25))
     stop = start + generator.uniform(30, 120)

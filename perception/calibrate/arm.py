@@ -12,11 +12,11 @@ from brokk_rl import record
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
-from perception.calibrate import rigid
+from perception.calibrate import transforms
 
 
 @dataclass(frozen=True)
-class Links:
+class LinkPoses:
     """The last link in `N` poses.
 
     Attributes:
@@ -31,7 +31,7 @@ class Links:
     tip_in_base_m: np.ndarray
 
 
-def links(machine: Machine, q: np.ndarray) -> Links:
+def compute_link_poses(machine: Machine, q: np.ndarray) -> LinkPoses:
     """Returns the last link at joint positions, `(N, J)`, rad or m.
 
     Raises:
@@ -56,10 +56,10 @@ def links(machine: Machine, q: np.ndarray) -> Links:
     motions = np.concatenate(
         [np.where(hinge, np.cross(origins, axes), axes), np.where(hinge, axes, 0.0)], -1
     )
-    return Links(rigid.pose(turn, tip), motions, tip)
+    return LinkPoses(transforms.make_transform(turn, tip), motions, tip)
 
 
-def wobble(base_from_link: np.ndarray, shift_m: float, turn_rad: float) -> np.ndarray:
+def build_wobble_motions(base_from_link: np.ndarray, shift_m: float, turn_rad: float) -> np.ndarray:
     """Returns motions of links about themselves in all six directions, `(N, 6, 6)` in the base frame."""
     found = np.zeros((len(base_from_link), 6, 6))
     for k, unit in enumerate(np.eye(3)):
@@ -72,7 +72,7 @@ def wobble(base_from_link: np.ndarray, shift_m: float, turn_rad: float) -> np.nd
 
 
 @dataclass(frozen=True)
-class Track:
+class JointTrajectory:
     """Joint positions over time, or of single frames by name.
 
     Attributes:
@@ -105,7 +105,7 @@ class Track:
         return (ends[1] - ends[0]) / over_s
 
 
-def read(path: Path, machine: Machine) -> Track:
+def read_joint_positions(path: Path, machine: Machine) -> JointTrajectory:
     """Returns joint positions from a recording (Parquet), or from YAML: `<stem>: [q1, …]`, rad or m.
 
     Raises:
@@ -113,8 +113,10 @@ def read(path: Path, machine: Machine) -> Track:
         RecordingError: the recording breaks the format.
     """
     if path.suffix == ".parquet":
-        recording = record.read(path, machine)
-        return Track(np.asarray(recording.t_s, float), np.asarray(recording.q, float), None)
+        recording = record.read_recording(path, machine)
+        return JointTrajectory(
+            np.asarray(recording.t_s, float), np.asarray(recording.q, float), None
+        )
     try:
         told = yaml.safe_load(path.read_text())
         names, q = tuple(str(name) for name in told), np.array(list(told.values()), float)
@@ -134,4 +136,4 @@ def read(path: Path, machine: Machine) -> Track:
             f"{path}: {names[row]}: {joint.name} is {q[row, column]:g} {joint.unit}, its travel is "
             f"{joint.lower.value:g} to {joint.upper.value:g}; are these degrees?"
         )
-    return Track(None, q, names)
+    return JointTrajectory(None, q, names)

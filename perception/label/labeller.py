@@ -20,11 +20,16 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
-from perception.label import placing as label_placing
-from perception.label import refine
-from perception.label.camera import CameraPose, CameraTracker
-from perception.label.cuboid import Cuboid, look, project, sight_lines
-from perception.label.outline import block_outline, mouth_outline, offsets, smooth_gray
+from perception.label import cuboid as label_placing
+from perception.label import refinement
+from perception.label.camera_pose import CameraPose, CameraTracker
+from perception.label.cuboid import Cuboid, compute_pixel_rays, project_points, trace_rays
+from perception.label.refinement import (
+    measure_edge_offsets,
+    sample_block_outline,
+    sample_mouth_outline,
+    smooth_gray,
+)
 
 FRAMES, OVERLAYS = "frames", "overlays"
 MIN_POINTS = 20
@@ -45,14 +50,14 @@ class CameraSpec(Protocol):
 
 
 @spec
-class Labelling:
+class BlockLabelling:
     """Labels a folder of frames of one block that does not move.
 
     Attributes:
         source: The frames.
         camera: How to know where the camera was.
         placing: YAML file: corners of the drilled face, thickness, mouths; see
-            `perception.label.placing`.
+            `perception.label.cuboid`.
         noise_per_m: Standard deviation of inverse depth, 1/m.
         num_sigma: Depth this many standard deviations off says that something else is there.
         num_refined: Frames, evenly spread, by which the block is refined; 0 takes it as placed.
@@ -97,9 +102,9 @@ class Labelling:
             ConfigError: the placing cannot be read, or names a frame that is not there.
             FrameError: no frame can be labelled.
         """
-        placing, tracker = label_placing.read(Path(self.placing)), self.camera.build()
+        placing, tracker = label_placing.read_placing(Path(self.placing)), self.camera.build()
         poses, told, clicked = self._poses(tracker, placing.frame)
-        cuboid = label_placing.placed(placing, *clicked)
+        cuboid = label_placing.place_cuboid(placing, *clicked)
         before, views = cuboid.world(np.array([cuboid.low_m, cuboid.high_m])), []
         if self.num_refined:
             names = sorted(poses)
@@ -110,18 +115,18 @@ class Labelling:
                 .astype(int)
             }
             views = [
-                refine.seen(frame, poses[frame.name].world_from_camera)
+                refinement.prepare_view(frame, poses[frame.name].world_from_camera)
                 for frame in self._frames(chosen)
             ]
-            cuboid = refine.refined(cuboid, views, self.noise_per_m, self.reach_px)
+            cuboid = refinement.refine_cuboid(cuboid, views, self.noise_per_m, self.reach_px)
         shift_m = float(
             np.linalg.norm(
                 cuboid.world(np.array([cuboid.low_m, cuboid.high_m])) - before, axis=1
             ).max()
         )
-        cuboid = label_placing.with_mouths(cuboid, placing, *clicked)
+        cuboid = label_placing.place_mouths(cuboid, placing, *clicked)
         cuboid = (
-            refine.refined_mouths(cuboid, views, self.noise_per_m, self.reach_px)
+            refinement.refine_mouths(cuboid, views, self.noise_per_m, self.reach_px)
             if views
             else cuboid
         )
@@ -227,17 +232,17 @@ class Labelling:
 
     def _outline_px(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> float | None:
         """Returns the mean distance between outline and edges, each point by its steepest edge within reach."""
-        outline = block_outline(cuboid, frame, pose, self.noise_per_m, self.reach_px)
+        outline = sample_block_outline(cuboid, frame, pose, self.noise_per_m, self.reach_px)
         if len(outline.points_m) < MIN_POINTS:
             return None
-        away = np.abs(offsets(outline, smooth_gray(frame), self.reach_px, np.inf))
+        away = np.abs(measure_edge_offsets(outline, smooth_gray(frame), self.reach_px, np.inf))
         return float(np.nan_to_num(away, nan=self.reach_px).mean())
 
     def _masks(
         self, cuboid: Cuboid, frame: Frame, pose: np.ndarray
     ) -> tuple[FrameLabel, float | None]:
         """Returns the masks, and which part of the known depth agrees with the block."""
-        there = look(cuboid, sight_lines(frame), pose)
+        there = trace_rays(cuboid, compute_pixel_rays(frame), pose)
         block = there.face >= 0
         with np.errstate(invalid="ignore"):
             away = frame.depth_m - np.where(block, there.depth_m, np.nan)
@@ -274,7 +279,7 @@ def _truth(
             camera_from_world[:3, :3] @ cuboid.world(np.array([mouth.x_m, mouth.y_m, 0.0]))
             + camera_from_world[:3, 3]
         )
-        seen = len(mouth_outline(cuboid, number, frame, pose, noise_per_m, 0.0).points_m)
+        seen = len(sample_mouth_outline(cuboid, number, frame, pose, noise_per_m, 0.0).points_m)
         circles.append(
             TrueCircle(
                 tuple(center.tolist()), tuple(rotation[:, 2].tolist()), tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
@@ -298,7 +303,7 @@ def _overlay(
         picture[mask] = 0.6 * picture[mask] + 0.4 * np.array(colour, np.float32)
     picture = picture.astype(np.uint8)
     for begin, end in cuboid.edges(pose[:3, 3]):
-        ends = project(cuboid.world(np.stack([begin, end])), frame, pose)
+        ends = project_points(cuboid.world(np.stack([begin, end])), frame, pose)
         if np.isfinite(ends).all() and np.abs(ends).max() < 1e5:
             one, other = (tuple(int(value) for value in np.rint(point)) for point in ends)
             cv2.line(picture, one, other, (255, 255, 255) if good else RED, 1, cv2.LINE_AA)

@@ -22,7 +22,7 @@ class Calibration(Protocol):
     """A way to find the camera: a spec in `conf/calibration`."""
 
     def calibrate(self, machine: Machine) -> dict[str, Any]:
-        """Returns what `calibration.yaml` says; see `perception.calibrate.result`."""
+        """Returns what `calibration.yaml` says; see `perception.calibrate.extrinsics`."""
         ...
 
 

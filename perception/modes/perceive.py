@@ -1,4 +1,4 @@
-"""`brokk mode=perceive`: finds boreholes in frames of a folder or a camera, and says why others are none."""
+"""`brokk mode=perceive`: find boreholes in frames of a folder or a camera, and explain refusals."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -18,15 +18,19 @@ from rich.progress import Progress
 from rich.table import Table
 
 from brokk_rl.contracts.vision import (
+    BoreholeFinder,
     Ellipse,
     FinderSpec,
     FrameDetections,
     FrameSourceSpec,
     HolePose,
-    Observer,
+    HoleTracker,
     Overlay,
     Rejection,
-    Target,
+    RejectionExplainer,
+    TrackedHole,
+    TrackerSpec,
+    WholePictureFinder,
 )
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session, write_json, write_text
@@ -38,13 +42,13 @@ log = logging.getLogger(__name__)
 
 @spec
 class PerceiveOptions:
-    """What to look at.
+    """Input and extent of a perceive run.
 
     Attributes:
         input: Folder of frames, or of any pictures with `until: ellipses`.
         until: `holes`, or `ellipses` of the whole picture, which need neither depth nor a camera.
-        frames: Frames to look at; `null` for all, which a live camera has no end of.
-        pictures: Whether an overlay is written for each frame.
+        frames: Number of frames; `null` for all, which a live camera has no end of.
+        pictures: Write an overlay for each frame.
     """
 
     input: str | None
@@ -61,208 +65,253 @@ class PerceiveOptions:
 
 @dataclass(frozen=True)
 class FrameEntry:
-    """One frame: its name, what came out of it, and why it was refused as a whole."""
+    """Result of one frame.
+
+    Attributes:
+        name: Name of the frame.
+        found: Its detections, `None` where the whole frame was refused.
+        target: The hole that most frames support so far, and its age in s.
+        refused: Reason why the whole frame was refused.
+    """
 
     name: str
-    sighting: FrameDetections | None
-    target: Target | None
+    found: FrameDetections | None
+    target: tuple[TrackedHole, float] | None
     refused: str | None
 
-    def plain(self, until: str) -> dict[str, Any]:
-        """Returns it as plain JSON data."""
-        if self.sighting is None:
+    def as_json(self, until: str) -> dict[str, Any]:
+        """Return it as plain JSON data."""
+        if self.found is None:
             return {"name": self.name, "refused": self.refused}
         plain: dict[str, Any] = {
             "name": self.name,
-            "ms": {k: round(v, 3) for k, v in self.sighting.ms.items()},
+            "ms": {stage: round(value, 3) for stage, value in self.found.ms.items()},
         }
         if until == "ellipses":
-            return plain | {"ellipses": [_describe_ellipse(one) for one in self.sighting.ellipses]}
-        return plain | {
-            "holes": [_describe_hole(one) for one in self.sighting.holes],
-            "rejected": [_describe_rejection(one) for one in self.sighting.rejected],
-            "target": self.target and {
-                **_describe_hole(self.target.pose),
-                "num_frames": self.target.num_frames, "age_s": self.target.age_s, "stale": self.target.stale,
-            },
-        }  # fmt: skip
+            return plain | {"ellipses": [_describe_ellipse(one) for one in self.found.ellipses]}
+        plain["holes"] = [_describe_hole(one) for one in self.found.holes]
+        plain["rejected"] = [_describe_rejection(one) for one in self.found.rejected]
+        plain["target"] = None
+        if self.target is not None:
+            hole, age_s = self.target
+            plain["target"] = {
+                **_describe_hole(hole.pose),
+                "num_frames": hole.num_frames,
+                "age_s": age_s,
+                "stale": hole.stale,
+            }
+        return plain
 
 
 @spec
 class Perceive:
-    """Finds boreholes in frames, and says of everything else why it is none.
+    """Find boreholes in frames, and explain every refusal.
 
     Attributes:
-        session: Folder.
-        perception: How holes are found.
-        source: Where frames come from.
-        gallery: Where pictures come from with `perceive.until: ellipses`.
-        overlay: Draws what was seen.
-        perceive: What to look at.
+        session: Run folder.
+        perception: Finder of boreholes.
+        tracker: Follows the boreholes over the frames.
+        source: Source of the frames.
+        gallery: Source of the pictures with `perceive.until: ellipses`.
+        overlay: Draws the detections.
+        perceive: Input and extent.
     """
 
     session: Session
     perception: FinderSpec
+    tracker: TrackerSpec
     source: FrameSourceSpec
     gallery: FrameSourceSpec
     overlay: Overlay
     perceive: PerceiveOptions
 
     def run(self) -> None:
-        """Writes `holes.json`, `explain.txt` and `overlays/<name>.png` into the run folder.
+        """Write `holes.json`, `explain.txt` and `overlays/<name>.png` into the run folder.
 
         Raises:
-            ConfigError: the option of perception does not look at pictures.
+            ConfigError: `perceive.until=ellipses` with a finder that cannot list ellipses.
             FrameError: there is no frame at all, or none that can be used.
             StorageError: a file could not be written.
         """
-        built = self.perception.build()
-        if not hasattr(built, "look"):
-            raise ConfigError(
-                "this option of perception does not look at pictures; choose perception=plane_conic or paper"
-            )
-        observer = cast(Observer, built)
+        finder = self.perception.build()
+        if self.perceive.until == "ellipses":
+            results = self._list_ellipses(_require_whole_picture_finder(finder))
+        else:
+            results = self._find_holes(finder, self.tracker.build())
         folder = self.session.folder
         entries: list[FrameEntry] = []
         try:
-            for entry, frame in self._entries(observer):
+            for entry, frame in results:
                 entries.append(entry)
-                if frame is not None and entry.sighting is not None and self.perceive.pictures:
+                if frame is not None and entry.found is not None and self.perceive.pictures:
                     (folder / "overlays").mkdir(exist_ok=True)
-                    self.overlay.write(
-                        folder / "overlays" / f"{entry.name}.png", frame, entry.sighting
-                    )
+                    path = folder / "overlays" / f"{entry.name}.png"
+                    self.overlay.write(path, frame, entry.found)
         finally:
-            if any(entry.sighting for entry in entries):
-                self._write(folder, entries, observer)
-        if entries and not any(entry.sighting for entry in entries):
+            if any(entry.found for entry in entries):
+                self._write(folder, entries, finder)
+        if entries and not any(entry.found for entry in entries):
             raise FrameError(
                 f"none of {len(entries)} frames can be used. The first: {entries[0].refused}"
             )
         self._show(entries)
         log.info("holes: %s", folder / "holes.json")
 
-    def _entries(self, observer: Observer) -> Iterator[tuple[FrameEntry, Frame | None]]:
-        """Yields each frame of the source with what came out of it."""
-        only_ellipses = self.perceive.until == "ellipses"
-        with (
-            (self.gallery if only_ellipses else self.source).build() as source,
-            Progress(transient=True) as progress,
-        ):
-            total = _least(source.num_frames, self.perceive.frames)
+    def _find_holes(
+        self, finder: BoreholeFinder, tracker: HoleTracker
+    ) -> Iterator[tuple[FrameEntry, Frame | None]]:
+        """Yield the result of each frame of the source."""
+        for name, frame, refused in self._read_frames(self.source):
+            if frame is None:
+                yield FrameEntry(name, None, None, refused), None
+                continue
+            try:
+                found = finder.find(frame).in_base_frame(frame)
+            except FrameError as error:
+                log.warning("%s", error)
+                yield FrameEntry(name, None, None, str(error)), frame
+                continue
+            target = _choose_target(tracker.update(found.holes, frame.t_s), frame.t_s)
+            yield FrameEntry(name, found, target, None), frame
+
+    def _list_ellipses(
+        self, finder: WholePictureFinder
+    ) -> Iterator[tuple[FrameEntry, Frame | None]]:
+        """Yield the ellipses of each picture of the gallery."""
+        for name, frame, refused in self._read_frames(self.gallery):
+            if frame is None:
+                yield FrameEntry(name, None, None, refused), None
+                continue
+            start = time.perf_counter()
+            ellipses = finder.find_ellipses(frame)
+            ms = {"ellipse": 1000.0 * (time.perf_counter() - start)}
+            yield FrameEntry(name, FrameDetections([], [], ellipses, None, ms), None, None), frame
+
+    def _read_frames(
+        self, source_spec: FrameSourceSpec
+    ) -> Iterator[tuple[str, Frame | None, str | None]]:
+        """Yield name, frame and, in place of a frame that cannot be used, the reason."""
+        with source_spec.build() as source, Progress(transient=True) as progress:
+            counts = [source.num_frames, self.perceive.frames]
+            total = min((count for count in counts if count is not None), default=None)
             task = progress.add_task("looking", total=total)
             number = 0
             while total is None or number < total:
+                name = f"{number:05d}"
                 try:
                     frame = source.read_latest()
                 except FrameError as error:
-                    yield FrameEntry(f"{number:05d}", None, None, str(error)), None
+                    yield name, None, str(error)
                     log.warning("%s", error)
                 else:
                     if frame is None:
                         return
-                    yield self._entry(observer, frame, number, only_ellipses), frame
+                    yield Path(frame.name).name or name, frame, None
                 number += 1
                 progress.update(task, completed=number)
 
-    def _entry(
-        self, observer: Observer, frame: Frame, number: int, only_ellipses: bool
-    ) -> FrameEntry:
-        name = Path(frame.name).name or f"{number:05d}"
-        if only_ellipses:
-            start = time.perf_counter()
-            found = observer.ellipses(frame)
-            return FrameEntry(
-                name,
-                FrameDetections(
-                    [], [], found, None, {"ellipse": 1000.0 * (time.perf_counter() - start)}
-                ),
-                None,
-                None,
-            )
-        try:
-            sighting = observer.look(frame)
-        except FrameError as error:
-            log.warning("%s", error)
-            return FrameEntry(name, None, None, str(error))
-        return FrameEntry(name, sighting, observer.follow(sighting, frame.t_s), None)
-
-    def _write(self, folder: Path, entries: list[FrameEntry], observer: Observer) -> None:
-        write_json(
-            folder / "holes.json",
-            {"schema": 1, "frames": [entry.plain(self.perceive.until) for entry in entries]},
-        )
+    def _write(self, folder: Path, entries: list[FrameEntry], finder: BoreholeFinder) -> None:
+        """Write `holes.json`, and `explain.txt` unless only ellipses were asked for."""
+        frames = [entry.as_json(self.perceive.until) for entry in entries]
+        write_json(folder / "holes.json", {"schema": 1, "frames": frames})
         if self.perceive.until == "ellipses":
             return
         lines = []
         for entry in entries:
-            lines.append(f"{entry.name}: {entry.refused or _count_holes(entry.sighting)}")
-            lines += [
-                f"  {observer.explain(one)}"
-                for one in (entry.sighting.rejected if entry.sighting else ())
-            ]
+            lines.append(f"{entry.name}: {entry.refused or _count_holes(entry.found)}")
+            for rejection in entry.found.rejected if entry.found else ():
+                lines.append(f"  {_explain(finder, rejection)}")
         write_text(folder / "explain.txt", "\n".join(lines) + "\n")
 
     def _show(self, entries: list[FrameEntry]) -> None:
-        used = [entry.sighting for entry in entries if entry.sighting]
+        """Print a table of counts, refusals, the target and the durations."""
+        used = [entry.found for entry in entries if entry.found]
         table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
         table.add_row("frames", f"{len(used)} used, {len(entries) - len(used)} refused")
         if self.perceive.until == "ellipses":
             table.add_row("ellipses", str(sum(len(one.ellipses) for one in used)))
         else:
-            table.add_row(
-                "holes",
-                f"{sum(len(one.holes) for one in used)} in {sum(bool(one.holes) for one in used)} frames",
-            )
-            counts = Counter(
-                f"{one.stage}: {one.reason}" for sighting in used for one in sighting.rejected
-            )
+            num_holes = sum(len(one.holes) for one in used)
+            table.add_row("holes", f"{num_holes} in {sum(bool(one.holes) for one in used)} frames")
+            counts: Counter[str] = Counter()
+            for one in used:
+                counts.update(
+                    f"{rejection.stage}: {rejection.reason}" for rejection in one.rejected
+                )
             for reason, count in counts.most_common():
                 table.add_row("refused", f"{count} × {reason}")
-            if target := next((entry.target for entry in reversed(entries) if entry.target), None):
-                place = ", ".join(f"{value:.3f}" for value in target.pose.center_m)
-                std = 1000.0 * math.sqrt(float(np.trace(target.pose.cov_m2)))
-                stale = ", stale" if target.stale else ""
-                table.add_row(
-                    "target",
-                    f"({place}) m in {target.pose.frame}, ±{std:.1f} mm, {target.num_frames} frames{stale}",
-                )
+            target = next((entry.target for entry in reversed(entries) if entry.target), None)
+            if target is not None:
+                table.add_row("target", _format_target(target[0]))
         for stage in used[0].ms if used else ():
             table.add_row(f"ms, {stage}", f"{median(one.ms.get(stage, 0.0) for one in used):.0f}")
         Console().print(table)
 
 
-def _least(*numbers: int | None) -> int | None:
-    return min((number for number in numbers if number is not None), default=None)
+def _require_whole_picture_finder(finder: BoreholeFinder) -> WholePictureFinder:
+    """Return a finder that can list ellipses.
+
+    Raises:
+        ConfigError: this one cannot.
+    """
+    if not isinstance(finder, WholePictureFinder):
+        raise ConfigError(
+            f"perceive.until=ellipses: {type(finder).__name__} has no method find_ellipses(frame); "
+            "choose perception=plane_conic or paper, or perceive.until=holes"
+        )
+    return finder
 
 
-def _count_holes(sighting: FrameDetections | None) -> str:
-    count = len(sighting.holes) if sighting else 0
-    return "no hole" if not count else "1 hole" if count == 1 else f"{count} holes"
+def _explain(finder: BoreholeFinder, rejection: Rejection) -> str:
+    """Return a refusal in words: the finder's own if it has any."""
+    if isinstance(finder, RejectionExplainer):
+        return finder.explain(rejection)
+    value, limit = f"{rejection.value:.4g}", f"{rejection.limit:.4g}"
+    return f"{rejection.stage}: {rejection.reason} is {value}, limit {limit}"
+
+
+def _choose_target(tracked: Sequence[TrackedHole], t_s: float) -> tuple[TrackedHole, float] | None:
+    """Return the confirmed hole that most frames support, and its age; `None` without one."""
+    confirmed = [hole for hole in tracked if hole.confirmed]
+    best = max(confirmed, key=lambda hole: (hole.num_frames, hole.pose.score), default=None)
+    return None if best is None else (best, t_s - best.seen_s)
+
+
+def _format_target(hole: TrackedHole) -> str:
+    place = ", ".join(f"{value:.3f}" for value in hole.pose.center_m)
+    std_mm = 1000.0 * math.sqrt(float(np.trace(hole.pose.cov_m2)))
+    stale = ", stale" if hole.stale else ""
+    return f"({place}) m in {hole.pose.frame}, ±{std_mm:.1f} mm, {hole.num_frames} frames{stale}"
+
+
+def _count_holes(found: FrameDetections | None) -> str:
+    count = len(found.holes) if found else 0
+    if count == 0:
+        return "no hole"
+    return "1 hole" if count == 1 else f"{count} holes"
 
 
 def _describe_hole(pose: HolePose) -> dict[str, Any]:
     return {
-        "center_m": pose.center_m.tolist(), "axis": pose.axis.tolist(), "radius_m": float(pose.radius_m),
-        "cov_m2": pose.cov_m2.tolist(), "axis_cov_rad2": pose.axis_cov_rad2.tolist(),
-        "frame": pose.frame, "score": float(pose.score),
-    }  # fmt: skip
+        "center_m": pose.center_m.tolist(),
+        "axis": pose.axis.tolist(),
+        "radius_m": float(pose.radius_m),
+        "cov_m2": pose.cov_m2.tolist(),
+        "axis_cov_rad2": pose.axis_cov_rad2.tolist(),
+        "frame": pose.frame,
+        "score": float(pose.score),
+    }
 
 
 def _describe_rejection(one: Rejection) -> dict[str, Any]:
-    value, limit = (float(v) if math.isfinite(v) else None for v in (one.value, one.limit))
     return {
-        "stage": one.stage, "reason": one.reason, "value": value, "limit": limit,
+        "stage": one.stage,
+        "reason": one.reason,
+        "value": float(one.value) if math.isfinite(one.value) else None,
+        "limit": float(one.limit) if math.isfinite(one.limit) else None,
         "ellipse": one.ellipse and _describe_ellipse(one.ellipse),
-    }  # fmt: skip
+    }
 
 
 def _describe_ellipse(one: Ellipse) -> dict[str, float]:
-    return {
-        "x": one.x,
-        "y": one.y,
-        "a": one.a,
-        "b": one.b,
-        "theta_rad": one.theta_rad,
-        "score": one.score,
-    }
+    return {name: getattr(one, name) for name in ("x", "y", "a", "b", "theta_rad", "score")}

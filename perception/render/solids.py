@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from perception.render.texture import Material
+from perception.render.materials import Material
 
 NEAR_M = 1e-4
 """Hits nearer than this are those of the surface that a shadow ray starts on."""
@@ -51,7 +51,7 @@ class Surface(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Pose:
+class SolidPose:
     """A place in camera coordinates: `rotation` (columns: the solid's axes, `(3, 3)`) and `center_m`, `(3,)`."""
 
     rotation: np.ndarray
@@ -95,11 +95,11 @@ class Solid(Protocol):
 
 
 @dataclass(frozen=True)
-class Plane:
+class PlaneSolid:
     """A plane without end: the third axis of `pose` is its normal."""
 
     role: str
-    pose: Pose
+    pose: SolidPose
     materials: tuple[Material, ...]
     corners_m: None = None
 
@@ -126,7 +126,7 @@ class Box:
     """A box about the origin of `pose`. Parts: faces -x, +x, -y, +y, -z, +z; one material may serve all of them."""
 
     role: str
-    pose: Pose
+    pose: SolidPose
     half_m: np.ndarray
     materials: tuple[Material, ...]
 
@@ -175,7 +175,7 @@ class Cylinder:
     """A cylinder with caps along the third axis of `pose`. Parts: side, cap."""
 
     role: str
-    pose: Pose
+    pose: SolidPose
     radius_m: float
     half_length_m: float
     materials: tuple[Material, ...]

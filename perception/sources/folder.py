@@ -15,7 +15,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
-from perception.calibrate.extrinsics import Place, placed
+from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
 from perception.sources import validation
 from perception.stereo import Stereo
 
@@ -43,7 +43,7 @@ class FrameFolder:
     rate_hz: float
     least_known: float
     needs: Literal["depth", "camera", "nothing"]
-    base_from_camera: Place
+    base_from_camera: CameraPlacement
     stereo: Stereo
 
     def check(self) -> None:
@@ -140,7 +140,7 @@ class FolderSource:
         self._camera = (
             None if self._settings.needs == "nothing" and not path.exists() else read_camera(path)
         )
-        place = placed(self._settings.base_from_camera, "source.base_from_camera")
+        place = load_extrinsics(self._settings.base_from_camera, "source.base_from_camera")
         if self._camera is not None and place.base_from_camera is not None:
             self._camera = replace(
                 self._camera, base_from_camera=place.base_from_camera, cov=place.cov

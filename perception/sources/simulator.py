@@ -11,14 +11,14 @@ import numpy as np
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception.render.concrete import frame_of, materials_of
-from perception.render.drawing import surround
-from perception.render.drilled import FRONT, Block, Hole
-from perception.render.rig import Rig
-from perception.render.scenes import Scenes
-from perception.render.solids import Cylinder, Pose, Solid
-from perception.render.studio import Shot, Studio
-from perception.render.texture import Material
+from perception.render.block_sampler import build_frame, draw_block_materials
+from perception.render.drilled_block import FRONT, DrilledBlock, DrilledHole
+from perception.render.frame_renderer import FrameRenderer, RenderedFrame
+from perception.render.materials import Material
+from perception.render.scene_ranges import SceneRanges
+from perception.render.scene_sampler import add_surroundings
+from perception.render.solids import Cylinder, Solid, SolidPose
+from perception.render.stereo_camera import StereoRig
 from perception.stereo import Stereo
 
 
@@ -41,8 +41,8 @@ class SimulatedCamera:
             noise.
     """
 
-    rig: Rig
-    surroundings: Scenes
+    rig: StereoRig
+    surroundings: SceneRanges
     stereo: Stereo
     task_scene: tuple[float, float, float, float, float, float]
     block_m: tuple[float, float, float]
@@ -80,7 +80,7 @@ class SimulatedSource:
 
     def __init__(self, settings: SimulatedCamera) -> None:
         self._settings = settings
-        self._studio = Studio(
+        self._studio = FrameRenderer(
             rig=settings.rig,
             scene=settings.surroundings,
             stereo=settings.stereo,
@@ -134,7 +134,7 @@ class SimulatedSource:
             t_s=number / self._settings.rate_hz, right=shot.right, baseline_m=rig.baseline_m,
         )  # fmt: skip
 
-    def shot(self, noise: np.random.Generator) -> Shot:
+    def shot(self, noise: np.random.Generator) -> RenderedFrame:
         """Returns what is shown now, with its truth."""
         settings, kind = self._settings, self._settings.surroundings
         chance = np.random.default_rng(settings.seed)  # the same stains and light for every frame
@@ -150,11 +150,15 @@ class SimulatedSource:
             [[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
         )
         rotation = from_base[:3, :3] @ turn
-        hole = Hole(np.array([0.0, 0.0, half[2]]), radius_m, settings.hole_depth_m, FRONT, 0.0)
-        pose = Pose(rotation, target - rotation @ hole.center_m)
-        block = Block(pose, half, materials_of(kind.block, half, (hole,), (), chance), (hole,))
+        hole = DrilledHole(
+            np.array([0.0, 0.0, half[2]]), radius_m, settings.hole_depth_m, FRONT, 0.0
+        )
+        pose = SolidPose(rotation, target - rotation @ hole.center_m)
+        block = DrilledBlock(
+            pose, half, draw_block_materials(kind.block, half, (hole,), (), chance), (hole,)
+        )
         down_m = float((from_base[:3, 3]) @ settings.rig.down_in_camera)
-        scene = surround(
+        scene = add_surroundings(
             kind,
             settings.rig,
             block,
@@ -174,7 +178,7 @@ class SimulatedSource:
             length = float(np.linalg.norm(end - start))
             if length > 1e-3:
                 radius_m = self._settings.arm_m[1 if number == len(points) - 2 else 0]
-                pose = Pose(frame_of(end - start, 0.0), (start + end) / 2)
+                pose = SolidPose(build_frame(end - start, 0.0), (start + end) / 2)
                 parts.append(
                     Cylinder(
                         "arm",

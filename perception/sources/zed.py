@@ -10,7 +10,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.spec import spec
-from perception.calibrate.extrinsics import Place, placed
+from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
 from perception.sources import validation
 from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
 
@@ -46,7 +46,7 @@ class Zed:
     confidence: int
     nearest_m: float
     farthest_m: float
-    base_from_camera: Place
+    base_from_camera: CameraPlacement
     fresh: Freshness
 
     def check(self) -> None:
@@ -63,7 +63,7 @@ class Zed:
 
     def build(self) -> LiveSource:
         """Returns the source, not yet opened."""
-        place = placed(self.base_from_camera, "source.base_from_camera")
+        place = load_extrinsics(self.base_from_camera, "source.base_from_camera")
         return LiveSource(
             ZedDevice(self), "ZED camera", self.fresh, place.base_from_camera, place.cov
         )

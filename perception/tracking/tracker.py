@@ -1,151 +1,136 @@
-"""One target from what is seen frame after frame."""
+"""Tracking of boreholes over frames: nearest-neighbour association, inverse-variance averaging."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from brokk_rl.contracts.vision import HolePose, Target
+from brokk_rl.contracts.vision import HolePose, TrackedHole
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 
-CHI2_3 = 11.34
-"""99 % of a chi-square with three degrees of freedom."""
+SMALLEST_VARIANCE_M2 = 1e-8
+"""Variance below which a detection counts no more, (0.1 mm)²: no camera measures better."""
 
 
 @spec
-class Fusion:
-    """Weighs what frames say by their covariance, leaves outliers out, says when the target is stale.
+class VarianceFusion:
+    """Average the detections of each hole by their variance, with a limited memory.
+
+    The error of the camera's pose is the same in all frames (`HolePose.shared_m2`): it weighs
+    nothing, and averaging does not reduce it.
 
     Attributes:
-        gate: Squared Mahalanobis distance beyond which a hole is another one, in units of the 99 %
-            quantile.
-        floor_m: Standard deviation that frames of one place share and that no averaging takes away.
-        drift_m: Standard deviation by which the target may move, per square root of a second.
-        confirm: Frames that must agree before there is a target.
-        stale_s: Age from which nobody should act on it.
-        forget_s: Age at which it is forgotten, and another one may take its place.
+        near_m: Detections nearer to each other than this are the same hole.
+        memory: Detections, at most, that count against a new one.
+        confirm: Detections from which a hole is confirmed.
+        stale_s: Age from which a hole is stale.
+        forget_s: Age from which a hole is forgotten.
     """
 
-    gate: float
-    floor_m: float
-    drift_m: float
+    near_m: float
+    memory: int
     confirm: int
     stale_s: float
     forget_s: float
 
     def check(self) -> None:
-        if not 0 < self.stale_s <= self.forget_s or self.confirm < 1 or self.gate <= 0:
+        if not 0 < self.stale_s <= self.forget_s or min(self.memory, self.confirm) < 1:
             raise ConfigError(
-                f"perception.filter: expected 0 < stale_s <= forget_s, confirm >= 1 and gate > 0, got {self.stale_s}, "
-                f"{self.forget_s}, {self.confirm} and {self.gate}"
+                "tracker: expected 0 < stale_s <= forget_s, memory and confirm of 1 or more, got "
+                f"{self.stale_s}, {self.forget_s}, {self.memory} and {self.confirm}"
             )
+        if self.near_m <= 0:
+            raise ConfigError(f"tracker: expected near_m above 0, got {self.near_m}")
 
-    def build(self) -> FusionFilter:
-        """Returns a filter that has seen nothing yet."""
-        return FusionFilter(self)
+    def build(self) -> FusionTracker:
+        """Return a tracker that has seen nothing yet."""
+        return FusionTracker(self)
 
 
 @dataclass(frozen=True)
 class _Track:
-    """A place at which holes were seen; covariances are those of the average, without what all frames share."""
+    """A hole that was seen at least once.
+
+    Attributes:
+        pose: The last detection, with the averaged centre.
+        weight: Inverse of the centre's variance without the shared part, 1/m².
+        own_cov_m2: Covariance of the centre without the shared part; its mean variance is
+            1 / weight.
+        num_frames: Detections so far.
+        seen_s: Time of the last one.
+    """
 
     pose: HolePose
+    weight: float
+    own_cov_m2: np.ndarray
     num_frames: int
     seen_s: float
-    updated_s: float
 
 
-class FusionFilter:
-    """See `Fusion`. Follows several places; the target is the one that most frames speak for."""
+class FusionTracker:
+    """See `VarianceFusion`."""
 
-    def __init__(self, settings: Fusion) -> None:
+    def __init__(self, settings: VarianceFusion) -> None:
         self.settings = settings
-        self._tracks: list[_Track] = []
+        self._tracks: dict[int, _Track] = {}
+        self._num_names = 0
 
-    def reset(self) -> None:
-        """Forgets everything."""
-        self._tracks = []
+    def update(self, holes: Sequence[HolePose], t_s: float) -> list[TrackedHole]:
+        """Take the holes of the frame at `t_s`; return all known ones by name; see `HoleTracker`."""
+        for hole in holes:
+            self._add(hole, t_s)
+        for name, track in list(self._tracks.items()):
+            if t_s - track.seen_s > self.settings.forget_s:
+                del self._tracks[name]
+        return [self._describe(name, track, t_s) for name, track in self._tracks.items()]
 
-    def update(self, poses: Sequence[HolePose], t_s: float) -> Target | None:
-        """Takes the holes seen at `t_s`; returns the target; see `TargetFilter`."""
-        s = self.settings
-        tracks = [track for track in self._tracks if t_s - track.seen_s <= s.forget_s]
-        tracks = [self._drifted(track, t_s) for track in tracks]
-        free = list(range(len(tracks)))
-        for pose in sorted(map(_own, poses), key=lambda pose: -pose.score):
-            distances = {k: self._distance(tracks[k].pose, pose) for k in free}
-            best = min(distances, key=distances.__getitem__, default=None)
-            if best is not None and distances[best] <= s.gate * CHI2_3:
-                tracks[best] = _fused(tracks[best], pose, t_s)
-                free.remove(best)
-            else:
-                tracks.append(_Track(pose, 1, t_s, t_s))
-        self._tracks = tracks
-        known = [track for track in tracks if track.num_frames >= s.confirm]
-        if not known:
-            return None
-        track = max(known, key=lambda track: (track.num_frames, track.pose.score))
-        age_s = t_s - track.seen_s
-        pose = track.pose
-        pose = replace(
-            pose, cov_m2=pose.cov_m2 + np.eye(3) * s.floor_m**2 + _or_zero(pose.shared_m2),
-            axis_cov_rad2=pose.axis_cov_rad2 + _or_zero(pose.shared_rad2),
-        )  # fmt: skip
-        return Target(pose, track.num_frames, age_s, age_s > s.stale_s)
+    def _add(self, hole: HolePose, t_s: float) -> None:
+        """Average a detection into the nearest track, or begin a new one."""
+        shared_m2 = _take_mean_variance(hole.shared_m2)
+        weight = 1.0 / max(SMALLEST_VARIANCE_M2, float(np.trace(hole.cov_m2)) / 3 - shared_m2)
+        own_cov_m2 = hole.cov_m2 if hole.shared_m2 is None else hole.cov_m2 - hole.shared_m2
+        name = self._find_nearest(hole)
+        if name is None:
+            self._num_names += 1
+            self._tracks[self._num_names] = _Track(hole, weight, own_cov_m2, 1, t_s)
+            return
+        old = self._tracks[name]
+        # The cap lets a base that was moved be noticed within a few detections.
+        before = min(old.weight, self.settings.memory * weight)
+        total = before + weight
+        center_m = (before * old.pose.center_m + weight * hole.center_m) / total
+        faded_cov_m2 = old.own_cov_m2 * (old.weight / before)
+        own_cov_m2 = (before**2 * faded_cov_m2 + weight**2 * own_cov_m2) / total**2
+        pose = replace(hole, center_m=center_m)
+        self._tracks[name] = _Track(pose, total, own_cov_m2, old.num_frames + 1, t_s)
 
-    def _drifted(self, track: _Track, t_s: float) -> _Track:
-        grown = track.pose.cov_m2 + np.eye(3) * self.settings.drift_m**2 * max(
-            t_s - track.updated_s, 0.0
+    def _find_nearest(self, hole: HolePose) -> int | None:
+        """Return the name of the track at the place of a detection, `None` for none."""
+        distances_m = {
+            name: float(np.linalg.norm(track.pose.center_m - hole.center_m))
+            for name, track in self._tracks.items()
+        }
+        name = min(distances_m, key=distances_m.__getitem__, default=None)
+        return name if name is not None and distances_m[name] <= self.settings.near_m else None
+
+    def _describe(self, name: int, track: _Track, t_s: float) -> TrackedHole:
+        shared_m2 = track.pose.shared_m2
+        cov_m2 = track.own_cov_m2 if shared_m2 is None else track.own_cov_m2 + shared_m2
+        return TrackedHole(
+            name=name,
+            pose=replace(track.pose, cov_m2=cov_m2),
+            std_m=math.sqrt(1.0 / track.weight + _take_mean_variance(shared_m2)),
+            num_frames=track.num_frames,
+            seen_s=track.seen_s,
+            confirmed=track.num_frames >= self.settings.confirm,
+            stale=t_s - track.seen_s > self.settings.stale_s,
         )
-        return replace(track, pose=replace(track.pose, cov_m2=grown), updated_s=t_s)
-
-    def _distance(self, first: HolePose, second: HolePose) -> float:
-        """Returns the squared Mahalanobis distance between two centres."""
-        apart = second.center_m - first.center_m
-        shared = first.cov_m2 + second.cov_m2 + np.eye(3) * self.settings.floor_m**2
-        return float(apart @ np.linalg.solve(shared, apart))
 
 
-def _own(pose: HolePose) -> HolePose:
-    """Returns a pose with what is its own of its covariances: further frames take that away, and not what all of them share."""
-    return replace(
-        pose,
-        cov_m2=pose.cov_m2 - _or_zero(pose.shared_m2),
-        axis_cov_rad2=pose.axis_cov_rad2 - _or_zero(pose.shared_rad2),
-    )
-
-
-def _or_zero(cov: np.ndarray | None) -> np.ndarray:
-    return np.zeros((3, 3)) if cov is None else cov
-
-
-def _fused(track: _Track, pose: HolePose, t_s: float) -> _Track:
-    """Returns the track with one more frame, weighed by information."""
-    before, tiny = track.pose, np.eye(3) * 1e-12
-    gain = before.cov_m2 @ np.linalg.inv(before.cov_m2 + pose.cov_m2 + tiny)
-    center = before.center_m + gain @ (pose.center_m - before.center_m)
-    cov = (np.eye(3) - gain) @ before.cov_m2 @ (np.eye(3) - gain).T + gain @ pose.cov_m2 @ gain.T
-    w = (
-        1.0 / max(float(np.trace(before.axis_cov_rad2)), 1e-12),
-        1.0 / max(float(np.trace(pose.axis_cov_rad2)), 1e-12),
-    )
-    part = w[1] / (w[0] + w[1])
-    axis = (1 - part) * before.axis + part * pose.axis
-    axis_cov = (1 - part) ** 2 * before.axis_cov_rad2 + part**2 * pose.axis_cov_rad2
-    number = track.num_frames + 1
-    fused = HolePose(
-        center_m=center,
-        axis=axis / np.linalg.norm(axis),
-        radius_m=before.radius_m + (pose.radius_m - before.radius_m) / number,
-        cov_m2=(cov + cov.T) / 2,
-        axis_cov_rad2=axis_cov,
-        frame=pose.frame,
-        score=max(before.score, pose.score),
-        t_s=t_s,
-        shared_m2=pose.shared_m2,
-        shared_rad2=pose.shared_rad2,
-    )
-    return _Track(fused, number, t_s, t_s)
+def _take_mean_variance(cov_m2: np.ndarray | None) -> float:
+    """Return the mean variance of the three coordinates, 0 for `None`."""
+    return 0.0 if cov_m2 is None else float(np.trace(cov_m2)) / 3

@@ -25,7 +25,9 @@ TOLERANCE = 1e-3
 """Largest difference of a probability between torch and onnxruntime."""
 
 
-def header_of(network: UNet, size_px: tuple[int, int], facts: Mapping[str, Any]) -> dict[str, Any]:
+def build_header(
+    network: UNet, size_px: tuple[int, int], facts: Mapping[str, Any]
+) -> dict[str, Any]:
     """Returns what stands in a network's files: what it takes and gives, and `facts` about its training, JSON."""
     return {
         "schema": SCHEMA,
@@ -38,7 +40,7 @@ def header_of(network: UNet, size_px: tuple[int, int], facts: Mapping[str, Any])
     }
 
 
-def write(path: Path, network: UNet, header: Mapping[str, Any]) -> None:
+def write_checkpoint(path: Path, network: UNet, header: Mapping[str, Any]) -> None:
     """Writes a checkpoint in one step.
 
     Raises:

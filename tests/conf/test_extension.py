@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from packages import install_package
 
 from brokk_rl import registry
 
@@ -16,6 +17,7 @@ import json
 
 import torch
 
+from brokk_rl.contracts.vision import FrameDetections
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 
@@ -46,7 +48,7 @@ class Dowser:
         return self
 
     def find(self, frame):
-        return None
+        return FrameDetections(holes=[])
 
 
 @spec
@@ -80,17 +82,6 @@ fails: not
 """
 
 
-def install(folder: Path, name: str, files: dict[str, str]) -> None:
-    """Puts a package with an entry point where a wheel would put it."""
-    for path, text in {"__init__.py": "", "conf/__init__.py": "", **files}.items():
-        (folder / name / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name / path).write_text(text)
-    about = folder / f"{name}-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(f"[brokk_rl.conf]\n{name} = {name}.conf\n")
-
-
 @pytest.fixture
 def mine(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder on the import path with the package `mine` in it."""
@@ -102,7 +93,7 @@ def mine(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
         "conf/perception/dowser.yaml": "_target_: mine.parts.Dowser\n",
         "conf/mode/show.yaml": MODE,
     }
-    install(folder, "mine", options)
+    install_package(folder, "mine", options)
     monkeypatch.syspath_prepend(str(folder))
     return folder
 
@@ -125,13 +116,13 @@ def test_its_options_run_beside_ours(mine: Path, brokk: Callable[..., Any], tmp_
     assert brokk("mode=show", "session.out=run").code == 0
     assert (tmp_path / "run" / "seen.json").read_text() == '["Sticky", "Wave", "Dowser"]'
     assert brokk("mode=show", "perception=truth", "session.out=ours").code == 0
-    assert (tmp_path / "ours" / "seen.json").read_text() == '["Sticky", "Wave", "Truth"]'
+    assert (tmp_path / "ours" / "seen.json").read_text() == '["Sticky", "Wave", "TruthPerception"]'
 
 
 def test_an_option_that_two_packages_offer_is_an_error_that_names_both(
     mine: Path, brokk: Callable[..., Any]
 ) -> None:
-    install(
+    install_package(
         mine, "yours", {"conf/actuator/sticky.yaml": "_target_: mine.parts.Sticky\nshare: 0.5\n"}
     )
     done = brokk("mode=list")

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 LAG = """# A fitted actuator.
-_target_: actuators.models.lag.Lag
+_target_: actuators.models.lag.FirstOrderLag
 dead_time_s: {q1: 0.5, other: 0.45}
 dead_band_extend: 0.1
 dead_band_retract: 0.1
@@ -114,7 +114,7 @@ def test_a_sweep_takes_files_beside_options(
         (
             "actuator",
             "_target_: os.system\n",
-            ("'_target_: os.system' is no actuator", "actuators.models.lag.Lag"),
+            ("'_target_: os.system' is no actuator", "actuators.models.lag.FirstOrderLag"),
         ),
         (
             "actuator",
@@ -133,22 +133,22 @@ def test_a_sweep_takes_files_beside_options(
         ),
         (
             "actuator",
-            "_target_: actuators.models.ideal.Ideal\nspeed_scale: ${oc.env:HOME}\n",
+            "_target_: actuators.models.lag.Ideal\nspeed_scale: ${oc.env:HOME}\n",
             ("interpolation", "${oc.env:HOME}"),
         ),
         (
             "actuator",
-            '_target_: actuators.models.ideal.Ideal\nspeed_scale: "\\x24{now:}"\n',
+            '_target_: actuators.models.lag.Ideal\nspeed_scale: "\\x24{now:}"\n',
             ("interpolation",),
         ),
         (
             "actuator",
-            "_target_: actuators.models.ideal.Ideal\n_partial_: true\n",
+            "_target_: actuators.models.lag.Ideal\n_partial_: true\n",
             ("'_partial_' is a setting of Hydra's",),
         ),
         (
             "actuator",
-            "# @package _global_\n_target_: actuators.models.ideal.Ideal\n",
+            "# @package _global_\n_target_: actuators.models.lag.Ideal\n",
             ("lies outside 'actuator'",),
         ),
         ("experiment", "hydra: {sweep: {dir: /}}\n", ("Hydra's own settings",)),

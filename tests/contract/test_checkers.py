@@ -15,10 +15,11 @@ from composed import option
 
 from brokk_rl.checks import check_actuator, check_excitation, check_finder, check_link, check_task
 from brokk_rl.contracts.actuator import Segment
+from brokk_rl.contracts.vision import FrameDetections, HolePose
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.signals import Borehole, Command, JointState
+from brokk_rl.signals import Command, JointState
 
 
 class Filter:
@@ -149,10 +150,46 @@ def test_a_broken_task_is_found(
         check_task(overriding(**methods), machine)
 
 
-def test_a_finder_with_an_axis_that_is_no_unit_vector_is_found() -> None:
-    hole = Borehole(np.zeros(3), np.array([0.0, 0.0, 2.0]), 0.05, np.eye(3))
-    with pytest.raises(AssertionError, match="unit vector"):
-        check_finder(SimpleNamespace(build=lambda: SimpleNamespace(find=lambda frame: hole)))
+def finder_of(answer: Any) -> Any:
+    """Returns the spec of a finder that always answers the same."""
+    return SimpleNamespace(build=lambda: SimpleNamespace(find=lambda frame: answer))
+
+
+HOLE = HolePose(
+    np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]), 0.05, np.eye(3), np.eye(3), "camera", 0.5, 0.0
+)  # fmt: skip
+
+
+def test_a_proper_finder_passes() -> None:
+    check_finder(finder_of(FrameDetections([HOLE])))
+    check_finder(finder_of(FrameDetections([])))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"axis": np.array([0.0, 0.0, 2.0])}, "unit vector"),
+        ({"center_m": np.array([0.0, np.nan, 1.0])}, "no point"),
+        ({"cov_m2": -np.eye(3)}, "cov_m2 has negative variances"),
+        ({"axis_cov_rad2": np.eye(2)}, "axis_cov_rad2 is not symmetric"),
+        ({"score": 3.0}, "score"),
+        ({"frame": "world"}, "camera or base"),
+        ({"radius_m": 0.0}, "radius"),
+    ],
+)
+def test_a_finder_with_an_impossible_hole_is_found(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(AssertionError, match=message):
+        check_finder(finder_of(FrameDetections([replace(HOLE, **change)])))
+
+
+def test_a_finder_that_answers_something_else_is_found() -> None:
+    with pytest.raises(AssertionError, match=r"expected FrameDetections .*, got NoneType"):
+        check_finder(finder_of(None))
+    with pytest.raises(AssertionError, match="no method find"):
+        check_finder(SimpleNamespace(build=lambda: SimpleNamespace(look=None)))  # type: ignore[arg-type,return-value]
+    unsorted = FrameDetections([replace(HOLE, score=0.2), HOLE])
+    with pytest.raises(AssertionError, match="surest first"):
+        check_finder(finder_of(unsorted))
 
 
 class Loopback:

@@ -13,9 +13,9 @@ import pytest
 import torch
 from composed import option
 
-from actuators.identify import descent
-from actuators.identify.dataset import Windows
-from actuators.identify.descent import Descent
+from actuators.identify import network_fit
+from actuators.identify.network_fit import FreeRunOptimizer
+from actuators.identify.training_data import TrainingWindows
 from actuators.models import checkpoint
 from actuators.models.network import JointNetworks
 from brokk_rl.machine import Machine
@@ -50,12 +50,12 @@ def test_a_captured_update_is_the_update(
     for captured in (True, False):
         with monkeypatch.context() as patch:
             if not captured:
-                patch.setattr(descent, "capture", as_it_is)
+                patch.setattr(network_fit, "capture", as_it_is)
             networks = JointNetworks(5, 13, 32, coupled, torch.Generator().manual_seed(0))
             networks.increment_scale.fill_(0.01)
-            at_work = Descent(networks.cuda(), machine, 3)
+            at_work = FreeRunOptimizer(networks.cuda(), machine, 3)
             update = at_work.updater(
-                Windows([recording(machine, 0)], machine, horizon, torch.device("cuda")),
+                TrainingWindows([recording(machine, 0)], machine, horizon, torch.device("cuda")),
                 32,
                 0.2,
                 0.2,
@@ -97,6 +97,8 @@ def test_a_fit_on_the_gpu_is_as_good_as_on_the_cpu(
     error = []
     for device in ("cpu", "cuda"):
         config.fit(machine, train, validation, tmp_path / device, 0, torch.device(device))
-        _, header = checkpoint.read(tmp_path / device / f"{name}.safetensors", name, machine)
+        _, header = checkpoint.read_checkpoint(
+            tmp_path / device / f"{name}.safetensors", name, machine
+        )
         error.append(np.array(list(header["fit"]["validation_rmse"].values())))
     assert error[1] == pytest.approx(error[0], rel=0.25)

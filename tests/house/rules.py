@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
 
 ROOMS = ("tasks", "actuators", "perception", "deploy", "diagnosis")
 EXTENSIONS = ("exam",)
@@ -184,6 +186,69 @@ def lengths(sources: Mapping[str, str], limit: int, reasons: Mapping[str, str]) 
         for module, count in counts.items()
         if count > limit and module not in reasons
     ]
+
+
+PREDICATES = ("is", "has", "can", "does", "may", "needs", "as", "to", "from", "main")
+"""First words of names that need no verb: predicates, conversions and the entry of a script."""
+FIRST_WORDS = ("what", "how", "whether", "is told", "says", "of ", "so much")
+"""Beginnings of a docstring that a reader has to read twice."""
+VERBS = frozenset(Path(__file__).with_name("verbs.txt").read_text().split())
+
+
+def verb_names(sources: Mapping[str, str], exceptions: Collection[str] = ()) -> list[str]:
+    """A function of a module begins with a verb."""
+    found = []
+    for module, tree in _trees(sources):
+        for node in tree.body:
+            if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                continue
+            name = node.name.lstrip("_")
+            if name.split("_")[0] not in (*VERBS, *PREDICATES) and node.name not in exceptions:
+                found.append(f"{module}:{node.lineno} {node.name} does not begin with a verb")
+    return found
+
+
+def unique_classes(sources: Mapping[str, str]) -> list[str]:
+    """The name of a public class exists once."""
+    owners: dict[str, list[str]] = {}
+    for module, tree in _trees(sources):
+        for node in tree.body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                owners.setdefault(node.name, []).append(module)
+    return [
+        f"{name} is a class of {', '.join(modules)}"
+        for name, modules in owners.items()
+        if len(modules) > 1
+    ]
+
+
+def first_lines(sources: Mapping[str, str]) -> list[str]:
+    """A docstring begins with an imperative or a noun phrase."""
+    found = []
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    for module, tree in _trees(sources):
+        for node in ast.walk(tree):
+            text = ast.get_docstring(node) if isinstance(node, documented) else None
+            if text and text.lower().startswith(FIRST_WORDS):
+                found.append(f"{module}:{getattr(node, 'lineno', 1)} '{text.splitlines()[0]}'")
+    return found
+
+
+def circles(sources: Mapping[str, str]) -> list[str]:
+    """Modules do not import each other in a circle, not even for the type checker alone."""
+    graph: dict[str, set[str]] = {}
+    for module, tree in _trees(sources):
+        names = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                inside = [f"{node.module}.{alias.name}" for alias in node.names]
+                names |= {name if name in sources else node.module for name in inside}
+        graph[module] = {name for name in names if name in sources and name != module}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return [" -> ".join(reversed(error.args[1]))]
+    return []
 
 
 def _trees(sources: Mapping[str, str]) -> Iterator[tuple[str, ast.Module]]:

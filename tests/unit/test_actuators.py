@@ -12,9 +12,9 @@ import torch
 from composed import option
 
 from actuators.models.hydraulic import Hydraulic
-from actuators.models.lag import Lag
-from actuators.models.parameters import per_joint
-from actuators.models.transport import commands_in_force, opened
+from actuators.models.lag import FirstOrderLag
+from actuators.models.parameters import expand_per_joint
+from actuators.models.transport import open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import GRAVITY_M_S2, Gravity
 from brokk_rl.history import History
@@ -55,7 +55,7 @@ def held(machine: Machine, steps: int, **level: float) -> torch.Tensor:
     return u
 
 
-def lag(**changes: Any) -> Lag:
+def lag(**changes: Any) -> FirstOrderLag:
     plain = {
         "dead_time_s": 0.0,
         "dead_band_extend": 0.0,
@@ -64,7 +64,7 @@ def lag(**changes: Any) -> Lag:
         "time_constant_s": 0.0,
         "spread": {},
     }
-    return Lag(**(plain | changes))
+    return FirstOrderLag(**(plain | changes))
 
 
 def hydraulic(**changes: Any) -> Hydraulic:
@@ -134,14 +134,16 @@ def test_the_machines_dead_time_shifts_by_eleven_periods(machine: Machine) -> No
 
 def test_commands_in_force_splits_the_period() -> None:
     u = torch.arange(5.0)[None, :, None]
-    earlier, later, part = commands_in_force(u, torch.tensor([[1.25]]))
+    earlier, later, part = select_commands_in_force(u, torch.tensor([[1.25]]))
     assert (earlier.item(), later.item(), part.item()) == (2.0, 3.0, 0.25)
 
 
 def test_the_dead_band_ends_on_each_side_by_itself() -> None:
     u = torch.tensor([-1.0, -0.6, -0.2, 0.0, 0.1, 0.55, 1.0])
     expected = [-1.0, -0.5, 0.0, 0.0, 0.0, 0.5, 1.0]  # (0.6 - 0.2) / 0.8 and (0.55 - 0.1) / 0.9
-    np.testing.assert_allclose(opened(u, torch.tensor(0.1), torch.tensor(0.2)), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        open_valve(u, torch.tensor(0.1), torch.tensor(0.2)), expected, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("dead_time_s", [0.61, 2.0])
@@ -318,8 +320,8 @@ def test_an_unknown_spread_lists_the_choices(machine: Machine) -> None:
 
 
 def test_a_table_by_joint_needs_every_joint_or_other(machine: Machine) -> None:
-    assert per_joint({"q2": 2, "other": 1}, machine, "x").tolist() == [1, 2, 1, 1, 1]
-    assert per_joint({"boom": 9, "other": 1}, machine, "x").tolist() == [
+    assert expand_per_joint({"q2": 2, "other": 1}, machine, "x").tolist() == [1, 2, 1, 1, 1]
+    assert expand_per_joint({"boom": 9, "other": 1}, machine, "x").tolist() == [
         1,
         1,
         1,
@@ -327,9 +329,9 @@ def test_a_table_by_joint_needs_every_joint_or_other(machine: Machine) -> None:
         1,
     ]  # a table for several machines
     with pytest.raises(ConfigError, match="x: no value for q1, q3, q4, q5"):
-        per_joint({"q2": 2.0}, machine, "x")
+        expand_per_joint({"q2": 2.0}, machine, "x")
     with pytest.raises(ConfigError, match="x: 'q6' is no joint"):
-        per_joint({"q6": 2.0}, machine, "x")
+        expand_per_joint({"q6": 2.0}, machine, "x")
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from actuators.models import checkpoint
-from actuators.models.coupled import Coupled
-from actuators.models.mlp import Mlp, load
-from actuators.models.network import JointNetworks, SharedFlow
+from actuators.models.network import Coupled, JointNetworks, Mlp, SharedFlow, load_networks
 from brokk_rl.errors import CheckpointError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -29,7 +27,9 @@ def networks(seed: int = 0, coupled: bool = False) -> JointNetworks:
 
 def written(path: Path, machine: Machine, **tensors: torch.Tensor) -> Path:
     made = networks()
-    checkpoint.write(path, "mlp", machine, {**made.state_dict(), **tensors}, {"width": 32})
+    checkpoint.write_checkpoint(
+        path, "mlp", machine, {**made.state_dict(), **tensors}, {"width": 32}
+    )
     return path
 
 
@@ -73,7 +73,9 @@ def test_a_free_run_in_one_go_is_step_by_step(kind: str, machine: Machine, tmp_p
     u = torch.rand(5, 4, 12 + 30, generator=generator) * 2.0 - 1.0
     q = (0.03 * torch.rand(5, 4, 13, generator=generator)).cumsum(2) - 0.3
     path = made.roll_out(u, q, lower, upper)
-    checkpoint.write(tmp_path / "a.safetensors", kind, machine, made.state_dict(), {"width": 32})
+    checkpoint.write_checkpoint(
+        tmp_path / "a.safetensors", kind, machine, made.state_dict(), {"width": 32}
+    )
     model = {"mlp": Mlp, "coupled": Coupled}[kind](
         checkpoint=str(tmp_path / "a.safetensors")
     ).build(machine, 4, CPU)
@@ -178,7 +180,7 @@ def test_a_missing_checkpoint_names_what_ships(machine: Machine) -> None:
         CheckpointError,
         match=r"no file 'nowhere\.safetensors'.*brokk170\.safetensors.*mode=identify",
     ):
-        load("nowhere.safetensors", "mlp", machine)
+        load_networks("nowhere.safetensors", "mlp", machine)
 
 
 @pytest.mark.parametrize("keep", [0, 5, 200, -100])
@@ -186,7 +188,7 @@ def test_a_truncated_checkpoint_is_refused(tmp_path: Path, machine: Machine, kee
     path = written(tmp_path / "a.safetensors", machine)
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(CheckpointError, match=r"a\.safetensors: corrupt or truncated"):
-        load(str(path), "mlp", machine)
+        load_networks(str(path), "mlp", machine)
 
 
 def test_nan_weights_are_refused(tmp_path: Path, machine: Machine) -> None:
@@ -194,7 +196,7 @@ def test_nan_weights_are_refused(tmp_path: Path, machine: Machine) -> None:
         tmp_path / "a.safetensors", machine, quiet=torch.tensor([0.0, 0.0, float("nan"), 0.0, 0.0])
     )
     with pytest.raises(CheckpointError, match=r"tensor 'quiet' holds NaN"):
-        load(str(path), "mlp", machine)
+        load_networks(str(path), "mlp", machine)
 
 
 def test_a_checkpoint_of_another_machine_names_what_differs(
@@ -202,25 +204,29 @@ def test_a_checkpoint_of_another_machine_names_what_differs(
 ) -> None:
     other = dataclasses.replace(machine, name="brokk400", period_s=0.06)
     with pytest.raises(CheckpointError, match="made for another machine: name, control differ"):
-        load(str(written(tmp_path / "a.safetensors", other)), "mlp", machine)
+        load_networks(str(written(tmp_path / "a.safetensors", other)), "mlp", machine)
 
 
 def test_tensors_of_another_network_are_refused(tmp_path: Path, machine: Machine) -> None:
     path = written(tmp_path / "a.safetensors", machine)
     tensors = load_file(path)
-    header = {"brokk": json.dumps(checkpoint.read(path, "mlp", machine)[1] | {"width": 16})}
+    header = {
+        "brokk": json.dumps(checkpoint.read_checkpoint(path, "mlp", machine)[1] | {"width": 16})
+    }
     save_file(tensors, path, metadata=header)
     with pytest.raises(CheckpointError, match="do not fit the network"):
-        load(str(path), "mlp", machine)
+        load_networks(str(path), "mlp", machine)
 
 
 def test_weights_of_others_are_refused(tmp_path: Path, machine: Machine) -> None:
     save_file({"a": torch.zeros(1)}, tmp_path / "a.safetensors")
     with pytest.raises(CheckpointError, match="not an actuator of ours"):
-        load(str(tmp_path / "a.safetensors"), "mlp", machine)
+        load_networks(str(tmp_path / "a.safetensors"), "mlp", machine)
 
 
 def test_another_kind_of_actuator_is_refused(tmp_path: Path, machine: Machine) -> None:
-    checkpoint.write(tmp_path / "a.safetensors", "arx", machine, {"weight": torch.zeros(5, 38)}, {})
+    checkpoint.write_checkpoint(
+        tmp_path / "a.safetensors", "arx", machine, {"weight": torch.zeros(5, 38)}, {}
+    )
     with pytest.raises(CheckpointError, match="holds a 'arx' of schema 1, expected a 'mlp'"):
-        load(str(tmp_path / "a.safetensors"), "mlp", machine)
+        load_networks(str(tmp_path / "a.safetensors"), "mlp", machine)

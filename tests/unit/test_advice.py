@@ -12,7 +12,7 @@ import training as runs
 from composed import option
 from hydra.utils import instantiate
 
-from actuators.person import Person
+from actuators.person import HumanFollower
 from brokk_rl.checks import check_task
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
@@ -35,12 +35,12 @@ def advice(**changes: Any) -> AdviceConfig:
     return AdviceConfig(**(numbers | changes))
 
 
-def person(**changes: Any) -> Person:
+def person(**changes: Any) -> HumanFollower:
     numbers: dict[str, Any] = {
         "delay_s": 0.3, "lag_s": 0.15, "attention_s": 0.0, "gain": 1.0, "tremor": 0.0, "dead_zone": 0.0, "joints_at_once": None,
         "grip_s": 0.0,
     }  # fmt: skip
-    return Person(**(numbers | changes))
+    return HumanFollower(**(numbers | changes))
 
 
 def task(name: str = "borehole_insertion", **changes: Any) -> Any:

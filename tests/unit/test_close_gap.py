@@ -17,7 +17,7 @@ from training import CPU, plant, small, train
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.policy import load_initial_weights, make_actor, write_bundle
-from diagnosis import downstream, downstream_page
+from diagnosis import retraining
 
 EPISODES = 200
 
@@ -41,15 +41,15 @@ def evaluations(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]
             "episodes": EPISODES,
             "policies": {policy: row(three[number]) for policy, three in rates.items()},
         }
-        for number, place in enumerate(downstream.PLANTS)
+        for number, place in enumerate(retraining.PLANTS)
     }
 
 
 def test_success_that_fell_and_came_back_is_told_as_such(tmp_path: Path) -> None:
-    found = downstream.compare(
+    found = retraining.compare_policies(
         evaluations(before=(0.95, 0.2, 0.15), after=(0.9, 0.95, 0.93), classical=(0.9, 0.1, 0.1))
     )
-    text, tone = downstream.headline(found)
+    text, tone = retraining.write_headline(found)
     assert (
         tone == "good"
         and "It is back" in text
@@ -60,9 +60,9 @@ def test_success_that_fell_and_came_back_is_told_as_such(tmp_path: Path) -> None
         0.78
     )
     assert found["predicted"]["mean"] == 0.95 and found["achieved"]["mean"] == 0.93
-    downstream_page.write(found | {"plants": {}, "retraining": {}}, tmp_path)
-    assert "It is back" in (tmp_path / downstream_page.PAGE).read_text()
-    assert (tmp_path / downstream_page.PICTURE).read_bytes().startswith(b"\x89PNG")
+    retraining.write_report(found | {"plants": {}, "retraining": {}}, tmp_path)
+    assert "It is back" in (tmp_path / retraining.REPORT_FILE).read_text()
+    assert (tmp_path / retraining.PICTURE_FILE).read_bytes().startswith(b"\x89PNG")
     json.dumps(found, allow_nan=False)
 
 
@@ -75,35 +75,43 @@ def test_success_that_fell_and_came_back_is_told_as_such(tmp_path: Path) -> None
     ],
 )
 def test_what_did_not_come_back_is_not_sold_as_success(after: float, said: str, tone: str) -> None:
-    found = downstream.compare(evaluations(before=(0.95, 0.2, 0.15), after=(0.9, 0.95, after)))
-    assert said in downstream.headline(found)[0] and downstream.headline(found)[1] == tone
+    found = retraining.compare_policies(
+        evaluations(before=(0.95, 0.2, 0.15), after=(0.9, 0.95, after))
+    )
+    assert (
+        said in retraining.write_headline(found)[0] and retraining.write_headline(found)[1] == tone
+    )
 
 
 def test_without_a_fall_there_is_nothing_to_regain() -> None:
-    found = downstream.compare(evaluations(before=(0.95, 0.94, 0.93), after=(0.95, 0.95, 0.95)))
-    assert downstream.headline(found)[0].startswith("Nothing to regain")
+    found = retraining.compare_policies(
+        evaluations(before=(0.95, 0.94, 0.93), after=(0.95, 0.95, 0.95))
+    )
+    assert retraining.write_headline(found)[0].startswith("Nothing to regain")
 
 
 def test_the_interval_of_a_difference_is_newcombe_s() -> None:
     # his table II, case (a), 56/70 and 48/80: 0.0524 to 0.3339
     first, second = (
-        {"mean": k / n, "ci95": list(downstream.compute_wilson_interval(k, n))}
+        {"mean": k / n, "ci95": list(retraining.compute_wilson_interval(k, n))}
         for k, n in ((56, 70), (48, 80))
     )
-    assert downstream.difference(first, second)["ci95"] == pytest.approx([0.0524, 0.3339], abs=5e-5)
+    assert retraining.subtract_rates(first, second)["ci95"] == pytest.approx(
+        [0.0524, 0.3339], abs=5e-5
+    )
 
 
 def test_a_wrong_order_costs_what_it_would_lose_on_the_machine() -> None:
     # the simulator swaps the first two; choosing by it loses 0.3 for each of them, nothing for the
     # third
-    assert downstream.rank_violation([0.8, 0.9, 0.1], [0.9, 0.6, 0.2]) == pytest.approx(
+    assert retraining.compute_rank_violation([0.8, 0.9, 0.1], [0.9, 0.6, 0.2]) == pytest.approx(
         (0.3 + 0.3 + 0.0) / 3
     )
-    assert downstream.rank_violation([0.5, 0.6, 0.7], [0.1, 0.2, 0.9]) == 0.0
+    assert retraining.compute_rank_violation([0.5, 0.6, 0.7], [0.1, 0.2, 0.9]) == 0.0
 
 
 def test_a_simulator_without_an_order_claims_none() -> None:
-    found = downstream.compare(
+    found = retraining.compare_policies(
         evaluations(before=(0.9, 0.2, 0.2), after=(0.9, 0.8, 0.7), classical=(0.9, 0.1, 0.1))
     )
     assert found["agreement"]["simulator"]["kendall"] is None and found["agreement"]["repaired"][

@@ -16,8 +16,8 @@ from composed import option
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
-from actuators.effects.affected import Affected
-from actuators.excite.plan.drive import Nominal
+from actuators.effects.composition import Affected
+from actuators.excite.player import NominalLink
 from actuators.modes.collect import Collect
 from brokk_rl import record
 from brokk_rl.errors import LinkError
@@ -38,7 +38,7 @@ SMALL = (
 
 def made(folder: Path, machine: Machine) -> dict[str, Recording]:
     return {
-        path.stem: record.read(path, machine)
+        path.stem: record.read_recording(path, machine)
         for path in sorted((folder / "recordings").glob("*.parquet"))
     }
 
@@ -72,7 +72,7 @@ def test_every_run_is_cut_into_files_that_know_each_other(
     runs = [file.metadata["run"] for file in files.values()]
     assert len(set(runs)) == 2 and runs[:3] == [runs[0]] * 3
     first, second, *_ = files.values()
-    assert second.metadata["created"] == record.later(first.metadata["created"], 12.0)
+    assert second.metadata["created"] == record.add_seconds(first.metadata["created"], 12.0)
     assert (
         first.metadata["source"] == "simulator: Lag, excitation: sine"
         and first.metadata["seed"] == "0"
@@ -177,7 +177,7 @@ def test_what_makes_no_sense_is_refused_and_leaves_nothing(
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
-class Fails(Nominal):
+class Fails(NominalLink):
     """Fails, or is interrupted, after 20 s."""
 
     error: type[BaseException] = LinkError
@@ -197,10 +197,10 @@ class Connected:
 
     source = "a test"
 
-    def __init__(self, link: type[Nominal]) -> None:
+    def __init__(self, link: type[NominalLink]) -> None:
         self._link = link
 
-    def build(self, machine: Machine, num_runs: int, session: Session) -> Nominal:
+    def build(self, machine: Machine, num_runs: int, session: Session) -> NominalLink:
         return self._link(machine, num_runs)
 
 
@@ -215,7 +215,7 @@ def test_what_was_recorded_before_an_interruption_is_kept(
     assert [file.num_samples for file in files.values()] == [240, 160] * 2
 
 
-class Killed(Nominal):
+class Killed(NominalLink):
     """Looks at the disk as if the power failed now: nothing more is written from here on."""
 
     seen: list[int] | None = None
@@ -224,7 +224,9 @@ class Killed(Nominal):
     def send(self, command: Command) -> Command:
         if self.read().t_s > 9.99 and self.seen is None:
             paths = self.folder.glob("recordings/*.parquet")
-            type(self).seen = [record.read(path, self._machine).num_samples for path in paths]
+            type(self).seen = [
+                record.read_recording(path, self._machine).num_samples for path in paths
+            ]
         return super().send(command)
 
 
@@ -244,7 +246,7 @@ def test_a_file_that_grows_is_on_the_disk_before_it_is_full(
     )
 
 
-class RealTime(Nominal):
+class RealTime(NominalLink):
     """Moves with the clock on the wall, at 20 Hz, and once comes late."""
 
     def __init__(self, machine: Machine, num_runs: int) -> None:

@@ -96,7 +96,7 @@ def test_a_log_is_split_at_its_gaps_and_its_pieces_share_the_run(
     assert {piece.run for piece in pieces} == {"dig"}
     assert "1 pieces shorter than 5 s left out" in caplog.text
     for piece in pieces:
-        record.check(piece, "piece")
+        record.check_recording(piece, "piece")
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_convert_from_the_command(brokk: Callable[..., object], excavator: Machi
     assert done.code == 0, done.err
     names = [path.name for path in sorted(Path("out/recordings").iterdir())]
     assert names == ["dig_00.parquet", "dig_01.parquet", "lift_00.parquet"]
-    recordings = record.read_all("out/recordings/*", excavator)
+    recordings = record.read_recordings("out/recordings/*", excavator)
     assert [recording.run for recording in recordings] == ["dig", "dig", "lift"]
 
 

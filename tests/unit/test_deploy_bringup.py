@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from desk import DBC, free_port
 
-from actuators.excite.plan.drive import NominalMachine
+from actuators.excite.player import NominalMachine
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.bringup import measure_joint_response

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.contracts.vision import HolePose
+from brokk_rl.contracts.vision import FrameDetections, HolePose
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
@@ -25,7 +25,7 @@ from deploy.recorder import capture_reader
 from deploy.recorder.capture import CaptureConfig, CaptureWriter, PictureSampler
 from deploy.runtime import perception_process
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
-from deploy.runtime.perception_process import CameraConfig, KnownHoles, read_frame
+from deploy.runtime.perception_process import CameraConfig, read_frame
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import DetectedTarget, FileTarget, GivenTarget, TargetSelector
 
@@ -77,67 +77,23 @@ def test_a_click_at_the_sky_or_without_a_calibrated_camera_gives_none() -> None:
 
 def test_a_frame_is_handed_on_whole_or_shrunk_with_its_camera(exchange: LoopMemory) -> None:
     assert exchange.frame is not None and exchange.frame.peek("t_s") is None
-    perception_process._publish(exchange.frame, FRAME, PIXELS, 5.0)
+    perception_process._publish_frame(exchange.frame, FRAME, PIXELS, 5.0)
     assert exchange.frame.peek("t_s") == 5.0 and exchange.frame.number == 1
     whole = read_frame(exchange.frame.read())
     assert np.array_equal(whole.color, FRAME.color) and np.array_equal(
         whole.depth_m, FRAME.depth_m, equal_nan=True
     )
-    perception_process._publish(exchange.frame, FRAME, PIXELS // 4, 6.0)
+    perception_process._publish_frame(exchange.frame, FRAME, PIXELS // 4, 6.0)
     small = read_frame(exchange.frame.read())
     assert small.color.shape == (180, 320, 3) and exchange.frame.number == 2
     center_m = np.array(TARGETS[0].center_in_base_m)
     assert seen_at(small, center_m) == pytest.approx(seen_at(FRAME, center_m), abs=0.003)
 
 
-def test_boreholes_keep_their_names_are_averaged_by_variance_and_forgotten() -> None:
-    known = KnownHoles(10.0)
-    known.take([pose(2.6, 0.0, 0.004), pose(2.2, 0.4)], 1.0)
-    known.take([pose(2.2, 0.4), pose(2.61, 0.0, 0.008)], 2.0)
-    first, second = known.plain()
-    assert (first["name"], second["name"]) == (1, 2)
-    assert first["center_in_base_m"][0] == pytest.approx(
-        2.6 + 0.01 / 5, abs=1e-4
-    )  # four times the variance, a fifth of the weight
-    assert first["std_m"] == pytest.approx(0.004 * np.sqrt(0.8), abs=1e-5)
-    known.take([pose(2.6, 0.0)], 11.9)
-    assert [one["name"] for one in known.plain()] == [1, 2]
-    known.take([pose(2.9, -0.4)], 12.5)
-    assert [one["name"] for one in known.plain()] == [1, 3], (
-        "the second was not seen for more than 10 s"
-    )
-
-
-def test_what_the_calibration_is_wrong_by_is_never_averaged_away() -> None:
-    calibration = replace(
-        pose(2.6, 0.0), cov_m2=(0.004**2 + 0.003**2) * np.eye(3), shared_m2=0.003**2 * np.eye(3)
-    )
-    known = KnownHoles(10.0)
-    for number in range(4):
-        known.take([calibration], float(number))
-    # of its own 4 mm, over four frames 2 mm; of the calibration 3 mm, in all of them: sqrt(4 + 9)
-    assert known.plain()[0]["std_m"] == pytest.approx(0.001 * np.sqrt(13.0), abs=1e-5)
-    surer = replace(
-        calibration, center_m=np.array([2.605, 0.0, 0.75]), cov_m2=(0.002**2 + 0.003**2) * np.eye(3)
-    )
-    known.take([surer], 4.0)
-    # 2 mm of its own, as what is known: half way
-    assert known.plain()[0]["center_in_base_m"][0] == pytest.approx(2.6025, abs=1e-4)
-
-
-def test_a_base_that_moved_is_noticed_within_a_few_sightings() -> None:
-    known = KnownHoles(10.0)
-    for number in range(200):
-        known.take([pose(2.6, 0.0)], 0.1 * number)
-    for number in range(30):
-        known.take([pose(2.65, 0.0)], 20.0 + 0.1 * number)
-    assert known.plain()[0]["center_in_base_m"][0] > 2.645
-
-
 def show(exchange: LoopMemory, *poses: HolePose, now_s: float | None = None) -> None:
-    known = KnownHoles(10.0)
-    known.take(list(poses), time.monotonic() if now_s is None else now_s)
-    known.write(exchange.holes, time.monotonic())
+    now_s = time.monotonic() if now_s is None else now_s
+    tracked = option("perception/tracker", "fusion").build().update(poses, now_s)
+    perception_process.write_holes(exchange.holes, tracked, time.monotonic())
 
 
 def aimed(exchange: LoopMemory) -> list[float]:
@@ -236,7 +192,7 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     point = OperatorRequest("point", "{:.4f},{:.4f}".format(*seen_at(FRAME, center_m)))
     assert not feed.wish(point), "there is no picture yet"
     assert exchange.frame is not None
-    perception_process._publish(exchange.frame, FRAME, PIXELS, time.monotonic())
+    perception_process._publish_frame(exchange.frame, FRAME, PIXELS, time.monotonic())
     assert feed.wish(point)
     wanted.refresh()
     assert np.linalg.norm(np.array(aimed(exchange)) - center_m) < 0.012
@@ -278,12 +234,8 @@ class Blinking:
             raise FrameError("the lens is dirty")
         return FRAME if self.count < 4 else None
 
-    def find(self, frame: Frame) -> None: ...
-
-    def look(self, frame: Frame) -> Any:
-        from brokk_rl.contracts.vision import FrameDetections
-
-        return FrameDetections([pose(2.6, 0.0)], [], [], None)
+    def find(self, frame: Frame) -> FrameDetections:
+        return FrameDetections([pose(2.6, 0.0)])
 
 
 def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recorded(
@@ -300,8 +252,14 @@ def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recor
 
 def camera(source: Any) -> CameraConfig:
     return CameraConfig(
-        source=source, finder=source, rate_hz=100.0, num_px=PIXELS, forget_s=10.0, stale_s=1.0, record_hz=1.0
-    )  # fmt: skip
+        source=source,
+        finder=source,
+        tracker=option("perception/tracker", "fusion"),
+        rate_hz=100.0,
+        num_px=PIXELS,
+        stale_s=1.0,
+        record_hz=1.0,
+    )
 
 
 def test_pictures_are_recorded_as_often_as_asked_and_come_back(
@@ -316,7 +274,7 @@ def test_pictures_are_recorded_as_often_as_asked_and_come_back(
         CaptureConfig(tmp_path, "deploy:dbc/example_gateway.dbc", MACHINE, {}, 2.0)
     ) as log:
         for number in range(3):
-            perception_process._publish(exchange.frame, FRAME, PIXELS, 100.0 + number)
+            perception_process._publish_frame(exchange.frame, FRAME, PIXELS, 100.0 + number)
             if (picture := pictures.due()) is not None:
                 log.add_picture(*picture)
     import base64

@@ -75,8 +75,8 @@ def write(
 def test_a_capture_becomes_the_recording_of_what_happened(machine: Machine, tmp_path: Path) -> None:
     write(tmp_path, machine)
     (found,) = READER.read(tmp_path / MCAP, machine)
-    record.write(found, tmp_path / "x.parquet")
-    again = record.read(tmp_path / "x.parquet", machine)
+    record.write_recording(found, tmp_path / "x.parquet")
+    again = record.read_recording(tmp_path / "x.parquet", machine)
     assert again.rate_hz == 20.0 and again.num_samples == pytest.approx(59, abs=2)
     assert again.q[:, 0] == pytest.approx(0.1 * again.t_s, abs=1e-3)
     step = int(np.flatnonzero(again.u[:, 0] > 0)[0])
@@ -211,7 +211,7 @@ def test_recover_and_convert_are_commands(
         "run_frames.blf",
     }
     done = brokk("mode=convert", "import=capture", "convert.input=whole/*.mcap", "session.out=made")
-    assert done.code == 0 and len(record.read_all("made/recordings/*.parquet", machine)) == 1
+    assert done.code == 0 and len(record.read_recordings("made/recordings/*.parquet", machine)) == 1
     assert brokk("mode=recover", "recover.input=nothing/*", "session.out=x").code == 2
 
 

@@ -11,12 +11,20 @@ import torch
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis.budget import Budget, account
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.geometry import COLUMNS, geometry
-from diagnosis.probes import probes
-from diagnosis.stages import TARGET, Known, foremost, measurement_noise, perception, stages
-from diagnosis.where import locate
+from diagnosis.geometry import TOOL_COLUMNS, compare_tool_points
+from diagnosis.probes import probe_residuals
+from diagnosis.stages import (
+    TARGET_COLUMNS,
+    StageEvidence,
+    TipErrorBudget,
+    assess_perception,
+    attribute_to_stages,
+    estimate_sensor_noise,
+    measure_tip_error,
+    select_stage,
+)
+from diagnosis.where import locate_gap
 
 PERIOD_S, DELAY = 0.05, 11
 DEAD_TIME_S = np.full(5, DELAY * PERIOD_S)
@@ -71,7 +79,7 @@ def test_a_slewing_error_moves_the_tip_along_its_circle(machine: Machine) -> Non
         .pose(torch.tensor(machine.home, dtype=torch.float32))
         .tip_in_base_m.tolist()
     )
-    found = account(turned, machine)
+    found = measure_tip_error(turned, machine)
     assert found.tip_rms_m == pytest.approx(
         2.0 * np.sin(0.005) * np.hypot(x, y), rel=1e-3
     )  # a chord
@@ -85,10 +93,10 @@ def test_joints_share_the_tip_error_and_those_that_cancel_count_below_zero(
     still = replace(recording(machine, 0), q=np.tile(machine.home, (1800, 1)))
     quiet = runs(machine, [still])
     error = np.array([0.0, 0.010, -0.004, 0.0, 0.0])
-    found = account(replace(quiet, simulated=quiet.simulated + error), machine)
+    found = measure_tip_error(replace(quiet, simulated=quiet.simulated + error), machine)
     assert sum(found.joint_part.values()) == pytest.approx(1.0)
     assert found.joint_part["q3"] < 0.0 < 1.0 < found.joint_part["q2"]
-    plain = Budget(found, None, None, {"kinematics": 0.002}).plain()
+    plain = TipErrorBudget(found, None, None, {"kinematics": 0.002}).plain()
     assert plain["before"]["tip_rms_mm"] == pytest.approx(1e3 * found.tip_rms_m)
     assert plain["after"] is None and plain["stages_mm"] == {"kinematics": 2.0}
 
@@ -110,15 +118,15 @@ def test_an_error_of_geometry_is_named_with_its_size(
         .tip_in_base_m.numpy()
     )
     tip = tip + 0.0005 * np.random.default_rng(0).standard_normal(tip.shape)
-    extra = dict(zip(COLUMNS, tip.T, strict=True))
-    sound = geometry([replace(moved, extra=extra)], machine)
+    extra = dict(zip(TOOL_COLUMNS, tip.T, strict=True))
+    sound = compare_tool_points([replace(moved, extra=extra)], machine)
     assert sound is not None and sound.rms_m == pytest.approx(0.0005 * np.sqrt(3.0), rel=0.05)
-    found = geometry([replace(moved, q=change(moved.q), extra=extra)], machine)
+    found = compare_tool_points([replace(moved, q=change(moved.q), extra=extra)], machine)
     assert (
         found is not None and found.cause == cause and found.size == pytest.approx(size, rel=0.03)
     )
     assert found.explained > 0.95
-    assert geometry([moved], machine) is None
+    assert compare_tool_points([moved], machine) is None
 
 
 def test_the_noise_of_a_sensor_is_told_from_its_motion(machine: Machine) -> None:
@@ -129,10 +137,10 @@ def test_the_noise_of_a_sensor_is_told_from_its_motion(machine: Machine) -> None
         + np.array([0.0003, 0.001, 0.002, 0.0, 0.004])
         * np.random.default_rng(0).standard_normal((1800, 5)),
     )
-    assert measurement_noise([noisy])[[0, 1, 2, 4]] == pytest.approx(
+    assert estimate_sensor_noise([noisy])[[0, 1, 2, 4]] == pytest.approx(
         [0.0003, 0.001, 0.002, 0.004], rel=0.15
     )
-    assert measurement_noise([moved]).max() < 1e-6
+    assert estimate_sensor_noise([moved]).max() < 1e-6
 
 
 def extending(speed: np.ndarray, _: Recording) -> np.ndarray:
@@ -172,7 +180,7 @@ def test_the_probe_of_what_was_planted_stands_out(
             run, simulated=run.simulated + 1e-4 * rng.standard_normal(run.simulated.shape).cumsum(1)
         )
 
-    found = probes(
+    found = probe_residuals(
         shaken(runs(machine, field, change)), shaken(runs(machine, reference)), machine, DEAD_TIME_S
     )
     assert found[0].joint == joint
@@ -193,16 +201,16 @@ def test_the_stage_is_where_the_error_was_planted(machine: Machine) -> None:
             )
             for r in (run, reference)
         )
-        location = locate(mine, other, machine, DEAD_TIME_S, np.random.default_rng(0))
-        known = Known(
+        location = locate_gap(mine, other, machine, DEAD_TIME_S, np.random.default_rng(0))
+        known = StageEvidence(
             location,
-            probes(mine, other, machine, DEAD_TIME_S),
-            Budget(account(mine, machine), None, None, {}),
+            probe_residuals(mine, other, machine, DEAD_TIME_S),
+            TipErrorBudget(measure_tip_error(mine, machine), None, None, {}),
             None,
             None,
         )
-        rows = stages(known, mine, other, machine)
-        return foremost(rows, location.has_gap), {row.stage: row.part for row in rows}
+        rows = attribute_to_stages(known, mine, other, machine)
+        return select_stage(rows, location.has_gap), {row.stage: row.part for row in rows}
 
     gain, parts = found(runs(machine, field, scaled(3, 1.2)))
     assert gain == "actuation" and sum(part or 0.0 for part in parts.values()) == pytest.approx(1.0)
@@ -230,23 +238,23 @@ def test_touches_are_held_against_the_estimated_hole(machine: Machine) -> None:
     )
     force = np.zeros(1800)
     force[[300, 301, 302, 900, 901]] = 1000.0
-    extra = dict(zip(TARGET, (tip + np.array([0.03, 0.04, 0.0])).T, strict=True)) | {
+    extra = dict(zip(TARGET_COLUMNS, (tip + np.array([0.03, 0.04, 0.0])).T, strict=True)) | {
         "force_n": force
     }
-    found = perception([replace(still, extra=extra)], machine)
+    found = assess_perception([replace(still, extra=extra)], machine)
     assert (
         found is not None
         and found.rms_m == pytest.approx(0.05, rel=1e-3)
         and "2 touches" in found.text
     )
-    assert perception([still], machine) is None
+    assert assess_perception([still], machine) is None
 
 
 def test_a_biased_encoder_is_a_matter_of_kinematics_only_where_tool_points_were_measured(
     machine: Machine,
 ) -> None:
     sound = runs(machine, [recording(machine, 0), recording(machine, 1)])
-    location = locate(sound, None, machine, DEAD_TIME_S, np.random.default_rng(0))
+    location = locate_gap(sound, None, machine, DEAD_TIME_S, np.random.default_rng(0))
 
     def stage(bias_rad: float) -> tuple[str | None, float | None]:
         shapes = []
@@ -261,11 +269,15 @@ def test_a_biased_encoder_is_a_matter_of_kinematics_only_where_tool_points_were_
             biased = replace(
                 moved,
                 q=moved.q + bias * (np.arange(5) == 2),
-                extra=dict(zip(COLUMNS, tip.T, strict=True)),
+                extra=dict(zip(TOOL_COLUMNS, tip.T, strict=True)),
             )
-            shapes.append(geometry([biased], machine))
-        found = stages(Known(location, [], None, shapes[0], shapes[1]), sound, None, machine)
-        return foremost(found, False), next(row.rms_m for row in found if row.stage == "kinematics")
+            shapes.append(compare_tool_points([biased], machine))
+        found = attribute_to_stages(
+            StageEvidence(location, [], None, shapes[0], shapes[1]), sound, None, machine
+        )
+        return select_stage(found, False), next(
+            row.rms_m for row in found if row.stage == "kinematics"
+        )
 
     assert stage(0.0) == (None, 0.0)
     name, rms_m = stage(0.02)
@@ -293,7 +305,7 @@ def test_starts_that_vary_and_stops_that_ring_are_seen_on_the_joint_that_does(
         return replace(r, q=q)
 
     field = [recording(machine, seed) for seed in range(4)]
-    rows = probes(
+    rows = probe_residuals(
         replace(runs(machine, field), recordings=[shaken(r) for r in field]),
         runs(
             machine,

@@ -13,7 +13,7 @@ from composed import option
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import Windows
+from brokk_rl.open_loop import FreeRunWindows
 from diagnosis import calibration, decision, residual_model
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.detection import DetectionResult, Penalties
@@ -21,7 +21,7 @@ from diagnosis.effect_library import EffectSimulator
 from diagnosis.refine import FittedSet
 from diagnosis.residuals import INCREMENT_SAMPLES, ErrorCovariance, Residuals
 from diagnosis.search import EffectSet
-from exam.calibration import Item, halves, logistic
+from exam.calibration import WeighedCase, fit_logistic, split_by_family
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ def test_work_is_remembered_from_window_to_window_of_a_recording_and_no_further(
 
 
 def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> None:
-    # a dead band halves all speeds: errors of 5 % of what is left are 2.5 % of what was simulated
+    # a dead band split_by_family all speeds: errors of 5 % of what is left are 2.5 % of what was simulated
     # before
     random, noise = (
         np.random.default_rng(7),
@@ -121,7 +121,7 @@ def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> 
     steady = np.repeat(0.05 * random.standard_normal((windows, 20, joints)), INCREMENT_SAMPLES, 1)
     measured = 0.5 * np.cumsum(way * (1.0 + steady), 1)
     q = np.concatenate([start[:, None], measured], 1)
-    cut = Windows(np.zeros((windows, 100, joints)), q, np.repeat("one", windows), 1, 1)
+    cut = FreeRunWindows(np.zeros((windows, 100, joints)), q, np.repeat("one", windows), 1, 1)
     simulator = EffectSimulator(cast(Actuator, None), machine, cut, np.zeros(windows), 0)
     residuals = Residuals(
         simulator, [noise] * joints, np.ones((windows, joints), dtype=bool), runs=before
@@ -170,9 +170,9 @@ def test_weights_of_signs_are_those_that_made_the_truth() -> None:
         for one in signs
     ]
     begin = {"constant": 0.0, "margin": 0.5, "names": 1.0}
-    found = logistic(signs, true, begin)
+    found = fit_logistic(signs, true, begin)
     assert found == pytest.approx({"constant": -1.0, "margin": 2.0, "names": 0.0}, abs=0.15)
-    few = logistic(
+    few = fit_logistic(
         signs[:4], true[:4], begin
     )  # a handful of answers changes little but how often anything is true
     assert [few[name] for name in ("margin", "names")] == pytest.approx([0.5, 1.0], abs=0.2)
@@ -239,8 +239,8 @@ def test_a_missing_or_unknown_sign_is_named(weights: ProbabilityModel) -> None:
 
 
 def test_halves_to_fit_and_to_judge_share_no_family() -> None:
-    def item(effects: list[str], outside: str | None) -> Item:
-        return Item(
+    def item(effects: list[str], outside: str | None) -> WeighedCase:
+        return WeighedCase(
             {
                 "effects": [{"effect": e} for e in effects],
                 "outside": {"ailment": outside} if outside else None,
@@ -255,6 +255,6 @@ def test_halves_to_fit_and_to_judge_share_no_family() -> None:
         item([], None),
         item([], None),
     ] * 3
-    first, second = halves(cases)
+    first, second = split_by_family(cases)
     assert len(first) + len(second) == len(cases)
     assert {one.family for one in first} & {one.family for one in second} <= {"none"}

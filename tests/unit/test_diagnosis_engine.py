@@ -13,10 +13,10 @@ import pytest
 import torch
 from composed import option
 
-from actuators.effects.affected import Affected
 from actuators.effects.command import DeadBand
+from actuators.effects.composition import Affected
 from actuators.effects.speed import Compliance, FlowGain
-from actuators.models.lag import Lag
+from actuators.models.lag import FirstOrderLag
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Effect
 from brokk_rl.errors import RecordingError
@@ -40,7 +40,7 @@ from diagnosis.detection import Penalties
 from diagnosis.pipeline import DiagnosisPipeline
 
 CPU = torch.device("cpu")
-PLANT = Lag(
+PLANT = FirstOrderLag(
     dead_time_s=0.31,
     dead_band_extend=0.07,
     dead_band_retract=0.1,
@@ -125,7 +125,7 @@ def diagnosed(
     )
     outcome = work.run(lambda doing, done: None)
     outcome.save(folder)
-    return answer.read(folder / answer.FILE)
+    return answer.read_answer(folder / answer.ANSWER_FILE)
 
 
 def test_a_speed_that_changed_is_found_on_a_single_axis_without_geometry(
@@ -214,8 +214,8 @@ def test_recordings_of_another_machine_are_refused(tmp_path: Path, machine: Mach
     )
     for part in ("reference", "field"):
         one = driven(other, {}, 1, 10.0, 3)[0]
-        record.write(
-            dataclasses.replace(one, metadata={"fingerprint": record.stamp(other)}),
+        record.write_recording(
+            dataclasses.replace(one, metadata={"fingerprint": record.format_fingerprint(other)}),
             tmp_path / part / "a.parquet",
         )
     with pytest.raises(RecordingError, match="limits differ"):
@@ -261,10 +261,10 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
     }
     assert found["where"]["joints"]["q3"] == {"rmse_rad": 0.03, "floor_rad": 0.002, "share": 1.0}
     assert found["gap"]["before"] == {"rmse_rad": 0.03}
-    assert answer.read(path) == said()
+    assert answer.read_answer(path) == said()
     path.write_text(json.dumps(found | {"schema": 2}))
     with pytest.raises(RecordingError, match="schema 2"):
-        answer.read(path)
+        answer.read_answer(path)
 
 
 def test_training_takes_the_found_effects_as_they_are(

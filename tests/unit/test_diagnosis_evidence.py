@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from actuators.models.valve import Pose
+from actuators.models.valve import PoseFeatures
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 from diagnosis import effect_library, gap, nonadditive_refit
@@ -249,7 +249,7 @@ def test_shares_of_effects_that_pay_only_together_are_equal_and_add_up() -> None
 def test_the_weight_of_a_planar_arm_by_sums_of_angles_is_that_of_the_mechanics(
     machine: Machine,
 ) -> None:
-    pose = Pose(machine, torch.device("cpu"))
+    pose = PoseFeatures(machine, torch.device("cpu"))
     lower, upper = (
         torch.as_tensor(side, dtype=torch.float32) for side in (machine.lower, machine.upper)
     )

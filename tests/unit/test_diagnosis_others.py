@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from actuators.models.lag import Lag
+from actuators.models.lag import FirstOrderLag
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import baseline, effect_library, sensors, timing, tool
+from diagnosis import baseline, effect_library, geometry, sensors, timing
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase
 from diagnosis.effect_library import DetectedEffect, estimate_interval
@@ -21,7 +21,7 @@ from diagnosis.residuals import Residuals, build_rays
 from diagnosis.responses import Response, fit_sizes
 
 CPU = torch.device("cpu")
-PLANT = Lag(
+PLANT = FirstOrderLag(
     dead_time_s=0.3,
     dead_band_extend=0.05,
     dead_band_retract=0.05,
@@ -59,7 +59,7 @@ def test_a_coarse_sensor_and_a_noisy_one_are_told_apart_with_their_sizes(machine
     q = field.q.copy()
     q[:, 1] += 1.5e-3 * np.random.default_rng(4).standard_normal(len(q))
     q[:, 3] = np.round(q[:, 3] / 0.004) * 0.004
-    found = sensors.search(
+    found = sensors.find_sensor_effects(
         GapCase(machine, reference, [dataclasses.replace(field, q=q)]),
         effect_library.load_effects(machine),
         8.0,
@@ -72,7 +72,7 @@ def test_a_coarse_sensor_and_a_noisy_one_are_told_apart_with_their_sizes(machine
         1.5e-3, rel=0.15
     )
     assert names["quantisation"].parameters["step_rad"]["q4"].mean == pytest.approx(0.004, rel=0.15)
-    assert not sensors.search(
+    assert not sensors.find_sensor_effects(
         GapCase(machine, reference, [field]), effect_library.load_effects(machine), 8.0, 12.0
     )
 
@@ -94,7 +94,9 @@ def tracked(
         ]
     )
     seen = tip @ turn.T + 2e-3 * np.random.default_rng(seed).standard_normal(tip.shape)
-    return dataclasses.replace(recording, extra=dict(zip(tool.COLUMNS, seen.T, strict=True)))
+    return dataclasses.replace(
+        recording, extra=dict(zip(geometry.COLUMNS_TOOL, seen.T, strict=True))
+    )
 
 
 def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Machine) -> None:
@@ -105,16 +107,18 @@ def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Mac
         tracked(swept(machine, 120.0, 7), machine, b, tilt, 8)
         for b, tilt in ((bias, 0.0), (none, 0.03))
     )
-    one = tool.search(GapCase(machine, [reference], [biased]), kinds, 8.0, 12.0)
+    one = geometry.find_geometry_errors(GapCase(machine, [reference], [biased]), kinds, 8.0, 12.0)
     assert [found.kind.name for found in one.found] == ["encoder_bias"] and one.left < 1.2
     assert one.found[0].parameters["bias_rad"]["q3"].mean == pytest.approx(0.015, abs=0.002)
-    other = tool.search(GapCase(machine, [reference], [tilted]), kinds, 8.0, 12.0)
+    other = geometry.find_geometry_errors(GapCase(machine, [reference], [tilted]), kinds, 8.0, 12.0)
     assert [found.kind.name for found in other.found] == ["base_tilt"]
     assert other.found[0].parameters["roll_rad"]["machine"].mean == pytest.approx(0.03, abs=0.003)
-    assert not tool.search(GapCase(machine, [reference], [reference]), kinds, 8.0, 12.0).found
+    assert not geometry.find_geometry_errors(
+        GapCase(machine, [reference], [reference]), kinds, 8.0, 12.0
+    ).found
     # two milliradians are seen, explained, and not worth a name; nothing else is named in their
     # place
-    faint = tool.search(
+    faint = geometry.find_geometry_errors(
         GapCase(
             machine, [reference], [tracked(swept(machine, 120.0, 7), machine, bias / 7.5, 0.0, 8)]
         ),
@@ -141,20 +145,22 @@ def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine:
         for seed, b in ((5, none), (7, none), (7, bias))
     )
     kinds = effect_library.load_effects(machine)
-    one = tool.search(GapCase(machine, [reference], [biased]), kinds, 8.0, 12.0)
+    one = geometry.find_geometry_errors(GapCase(machine, [reference], [biased]), kinds, 8.0, 12.0)
     assert [found.kind.name for found in one.found] == ["encoder_bias"] and one.left < 1.2
     assert one.found[0].joints.tolist() == [False, False, False, True, False]
     assert one.found[0].parameters["bias_rad"]["q4"].mean == pytest.approx(0.012, abs=0.001)
     # the clock itself is no error of geometry, even where the reference is not late at all
     plain = tracked(swept(machine, 120.0, 5), machine, none, 0.0, 5)
-    assert not tool.search(GapCase(machine, [plain], [field]), kinds, 8.0, 12.0).found
+    assert not geometry.find_geometry_errors(
+        GapCase(machine, [plain], [field]), kinds, 8.0, 12.0
+    ).found
 
 
 def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) -> None:
     one = swept(machine, 20.0, 9)
-    assert tool.search(
+    assert geometry.find_geometry_errors(
         GapCase(machine, [one], [one]), effect_library.load_effects(machine), 8.0, 12.0
-    ) == tool.Seen([], 1.0)
+    ) == geometry.GeometryFindings([], 1.0)
 
 
 def held_over(

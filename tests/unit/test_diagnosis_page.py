@@ -12,11 +12,11 @@ from composed import option
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import outcome, page, pictures, wording
-from diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Selected, Where
+from diagnosis import answer as outcome
+from diagnosis import plots, report
+from diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Outcome, Selected, Where
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.outcome import Outcome
-from diagnosis.survey import Survey, survey
+from diagnosis.stages import Survey, survey_gap
 
 GAIN = Selected(
     effect="flow_gain", joints=("q4",), probability=0.97, parameters={"gain": {"q4": Estimate(0.81, (0.78, 0.84))}},
@@ -52,7 +52,7 @@ def seen(machine: Machine) -> tuple[Outcome, Survey]:
         runs(machine, 6, 1, 1.0),
     )
     thresholds = option("thresholds", "default")
-    found = survey(
+    found = survey_gap(
         before,
         floor,
         after,
@@ -78,7 +78,7 @@ def seen(machine: Machine) -> tuple[Outcome, Survey]:
 def test_the_report_says_verdict_gap_cause_place_and_what_to_do(
     machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path
 ) -> None:
-    page.write(seen[0], tmp_path, machine)
+    report.write_report(seen[0], tmp_path, machine)
     text = (tmp_path / "report.html").read_text()
     for part in (
         "The simulator lacks flow gain on q4 (probability 0.97); adding it closes 93 % of the gap (95 %: 88 to 96 %).",
@@ -113,7 +113,7 @@ def test_what_a_report_is_made_of_is_saved_and_read_again(
     machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path
 ) -> None:
     seen[0].save(tmp_path)
-    again = outcome.load(tmp_path, machine)
+    again = outcome.load_outcome(tmp_path, machine)
     assert again.answer.to_json() == seen[0].answer.to_json()
     assert (
         again.before.error == pytest.approx(seen[0].before.error, abs=1e-6)
@@ -121,7 +121,7 @@ def test_what_a_report_is_made_of_is_saved_and_read_again(
     )
     (tmp_path / "diagnosis.npz").write_bytes(b"half")
     with pytest.raises(RecordingError, match="cannot be read"):
-        outcome.load(tmp_path, machine)
+        outcome.load_outcome(tmp_path, machine)
 
 
 @pytest.mark.parametrize("verdict", ["none", "unknown"])
@@ -144,10 +144,10 @@ def test_an_answer_without_effects_is_said_in_plain_words(
             if key not in ("evidence", "budget", "probes")
         },
     )
-    text, tone = wording.headline(bare)
+    text, tone = report.write_headline(bare)
     assert tone == ("good" if verdict == "none" else "warn")
     assert ("No gap" in text) == (verdict == "none") and ("in q4" in text) == (verdict == "unknown")
-    page.write(Outcome(bare, seen[0].before, None, None), tmp_path, machine)
+    report.write_report(Outcome(bare, seen[0].before, None, None), tmp_path, machine)
     assert "12.0 mrad before; the floor is 10.0 mrad" in (tmp_path / "report.html").read_text()
 
 
@@ -159,8 +159,8 @@ def test_what_moves_the_tool_alone_is_told_where_the_tool_is(seen: tuple[Outcome
         "stages": [{"stage": "kinematics", "part": None, "text": said}],
     }
     answer = replace(seen[0].answer, selected=(one,), more=more)
-    assert f" M{said[1:]}." in wording.headline(answer)[0]
-    assert "tool" not in wording.headline(replace(answer, selected=seen[0].answer.selected))[0]
+    assert f" M{said[1:]}." in report.write_headline(answer)[0]
+    assert "tool" not in report.write_headline(replace(answer, selected=seen[0].answer.selected))[0]
 
 
 def test_an_answer_that_cannot_tell_says_why(
@@ -170,17 +170,17 @@ def test_an_answer_that_cannot_tell_says_why(
         verdict="unknown", selected=(), ranking=(), where=Where({}, (), None), gap=Gap(0.01, 0.01, 0.01, None),
         next_experiment=None, reason="cannot tell, because nothing moves",
     )  # fmt: skip
-    assert wording.headline(bare)[0].startswith(
+    assert report.write_headline(bare)[0].startswith(
         "There is no telling. Cannot tell, because nothing moves. Error over 5 s"
     )
-    assert pictures.paths(Outcome(bare, seen[0].before, None, None), machine).axes
+    assert plots.draw_paths(Outcome(bare, seen[0].before, None, None), machine).axes
 
 
 def test_lists_and_classes_read_as_sentences() -> None:
     assert (
-        wording.listed(["a"]) == "a"
-        and wording.listed(["a", "b", "c"]) == "a, b and c"
-        and wording.listed([]) == ""
+        report.join_words(["a"]) == "a"
+        and report.join_words(["a", "b", "c"]) == "a, b and c"
+        and report.join_words([]) == ""
     )
-    assert wording.same_as(replace(GAIN, same_as=())) == ""
-    assert "probability of 0.97 is that of one of them" in wording.same_as(GAIN)
+    assert report.describe_class(replace(GAIN, same_as=())) == ""
+    assert "probability of 0.97 is that of one of them" in report.describe_class(GAIN)

@@ -40,7 +40,7 @@ def driven(
 def given(folder: Path, *recordings: Recording) -> str:
     """Writes recordings and returns what `diagnosis.field` takes."""
     for number, recording in enumerate(recordings):
-        record.write(recording, folder / f"{number}.parquet")
+        record.write_recording(recording, folder / f"{number}.parquet")
     return f"diagnosis.field={folder}/*.parquet"
 
 
@@ -85,7 +85,7 @@ def test_recordings_of_another_machine_are_refused_by_name(
 ) -> None:
     stretched = replace(machine.joints[2], upper=replace(machine.joints[2].upper, value=2.5))
     other = replace(machine, joints=(*machine.joints[:2], stretched, *machine.joints[3:]))
-    stamped = replace(driven(machine), metadata={"fingerprint": record.stamp(other)})
+    stamped = replace(driven(machine), metadata={"fingerprint": record.format_fingerprint(other)})
     done = brokk(
         "mode=diagnose", given(tmp_path / "field", stamped), "actuator=lag", "session.out=out"
     )

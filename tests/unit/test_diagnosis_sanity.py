@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.inspection import Thresholds
+from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis.sanity import TEXTS, Remark, examine
+from diagnosis.sanity import TEXTS, RecordingRemark, examine_recordings
 
 PERIOD_S = 0.05
 DELAY = 11
@@ -19,7 +19,7 @@ NOISE = 0.0003
 
 
 @pytest.fixture(scope="module")
-def thresholds() -> Thresholds:
+def thresholds() -> InspectionThresholds:
     return option("thresholds", "default")
 
 
@@ -48,24 +48,24 @@ def recording(
     )  # fmt: skip
 
 
-def named(remarks: list[Remark]) -> dict[str, Remark]:
+def named(remarks: list[RecordingRemark]) -> dict[str, RecordingRemark]:
     return {remark.name: remark for remark in remarks}
 
 
 def test_a_sound_recording_says_only_which_joint_rested(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
-    (remark,) = examine([recording(machine)], machine, thresholds)
+    (remark,) = examine_recordings([recording(machine)], machine, thresholds)
     assert (remark.name, remark.joint, remark.severity) == ("joint at rest", "q2", "note")
 
 
 def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
-    found = named(examine([recording(machine, np.abs(sound.u[:, 3]) > 0)], machine, thresholds))[
-        "interlock"
-    ]
+    found = named(
+        examine_recordings([recording(machine, np.abs(sound.u[:, 3]) > 0)], machine, thresholds)
+    )["interlock"]
     assert (
         found.joint == "q3"
         and found.severity == "bad"
@@ -76,23 +76,25 @@ def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
 
 
 def test_a_joint_locked_in_a_pose_is_an_interlock_and_says_where(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
     limit = float(np.quantile(sound.q[:, 0], 0.5))
     found = named(
-        examine([recording(machine, np.roll(sound.q[:, 0] > limit, -DELAY))], machine, thresholds)
+        examine_recordings(
+            [recording(machine, np.roll(sound.q[:, 0] > limit, -DELAY))], machine, thresholds
+        )
     )["interlock"]
     assert found.joint == "q3" and "q3 ignores its command when q1 is above" in found.amount
 
 
 def test_a_lock_without_a_common_condition_stays_unexplained(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     ignored = np.zeros(4800, dtype=bool)
     for begin in np.random.default_rng(3).integers(0, 4700, 12):
         ignored[begin : begin + 60] = True
-    found = named(examine([recording(machine, ignored)], machine, thresholds))
+    found = named(examine_recordings([recording(machine, ignored)], machine, thresholds))
     assert "interlock" not in found and found["command without motion"].joint == "q3"
     assert "s in all" in found["command without motion"].amount
 
@@ -107,10 +109,10 @@ def test_a_lock_without_a_common_condition_stays_unexplained(
     ],
 )
 def test_what_is_wrong_with_a_clock_is_told_apart(
-    machine: Machine, thresholds: Thresholds, change, name: str | None
+    machine: Machine, thresholds: InspectionThresholds, change, name: str | None
 ) -> None:
     sound = recording(machine)
-    found = named(examine([replace(sound, t_s=change(sound.t_s))], machine, thresholds))
+    found = named(examine_recordings([replace(sound, t_s=change(sound.t_s))], machine, thresholds))
     assert {key for key in found if "clock" in key} == ({name} if name else set())
     if name == "clock jumps":
         assert found[name].count == 2 and found[name].from_s == pytest.approx(100.0, abs=0.1)
@@ -119,40 +121,42 @@ def test_what_is_wrong_with_a_clock_is_told_apart(
 
 
 def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_not(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
     middle = float(sound.q[:, 2].min() + 0.7 * np.ptp(sound.q[:, 2]))
     q = sound.q.copy()
     q[:, 2] = np.minimum(q[:, 2], middle)
-    found = named(examine([replace(sound, q=q)], machine, thresholds))["saturated sensor"]
+    found = named(examine_recordings([replace(sound, q=q)], machine, thresholds))[
+        "saturated sensor"
+    ]
     assert found.joint == "q3" and found.severity == "bad"
     shifted = q + np.where(np.arange(5) == 2, machine.upper[2] - q[:, 2].max(), 0.0).astype(
         np.float32
     )
     assert "saturated sensor" not in named(
-        examine([replace(sound, q=shifted)], machine, thresholds)
+        examine_recordings([replace(sound, q=shifted)], machine, thresholds)
     )
 
 
 def test_lost_frames_and_broken_rules_are_one_remark_each(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
     q, u = sound.q.copy(), sound.u.copy()
     for row in range(100, 4000, 97):
         q[row] = q[row - 1]
     u[400:420, 1] = 0.5
-    found = named(examine([replace(sound, q=q, u=u)], machine, thresholds))
+    found = named(examine_recordings([replace(sound, q=q, u=u)], machine, thresholds))
     assert found["lost frames"].count > 10 and found["exclusive joint"].joint == "q2"
     assert found["exclusive joint"].from_s == pytest.approx(20.0)
 
 
 def test_the_gravest_comes_first_and_all_of_it_is_plain(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
-    remarks = examine(
+    remarks = examine_recordings(
         [replace(recording(machine, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)],
         machine,
         thresholds,

@@ -9,12 +9,11 @@ import pytest
 
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis.blocks import FALSE_DISCOVERIES, adjusted, excess_p
+from diagnosis.error_growth import measure_growth
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.growth import growth
-from diagnosis.occasions import REGIMES, in_force, loads, regimes
-from diagnosis.tracing import traced
-from diagnosis.where import Location, locate
+from diagnosis.permutation_test import FALSE_DISCOVERY_RATE, adjust_p_values, compute_excess_p
+from diagnosis.regimes import REGIMES, label_loads, label_regimes, shift_by_dead_time
+from diagnosis.where import GapLocation, locate_gap, trace_to_origin
 
 PERIOD_S = 0.05
 DELAY_S = 0.5
@@ -64,7 +63,9 @@ def planted(
     """Returns free runs in which one joint is simulated too fast, by `speed` rad/s, in one regime."""
     label = base.cut(
         [
-            regimes(in_force(r.u, np.full(5, DELAY_S), PERIOD_S), r.q, machine, 20.0)
+            label_regimes(
+                shift_by_dead_time(r.u, np.full(5, DELAY_S), PERIOD_S), r.q, machine, 20.0
+            )
             for r in base.recordings
         ]
     )
@@ -75,8 +76,8 @@ def planted(
     return replace(base, simulated=base.simulated + added)
 
 
-def located(field: WindowedRuns, reference: WindowedRuns | None, machine: Machine) -> Location:
-    return locate(field, reference, machine, np.full(5, DELAY_S), np.random.default_rng(0))
+def located(field: WindowedRuns, reference: WindowedRuns | None, machine: Machine) -> GapLocation:
+    return locate_gap(field, reference, machine, np.full(5, DELAY_S), np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("regime", ["creep", "cruise", "after a reversal", "hold", "stop"])
@@ -135,7 +136,7 @@ def test_every_way_of_sorting_adds_up_to_the_whole(machine: Machine, has_floor: 
 def test_an_error_is_traced_to_the_samples_that_added_to_it() -> None:
     error = np.array([0.0, 1.0, 1.0, 3.0, 2.0]).reshape(1, 5, 1)
     label = np.array([0, 0, 1, 1, 0]).reshape(1, 5, 1)
-    parts = traced(error, label, 2)
+    parts = trace_to_origin(error, label, 2)
     assert parts[0, 0, :, 0].tolist() == [0.0, 1.0, 1.0, 1.0, 0.0]
     assert parts[1, 0, :, 0].tolist() == [0.0, 0.0, 0.0, 2.0, 2.0]
     assert (parts * error).sum((1, 2, 3)).tolist() == [5.0, 10.0]  # of 1 + 1 + 9 + 4
@@ -158,7 +159,7 @@ def test_each_sample_has_the_regime_that_its_command_makes(machine: Machine) -> 
     u[20:60, 2], u[60:80, 2], u[80:120, 2], u[160:200, 2] = 0.2, 0.6, -0.6, -0.6
     u[100:110, 3] = 0.6
     q = np.tile(machine.home, (200, 1))
-    names = np.array(REGIMES)[regimes(u, q, machine, 20.0)]
+    names = np.array(REGIMES)[label_regimes(u, q, machine, 20.0)]
     assert (
         names[10, 2] == "hold"
         and names[22, 2] == "start"
@@ -172,18 +173,21 @@ def test_each_sample_has_the_regime_that_its_command_makes(machine: Machine) -> 
     )
     assert names[122, 2] == "stop" and names[150, 2] == "hold" and names[165, 2] == "start"
     q[:, 2] = machine.upper[2] - 0.01
-    names = np.array(REGIMES)[regimes(u, q, machine, 20.0)]
+    names = np.array(REGIMES)[label_regimes(u, q, machine, 20.0)]
     assert names[85, 2] == "near an end stop" and names[150, 2] == "hold"
 
 
 def test_the_command_in_force_is_that_of_a_dead_time_before() -> None:
     u = np.arange(20.0)[:, None] / 20.0
-    assert in_force(u, np.array([0.5]), PERIOD_S)[:, 0].tolist() == [0.0] * 11 + u[:9, 0].tolist()
+    assert (
+        shift_by_dead_time(u, np.array([0.5]), PERIOD_S)[:, 0].tolist()
+        == [0.0] * 11 + u[:9, 0].tolist()
+    )
 
 
 def test_lifting_and_lowering_are_told_by_the_weight(machine: Machine) -> None:
     acting = np.tile([[0.5], [-0.5], [0.0]], (1, 5))
-    label = loads(acting, np.tile(machine.home, (3, 1)), machine)
+    label = label_loads(acting, np.tile(machine.home, (3, 1)), machine)
     assert label[:, 0].tolist() == [1, 1, 0]  # slewing carries nothing
     assert label[:, 1].tolist() == [3, 2, 0]  # q2 + lowers the boom
 
@@ -201,7 +205,9 @@ def test_growth_says_what_kind_of_error_it_is(machine: Machine, shape, expected:
     quiet = runs(machine, 2, 0, size=0.0)
     sign = np.where(np.arange(quiet.num_windows) % 2, 1.0, -1.0)[:, None, None]
     error = sign * shape(PERIOD_S * np.arange(1, STEPS + 1))[None, :, None]
-    found = growth(replace(quiet, simulated=quiet.simulated + error), None, machine, None)["q1"]
+    found = measure_growth(replace(quiet, simulated=quiet.simulated + error), None, machine, None)[
+        "q1"
+    ]
     assert found.reading == expected
     assert found.horizon_s == pytest.approx((0.05, 0.5, 2.0, 5.0))
     assert found.rmse == pytest.approx([float(shape(t)) for t in (0.05, 0.5, 2.0, 5.0)], rel=1e-4)
@@ -211,8 +217,10 @@ def test_chance_alone_is_seldom_taken_for_a_gap() -> None:
     generator, alarms, trials = np.random.default_rng(0), 0, 200
     for _ in range(trials):
         blocks = generator.chisquare(8, (18, 12))  # heavy tails, twelve cells
-        p = excess_p((blocks[:6], np.ones((6, 12))), (blocks[6:], np.ones((12, 12))), generator)
-        alarms += bool((adjusted(p) <= FALSE_DISCOVERIES).any())
+        p = compute_excess_p(
+            (blocks[:6], np.ones((6, 12))), (blocks[6:], np.ones((12, 12))), generator
+        )
+        alarms += bool((adjust_p_values(p) <= FALSE_DISCOVERY_RATE).any())
     # 5 % are nominal; of 200 trials 19 or more would be a chance of 1 in 500
     assert alarms < 19
 
@@ -220,9 +228,11 @@ def test_chance_alone_is_seldom_taken_for_a_gap() -> None:
 def test_p_is_that_of_all_ways_to_swap_sides() -> None:
     # of the 20 ways to choose 3 of 6 blocks, only the one seen is so extreme
     sums = np.array([[5.0], [6.0], [7.0], [1.0], [2.0], [3.0]])
-    p = excess_p((sums[:3], np.ones((3, 1))), (sums[3:], np.ones((3, 1))), np.random.default_rng(0))
+    p = compute_excess_p(
+        (sums[:3], np.ones((3, 1))), (sums[3:], np.ones((3, 1))), np.random.default_rng(0)
+    )
     assert p[0] == pytest.approx(1 / 20, abs=0.015)
-    nowhere = excess_p(
+    nowhere = compute_excess_p(
         (sums[:3], np.zeros((3, 1))), (sums[3:], np.ones((3, 1))), np.random.default_rng(0)
     )
     assert np.isnan(nowhere[0])

@@ -11,8 +11,8 @@ import pytest
 import torch
 from composed import names, option
 
+from actuators.effects.effect import EffectSpec, Wrapped
 from actuators.effects.library import LibraryModel
-from actuators.effects.wrapped import EffectSpec, Wrapped
 from brokk_rl.checks import NUM_ENVS, check_actuator_model
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History

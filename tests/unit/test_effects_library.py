@@ -213,7 +213,7 @@ def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(
             )
             for k in range(4)
         ]  # fmt: skip
-        delay = dead_time.delays(recordings, machine, np.random.default_rng(0))["q1"]
+        delay = dead_time.estimate_dead_times(recordings, machine, np.random.default_rng(0))["q1"]
         assert delay is not None
         found.append(delay.value_s)
     assert found[1] - found[0] == pytest.approx(shift_s, abs=0.0101)

@@ -14,8 +14,8 @@ from composed import option
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actuators.effects.affected import Affected
-from actuators.effects.kinematics import turned
+from actuators.effects.composition import Affected
+from actuators.effects.kinematics import rotate_points
 from brokk_rl.checks import check_actuator
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
@@ -476,5 +476,5 @@ def test_extrinsics_turn_and_displace_what_the_camera_sees(machine: Machine) -> 
 @given(angles=st.tuples(*[st.floats(-0.3, 0.3)] * 3), point=st.tuples(*[st.floats(-5, 5)] * 3))
 @few
 def test_turning_keeps_lengths(angles: tuple[float, ...], point: tuple[float, ...]) -> None:
-    got = turned(torch.tensor([point]), *(torch.tensor([[angle]]) for angle in angles))
+    got = rotate_points(torch.tensor([point]), *(torch.tensor([[angle]]) for angle in angles))
     assert got.norm().item() == pytest.approx(math.dist(point, (0, 0, 0)), abs=1e-4)

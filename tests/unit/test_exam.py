@@ -22,11 +22,11 @@ from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.machine import Machine
 from diagnosis import answer
-from diagnosis.answer import FILE
-from exam import paper, seal, sitting
-from exam.baselines import Always
-from exam.mix import KINDS, Mix, Question
-from exam.trees import Trees
+from diagnosis.answer import ANSWER_FILE
+from exam import dataset, run_cases
+from exam.baselines import ConstantAnswer
+from exam.case_distribution import KINDS, CaseDesign, CaseDistribution
+from exam.residual_forest import ResidualForest
 
 SMALL = (
     "mode=exam", "exam.mix.num_cases=2", "exam.mix.shares={none: 0.5, faint: 0, one: 0.5, several: 0, outside: 0}",
@@ -35,16 +35,18 @@ SMALL = (
 )  # fmt: skip
 
 
-def questions(mix: Mix, machine: Machine, seed: int) -> list[Question]:
+def questions(mix: CaseDistribution, machine: Machine, seed: int) -> list[CaseDesign]:
     return mix.questions(machine, ("fading", "interlock"), np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
-def mix() -> Mix:
+def mix() -> CaseDistribution:
     return option("exam_mix", "main")
 
 
-def test_kinds_have_their_shares_and_effects_come_round_evenly(mix: Mix, machine: Machine) -> None:
+def test_kinds_have_their_shares_and_effects_come_round_evenly(
+    mix: CaseDistribution, machine: Machine
+) -> None:
     found = questions(mix, machine, 3)
     assert {kind: sum(one.kind == kind for one in found) for kind in KINDS} == {
         "none": 15, "faint": 10, "one": 35, "several": 20, "outside": 20,
@@ -57,7 +59,7 @@ def test_kinds_have_their_shares_and_effects_come_round_evenly(mix: Mix, machine
     }
 
 
-def test_a_case_holds_what_its_kind_says(mix: Mix, machine: Machine) -> None:
+def test_a_case_holds_what_its_kind_says(mix: CaseDistribution, machine: Machine) -> None:
     for one in questions(mix, machine, 4):
         sizes, count = [fault.size for fault in one.faults], len(one.faults)
         assert count == {"none": 0, "faint": 1, "one": 1, "several": count, "outside": 0}[one.kind]
@@ -74,14 +76,14 @@ def test_a_case_holds_what_its_kind_says(mix: Mix, machine: Machine) -> None:
 
 
 def test_the_same_seed_gives_the_same_cases_and_another_one_others(
-    mix: Mix, machine: Machine
+    mix: CaseDistribution, machine: Machine
 ) -> None:
     first, again, other = (repr(questions(mix, machine, seed)) for seed in (5, 5, 6))
     assert first == again != other
 
 
 def test_parameters_lie_at_their_size_between_nothing_and_typical(
-    mix: Mix, machine: Machine
+    mix: CaseDistribution, machine: Machine
 ) -> None:
     for one in questions(mix, machine, 7):
         for fault in one.faults:
@@ -103,12 +105,12 @@ def exam(brokk: Callable[..., Any], tmp_path: Path) -> Path:
 
 
 def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: Machine) -> None:
-    labels = exam / seal.LABELS
+    labels = exam / dataset.LABELS_FILE
     assert labels.stat().st_mode & 0o777 == 0o600
-    assert (exam / seal.HASH).read_text().split()[0] == hashlib.sha256(
+    assert (exam / dataset.HASH_FILE).read_text().split()[0] == hashlib.sha256(
         labels.read_bytes()
     ).hexdigest()
-    files = sorted((exam / paper.CASES).rglob("*.parquet"))
+    files = sorted((exam / dataset.CASES_FOLDER).rglob("*.parquet"))
     assert len(files) == 2 * 3 and {file.stat().st_mtime for file in files} == {
         files[0].stat().st_mtime
     }
@@ -116,7 +118,7 @@ def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: M
         assert set(pq.read_schema(file).metadata) == {
             b"brokk.schema", b"brokk.machine", b"brokk.rate_hz", b"brokk.created", b"brokk.fingerprint"
         }  # fmt: skip
-        found = record.read(file, machine)
+        found = record.read_recording(file, machine)
         moving = np.abs(found.u) > 0
         exclusive = machine.is_exclusive
         assert not (moving[:, exclusive].any(1) & moving[:, ~exclusive].any(1)).any()
@@ -131,14 +133,14 @@ def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: M
 
 
 def test_labels_that_were_changed_are_not_scored(tmp_path: Path) -> None:
-    seal.seal(tmp_path, {"cases": [{"kind": "one"}]}, "salt")
-    assert seal.opened(tmp_path)["cases"] == [{"kind": "one"}]
-    path = tmp_path / seal.LABELS
+    dataset.seal_labels(tmp_path, {"cases": [{"kind": "one"}]}, "salt")
+    assert dataset.open_labels(tmp_path)["cases"] == [{"kind": "one"}]
+    path = tmp_path / dataset.LABELS_FILE
     path.write_text(path.read_text().replace('"one"', '"none"'))
     with pytest.raises(RecordingError, match="is not what was sealed"):
-        seal.opened(tmp_path)
+        dataset.open_labels(tmp_path)
     with pytest.raises(StorageError, match="is sealed"):
-        seal.seal(tmp_path, {"cases": []}, "salt")
+        dataset.seal_labels(tmp_path, {"cases": []}, "salt")
 
 
 def test_an_exam_is_made_sat_and_scored_from_the_command_line(
@@ -162,7 +164,7 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(
         *about,
         "exam.do=score",
         f"+exam.answers.none={answers}",
-        f"exam.ledger={ledger}",
+        f"exam.report={ledger}",
         f"session.out={marks}",
     )
     assert done.code == 0, done.err
@@ -178,21 +180,25 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(
     (line,) = [json.loads(text) for text in ledger.read_text().splitlines()]
     assert (
         line["candidate"] == "none"
-        and line["labels_sha256"] == (exam / seal.HASH).read_text().split()[0]
+        and line["labels_sha256"] == (exam / dataset.HASH_FILE).read_text().split()[0]
     )
 
 
 def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
     exam: Path, machine: Machine, brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
-    first, second = sorted((exam / paper.CASES).iterdir())
+    first, second = sorted((exam / dataset.CASES_FOLDER).iterdir())
     answers, marks = tmp_path / "answers", tmp_path / "marks"
     answers.mkdir()
     assert (
-        sitting.sit(Recorder(ValueError("ran away")), [first], answers, machine, 1, lambda: None)
+        run_cases.answer_cases(
+            Recorder(ValueError("ran away")), [first], answers, machine, 1, lambda: None
+        )
         == 1
     )
-    sitting.sit(Always(effect=None, probability=0.5), [second], answers, machine, 1, lambda: None)
+    run_cases.answer_cases(
+        ConstantAnswer(effect=None, probability=0.5), [second], answers, machine, 1, lambda: None
+    )
     score = ("mode=exam", "exam.do=score", f"exam.folder={exam}", f"+exam.answers.it={answers}")
     for expected, missed in (({"value": 2, "of": 2}, 1), ({"value": 1, "of": 2}, 0)):
         done = brokk(*score, f"session.out={marks}_{missed}")
@@ -266,9 +272,9 @@ def test_cases_of_an_exam_hang_on_the_salt_and_those_of_development_on_the_seed_
 def test_a_forest_learns_from_development_cases_only_and_answers(
     exam: Path, machine: Machine, tmp_path: Path
 ) -> None:
-    trees = Trees(exam=str(exam), trees=20, least=0.3, seed=0)
-    trees.answer(exam / paper.CASES / "0000", tmp_path / "out", machine)
-    found = answer.read(tmp_path / "out" / FILE)
+    trees = ResidualForest(exam=str(exam), trees=20, least=0.3, seed=0)
+    trees.answer(exam / dataset.CASES_FOLDER / "0000", tmp_path / "out", machine)
+    found = answer.read_answer(tmp_path / "out" / ANSWER_FILE)
     assert all(0 <= one.probability <= 1 for one in found.ranking) and found.verdict in (
         "effects",
         "none",
@@ -279,7 +285,7 @@ def test_a_forest_learns_from_development_cases_only_and_answers(
     (sealed / "exam.json").write_text('{"sealed": true}')
     with pytest.raises(ConfigError, match="development seeds only"):
         replace(trees, exam=str(sealed)).answer(
-            exam / paper.CASES / "0000", tmp_path / "out", machine
+            exam / dataset.CASES_FOLDER / "0000", tmp_path / "out", machine
         )
 
 
@@ -294,21 +300,21 @@ class Recorder:
         self.given.append((case, sorted(str(path.relative_to(case)) for path in case.rglob("*"))))
         if self._failure:
             raise self._failure
-        Always(effect=None, probability=0.5).answer(case, out, machine)
+        ConstantAnswer(effect=None, probability=0.5).answer(case, out, machine)
 
 
 def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_again(
     machine: Machine, tmp_path: Path
 ) -> None:
-    case, answers = tmp_path / "exam" / paper.CASES / "0000", tmp_path / "answers"
+    case, answers = tmp_path / "exam" / dataset.CASES_FOLDER / "0000", tmp_path / "answers"
     (case / "field").mkdir(parents=True)
     (case / "field" / "00.parquet").touch()
-    seal.seal(tmp_path / "exam", {"cases": []}, "salt")
+    dataset.seal_labels(tmp_path / "exam", {"cases": []}, "salt")
     first, second, third = Recorder(RecordingError("no")), Recorder(None), Recorder(None)
-    assert sitting.sit(first, [case], answers, machine, 1, lambda: None) == 1
-    assert sitting.seconds(answers / "0000") is None
-    assert sitting.sit(second, [case], answers, machine, 1, lambda: None) == 0
-    assert sitting.sit(third, [case], answers, machine, 1, lambda: None) == 0
+    assert run_cases.answer_cases(first, [case], answers, machine, 1, lambda: None) == 1
+    assert run_cases.read_seconds(answers / "0000") is None
+    assert run_cases.answer_cases(second, [case], answers, machine, 1, lambda: None) == 0
+    assert run_cases.answer_cases(third, [case], answers, machine, 1, lambda: None) == 0
     given, content = second.given[0]
     assert (
         content == ["field", "field/00.parquet"]
@@ -317,8 +323,8 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     )
     assert (
         third.given == []
-        and (answers / "0000" / FILE).is_file()
-        and sitting.seconds(answers / "0000") is not None
+        and (answers / "0000" / ANSWER_FILE).is_file()
+        and run_cases.read_seconds(answers / "0000") is not None
     )
 
 
@@ -327,7 +333,7 @@ def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_pa
         (("false", "{case}", "{out}"), 10.0, "exit status 1"),
         (("sleep", "9", "#{case}{out}"), 0.2, "within"),
     ):
-        command = sitting.Command(
+        command = run_cases.CommandCandidate(
             command=words if words[0] == "false" else ("sh", "-c", "sleep 9 #{case}{out}"),
             limit_s=limit_s,
             threads=1,

@@ -20,8 +20,8 @@ from diagnosis.detection import DetectionResult, Penalties
 from diagnosis.residuals import Residuals
 from diagnosis.responses import Response, fit_faults
 from diagnosis.search import SubsetTable
-from exam import seal
-from exam.calibration import Calibration, Item, items
+from exam import dataset
+from exam.calibration import PenaltyFit, WeighedCase, load_weighed_cases
 
 SIZES = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 
@@ -104,20 +104,20 @@ def test_prices_are_found_that_name_what_is_there_and_nothing_else(
     lag = {"effect": "lag", "joints": ["q1"], "size": 1.0, "parameters": {}, "nothing": {}}
     cases = [
         *(
-            Item(
+            WeighedCase(
                 label("none", []), decision.record_weights(found(machine, cheap, 0.14, seed), cheap)
             )
             for seed in range(3)
         ),
         *(
-            Item(
+            WeighedCase(
                 label("one", [lag]),
                 decision.record_weights(found(machine, cheap, 0.4, seed), cheap),
             )
             for seed in range(3)
         ),
     ]
-    fit = Calibration(
+    fit = PenaltyFit(
         machine, effect_library.load_effects(machine), [], [], trials=8, seed=0, workers=1
     )
     assert fit.value(cases, cheap, weights) < 0.8
@@ -148,14 +148,14 @@ def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothin
 def test_nothing_is_tuned_to_a_sealed_exam(tmp_path: Path) -> None:
     (tmp_path / "answers").mkdir()
     (tmp_path / "exam.json").write_text('{"sealed": true}')
-    (tmp_path / seal.LABELS).write_text("{}")
+    (tmp_path / dataset.LABELS_FILE).write_text("{}")
     with pytest.raises(ConfigError, match="development exams only"):
-        items([tmp_path / "answers"])
+        load_weighed_cases([tmp_path / "answers"])
 
 
 def test_answers_that_do_not_say_what_was_weighed_are_named(tmp_path: Path) -> None:
     (tmp_path / "answers").mkdir()
     (tmp_path / "exam.json").write_text('{"sealed": false}')
-    seal.seal(tmp_path, {"cases": []}, "salt")
+    dataset.seal_labels(tmp_path, {"cases": []}, "salt")
     with pytest.raises(RecordingError, match=r"what was weighed"):
-        items([tmp_path / "answers"])
+        load_weighed_cases([tmp_path / "answers"])

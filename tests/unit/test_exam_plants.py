@@ -12,22 +12,22 @@ from composed import option
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.signals import Command
-from exam.plants import strangers
-from exam.plants.anatomy import MAKES, Anatomy, drawn
-from exam.plants.faults import FAULTS, afflicted
-from exam.plants.line import Line
+from exam.plants import out_of_library_faults
+from exam.plants.electronics import CommandBus
+from exam.plants.faults import FAULTS, apply_faults
 from exam.plants.linkage import Arm
-from exam.plants.plant import Plant
-from exam.plants.valve import Valve
+from exam.plants.plant import ExamPlant
+from exam.plants.plant_parameters import MAKES, PlantParameters, draw_plant
+from exam.plants.valve import SpoolValve
 
 Q3 = 2
 
 
-def clean(machine: Machine, make: str) -> Anatomy:
+def clean(machine: Machine, make: str) -> PlantParameters:
     """A machine of this make without nuisances, noise or lever arms, so that numbers can be worked by hand."""
-    numbers = next(found for seed in range(100) if (found := drawn(machine, seed, 0.0))[0] == make)[
-        1
-    ]
+    numbers = next(
+        found for seed in range(100) if (found := draw_plant(machine, seed, 0.0))[0] == make
+    )[1]
     for name, value in {
         "noise_rad": 0.0,
         "lever": 0.0,
@@ -54,13 +54,13 @@ def size(machine: Machine, none: float, value: float) -> np.ndarray:
 def played(
     machine: Machine,
     make: str,
-    runs: list[tuple[Anatomy, np.ndarray]],
+    runs: list[tuple[PlantParameters, np.ndarray]],
     ailments: Sequence[str | None] | None = None,
 ) -> np.ndarray:
     """Returns the positions of several machines of one make side by side, `(T + 1, N, J)`, each under commands `(T, J)`."""
     numbers, commands = [numbers for numbers, _ in runs], np.stack([u for _, u in runs], 1)
     count = len(runs)
-    plant = Plant(
+    plant = ExamPlant(
         machine,
         make,
         numbers,
@@ -84,7 +84,7 @@ def step(machine: Machine, level: float, steps: int = 50, joint: int = Q3) -> np
 
 
 def speeds(
-    machine: Machine, make: str, runs: list[tuple[Anatomy, float]], joint: int = Q3
+    machine: Machine, make: str, runs: list[tuple[PlantParameters, float]], joint: int = Q3
 ) -> np.ndarray:
     """Steady speeds at commands, of `max_speed`."""
     q = played(
@@ -125,7 +125,9 @@ def test_a_fault_changes_the_steady_speed_of_its_joint_as_it_says(
     well = clean(machine, make)
     ill = [
         (
-            afflicted(well, {effect: {name: size(machine, *pair) for name, pair in sizes.items()}}),
+            apply_faults(
+                well, {effect: {name: size(machine, *pair) for name, pair in sizes.items()}}
+            ),
             level,
         )
         for effect, (sizes, level, _) in STEADY.items()
@@ -142,7 +144,7 @@ def test_a_fault_changes_the_steady_speed_of_its_joint_as_it_says(
 @pytest.mark.parametrize("make", MAKES)
 def test_one_direction_is_spared_by_an_asymmetry(machine: Machine, make: str) -> None:
     well = clean(machine, make)
-    ill = afflicted(
+    ill = apply_faults(
         well,
         {
             "asymmetry": {
@@ -168,7 +170,7 @@ def test_a_fault_in_time_costs_the_way_of_that_time(machine: Machine, make: str)
         "rate_limit": ("stroke_s", 0.5, 0.215),
     }
     runs = [well] + [
-        afflicted(well, {effect: {name: size(machine, 0.0, value)}})
+        apply_faults(well, {effect: {name: size(machine, 0.0, value)}})
         for effect, (name, value, _) in late.items()
     ]
     q = played(machine, make, [(numbers, step(machine, 1.0)) for numbers in runs])[:, :, Q3]
@@ -181,7 +183,7 @@ def test_backlash_takes_its_gap_at_each_reversal(machine: Machine, make: str) ->
     u = np.concatenate([step(machine, 0.6, 30), step(machine, -0.6, 30), step(machine, 0.0, 20)])
     faults = {"backlash": {"gap_rad": size(machine, 0.0, 0.02)}}
     before, after = played(
-        machine, make, [(afflicted(clean(machine, make), found), u) for found in ({}, faults)]
+        machine, make, [(apply_faults(clean(machine, make), found), u) for found in ({}, faults)]
     )[:, :, Q3].T
     assert before.max() - after.max() == pytest.approx(
         0.01, abs=0.001
@@ -195,7 +197,9 @@ def test_backlash_takes_its_gap_at_each_reversal(machine: Machine, make: str) ->
 def test_a_leak_lets_a_heavy_joint_sink_in_proportion_to_its_load(
     machine: Machine, make: str
 ) -> None:
-    numbers = afflicted(clean(machine, make), {"creep": {"sink_rad_s": size(machine, 0.0, 0.05)}})
+    numbers = apply_faults(
+        clean(machine, make), {"creep": {"sink_rad_s": size(machine, 0.0, 0.05)}}
+    )
     arm = Arm(machine, {name: value[None] for name, value in numbers.items()})
     load = arm.load(machine.home[None])[0, Q3]
     q = played(machine, make, [(numbers, step(machine, 0.0, 200))])[:, 0, Q3]
@@ -206,7 +210,7 @@ def test_a_leak_lets_a_heavy_joint_sink_in_proportion_to_its_load(
 @pytest.mark.parametrize("make", MAKES)
 def test_a_worn_pump_slows_joints_that_move_together_only(machine: Machine, make: str) -> None:
     demand = np.array([0.5, 0.0, 0.5, 0.5, 0.5])
-    numbers = afflicted(clean(machine, make), {"flow_sharing": {"demand": demand}})
+    numbers = apply_faults(clean(machine, make), {"flow_sharing": {"demand": demand}})
     together = np.ones((50, 5)) * [1.0, 0.0, 1.0, 1.0, 1.0]
     q = played(machine, make, [(numbers, together), (numbers, step(machine, 1.0))])
     flow, alone = (q[50] - q[40]) / 0.5 / machine.max_speed
@@ -216,7 +220,7 @@ def test_a_worn_pump_slows_joints_that_move_together_only(machine: Machine, make
 
 @pytest.mark.parametrize("make", MAKES)
 def test_stiction_asks_for_more_command_to_start_than_to_go_on(machine: Machine, make: str) -> None:
-    numbers = afflicted(clean(machine, make), {"stiction": {"start": size(machine, 0.0, 0.2)}})
+    numbers = apply_faults(clean(machine, make), {"stiction": {"start": size(machine, 0.0, 0.2)}})
     pushed = np.concatenate([step(machine, 0.25, 30), step(machine, 0.15, 50)])
     below, after = played(machine, make, [(numbers, step(machine, 0.15, 80)), (numbers, pushed)])[
         :, :, Q3
@@ -235,7 +239,7 @@ def test_what_is_soft_rings_at_its_period_and_what_is_not_does_not(
     }
 
     q = played(
-        machine, make, [(afflicted(clean(machine, make), found), u) for found in ({}, faults)]
+        machine, make, [(apply_faults(clean(machine, make), found), u) for found in ({}, faults)]
     )[42:, :, Q3]
     stiff, soft = np.abs(np.diff(q, axis=0)).sum(0) - np.abs(q[-1] - q[0])
     assert soft > 5.0 * stiff and soft > 0.004
@@ -243,7 +247,7 @@ def test_what_is_soft_rings_at_its_period_and_what_is_not_does_not(
 
 @pytest.mark.parametrize("make", MAKES)
 def test_a_loose_compensator_lifts_slower_than_it_lowers(machine: Machine, make: str) -> None:
-    numbers = afflicted(
+    numbers = apply_faults(
         clean(machine, make), {"load_dependence": {"sensitivity": size(machine, 0.0, 0.6)}}
     )
     well = clean(machine, make)
@@ -259,7 +263,7 @@ def test_lost_frames_hold_the_command_before_and_late_ones_keep_their_order() ->
         "jitter_s": np.full((1, 1), 0.1),
         "loss": np.full((1, 1), 0.5),
     }
-    line = Line(numbers, 0.05)
+    line = CommandBus(numbers, 0.05)
     frames = [
         (1.0, 0.9, 0.0),
         (2.0, 0.4, 0.0),
@@ -289,7 +293,7 @@ def test_a_spool_with_bounded_slope_takes_its_time() -> None:
         "hysteresis": 0.0, "stroke_s": 0.5, "breakaway": 0.0, "pilot_s": 0.0, "spool_hz": 8.0, "spool_damping": 0.9, "stop": 1.0,
         "overlap_extend": 0.0, "overlap_retract": 0.0, "notch": 0.0, "wave": 0.0, "wave_number": 2.0, "wave_phase": 0.0,
         "extend": 1.0, "retract": 1.0, "retract_ratio": 1.0, "speed_scale": 1.0}.items()}  # fmt: skip
-    valve, one, none = Valve(machine_numbers), np.ones((1, 1)), np.zeros((1, 1))
+    valve, one, none = SpoolValve(machine_numbers), np.ones((1, 1)), np.zeros((1, 1))
     path = [float(valve.step(one, 0.005, none, none > 0, none)[0, 0]) for _ in range(200)]
     assert path[60] - path[40] == pytest.approx(20 * 0.005 / 0.5, rel=0.01)
     assert path[-1] == pytest.approx(1.0, abs=0.01)
@@ -334,12 +338,12 @@ def test_a_longer_link_and_a_tilted_base_move_the_tool_as_geometry_says(machine:
 
 
 def test_a_run_is_the_same_whatever_runs_beside_it_and_machines_differ(machine: Machine) -> None:
-    found = [drawn(machine, seed, 1.0) for seed in range(40)]
+    found = [draw_plant(machine, seed, 1.0) for seed in range(40)]
     mine = [numbers for make, numbers in found if make == "throttled"][:3]
     u = step(machine, 0.7, 40)
 
-    def paths(numbers: list[Anatomy], seeds: list[int]) -> np.ndarray:
-        plant = Plant(
+    def paths(numbers: list[PlantParameters], seeds: list[int]) -> np.ndarray:
+        plant = ExamPlant(
             machine,
             "throttled",
             numbers,
@@ -369,12 +373,12 @@ def test_chance_alone_leaves_most_of_the_stated_floor(
     numbers = [
         found
         for seed in range(24)
-        for make, found in [drawn(machine, seed, rough)]
+        for make, found in [draw_plant(machine, seed, rough)]
         if make == "throttled"
     ]
     count, steps = len(numbers), 1200
     none, zeros = [None] * 2 * count, np.zeros(2 * count)
-    twice = Plant(
+    twice = ExamPlant(
         machine,
         "throttled",
         numbers * 2,
@@ -402,7 +406,7 @@ def test_each_ailment_shows_and_a_machine_of_severity_zero_is_well(machine: Mach
     well = clean(machine, "throttled")
     u = np.concatenate([step(machine, level, 60) for level in (0.8, 0.8, 0.8, -0.8, 0.3, -0.3)])
     u[:, 3] = np.where(u[:, Q3] > 0, 0.5, 0.0)
-    ill, kinds = well | {"stranger": size(machine, 0.0, 1.0)}, list(strangers.KINDS)
+    ill, kinds = well | {"stranger": size(machine, 0.0, 1.0)}, list(out_of_library_faults.KINDS)
     q = played(
         machine,
         "throttled",
@@ -419,7 +423,7 @@ def test_every_fault_is_neutral_where_a_joint_has_not_got_it(
 ) -> None:
     numbers = clean(machine, "compensated")
     for effect in FAULTS:
-        found = afflicted(numbers, {effect: mix_sizes(effect)})
+        found = apply_faults(numbers, {effect: mix_sizes(effect)})
         differing = [
             name for name in numbers if not np.array_equal(found[name][:2], numbers[name][:2])
         ]

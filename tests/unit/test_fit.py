@@ -13,9 +13,9 @@ import torch
 from composed import option
 from safetensors.torch import load_file
 
-from actuators.identify import fit, survey
-from actuators.identify.dataset import Windows
-from actuators.identify.fit import NetworkFit
+from actuators.identify import network_fit, training_data
+from actuators.identify.network_fit import NetworkFit
+from actuators.identify.training_data import TrainingWindows
 from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -81,7 +81,7 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_not_stopped(
 ) -> None:
     config = tiny(name)
     config.fit(machine, *runs, tmp_path / "whole", 3, CPU)
-    step, count = fit.Descent._update, 0
+    step, count = network_fit.FreeRunOptimizer._update, 0
 
     def killed(self: Any, u: torch.Tensor, q: torch.Tensor) -> None:
         nonlocal count
@@ -92,7 +92,7 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_not_stopped(
         step(self, u, q)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fit.Descent, "_update", killed)
+        patch.setattr(network_fit.FreeRunOptimizer, "_update", killed)
         with pytest.raises(KilledError):
             config.fit(machine, *runs, tmp_path / "part", 3, CPU)
     assert [path.name for path in (tmp_path / "part").iterdir()] == [f"{name}.partial.safetensors"]
@@ -119,7 +119,7 @@ def test_an_interrupted_fit_with_other_settings_or_data_says_what_differs(
         raise KilledError
 
     with monkeypatch.context() as patch:
-        patch.setattr(fit._Fitting, "_validate", killed)
+        patch.setattr(network_fit._NetworkFitting, "_validate", killed)
         with pytest.raises(KilledError):
             tiny("mlp").fit(machine, *runs, tmp_path, 0, CPU)
     partial = tmp_path / "mlp.partial.safetensors"
@@ -143,7 +143,7 @@ def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine
         dataclasses.replace(part, q=np.full_like(part.q, number))
         for number, part in enumerate(parts)
     ]
-    windows = Windows(marked, machine, 7, CPU)
+    windows = TrainingWindows(marked, machine, 7, CPU)
     draws = [windows.draw(64, 0.25, 0.25, torch.tensor(key)) for key in (5, 5, 6)]
     assert draws[0][0].shape == draws[0][1].shape == (5, 64, 13 + 7)
     assert torch.equal(draws[0][0], draws[1][0])
@@ -158,7 +158,7 @@ def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine
 def test_windows_drawn_together_are_the_same_times_for_all_joints(machine: Machine) -> None:
     part = recording(machine)
     clock = np.repeat(np.arange(part.num_samples, dtype=np.float32)[:, None], 5, 1)
-    _, q = Windows([dataclasses.replace(part, q=clock)], machine, 7, CPU).draw(
+    _, q = TrainingWindows([dataclasses.replace(part, q=clock)], machine, 7, CPU).draw(
         16, 0.2, 0.2, torch.tensor(1), together=True
     )
     assert q.shape == (5, 80, 20)
@@ -171,7 +171,7 @@ def test_busy_windows_are_those_in_which_most_is_commanded_at_once(machine: Mach
     u[:, 0] = 0.3
     u[100:120] = 0.4  # all joints: 39 of 381 windows hold some of it
     part = dataclasses.replace(recording(machine, minutes=400 / 1200), u=u)
-    found, _ = Windows([part], machine, 7, CPU).draw(40, 0.0, 1.0, torch.tensor(1))
+    found, _ = TrainingWindows([part], machine, 7, CPU).draw(40, 0.0, 1.0, torch.tensor(1))
     assert (found[1:].amax(2) == torch.tensor(0.4)).all()
 
 
@@ -186,7 +186,9 @@ def test_the_noise_of_a_resting_joint_is_that_of_its_sensor(
     q[: len(q) // 2] = q[0] + noise * np.random.default_rng(1).standard_normal((len(q) // 2, 5))
     if step:
         q = np.round(q / step) * step
-    found = survey.resting_noise([dataclasses.replace(made, u=u, q=q.astype(np.float32))], machine)
+    found = training_data.estimate_resting_noise(
+        [dataclasses.replace(made, u=u, q=q.astype(np.float32))], machine
+    )
     assert found == pytest.approx(step / 6**0.5 if step else noise * 2**0.5, rel=0.05)
 
 
@@ -198,16 +200,18 @@ def test_too_little_data_says_how_much_and_of_which_joint(machine: Machine) -> N
         RecordingError,
         match=r"too little data: q3 0\.0 min forth and 0\.\d min back commanded .* needed are 0\.25 min",
     ):
-        survey.check_enough([dataclasses.replace(part, u=u)], machine)
+        training_data.check_enough([dataclasses.replace(part, u=u)], machine)
 
 
 def test_thin_data_is_warned_of(machine: Machine, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
-        survey.check_enough([recording(machine, minutes=4.0)], machine)
+        training_data.check_enough([recording(machine, minutes=4.0)], machine)
     assert "thin data: q1 1." in caplog.text
     caplog.clear()
     with caplog.at_level(logging.WARNING):
-        survey.check_enough([recording(machine, seed, minutes=4.0) for seed in range(5)], machine)
+        training_data.check_enough(
+            [recording(machine, seed, minutes=4.0) for seed in range(5)], machine
+        )
     assert not caplog.text
 
 
@@ -218,8 +222,8 @@ def test_joints_that_never_move_together_are_warned_of(
     u = np.zeros_like(part.u)
     u[:, 1] = part.u[:, 1]
     with caplog.at_level(logging.WARNING):
-        survey.check_together([dataclasses.replace(part, u=u)])
+        training_data.check_together([dataclasses.replace(part, u=u)])
         assert "several joints are commanded at once for 0.0 min" in caplog.text
         caplog.clear()
-        survey.check_together([part])
+        training_data.check_together([part])
         assert not caplog.text

@@ -15,7 +15,7 @@ from composed import option
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actuators.person import Person
+from actuators.person import HumanFollower
 from brokk_rl.checks import check_follower
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -32,8 +32,8 @@ NEUTRAL: dict[str, Any] = {
 }  # fmt: skip
 
 
-def person(**numbers: Any) -> Person:
-    return Person(**(NEUTRAL | numbers))
+def person(**numbers: Any) -> HumanFollower:
+    return HumanFollower(**(NEUTRAL | numbers))
 
 
 def follow(machine: Machine, proposed: torch.Tensor, **numbers: Any) -> torch.Tensor:
@@ -432,6 +432,9 @@ def test_every_policy_is_evaluated_with_the_same_persons(machine: Machine, tmp_p
 def test_a_policy_says_behind_whom_it_was_trained(tmp_path: Path) -> None:
     assert read_follower(tmp_path) is None
     (tmp_path / RESOLVED).write_text(
-        "follower:\n  _target_: actuators.person.Person\n  delay_s: [0.2, 0.4]\n"
+        "follower:\n  _target_: actuators.person.HumanFollower\n  delay_s: [0.2, 0.4]\n"
     )
-    assert read_follower(tmp_path) == {"_target_": "actuators.person.Person", "delay_s": [0.2, 0.4]}
+    assert read_follower(tmp_path) == {
+        "_target_": "actuators.person.HumanFollower",
+        "delay_s": [0.2, 0.4],
+    }

@@ -15,9 +15,9 @@ import yaml
 from composed import option
 
 from actuators.identify import greybox
-from actuators.identify.gauss_newton import FreeRuns, certainty
+from actuators.identify.gauss_newton import CandidateRuns, estimate_uncertainty
 from actuators.identify.greybox import GreyBoxFit
-from actuators.models.lag import Lag
+from actuators.models.lag import FirstOrderLag
 from brokk_rl import open_loop
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.history import History
@@ -25,7 +25,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
-TRUTH = Lag(
+TRUTH = FirstOrderLag(
     dead_time_s={"q1": 0.41, "q3": 0.525, "other": 0.46},
     dead_band_extend={"q1": 0.05, "q4": 0.16, "other": 0.1},
     dead_band_retract={"q2": 0.12, "other": 0.07},
@@ -125,8 +125,8 @@ def test_what_a_fit_leaves_is_an_option(
     assert "4 recordings (4 runs, 2 min)" in text and "95 % intervals" in text
     done = brokk("mode=train", f"actuator=@{tmp_path}/lag.yaml", "--cfg", "job")
     node = yaml.safe_load(done.out)["actuator"]
-    assert node.pop("_target_") == "actuators.models.lag.Lag"
-    assert Lag(**node) == fitted
+    assert node.pop("_target_") == "actuators.models.lag.FirstOrderLag"
+    assert FirstOrderLag(**node) == fitted
 
 
 def test_known_numbers_of_the_plant_are_found(machine: Machine, tmp_path: Path) -> None:
@@ -170,8 +170,8 @@ def test_an_interrupted_fit_goes_on_exactly(
             raise KeyboardInterrupt
         return improve(*given)
 
-    improve = greybox.improve
-    monkeypatch.setattr(greybox, "improve", stopping)
+    improve = greybox.take_step
+    monkeypatch.setattr(greybox, "take_step", stopping)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             fit.fit(machine, runs[:4], runs[4:], tmp_path / "parts", 0, CPU)
@@ -214,12 +214,12 @@ def test_a_machine_that_was_blocked_for_a_while_hardly_moves_the_numbers(
 
 
 def test_independent_joints_may_be_varied_together(machine: Machine, runs: list[Recording]) -> None:
-    cut = open_loop.windows(runs[:1], machine, 3.0, 8.0)
+    cut = open_loop.cut_windows(runs[:1], machine, 3.0, 8.0)
     active = np.ones((len(cut.q), 5), dtype=bool)
     free = {"gain": (0.2, 2.0), "dead_time_s": (0.0, 0.6)}
     x = np.full((2, 5), 0.45)
     together, apart = (
-        FreeRuns(TRUTH, free, coupled, machine, cut, active, CPU).jacobian(x)
+        CandidateRuns(TRUTH, free, coupled, machine, cut, active, CPU).jacobian(x)
         for coupled in (False, True)
     )
     np.testing.assert_allclose(together[0], apart[0], atol=1e-6)
@@ -234,12 +234,14 @@ def test_the_interval_covers_as_often_as_it_says(machine: Machine) -> None:
     every = recordings(TRUTH, machine, 48, 12.0, seed=5)
 
     def fitted(part: list[Recording]) -> tuple[np.ndarray, np.ndarray]:
-        cut = open_loop.windows(part, machine, 3.0, 3.0)
-        runs = FreeRuns(wrong, free, False, machine, cut, np.ones((len(cut.q), 5), dtype=bool), CPU)
+        cut = open_loop.cut_windows(part, machine, 3.0, 3.0)
+        runs = CandidateRuns(
+            wrong, free, False, machine, cut, np.ones((len(cut.q), 5), dtype=bool), CPU
+        )
         x = np.full((1, 5), 0.5)
         for _ in range(4):
-            x, _ = greybox.improve(runs, x, 3.0)
-        return x, certainty(runs, x, 3.0).half
+            x, _ = greybox.take_step(runs, x, 3.0)
+        return x, estimate_uncertainty(runs, x, 3.0).half
 
     limit, _ = fitted(every)  # where the wrong model ends up with many runs
     for start in range(0, 48, 6):

@@ -13,8 +13,8 @@ import torch
 from composed import option
 
 from actuators.identify import page
-from actuators.identify.verdict import verdict
-from actuators.models.lag import Lag
+from actuators.identify.results import write_verdict
+from actuators.models.lag import FirstOrderLag
 from actuators.models.linear import Hold
 from actuators.modes.identify import Identification, Identify
 from brokk_rl import record
@@ -25,7 +25,7 @@ from brokk_rl.record import Recording
 from brokk_rl.session import Session
 
 CPU = torch.device("cpu")
-PLANT = Lag(
+PLANT = FirstOrderLag(
     dead_time_s=0.55,
     dead_band_extend=0.1,
     dead_band_retract=0.1,
@@ -61,7 +61,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 machine=machine.name, joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(300) * 0.05,
                 u=u[run, rows], q=positions[run, rows], metadata={"run": f"run {run}", "source": "test"},
             )  # fmt: skip
-            record.write(made, folder / f"run{run}_{part}.parquet")
+            record.write_recording(made, folder / f"run{run}_{part}.parquet")
     return folder
 
 
@@ -219,9 +219,9 @@ def test_short_recordings_leave_out_the_horizons_that_do_not_fit(
 ) -> None:
     cut = tmp_path / "short"
     for path in recordings.iterdir():
-        whole = record.read(path, machine)
+        whole = record.read_recording(path, machine)
         part = {"t_s": whole.t_s[:100], "u": whole.u[:100], "q": whole.q[:100]}
-        record.write(
+        record.write_recording(
             Recording(**{**vars(whole), **part}), cut / path.name
         )  # 5 s less 1.65 s: no window of 5 s
     result = run(identify(machine, tmp_path / "out", cut, Fit()))
@@ -248,7 +248,7 @@ def test_a_model_that_stands_still_is_no_good_news(
         "judged_s": 0.0,
     }
     result["delay_s"]["q4"] |= {"value": 0.8, "ci95": [0.78, 0.82]}
-    texts = [finding.text for finding in verdict(result, machine)]
+    texts = [finding.text for finding in write_verdict(result, machine)]
     for part in (
         "q3 is too little excited: commanded for 30 s only; no command beyond +0.2",
         "q3 never moves by command in the runs judged by",

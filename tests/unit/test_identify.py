@@ -12,7 +12,7 @@ import torch
 from composed import option
 
 from actuators.identify import dead_time
-from actuators.models.lag import Lag
+from actuators.models.lag import FirstOrderLag
 from actuators.models.linear import ArxFit, Hold
 from brokk_rl import open_loop, record
 from brokk_rl.errors import RecordingError
@@ -21,7 +21,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
-PLANT = Lag(
+PLANT = FirstOrderLag(
     dead_time_s=0.43,
     dead_band_extend=0.06,
     dead_band_retract=0.09,
@@ -73,7 +73,7 @@ def recordings(
 
 
 def test_the_dead_time_is_found_to_the_hundredth(machine: Machine) -> None:
-    found = dead_time.delays(
+    found = dead_time.estimate_dead_times(
         recordings(machine, "sine", 10, 60.0), machine, np.random.default_rng(0)
     )
     for delay in found.values():
@@ -85,7 +85,7 @@ def test_the_dead_time_is_found_to_the_hundredth(machine: Machine) -> None:
 
 def test_a_joint_that_rests_has_no_dead_time(machine: Machine) -> None:
     only_q1 = recordings(machine, "sine", 1, 30.0)
-    found = dead_time.delays(only_q1, machine, np.random.default_rng(0))
+    found = dead_time.estimate_dead_times(only_q1, machine, np.random.default_rng(0))
     assert found["q1"] is not None
     assert found["q3"] is None
 
@@ -107,9 +107,9 @@ def test_a_linear_machine_is_learned_by_the_linear_model(machine: Machine, tmp_p
         q=q,
     )
     actuator = ArxFit(name="arx", ridge=1e-8).fit(machine, [run], [run], tmp_path, 0, CPU)
-    cut = open_loop.windows([run], machine, 5.0, 1.0)
+    cut = open_loop.cut_windows([run], machine, 5.0, 1.0)
     error, still = (
-        np.abs(open_loop.free_run(model, machine, cut, CPU) - cut.measured).max()
+        np.abs(open_loop.roll_out(model, machine, cut, CPU) - cut.measured).max()
         for model in (actuator, Hold())
     )
     assert error < 0.02 * still
@@ -148,11 +148,11 @@ def test_collect_and_identify_from_the_command(
     )
     files = sorted(Path("sine/recordings").iterdir())
     assert len(files) == 20
-    first, second = (record.read(path, machine) for path in files[:2])
+    first, second = (record.read_recording(path, machine) for path in files[:2])
     assert first.num_samples == second.num_samples == 600
     assert first.metadata["source"] == "simulator: Lag, excitation: sine"
     assert json.loads(first.metadata["fingerprint"]) == machine.fingerprint()
-    assert second.metadata["created"] == record.later(first.metadata["created"], 30.0)
+    assert second.metadata["created"] == record.add_seconds(first.metadata["created"], 30.0)
     done = brokk(
         "mode=identify", "session.out=fit", "session.device=cpu", "identify.recordings=sine/recordings/*",
         "identify.test=levels/recordings/*", *TINY,

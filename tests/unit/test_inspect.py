@@ -14,7 +14,7 @@ import pytest
 from hydra.utils import instantiate
 
 from brokk_rl import record
-from brokk_rl.inspection import Finding, Thresholds, inspect
+from brokk_rl.inspection import InspectionThresholds, RecordingFinding, inspect_recording
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -25,7 +25,7 @@ NOISE = 0.0003
 
 
 @pytest.fixture(scope="module")
-def thresholds() -> Thresholds:
+def thresholds() -> InspectionThresholds:
     with hydra.initialize_config_module("conf", version_base="1.3"):
         cfg = hydra.compose("config", overrides=["mode=inspect"])
     return instantiate(cfg.thresholds)
@@ -49,8 +49,10 @@ def sound(machine: Machine, seconds: float = 60.0) -> Recording:
     )  # fmt: skip
 
 
-def found(recording: Recording, machine: Machine, thresholds: Thresholds) -> list[Finding]:
-    return inspect(recording, machine, thresholds).findings
+def found(
+    recording: Recording, machine: Machine, thresholds: InspectionThresholds
+) -> list[RecordingFinding]:
+    return inspect_recording(recording, machine, thresholds).findings
 
 
 def changed(
@@ -59,12 +61,16 @@ def changed(
     return replace(recording, u=recording.u if u is None else u, q=recording.q if q is None else q)
 
 
-def test_a_sound_recording_has_no_findings(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_sound_recording_has_no_findings(
+    machine: Machine, thresholds: InspectionThresholds
+) -> None:
     assert found(sound(machine), machine, thresholds) == []
 
 
-def test_its_figures_are_those_it_was_made_with(machine: Machine, thresholds: Thresholds) -> None:
-    seen = inspect(sound(machine), machine, thresholds)
+def test_its_figures_are_those_it_was_made_with(
+    machine: Machine, thresholds: InspectionThresholds
+) -> None:
+    seen = inspect_recording(sound(machine), machine, thresholds)
     assert seen.timing["rate_hz"] == pytest.approx(20.0)
     assert seen.timing["jitter_s"] == pytest.approx(0.0, abs=1e-9)
     joint = seen.joints["q3"]
@@ -75,15 +81,19 @@ def test_its_figures_are_those_it_was_made_with(machine: Machine, thresholds: Th
     assert seen.joints["q1"]["commanded"] == 0.0
 
 
-def test_the_step_of_a_coarse_sensor_is_found(machine: Machine, thresholds: Thresholds) -> None:
+def test_the_step_of_a_coarse_sensor_is_found(
+    machine: Machine, thresholds: InspectionThresholds
+) -> None:
     whole = sound(machine)
-    coarse = inspect(
+    coarse = inspect_recording(
         changed(whole, q=np.round(whole.q / 0.004) * np.float32(0.004)), machine, thresholds
     )
     assert coarse.joints["q3"]["step"] == pytest.approx(0.004, rel=0.01)
 
 
-def test_a_command_that_moves_nothing_is_found(machine: Machine, thresholds: Thresholds) -> None:
+def test_a_command_that_moves_nothing_is_found(
+    machine: Machine, thresholds: InspectionThresholds
+) -> None:
     whole = sound(machine)
     u = whole.u.copy()
     u[200:280, 3] = 0.8  # the interlock was open
@@ -96,7 +106,7 @@ def test_a_command_that_moves_nothing_is_found(machine: Machine, thresholds: Thr
 
 
 def test_a_joint_that_is_pressed_against_its_stop_is_no_finding(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     whole = sound(machine)
     u, q = whole.u.copy(), whole.q.copy()
@@ -107,7 +117,7 @@ def test_a_joint_that_is_pressed_against_its_stop_is_no_finding(
 
 
 def test_a_joint_that_sinks_is_found_with_its_speed(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     whole = sound(machine)
     q = whole.q.copy()
@@ -119,7 +129,7 @@ def test_a_joint_that_sinks_is_found_with_its_speed(
 
 
 def test_a_frozen_sensor_is_found_amid_motion_and_at_rest(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     whole = sound(machine)
     q = whole.q.copy()
@@ -132,14 +142,14 @@ def test_a_frozen_sensor_is_found_amid_motion_and_at_rest(
 
 
 def test_a_coarse_sensor_at_rest_between_motions_is_not_frozen(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     whole = sound(machine)
     q = np.round((whole.q - machine.home) / 0.004) * np.float32(0.004) + machine.home
     assert found(changed(whole, q=q.astype(np.float32)), machine, thresholds) == []
 
 
-def test_lost_frames_are_found(machine: Machine, thresholds: Thresholds) -> None:
+def test_lost_frames_are_found(machine: Machine, thresholds: InspectionThresholds) -> None:
     whole = sound(machine)
     q = whole.q.copy()
     for row in (110, 111, 130):
@@ -155,7 +165,7 @@ def test_lost_frames_are_found(machine: Machine, thresholds: Thresholds) -> None
 
 
 def test_positions_beyond_the_limits_and_exclusive_joints_in_company_are_found(
-    machine: Machine, thresholds: Thresholds
+    machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     whole = sound(machine)
     u, q = whole.u.copy(), whole.q.copy()
@@ -177,8 +187,8 @@ def test_positions_beyond_the_limits_and_exclusive_joints_in_company_are_found(
 def test_inspect_from_the_command_lists_every_breach_and_fails_at_none(
     brokk: Callable[..., object], machine: Machine, tmp_path: Path
 ) -> None:
-    record.write(sound(machine), tmp_path / "a.parquet")
-    record.write(replace(sound(machine), metadata={}), tmp_path / "b.parquet")
+    record.write_recording(sound(machine), tmp_path / "a.parquet")
+    record.write_recording(replace(sound(machine), metadata={}), tmp_path / "b.parquet")
     table = pq.read_table(tmp_path / "b.parquet")
     u = table.column("u_q2").to_numpy().copy()
     u[[5, 6, 90]] = 1.5
@@ -207,9 +217,9 @@ def test_parts_of_a_run_that_overlap_in_time_are_told(
     brokk: Callable[..., object], machine: Machine, tmp_path: Path
 ) -> None:
     first = sound(machine, 20.0)
-    later = record.later(first.metadata["created"], 15.0)
-    record.write(first, tmp_path / "a_0.parquet")
-    record.write(
+    later = record.add_seconds(first.metadata["created"], 15.0)
+    record.write_recording(first, tmp_path / "a_0.parquet")
+    record.write_recording(
         replace(first, metadata={**first.metadata, "created": later}), tmp_path / "a_1.parquet"
     )
     done = brokk(

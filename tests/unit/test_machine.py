@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from actuators.models.lag import Lag
+from actuators.models.lag import FirstOrderLag
 from brokk_rl.checks import check_actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import Gravity
@@ -28,7 +28,7 @@ def unseen(machine: Machine) -> Machine:
 
 
 def test_its_actuators_can_be_modelled(unseen: Machine) -> None:
-    lag = Lag(
+    lag = FirstOrderLag(
         dead_time_s=None,
         dead_band_extend=0.1,
         dead_band_retract=0.1,

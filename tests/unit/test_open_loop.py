@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from actuators.identify.regimes import by_regime, memberships
-from actuators.identify.scores import Scores
-from actuators.models.lag import Lag
+from actuators.identify.scores import FreeRunScores, classify_seconds, score_regimes
+from actuators.models.lag import FirstOrderLag
 from brokk_rl import open_loop
 from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
@@ -18,7 +17,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
-PLANT = Lag(
+PLANT = FirstOrderLag(
     dead_time_s=0.43,
     dead_band_extend=0.06,
     dead_band_retract=0.09,
@@ -58,32 +57,34 @@ def recording(u: np.ndarray, q: np.ndarray, run: str) -> Recording:
     )  # fmt: skip
 
 
-def scores(cut: open_loop.Windows, machine: Machine, **predicted: np.ndarray) -> Scores:
-    return Scores(predicted, cut, machine, np.random.default_rng(0))
+def scores(
+    cut: open_loop.FreeRunWindows, machine: Machine, **predicted: np.ndarray
+) -> FreeRunScores:
+    return FreeRunScores(predicted, cut, machine, np.random.default_rng(0))
 
 
 def test_a_plant_with_a_state_runs_freely_without_error_wherever_a_window_begins(
     machine: Machine,
 ) -> None:
-    cut = open_loop.windows(levels(machine, [600, 600]), machine, 10.0, 5.0)
+    cut = open_loop.cut_windows(levels(machine, [600, 600]), machine, 10.0, 5.0)
     # 0.65 s of history, 1 s to warm up, 10 s: windows at 0, 5, 10 and 15 s of each 30 s
     assert (cut.q.shape, cut.u.shape) == ((8, 233, 5), (8, 232, 5))
     assert list(cut.run) == ["run 0"] * 4 + ["run 1"] * 4
     # what is left of the speed at rest after the warm-up: exp(-1 / 0.3) of it, 0.3 s long
     assert (
-        np.abs(open_loop.free_run(PLANT, machine, cut, CPU) - cut.measured).max()
+        np.abs(open_loop.roll_out(PLANT, machine, cut, CPU) - cut.measured).max()
         < 0.2 * 0.3 * np.exp(-1.0 / 0.3) * 1.5
     )
 
 
 def test_short_recordings_serve_the_horizons_that_fit(machine: Machine) -> None:
     runs = levels(machine, [33 + 40, 33 + 100, 30])  # room for 2 s, 5 s and nothing
-    assert open_loop.longest_s(runs, machine) == pytest.approx(5.0)
-    cut = open_loop.windows(runs, machine, 5.0, 1.0, 1.0)
+    assert open_loop.find_longest_horizon_s(runs, machine) == pytest.approx(5.0)
+    cut = open_loop.cut_windows(runs, machine, 5.0, 1.0, 1.0)
     left = np.isfinite(cut.measured[..., 0]).sum(1)
     assert list(left) == [40, 20, 100, 80, 60, 40, 20]
     assert np.isfinite(cut.q[:, :33]).all()
-    found = scores(cut, machine, plant=open_loop.free_run(PLANT, machine, cut, CPU))
+    found = scores(cut, machine, plant=open_loop.roll_out(PLANT, machine, cut, CPU))
     assert (
         found.at("plant", 5.0)[0]["ci95"] is None and found.at("plant", 2.0)[0]["ci95"] is not None
     )
@@ -94,18 +95,18 @@ def test_recordings_too_short_for_any_horizon_are_refused(machine: Machine) -> N
         RecordingError,
         match=r"too little data: a free run of 10 s needs 11\.65 s of recording, the longest of 2 has 5",
     ):
-        open_loop.windows(levels(machine, [100, 100]), machine, 10.0, 1.0)
+        open_loop.cut_windows(levels(machine, [100, 100]), machine, 10.0, 1.0)
 
 
 def test_a_model_that_runs_into_nan_is_named(machine: Machine) -> None:
-    cut = open_loop.windows(levels(machine, [100]), machine, 1.0, 1.0)
+    cut = open_loop.cut_windows(levels(machine, [100]), machine, 1.0, 1.0)
     cut.u[:] = np.nan
     with pytest.raises(BrokkError, match="Lag ran into NaN in a free run"):
-        open_loop.free_run(PLANT, machine, cut, CPU)
+        open_loop.roll_out(PLANT, machine, cut, CPU)
 
 
 def test_errors_are_those_at_the_end_of_each_horizon(machine: Machine) -> None:
-    cut = open_loop.windows(levels(machine, [400, 400]), machine, 2.0, 10.0)
+    cut = open_loop.cut_windows(levels(machine, [400, 400]), machine, 2.0, 10.0)
     ramp = 0.01 * np.arange(1, 41)[None, :, None]
     found = scores(cut, machine, ramp=cut.measured + ramp)
     row = found.at("ramp", 2.0)[0]
@@ -122,7 +123,7 @@ def test_intervals_come_from_runs_not_from_windows(machine: Machine) -> None:
     runs = [recording(np.zeros((200, 5)), np.zeros((200, 5)), f"run {n}") for n in range(9)]
     widths = []
     for stride_s in (2.0, 0.2):
-        cut = open_loop.windows(runs, machine, 1.0, stride_s)
+        cut = open_loop.cut_windows(runs, machine, 1.0, stride_s)
         error = np.where(cut.run == "run 4", 0.3, 0.1)[:, None, None] * np.ones((1, 20, 5))
         row = scores(cut, machine, model=cut.measured + error).at("model", 1.0)[0]
         assert row["rmse"] == pytest.approx(np.sqrt((8 * 0.01 + 0.09) / 9), abs=1e-6)
@@ -135,7 +136,7 @@ def test_a_small_difference_that_every_run_shows_is_certain_although_intervals_o
     machine: Machine,
 ) -> None:
     runs = [recording(np.zeros((200, 5)), np.zeros((200, 5)), f"run {n}") for n in range(9)]
-    cut = open_loop.windows(runs, machine, 1.0, 1.0)
+    cut = open_loop.cut_windows(runs, machine, 1.0, 1.0)
     size = np.array([0.1 * (1 + int(name[-1])) for name in cut.run])[:, None, None] * np.ones(
         (1, 20, 5)
     )
@@ -153,12 +154,12 @@ def test_seconds_belong_to_regimes_by_the_commands_that_act_in_them(machine: Mac
     u[40:80, 0], u[80:100, 0], u[60:, 2] = 0.5, -0.9, 0.1
     q = np.tile(0.5 * (machine.lower + machine.upper), (140, 1))
     q[100:, 0] = machine.upper[0]
-    cut = open_loop.windows(
+    cut = open_loop.cut_windows(
         [recording(u, q, "a")], machine, 5.0, 100.0
     )  # from 1.65 s on: 33 samples before
     drift = np.linspace(0.05, 5.0, 100)[None, :, None] * np.array([0.1, 0.0, 0.2, 0.0, 0.0])
     found = scores(cut, machine, model=cut.measured + drift)
-    members = {name: inside[0] for name, inside in memberships(found, np.zeros(5)).items()}
+    members = {name: inside[0] for name, inside in classify_seconds(found, np.zeros(5)).items()}
     # q1 acts from sample 40 on: seconds are samples 32-51, 52-71, 72-91, 92-111, 112-131
     assert members["at rest"][:, 0].tolist() == [False, False, False, False, True]
     assert members["alone"][:, 0].tolist() == [True, False, False, False, False]
@@ -168,9 +169,9 @@ def test_seconds_belong_to_regimes_by_the_commands_that_act_in_them(machine: Mac
     assert members["large commands"][:, 0].tolist() == [False, False, True, True, False]
     assert members["near a stop"][:, 0].tolist() == [False, False, False, True, False]
     assert members["small commands"][:, 2].tolist() == [False, True, True, True, True]
-    delayed = memberships(found, np.full(5, 1.0))["alone"][0]
+    delayed = classify_seconds(found, np.full(5, 1.0))["alone"][0]
     assert delayed[:, 0].tolist() == [False, True, False, False, False]
-    table = by_regime(found, np.zeros(5))
+    table = score_regimes(found, np.zeros(5))
     for regime in ("with others", "at rest"):
         assert table["q1"][regime]["models"]["model"]["drift_per_s"] == pytest.approx(0.1, rel=1e-5)
     assert table["q1"]["with others"]["time"] == pytest.approx(0.6)

@@ -16,8 +16,8 @@ from hydra.utils import instantiate
 
 import conf
 from brokk_rl.errors import ConfigError
-from perception.train import augment, jpeg, report
-from perception.train.data import Crop, Samples, Views, cut
+from perception.train import augmentation, evaluation
+from perception.train.samples import Crop, Samples, TrainingViews, cut_windows
 
 SHIPPED: dict[str, Any] = instantiate(
     yaml.safe_load(Path(next(iter(conf.__path__)), "mode/train_perception.yaml").read_text())[
@@ -42,7 +42,8 @@ def chance(seed: int) -> torch.Generator:
 def test_each_changes_each_picture_its_own_way_and_the_same_for_the_same_seed(name: str) -> None:
     step = {name: replace(SHIPPED[name], probability=1.0)}
     one, same, other = (
-        augment.augmented(picture(), step, chance(seed), chance(seed)) for seed in (1, 1, 2)
+        augmentation.apply_augmentations(picture(), step, chance(seed), chance(seed))
+        for seed in (1, 1, 2)
     )
     assert one.shape == (2, 3, 64, 96) and one.dtype == torch.float32
     assert one.min() >= 0.0 and one.max() <= 1.0
@@ -54,12 +55,18 @@ def test_each_changes_each_picture_its_own_way_and_the_same_for_the_same_seed(na
 @pytest.mark.parametrize("name", SHIPPED)
 def test_each_happens_as_often_as_its_probability_says(name: str) -> None:
     off = {name: replace(SHIPPED[name], probability=0.0)}
-    assert torch.equal(augment.augmented(picture(), off, chance(0), chance(0)), picture())
+    assert torch.equal(
+        augmentation.apply_augmentations(picture(), off, chance(0), chance(0)), picture()
+    )
     half, many = (
         {name: replace(SHIPPED[name], probability=0.5)},
         picture()[:1, :, :16, :16].repeat(200, 1, 1, 1),
     )
-    changed = (augment.augmented(many, half, chance(0), chance(0)) != many).flatten(1).any(1)
+    changed = (
+        (augmentation.apply_augmentations(many, half, chance(0), chance(0)) != many)
+        .flatten(1)
+        .any(1)
+    )
     assert 0.35 < changed.float().mean() < 0.65
 
 
@@ -70,7 +77,9 @@ def test_nothing_moves_in_the_picture(name: str) -> None:
     step, bright = {name: replace(SHIPPED[name], probability=1.0)}, torch.zeros(8, 3, 64, 96)
     bright[:, :, 28:36, 44:52] = 0.6
     rows, columns = np.meshgrid(np.arange(64), np.arange(96), indexing="ij")
-    for seen in augment.augmented(bright, step, chance(0), chance(0)).mean(1).numpy():
+    for seen in (
+        augmentation.apply_augmentations(bright, step, chance(0), chance(0)).mean(1).numpy()
+    ):
         weight = np.clip(seen - np.median(seen) - 0.12, 0.0, None)
         if weight.sum() > 1.0:  # strong dust leaves nothing to see
             assert abs((rows * weight).sum() / weight.sum() - 31.5) < 1.0
@@ -82,15 +91,15 @@ def test_contrast_gamma_exposure_and_haze_follow_their_formulas() -> None:
         torch.full((1, 3, 8, 8), 0.25),
         functools.partial(torch.testing.assert_close, rtol=1e-5, atol=1e-6),
     )
-    gamma = augment.Gamma(probability=1.0, exponent=(2.0, 2.0))
+    gamma = augmentation.Gamma(probability=1.0, exponent=(2.0, 2.0))
     close(gamma.changed(flat, chance(0)), flat * 0.25)
-    exposure = augment.Exposure(probability=1.0, gain=(2.0, 2.0), tint=0.0)
+    exposure = augmentation.Exposure(probability=1.0, gain=(2.0, 2.0), tint=0.0)
     close(exposure.changed(flat, chance(0)), flat * 2.0)
-    contrast = augment.Contrast(probability=1.0, gain=(0.5, 0.5))
+    contrast = augmentation.Contrast(probability=1.0, gain=(0.5, 0.5))
     stretched = contrast.changed(picture(), chance(0))
     close(stretched.mean(), picture().mean())
     close(stretched.std(), 0.5 * picture().std())
-    haze = augment.Haze(
+    haze = augmentation.Haze(
         probability=1.0, transmission=(0.25, 0.25), brightness=(0.8, 0.8), unevenness=0.0
     )
     far, near = haze.changed(0 * flat, chance(0)), haze.changed(0 * flat + 1.0, chance(0))
@@ -101,14 +110,14 @@ def test_contrast_gamma_exposure_and_haze_follow_their_formulas() -> None:
 def test_noise_has_the_strength_it_is_given_whatever_its_grain() -> None:
     flat = torch.full((1, 3, 200, 200), 0.5)
     for grain_px in (0.0, 0.3, 1.0):
-        noise = augment.Noise(
+        noise = augmentation.SensorNoise(
             probability=1.0, constant=(0.03, 0.03), photon=(0.0, 0.0), grain_px=(grain_px, grain_px)
         )
         assert float(noise.changed(flat, chance(0)).std()) == pytest.approx(0.03, rel=0.05)
 
 
 def test_a_shadow_only_darkens_and_motion_smears_as_far_as_it_says() -> None:
-    shadow = augment.Shadow(
+    shadow = augmentation.Shadow(
         probability=1.0, depth=(0.3, 0.3), width=(0.3, 0.3), softness=(0.05, 0.05)
     )
     dark = shadow.changed(picture(), chance(4)) / picture()
@@ -116,7 +125,7 @@ def test_a_shadow_only_darkens_and_motion_smears_as_far_as_it_says() -> None:
     point = torch.zeros(1, 3, 41, 41)
     point[:, :, 20, 20] = 1.0
     smear = (
-        augment.MotionBlur(probability=1.0, length_px=(9.0, 9.0))
+        augmentation.MotionBlur(probability=1.0, length_px=(9.0, 9.0))
         .changed(point, chance(2))[0, 0]
         .numpy()
     )
@@ -126,7 +135,7 @@ def test_a_shadow_only_darkens_and_motion_smears_as_far_as_it_says() -> None:
 
 
 def test_a_blur_is_that_of_opencv() -> None:
-    blur = augment.Blur(probability=1.0, sigma_px=(1.2, 1.2))
+    blur = augmentation.Blur(probability=1.0, sigma_px=(1.2, 1.2))
     theirs = cv2.GaussianBlur(picture()[0, 0].numpy(), (9, 9), 1.2, borderType=cv2.BORDER_REPLICATE)
     np.testing.assert_allclose(blur.changed(picture(), chance(0))[0, 0], theirs, atol=1e-5)
 
@@ -148,7 +157,7 @@ def test_what_jpeg_leaves_is_what_opencv_writes_into_a_file(quality: int) -> Non
     )[..., ::-1]
     pictures = torch.from_numpy(written.transpose(2, 0, 1).copy())[None] / 255.0
     ours = (
-        jpeg.recompressed(pictures, torch.full((1, 1, 1, 1), float(quality)))[0]
+        augmentation.recompress_jpeg(pictures, torch.full((1, 1, 1, 1), float(quality)))[0]
         .numpy()
         .transpose(1, 2, 0)
         * 255.0
@@ -165,9 +174,9 @@ def test_a_crop_keeps_picture_and_mask_together() -> None:
     bright[:, 0, 50:90, 80:150] = 255
     bright[:, 1] = 255 - bright[:, 0]
     windows = crop.windows(torch.ones(12), (144, 240), chance(3))
-    seen = cut(bright, windows, (80, 48))
+    seen = cut_windows(bright, windows, (80, 48))
     assert seen.shape == (12, 2, 48, 80)
-    inside = cut(torch.full_like(bright, 255), windows, (80, 48))[:, 0]
+    inside = cut_windows(torch.full_like(bright, 255), windows, (80, 48))[:, 0]
     torch.testing.assert_close(seen[:, 0] + seen[:, 1], inside)
     assert len({round(float(one.sum()), 1) for one in seen[:, 0]}) == 12
 
@@ -179,10 +188,10 @@ def test_a_sample_that_nothing_is_done_to_is_what_the_segmenter_would_see(closer
     layers = np.stack([across, down, 127 + 60 * np.sin(across / 9.0), 0 * down, 0 * down]).astype(
         np.uint8
     )
-    views = Views(
+    views = TrainingViews(
         torch.from_numpy(np.stack([layers, layers[:, ::-1].copy()])[None]), ("clean",), ("one",)
     )
-    seen, _ = report.looked_at(views, (80, 48))
+    seen, _ = evaluation.crop_segmenter_views(views, (80, 48))
     sample, _ = Samples(views, plain, {}, (80, 48), closer, 0, torch.device("cpu")).batch(0, 1)
     assert float((255.0 * sample[0] - seen[0, int(closer)].float()).abs().mean()) < 2.0
 
@@ -192,7 +201,7 @@ def test_a_crop_is_the_part_that_opencv_cuts_out() -> None:
     view = cv2.resize(view, (240, 144), interpolation=cv2.INTER_CUBIC)
     crop = Crop(width=(0.5, 0.5), shift=0.1, roll_rad=0.3, mirror=0.0)
     window = crop.windows(torch.ones(1), (144, 240), chance(5))
-    seen = cut(torch.from_numpy(view)[None, None], window, (80, 48))[0, 0].numpy()
+    seen = cut_windows(torch.from_numpy(view)[None, None], window, (80, 48))[0, 0].numpy()
     # from a sample's pixels to places from -1 to 1, to places in the view, to its pixels
     into = np.array([[2 / 80, 0, 1 / 80 - 1], [0, 2 / 48, 1 / 48 - 1], [0, 0, 1]])
     out = np.array([[120, 0, 119.5], [0, 72, 71.5], [0, 0, 1]])

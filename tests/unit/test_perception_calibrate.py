@@ -21,8 +21,9 @@ from brokk_rl import record
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from perception import dataset
-from perception.calibrate import arm, clock, hand_eye, rigid, start, touched
-from perception.calibrate.extrinsics import point_std_m
+from perception.calibrate import arm, clock_offset, hand_eye, touched_points, transforms
+from perception.calibrate import hand_eye as start
+from perception.calibrate.extrinsics import compute_point_std_m
 from perception.sources.folder import FrameFolder
 
 EXACT = np.diag([0.0005, 0.0005, 0.001, 0.001, 0.001, 0.0005]) ** 2
@@ -33,18 +34,20 @@ def drawn(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     """Returns camera, board and poses of link and board that fit exactly: `A Y = X B`."""
     chance = np.random.default_rng(seed)
     x, y = (
-        rigid.pose(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 1, 3))
+        transforms.make_transform(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 1, 3))
         for _ in range(2)
     )
-    a = rigid.pose(Rotation.random(count, rng=chance).as_matrix(), chance.normal(0, 1, (count, 3)))
-    return x, y, a, rigid.inverse(x) @ a @ y
+    a = transforms.make_transform(
+        Rotation.random(count, rng=chance).as_matrix(), chance.normal(0, 1, (count, 3))
+    )
+    return x, y, a, transforms.invert(x) @ a @ y
 
 
 @settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 10_000), count=st.integers(4, 12))
 def test_both_closed_forms_are_exact_without_noise(seed: int, count: int) -> None:
     x, y, a, b = drawn(seed, count)
-    for method in (start.kronecker, start.motions):
+    for method in (start.solve_kronecker, start.solve_motion_pairs):
         camera, link = method(a, b)
         np.testing.assert_allclose(camera, x, atol=1e-6)
         np.testing.assert_allclose(link, y, atol=1e-6)
@@ -52,9 +55,9 @@ def test_both_closed_forms_are_exact_without_noise(seed: int, count: int) -> Non
 
 def test_links_move_as_their_motions_say(machine: Machine) -> None:
     q, step = board.MIDDLE[None], 1e-3
-    here = arm.links(machine, q)
+    here = arm.compute_link_poses(machine, q)
     for joint in range(machine.num_joints):
-        there = arm.links(machine, q + step * np.eye(5)[joint]).base_from_link[0]
+        there = arm.compute_link_poses(machine, q + step * np.eye(5)[joint]).base_from_link[0]
         motion = here.joints[0, joint] * step
         tip = here.tip_in_base_m[0]
         np.testing.assert_allclose(
@@ -72,13 +75,13 @@ def test_links_move_as_their_motions_say(machine: Machine) -> None:
 
 def off(found: np.ndarray) -> tuple[float, float]:
     """Returns how far a camera is from the true one, mm and degrees."""
-    away = rigid.apart(found, board.CAMERA)
+    away = transforms.compute_motion(found, board.CAMERA)
     return 1000 * float(np.linalg.norm(away[:3])), float(np.degrees(np.linalg.norm(away[3:])))
 
 
 def opencv(views: Any) -> np.ndarray:
     """Returns the camera as OpenCV finds it (Park and Martin): the same equations, all poses alike."""
-    back, seen = rigid.inverse(views.base_from_link), views.camera_from_board[:, 0]
+    back, seen = transforms.invert(views.base_from_link), views.camera_from_board[:, 0]
     turn, shift = cv2.calibrateHandEye(
         list(back[:, :3, :3]),
         list(back[:, :3, 3]),
@@ -86,7 +89,7 @@ def opencv(views: Any) -> np.ndarray:
         list(seen[:, :3, 3]),
         method=cv2.CALIB_HAND_EYE_PARK,
     )
-    return rigid.pose(turn, shift[:, 0])
+    return transforms.make_transform(turn, shift[:, 0])
 
 
 @pytest.mark.parametrize(
@@ -101,14 +104,14 @@ def test_a_poor_arm_and_wrong_sights_leave_millimetres(
             machine, count, seed, np.radians(zero_deg), own_rad=0.001, wobble_m=0.0005
         )
         views, bad = board.views(machine, poses, EXACT, seed, wrong)
-        found = hand_eye.solve(views)
+        found = hand_eye.solve_hand_eye(views)
         assert (
             found is not None and not (bad & found.used).any() and (~bad & ~found.used).sum() <= 1
         )
         ours.append(off(found.guess.base_from_camera))
         if hasattr(cv2, "calibrateHandEye"):  # OpenCV 5.0.0 has forgotten it
             theirs.append(off(opencv(views)))
-        away = rigid.apart(found.guess.base_from_camera, board.CAMERA)
+        away = transforms.compute_motion(found.guess.base_from_camera, board.CAMERA)
         surprise.append(away @ np.linalg.solve(found.cov[:6, :6], away))
     mm, degrees = np.median(ours, axis=0)
     assert mm <= 3.7 and degrees <= 0.58 and np.max(ours, axis=0)[0] < 8.0
@@ -135,7 +138,7 @@ def test_whatever_was_recorded_the_answer_is_a_place(
         poses, q=board.MIDDLE + size * (poses.q - board.MIDDLE)
     )  # the arm hardly moves, or so it says
     views, _ = board.views(machine, poses, EXACT * 10 ** chance.uniform(-2, 2), seed, wrong)
-    found = hand_eye.solve(views)
+    found = hand_eye.solve_hand_eye(views)
     assert found is not None
     place = found.guess.base_from_camera
     assert np.isfinite(place).all() and np.isfinite(found.cov).all()
@@ -144,18 +147,18 @@ def test_whatever_was_recorded_the_answer_is_a_place(
         1.0, spread[-1]
     )  # an arm that does not move leaves 1e12 square metres open: rounding
     np.testing.assert_allclose(place[:3, :3] @ place[:3, :3].T, np.eye(3), atol=1e-9)
-    assert found.used.sum() >= min(hand_eye.FEWEST, count)
+    assert found.used.sum() >= min(hand_eye.MIN_VIEWS, count)
 
 
 def test_of_two_poses_that_fit_the_corners_the_arm_chooses(machine: Machine) -> None:
     poses = board.posed(machine, 20, 3, 0.0, 0.001, 0.0005)
     views, _ = board.views(machine, poses, EXACT, 3)
-    flip = rigid.pose(Rotation.from_rotvec([0.7, 0.3, 0.0]).as_matrix(), np.zeros(3))
+    flip = transforms.make_transform(Rotation.from_rotvec([0.7, 0.3, 0.0]).as_matrix(), np.zeros(3))
     both = np.stack([views.camera_from_board[:, 0], views.camera_from_board[:, 0] @ flip], 1)
     swapped = np.arange(20) % 2 == 0
     both[swapped] = both[swapped, ::-1]
     mirrored = replace(views, camera_from_board=both, seen_cov=np.repeat(views.seen_cov, 2, 1))
-    alone, found = hand_eye.solve(views), hand_eye.solve(mirrored)
+    alone, found = hand_eye.solve_hand_eye(views), hand_eye.solve_hand_eye(mirrored)
     assert alone is not None and found is not None and found.used.all()
     np.testing.assert_allclose(
         found.guess.base_from_camera, alone.guess.base_from_camera, atol=1e-4
@@ -171,7 +174,7 @@ def swing(
     q = board.MIDDLE + moving * np.outer(phase, [0.3, 0.1, -0.2, 0.3, 0.2])
     frame_s = np.arange(1.0, 18.0, 1 / 15)
     there = np.stack([np.interp(frame_s + offset_s, t_s, column) for column in q.T], 1)
-    return frame_s, arm.links(machine, there).base_from_link[:, :3, :3], t_s, q
+    return frame_s, arm.compute_link_poses(machine, there).base_from_link[:, :3, :3], t_s, q
 
 
 @pytest.mark.parametrize("offset_s", [-0.31, 0.0, 0.08, 0.64])
@@ -188,8 +191,8 @@ def test_the_offset_of_the_clocks_is_found_to_a_few_milliseconds(
         @ turns
         @ Rotation.from_rotvec(0.002 * chance.standard_normal((len(turns), 3))).as_matrix()
     )
-    found = clock.offset(
-        frame_s, turns, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0, 0.4
+    found = clock_offset.estimate_clock_offset(
+        frame_s, turns, t_s, arm.compute_link_poses(machine, q).base_from_link[:, :3, :3], 1.0, 0.4
     )
     assert found is not None and found.correlation > 0.6
     assert found.offset_s == pytest.approx(offset_s, abs=0.02)
@@ -203,12 +206,15 @@ def test_an_arm_that_rests_tells_nothing_about_clocks(machine: Machine) -> None:
             0.002 * np.random.default_rng(0).standard_normal((len(turns), 3))
         ).as_matrix()
     )
-    found = clock.offset(
-        frame_s, noisy, t_s, arm.links(machine, q).base_from_link[:, :3, :3], 1.0, 0.4
+    found = clock_offset.estimate_clock_offset(
+        frame_s, noisy, t_s, arm.compute_link_poses(machine, q).base_from_link[:, :3, :3], 1.0, 0.4
     )
     assert found is None or found.correlation < 0.4
     assert (
-        clock.offset(frame_s[:9], turns[:9], t_s, turns[:1].repeat(len(t_s), 0), 1.0, 0.4) is None
+        clock_offset.estimate_clock_offset(
+            frame_s[:9], turns[:9], t_s, turns[:1].repeat(len(t_s), 0), 1.0, 0.4
+        )
+        is None
     )
 
 
@@ -227,13 +233,16 @@ def test_touched_points_give_the_camera_though_some_are_wrong(
     )
     there = there + 0.002 * chance.standard_normal(there.shape)
     there[-wrong or count :] += chance.normal(0, 0.2, (wrong, 3)) + 0.1
-    found = touched.fit(
-        touched.Points(seen, there, np.broadcast_to(0.002**2 * np.eye(3), (count, 3, 3))), 0.002
+    found = touched_points.fit_camera_to_points(
+        touched_points.PointPairs(
+            seen, there, np.broadcast_to(0.002**2 * np.eye(3), (count, 3, 3))
+        ),
+        0.002,
     )
     assert found is not None
     if count - wrong >= 6:
         assert not found.used[count - wrong :].any()
-        away = rigid.apart(found.base_from_camera, board.CAMERA)
+        away = transforms.compute_motion(found.base_from_camera, board.CAMERA)
         assert (
             away @ np.linalg.solve(found.cov, away) < 45.0
         )  # one in ten million of six degrees of freedom, were they normal
@@ -246,7 +255,7 @@ def test_uncertainty_at_a_distance_is_that_worked_by_hand() -> None:
     # 3 mm in each direction, and turns of 1 mrad about x and y that move a point 2 m ahead by 2 mm
     # each, about z by nothing
     cov = np.diag([0.003**2] * 3 + [0.001**2] * 3)
-    assert point_std_m(cov, 2.0) == pytest.approx(np.sqrt(3 * 0.003**2 + 2 * 0.002**2))
+    assert compute_point_std_m(cov, 2.0) == pytest.approx(np.sqrt(3 * 0.003**2 + 2 * 0.002**2))
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +282,7 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     mm, degrees = off(np.array(told["T_base_cam"]))
     assert mm < 6.0 and degrees < 0.2
     assert told["num_used"] >= 19 and told["missing"] == [] and told["corners_px"] < 0.3
-    away = rigid.apart(np.array(told["T_base_cam"]), board.CAMERA)
+    away = transforms.compute_motion(np.array(told["T_base_cam"]), board.CAMERA)
     assert away @ np.linalg.solve(np.array(told["covariance"]), away) < 25.0
     assert told["other_half"]["median_m"] < 0.01
     (lost,) = (one for one in told["poses"] if one["name"] == "020")
@@ -343,13 +352,13 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
         u=np.zeros_like(q),
         q=q,
     )
-    record.write(recording, tmp_path / "run.parquet")
+    record.write_recording(recording, tmp_path / "run.parquet")
     frame_s, late_s, chance = np.arange(0.5, 11.5, 0.3), 0.12, np.random.default_rng(0)
     dataset.write_camera(tmp_path, board.MATRIX, None, None)
     there = np.stack([np.interp(frame_s + late_s, t_s, column) for column in q.T], 1)
-    links = arm.links(machine, there).base_from_link
+    links = arm.compute_link_poses(machine, there).base_from_link
     for number, link in enumerate(links):
-        seen = rigid.inverse(board.CAMERA) @ link @ poses.link_from_board
+        seen = transforms.invert(board.CAMERA) @ link @ poses.link_from_board
         dataset.write_picture(tmp_path / f"{number:03d}.color.png", board.picture(seen, chance))
     # the folder's first frame is at 0 s, the recording's clock says 0.5 + 0.12 s then
     done = brokk(
@@ -374,7 +383,7 @@ def test_the_command_takes_touched_points(
     for number in range(8):
         while True:
             q = board.MIDDLE + chance.uniform(-1, 1, 5) * [0.4, 0.2, 0.4, 0.4, 0.4]
-            tip = arm.links(machine, q[None]).tip_in_base_m[0]
+            tip = arm.compute_link_poses(machine, q[None]).tip_in_base_m[0]
             seen = (tip - board.CAMERA[:3, 3]) @ board.CAMERA[:3, :3]
             pixel = (matrix @ seen / seen[2])[:2]
             if seen[2] > 0.8 and 20 < pixel[0] < width - 20 and 20 < pixel[1] < height - 20:
@@ -433,22 +442,25 @@ def test_logs_of_poses_of_any_arm_are_enough(
     t_s, eye_s, late_s = np.arange(0.0, 40.0, 0.02), np.arange(1.0, 38.0, 0.1), -0.23
     phase = np.outer(t_s, [0.5, 0.7, 0.9, 0.4, 0.6, 0.8])
     wave = 0.7 * np.sin(phase + chance.uniform(0, 6, 6)) + 0.2 * np.sin(2.3 * phase)
-    hand = rigid.pose(
+    hand = transforms.make_transform(
         Rotation.from_rotvec(wave[:, 3:]).as_matrix(), [0.6, 0.0, 0.5] + 0.3 * wave[:, :3]
     )
     x, y = (
-        rigid.pose(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 0.3, 3))
+        transforms.make_transform(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 0.3, 3))
         for _ in range(2)
     )
     there = hand[np.searchsorted(t_s, eye_s + late_s)]
-    seen = rigid.inverse(x) @ (there if camera_on == "base" else rigid.inverse(there)) @ y
+    seen = transforms.invert(x) @ (there if camera_on == "base" else transforms.invert(there)) @ y
     seen = np.array(
-        [rigid.moved(one, np.repeat([0.001, 0.003], 3) * chance.standard_normal(6)) for one in seen]
+        [
+            transforms.apply_motion(one, np.repeat([0.001, 0.003], 3) * chance.standard_normal(6))
+            for one in seen
+        ]
     )
     for k in chance.permutation(len(seen))[:40]:
-        seen[k] = rigid.moved(seen[k], chance.normal(0, 0.4, 6))
-    arm_file = log_of(tmp_path / "arm.csv", t_s, rigid.inverse(hand))
-    camera_file = log_of(tmp_path / "camera.csv", eye_s, rigid.inverse(seen), named=False)
+        seen[k] = transforms.apply_motion(seen[k], chance.normal(0, 0.4, 6))
+    arm_file = log_of(tmp_path / "arm.csv", t_s, transforms.invert(hand))
+    camera_file = log_of(tmp_path / "camera.csv", eye_s, transforms.invert(seen), named=False)
     done = brokk(
         "mode=calibrate", "calibration=poses", f"calibration.arm={arm_file}", f"calibration.camera={camera_file}",
         "calibration.arm_tells=link_from_base", "calibration.camera_tells=board_from_camera",
@@ -456,7 +468,7 @@ def test_logs_of_poses_of_any_arm_are_enough(
     )  # fmt: skip
     assert done.code == 0, done.err
     told = yaml.safe_load(Path("run/calibration.yaml").read_text())
-    away = rigid.apart(np.array(told[f"T_{camera_on}_cam"]), x)
+    away = transforms.compute_motion(np.array(told[f"T_{camera_on}_cam"]), x)
     assert np.linalg.norm(away[:3]) < 0.0037 and np.linalg.norm(away[3:]) < np.radians(0.58)
     assert told["clock"]["trusted"] and told["clock"]["offset_s"] == pytest.approx(
         late_s, abs=0.015

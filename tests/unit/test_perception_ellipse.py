@@ -12,7 +12,7 @@ from composed import option
 
 from brokk_rl.contracts.vision import Ellipse, SizePrior
 from brokk_rl.errors import ConfigError
-from perception.benchmark import hidden, patterns, photographs
+from perception.benchmark import calibration_patterns, occluded_ellipses, photographs
 from perception.ellipse import conic, edge_drawing
 
 K = np.array([[1056.0, 0.0, 959.5], [0.0, 1056.0, 539.5], [0.0, 0.0, 1.0]])
@@ -78,35 +78,43 @@ def test_one_of_the_two_circles_of_a_known_radius_is_the_true_one() -> None:
     [("clean", 0.98), ("dark", 0.98), ("haze", 0.98), ("noise_25", 0.9), ("blur", 0.95)],
 )
 def test_patterns_are_found_in_any_light(condition: str, recall: float, detector) -> None:
-    picture, truth = patterns.pattern(np.random.default_rng(5), condition, 512, 384)
+    picture, truth = calibration_patterns.draw_pattern(
+        np.random.default_rng(5), condition, 512, 384
+    )
     found = detector.detect(picture, None, None)
-    hits = patterns.matches(found, truth)
+    hits = calibration_patterns.count_matches(found, truth)
     assert hits >= recall * len(truth)
     assert hits >= 0.95 * len(found)
 
 
 @pytest.mark.parametrize("style", ["dots", "rings", "board"])
 def test_coloured_photographs_are_searched_as_well(style: str, detector) -> None:
-    picture, truth = photographs.photograph(np.random.default_rng(7), style, 512, 384)
+    picture, truth = photographs.draw_photograph(np.random.default_rng(7), style, 512, 384)
     found = detector.detect(picture, None, None)
-    hits = patterns.matches(found, truth)
+    hits = calibration_patterns.count_matches(found, truth)
     assert len(truth) > 5 and hits >= 0.95 * len(truth) and hits >= 0.95 * len(found)
 
 
 @pytest.mark.parametrize("kind", ["noise", "spiral", "squares", "octagons", "hearts"])
 def test_nothing_is_found_where_nothing_is(kind: str, detector) -> None:
-    assert not detector.detect(patterns.negative(kind, np.random.default_rng(0)), None, None)
+    assert not detector.detect(
+        calibration_patterns.draw_negative(kind, np.random.default_rng(0)), None, None
+    )
 
 
 @pytest.mark.parametrize("kind", ["hearts of arcs", "spirals", "polygons", "salt"])
 def test_shapes_like_parts_of_ellipses_are_none(kind: str, detector) -> None:
-    assert not detector.detect(hidden.shapes(np.random.default_rng(3), kind), None, None)
+    assert not detector.detect(
+        occluded_ellipses.draw_lookalikes(np.random.default_rng(3), kind), None, None
+    )
 
 
 def test_hearts_of_curves_are_none(detector) -> None:
     for seed in range(1000, 1008):
         assert not detector.detect(
-            hidden.shapes(np.random.default_rng(seed), "hearts of curves"), None, None
+            occluded_ellipses.draw_lookalikes(np.random.default_rng(seed), "hearts of curves"),
+            None,
+            None,
         )
 
 
@@ -114,10 +122,12 @@ def test_hearts_of_curves_are_none(detector) -> None:
 def test_ellipses_of_which_half_is_seen_are_found(style: str, detector) -> None:
     hits = found = there = 0
     for seed in range(3):
-        picture, truth = hidden.hidden(np.random.default_rng(seed), style)
+        picture, truth = occluded_ellipses.draw_occluded_ellipses(
+            np.random.default_rng(seed), style
+        )
         seen = detector.detect(picture, None, None)
         hits, found, there = (
-            hits + patterns.matches(seen, truth),
+            hits + calibration_patterns.count_matches(seen, truth),
             found + len(seen),
             there + len(truth),
         )
@@ -149,7 +159,9 @@ def test_what_hides_half_of_a_disc_may_be_as_dark_and_as_wide(detector) -> None:
     cv2.rectangle(gray, (100, 95), (136, 145), 70, -1)
     found = detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
     assert [
-        patterns.overlap(row(one), np.array([100.0, 120, 30, 22, 0])) > 0.9 for one in found
+        calibration_patterns.compute_ellipse_overlap(row(one), np.array([100.0, 120, 30, 22, 0]))
+        > 0.9
+        for one in found
     ] == [True]
 
 
@@ -160,7 +172,9 @@ def test_half_of_an_ellipse_tells_the_whole(detector) -> None:
     found = detector.detect(cv2.GaussianBlur(picture, (0, 0), 0.8), None, SizePrior(45.0, 75.0))
     assert (
         max(
-            patterns.overlap(row(one), np.array([120, 100, 60, 45, np.radians(20)]))
+            calibration_patterns.compute_ellipse_overlap(
+                row(one), np.array([120, 100, 60, 45, np.radians(20)])
+            )
             for one in found
         )
         > 0.9

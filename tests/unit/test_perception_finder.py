@@ -11,9 +11,8 @@ from composed import option
 from drawn import AXIS, CENTER, drawn
 
 from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, SizePrior
-from brokk_rl.errors import FrameError
 from perception import dataset, search
-from perception.benchmark.cells import Tally, compare, judge
+from perception.benchmark.scoring import FinderScore, match_holes, score_frame
 from perception.finder import StagedFinder, rectify
 
 
@@ -25,36 +24,37 @@ def finder_with(masks: Masks) -> StagedFinder:
 
 def test_a_hole_is_found_from_picture_and_depth_alone() -> None:
     frame, masks, _ = drawn(noise=0.001)
-    sighting = finder_with(masks).look(frame)
-    assert len(sighting.holes) == 1
-    assert sighting.holes[0].center_m == pytest.approx(CENTER, abs=1e-3)
-    assert float(sighting.holes[0].axis @ AXIS) > np.cos(np.radians(0.3))
-    assert {"segment", "ellipse", "pose", "total"} <= set(sighting.ms)
+    found = finder_with(masks).find(frame)
+    assert len(found.holes) == 1
+    assert found.holes[0].center_m == pytest.approx(CENTER, abs=1e-3)
+    assert float(found.holes[0].axis @ AXIS) > np.cos(np.radians(0.3))
+    assert {"segment", "ellipse", "pose", "total"} <= set(found.ms)
 
 
 def test_the_base_frame_is_where_the_camera_is_said_to_be() -> None:
     frame, masks, _ = drawn()
     moved = np.eye(4)
     moved[:3, 3] = 1.0, 2.0, 3.0
-    found = finder_with(masks).find(replace(frame, base_from_camera=moved))
-    assert found is not None
-    assert found.center_in_base_m == pytest.approx(CENTER + moved[:3, 3], abs=1e-3)
-    with pytest.raises(FrameError, match="where the camera is"):
-        finder_with(masks).find(replace(frame, base_from_camera=None))
+    (hole,) = finder_with(masks).find(replace(frame, base_from_camera=moved)).holes
+    assert hole.frame == "base"
+    assert hole.center_m == pytest.approx(CENTER + moved[:3, 3], abs=1e-3)
+    (hole,) = finder_with(masks).find(replace(frame, base_from_camera=None)).holes
+    assert hole.frame == "camera"
+    assert hole.center_m == pytest.approx(CENTER, abs=1e-3)
 
 
 def test_without_a_block_nothing_is_looked_at_and_it_is_said() -> None:
     frame, masks, _ = drawn()
-    sighting = finder_with(Masks(np.zeros_like(masks.block), None)).look(frame)
-    assert not sighting.holes and sighting.rejected[0].stage == "segment"
+    found = finder_with(Masks(np.zeros_like(masks.block), None)).find(frame)
+    assert not found.holes and found.rejected[0].stage == "segment"
 
 
 def test_a_flat_disc_is_refused_in_words() -> None:
     frame, masks, _ = drawn(depth_m=0.0)
     finder = finder_with(masks)
-    sighting = finder.look(frame)
-    assert not sighting.holes
-    assert any("flat dark disc" in finder.explain(one) for one in sighting.rejected)
+    found = finder.find(frame)
+    assert not found.holes
+    assert any("flat dark disc" in finder.explain(one) for one in found.rejected)
 
 
 def test_lens_distortion_is_taken_out() -> None:
@@ -89,8 +89,8 @@ def test_figures_are_counted_as_by_hand() -> None:
     truth = dataset.SceneTruth(
         "test", {}, (circle(0.0, 0.3), circle(0.5, 0.3)), (circle(1.0, 0.0),), {}
     )
-    tally = Tally()
-    compare([pose(0.0, 2.003), pose(1.01), pose(3.0)], truth, drawn()[0], tally)
+    tally = FinderScore()
+    match_holes([pose(0.0, 2.003), pose(1.01), pose(3.0)], truth, drawn()[0], tally)
     assert (tally.true, tally.found, tally.decoys, tally.fooled, tally.false) == (2, 1, 1, 1, 1)
     assert tally.position_m == pytest.approx([0.003])
     assert tally.along_sigmas == pytest.approx([3.0])
@@ -104,14 +104,14 @@ def test_a_frame_that_is_refused_counts_as_one_in_which_nothing_was_found() -> N
         tuple(CENTER), tuple(AXIS), tuple(CENTER), tuple(AXIS), 0.05, 0.3, 0.0, True
     )
     truth = dataset.SceneTruth("test", {}, (hole,), (), {})
-    seen, _ = judge(finder_with(masks), frame, truth)
+    seen, _ = score_frame(finder_with(masks), frame, truth)
     assert seen.is_perfect and seen.row()["position_mm_median"] < 2.0
     blind = option("perception", "plane_conic").build()
-    missed, sighting = judge(
+    missed, found = score_frame(
         blind, replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), truth
     )
     assert (missed.refused, missed.true, missed.found, missed.is_perfect) == (1, 1, 0, False)
-    assert not sighting.holes
+    assert not found.holes
 
 
 def test_beside_an_arm_a_face_is_searched_where_nobody_knows_its_depth() -> None:

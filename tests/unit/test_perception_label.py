@@ -16,9 +16,9 @@ from composed import option
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
-from perception.label import placing as label_placing
-from perception.label.camera import Charuco, Given, TagGrid
-from perception.label.cuboid import look, sight_lines
+from perception.label import cuboid as label_placing
+from perception.label.camera_pose import Charuco, GivenPoses, TagGrid
+from perception.label.cuboid import compute_pixel_rays, trace_rays
 
 SIZE_PX = (480, 270)
 EYES_M = ((-1.8, -0.9, 1.0), (-2.0, 0.3, 0.8), (-1.5, 0.9, 1.2), (-2.4, -0.3, 0.7))
@@ -113,17 +113,17 @@ def test_a_placing_that_says_too_little_shows_how_it_should_look(tmp_path: Path)
     ):
         (tmp_path / "placing.yaml").write_text(yaml.safe_dump(told))
         with pytest.raises(ConfigError, match="expected YAML such as"):
-            label_placing.read(tmp_path / "placing.yaml")
+            label_placing.read_placing(tmp_path / "placing.yaml")
 
 
 def test_rays_meet_a_cuboid_where_a_second_renderer_says(
     footage: tuple[Path, list[cuboid.View]],
 ) -> None:
     view = cuboid.seen(cuboid.looking(EYES_M[0], (0.1, 0.0, 0.3)), SIZE_PX)
-    placing = label_placing.Placing(None, CORNERS_M, 1.2, ((cuboid.HOLE_M, cuboid.RADIUS_M),))
-    block = label_placing.placed(placing, view.frame, view.world_from_camera)
-    block = label_placing.with_mouths(block, placing, view.frame, view.world_from_camera)
-    seen = look(block, sight_lines(view.frame), view.world_from_camera)
+    placing = label_placing.BlockPlacing(None, CORNERS_M, 1.2, ((cuboid.HOLE_M, cuboid.RADIUS_M),))
+    block = label_placing.place_cuboid(placing, view.frame, view.world_from_camera)
+    block = label_placing.place_mouths(block, placing, view.frame, view.world_from_camera)
+    seen = trace_rays(block, compute_pixel_rays(view.frame), view.world_from_camera)
     np.testing.assert_array_equal(seen.face >= 0, view.block)
     np.testing.assert_array_equal(seen.mouth, view.mouth)
     flat = view.block & ~view.mouth
@@ -157,7 +157,7 @@ def test_a_frame_without_board_is_refused() -> None:
     with pytest.raises(FrameError, match="0 corners of the board are seen"):
         option("perception/camera_pose", "charuco").build().locate(frame)
     with pytest.raises(FrameError, match="no pose of the camera"):
-        Given(poses=None).build().locate(frame)
+        GivenPoses(poses=None).build().locate(frame)
 
 
 def board_view(spec: Charuco | TagGrid) -> Frame:

@@ -33,7 +33,7 @@ def folder(tmp_path: Path) -> Path:
 def test_holes_overlays_and_refusals_are_written(folder: Path, brokk: Callable) -> None:
     done = brokk(
         "mode=perceive", f"perceive.input={folder}", "session.out=out", "perception/segmenter=truth",
-        "perception.pose.looks.mouth=0", "perception.filter.confirm=1",
+        "perception.pose.looks.mouth=0", "tracker.confirm=1",
     )  # fmt: skip
     assert done.code == 0, done.err
     frames = json.loads(Path("out/holes.json").read_text())["frames"]
@@ -78,6 +78,21 @@ def test_a_folder_of_nothing_is_refused(tmp_path: Path, brokk: Callable) -> None
     assert not Path("out").exists()
 
 
-def test_perception_that_looks_at_nothing_is_refused(folder: Path, brokk: Callable) -> None:
+def test_a_finder_that_only_finds_holes_is_enough(folder: Path, brokk: Callable) -> None:
     done = brokk("mode=perceive", f"perceive.input={folder}", "perception=truth", "session.out=out")
-    assert done.code != 0 and "plane_conic" in done.err + done.out
+    assert done.code == 0, done.err
+    frames = json.loads(Path("out/holes.json").read_text())["frames"]
+    assert [len(frame["holes"]) for frame in (frames[0], frames[2])] == [1, 1]
+    assert frames[0]["holes"][0]["center_m"] == [2.6, 0.0, 0.4]
+    assert Path("out/overlays/00000.png").exists()
+
+
+def test_a_finder_that_lists_no_ellipses_is_refused_where_they_are_asked_for(
+    folder: Path, brokk: Callable
+) -> None:
+    done = brokk(
+        "mode=perceive", f"perceive.input={folder}", "perceive.until=ellipses", "perception=truth", "session.out=out"
+    )  # fmt: skip
+    assert done.code != 0
+    for part in ("TruthFinder", "find_ellipses", "plane_conic"):
+        assert part in done.err + done.out

@@ -16,16 +16,15 @@ from composed import names, option
 
 from brokk_rl.errors import ConfigError, FrameError
 from perception import dataset
-from perception.render.concrete import frame_of
-from perception.render.drawing import compose, hidden_part, rim_points
-from perception.render.drilled import Block, Chip, Disc, Hole
-from perception.render.rig import Rig
-from perception.render.scenes import Scenes
-from perception.render.sensor import Exposure, dust, photograph
-from perception.render.solids import Box, Cylinder, Plane, Pose
-from perception.render.studio import Studio
-from perception.render.texture import Material
-from perception.render.tracer import Light, Pinhole, Tracer
+from perception.render.block_sampler import build_frame
+from perception.render.drilled_block import Chip, Disc, DrilledBlock, DrilledHole
+from perception.render.frame_renderer import FrameRenderer
+from perception.render.materials import Material
+from perception.render.ray_tracer import Light, Pinhole, Tracer
+from perception.render.scene_ranges import SceneRanges
+from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
+from perception.render.solids import Box, Cylinder, PlaneSolid, SolidPose
+from perception.render.stereo_camera import CameraExposure, StereoRig, draw_dust, take_picture
 
 GREY = Material((0.5, 0.5, 0.5), 0.0, 0.001)
 STONE = Material((0.5, 0.5, 0.5), 0.25, 0.0006, 2)
@@ -38,12 +37,12 @@ FACING = np.diag([1.0, -1.0, -1.0])
 
 def drilled(
     rotation: np.ndarray, center_m: np.ndarray, material: Material = GREY, **extra: Any
-) -> Block:
+) -> DrilledBlock:
     """Returns a block, 1 x 0.8 x 0.6 m, with one hole of 50 mm, 0.3 m deep, in the middle of the face, which lies at `center_m`."""
     half = np.array([0.5, 0.4, 0.3])
-    hole = Hole(np.array([0.0, 0.0, half[2]]), 0.05, 0.3)
-    pose = Pose(rotation, center_m - rotation @ hole.center_m)
-    return Block(pose, half, (material,) * 12, (hole,), **extra)
+    hole = DrilledHole(np.array([0.0, 0.0, half[2]]), 0.05, 0.3)
+    pose = SolidPose(rotation, center_m - rotation @ hole.center_m)
+    return DrilledBlock(pose, half, (material,) * 12, (hole,), **extra)
 
 
 def seen(solids: list[Any], camera: Pinhole = SMALL, light: Light = NOON) -> Any:
@@ -51,24 +50,24 @@ def seen(solids: list[Any], camera: Pinhole = SMALL, light: Light = NOON) -> Any
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig() -> StereoRig:
     """The default rig at a quarter of its size."""
     return replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
 
 
 @lru_cache
-def kind(name: str) -> Scenes:
+def kind(name: str) -> SceneRanges:
     return option("scene", name)
 
 
-def studio(name: str, rig: Rig, depth: str = "exact") -> Studio:
-    return Studio(
+def studio(name: str, rig: StereoRig, depth: str = "exact") -> FrameRenderer:
+    return FrameRenderer(
         rig=rig, scene=kind(name), stereo=option("stereo", "sgbm"), depth=depth, pair=True
     )  # type: ignore[arg-type]
 
 
 def test_a_wall_that_fills_the_picture_is_drawn_though_no_edge_crosses_it() -> None:
-    wall = Plane("ground", Pose(FACING, np.array([0.0, 0.0, 2.0])), (GREY,))
+    wall = PlaneSolid("ground", SolidPose(FACING, np.array([0.0, 0.0, 2.0])), (GREY,))
     view = Tracer([wall], NOON, (0.0, 0.0, 0.0)).view(SMALL)
     np.testing.assert_allclose(view.depth_m, 2.0, rtol=1e-6)
     np.testing.assert_allclose(view.radiance, 0.5 * (1.0 + 0.5), rtol=1e-5)
@@ -124,7 +123,7 @@ def test_the_mouth_is_the_projected_circle(obliquity: float) -> None:
 
 
 def test_a_tilted_face_has_the_depth_of_its_plane() -> None:
-    rotation, center = frame_of(np.array([0.3, -0.5, -0.8]), 0.3), np.array([0.05, 0.02, 1.5])
+    rotation, center = build_frame(np.array([0.3, -0.5, -0.8]), 0.3), np.array([0.05, 0.02, 1.5])
     view = seen([drilled(rotation, center)])
     normal = rotation[:, 2]
     y, x = np.mgrid[:240, :320]
@@ -158,7 +157,7 @@ def test_a_ray_goes_through_a_chip_into_the_hole_and_out_of_neither() -> None:
 def test_a_bar_in_the_concrete_is_seen_through_the_hole_alone() -> None:
     # the bar, 10 mm thick, lies 50 mm below the face across the whole block
     bar = Cylinder(
-        "block", Pose(np.eye(3)[:, [1, 2, 0]], np.array([0.0, 0.0, 1.05])), 0.005, 0.4, (GREY,)
+        "block", SolidPose(np.eye(3)[:, [1, 2, 0]], np.array([0.0, 0.0, 1.05])), 0.005, 0.4, (GREY,)
     )
     view = seen([drilled(FACING, np.array([0.0, 0.0, 1.0])), bar])
     assert (view.solid == 1).sum() > 100 and view.mouth[view.solid == 1].all()
@@ -171,10 +170,13 @@ def test_a_bar_in_the_concrete_is_seen_through_the_hole_alone() -> None:
 
 def test_a_cylinder_and_a_box_are_where_they_should_be() -> None:
     post = Cylinder(
-        "arm", Pose(np.eye(3)[:, [2, 0, 1]], np.array([0.1, 0.0, 1.0])), 0.05, 0.2, (GREY,)
+        "arm", SolidPose(np.eye(3)[:, [2, 0, 1]], np.array([0.1, 0.0, 1.0])), 0.05, 0.2, (GREY,)
     )  # upright
     crate = Box(
-        "clutter", Pose(np.eye(3), np.array([-0.2, 0.0, 1.0])), np.array([0.1, 0.1, 0.1]), (GREY,)
+        "clutter",
+        SolidPose(np.eye(3), np.array([-0.2, 0.0, 1.0])),
+        np.array([0.1, 0.1, 0.1]),
+        (GREY,),
     )
     t, solid, _ = Tracer([post, crate], NOON, (0, 0, 0)).first(
         np.zeros(3), np.array([[0.1, 0.0, 1.0], [-0.2, 0.0, 1.0], [0.0, 0.0, 1.0]], np.float32)
@@ -187,9 +189,9 @@ def test_a_cylinder_and_a_box_are_where_they_should_be() -> None:
 
 
 def test_a_shadow_lies_where_the_light_is_blocked() -> None:
-    wall = Plane("ground", Pose(FACING, np.array([0.0, 0.0, 2.0])), (GREY,))
+    wall = PlaneSolid("ground", SolidPose(FACING, np.array([0.0, 0.0, 2.0])), (GREY,))
     board = Box(
-        "arm", Pose(np.eye(3), np.array([0.5, 0.0, 1.0])), np.array([0.1, 0.1, 0.01]), (GREY,)
+        "arm", SolidPose(np.eye(3), np.array([0.5, 0.0, 1.0])), np.array([0.1, 0.1, 0.01]), (GREY,)
     )
     to_sun = np.array([1.0, 0.0, -2.0]) / np.sqrt(
         5
@@ -222,7 +224,7 @@ def test_it_grows_darker_down_a_hole_and_stays_even_on_a_painted_disc() -> None:
 def test_both_pictures_show_the_same_texture() -> None:
     camera, partner = SMALL, Pinhole(320, 240, 400.0, np.array([0.12, 0.0, 0.0]))
     tracer = Tracer(
-        [drilled(frame_of(np.array([0.2, -0.4, -0.9]), 0.0), np.array([0.1, 0.0, 1.2]), STONE)],
+        [drilled(build_frame(np.array([0.2, -0.4, -0.9]), 0.0), np.array([0.1, 0.0, 1.2]), STONE)],
         NOON,
         (0, 0, 0),
     )
@@ -242,24 +244,24 @@ def test_both_pictures_show_the_same_texture() -> None:
     assert abs(error.mean()) < 0.01 * left.radiance[inner].mean()
 
 
-def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Rig) -> None:
+def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: StereoRig) -> None:
     full = replace(rig, width=960, height=540, focal_px=1056.0)  # the middle of a 1080p picture
-    rotation, center = frame_of(np.array([0.1, -0.57, -0.82]), 0.3), np.array([0.0, 0.0, 2.5])
+    rotation, center = build_frame(np.array([0.1, -0.57, -0.82]), 0.3), np.array([0.0, 0.0, 2.5])
     tracer = Tracer(
         [
             drilled(rotation, center, STONE),
-            Plane("ground", Pose(FACING, np.array([0.0, 0.0, 5.0])), (STONE,)),
+            PlaneSolid("ground", SolidPose(FACING, np.array([0.0, 0.0, 5.0])), (STONE,)),
         ],
         NOON,
         (0, 0, 0),
     )
     exposure, chance = (
-        Exposure(1.0, 0.0, 0.0, 0.0, 0.5, 8000.0, 8.0, 1.0, 0.0),
+        CameraExposure(1.0, 0.0, 0.0, 0.0, 0.5, 8000.0, 8.0, 1.0, 0.0),
         np.random.default_rng(0),
     )
     views = [tracer.view(camera) for camera in (full.left, full.right)]
     left, right = (
-        photograph(view.radiance, view.depth_m, exposure, dust(0.0, chance), chance)
+        take_picture(view.radiance, view.depth_m, exposure, draw_dust(0.0, chance), chance)
         for view in views
     )
     stereo = option("stereo", "sgbm")
@@ -284,11 +286,11 @@ def test_dust_takes_contrast_as_it_says() -> None:
     light = np.where(np.arange(60) < 30, 0.2, 0.8).astype(np.float32)[None, :, None] * np.ones(
         (40, 1, 3), np.float32
     )
-    thick = Exposure(
+    thick = CameraExposure(
         1.0, np.log(4.0) / 2.0, 0.6, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0
     )  # a quarter is left after 2 m
-    taken = photograph(
-        light, depth, thick, dust(0.0, np.random.default_rng(0)), np.random.default_rng(0)
+    taken = take_picture(
+        light, depth, thick, draw_dust(0.0, np.random.default_rng(0)), np.random.default_rng(0)
     )
     assert taken[0, 0, 0] == pytest.approx(255 * (0.2 / 4 + 0.6 * 3 / 4), abs=1)
     assert taken[0, -1, 0] == pytest.approx(255 * (0.8 / 4 + 0.6 * 3 / 4), abs=1)
@@ -296,9 +298,9 @@ def test_dust_takes_contrast_as_it_says() -> None:
 
 def test_noise_in_the_dark_is_that_of_the_electrons() -> None:
     light, depth = np.full((200, 200, 3), 0.5, np.float32), np.ones((200, 200), np.float32)
-    dim = Exposure(0.15, 0.0, 0.0, 0.0, 0.0, 8000.0, 8.0, 1.0, 0.0)
-    taken = photograph(
-        light, depth, dim, dust(0.0, np.random.default_rng(0)), np.random.default_rng(1)
+    dim = CameraExposure(0.15, 0.0, 0.0, 0.0, 0.0, 8000.0, 8.0, 1.0, 0.0)
+    taken = take_picture(
+        light, depth, dim, draw_dust(0.0, np.random.default_rng(0)), np.random.default_rng(1)
     ).astype(float)
     # 0.075 of 8000 electrons are 600; their noise sqrt(600 + 8^2) is 25.8 electrons or 0.82 of 255
     # steps, rounding adds 1 / 12
@@ -307,10 +309,10 @@ def test_noise_in_the_dark_is_that_of_the_electrons() -> None:
 
 
 @pytest.mark.parametrize("name", names("scene"))
-def test_truth_and_masks_agree_in_every_kind_of_scene(name: str, rig: Rig) -> None:
+def test_truth_and_masks_agree_in_every_kind_of_scene(name: str, rig: StereoRig) -> None:
     chance = np.random.default_rng(3)
     for _ in range(1 if name != "varied" else 3):
-        shot = studio(name, rig).shot(compose(kind(name), rig, chance), chance)
+        shot = studio(name, rig).shot(compose_scene(kind(name), rig, chance), chance)
         assert shot.color.shape == shot.right.shape == (270, 480, 3)
         assert (
             not (shot.label.hole_mask & ~shot.label.block).any()
@@ -333,10 +335,10 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(name: str, rig: Rig) -> No
             assert hole.in_view
 
 
-def test_the_conditions_of_the_benchmark_are_what_they_are_called(rig: Rig) -> None:
+def test_the_conditions_of_the_benchmark_are_what_they_are_called(rig: StereoRig) -> None:
     chance = np.random.default_rng(5)
     scenes = {
-        name: [compose(kind(name), rig, chance) for _ in range(4)]
+        name: [compose_scene(kind(name), rig, chance) for _ in range(4)]
         for name in ("hidden", "decoy", "empty", "dark", "haze")
     }
     assert all(abs(scene.hidden[0] - 0.3) < 0.02 for scene in scenes["hidden"])
@@ -350,20 +352,20 @@ def test_the_conditions_of_the_benchmark_are_what_they_are_called(rig: Rig) -> N
     assert all(scene.conditions["transmission"] == pytest.approx(0.25) for scene in scenes["haze"])
 
 
-def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: Rig) -> None:
+def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: StereoRig) -> None:
     chance = np.random.default_rng(7)
     large = replace(rig, width=640, height=360, focal_px=352.0)
     near = replace(kind("hidden"), sight=replace(kind("hidden").sight, distance_m=(0.8, 0.8)))
     for _ in range(2):
-        scene = compose(near, large, chance)
+        scene = compose_scene(near, large, chance)
         shot = studio("hidden", large).shot(scene, chance)
         assert scene.block is not None
-        pixel = np.round(large.left.project(rim_points(scene.block, scene.block.holes[0]))).astype(
+        pixel = np.round(large.left.project(sample_rim(scene.block, scene.block.holes[0]))).astype(
             int
         )
         covered = shot.label.arm[pixel[:, 1], pixel[:, 0]].mean()
         assert covered == pytest.approx(scene.hidden[0], abs=0.05)
-        assert hidden_part([], scene.block, scene.block.holes[0]) == 0.0
+        assert compute_hidden_share([], scene.block, scene.block.holes[0]) == 0.0
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -413,10 +415,10 @@ def test_the_left_picture_alone_is_that_of_a_pair(
     assert refused.code == 2 and "no pair to match" in refused.err
 
 
-def test_truth_and_masks_come_back_as_they_were_written(rig: Rig, tmp_path: Path) -> None:
+def test_truth_and_masks_come_back_as_they_were_written(rig: StereoRig, tmp_path: Path) -> None:
     chance, stem = np.random.default_rng(2), tmp_path / "00000"
     maker = studio("decoy", rig)
-    shot = maker.shot(compose(kind("decoy"), rig, chance), chance)
+    shot = maker.shot(compose_scene(kind("decoy"), rig, chance), chance)
     dataset.write_frame(stem, shot.color, shot.depth_m, shot.right, shot.label, shot.truth)
     again = dataset.read_truth(stem)
     assert again.holes[0].radius_m == shot.truth.holes[0].radius_m and len(again.decoys) == len(

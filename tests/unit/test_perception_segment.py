@@ -17,8 +17,8 @@ from brokk_rl.errors import CheckpointError, ConfigError, FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
 from perception.dataset import FrameLabel
-from perception.render.drawing import compose
-from perception.render.studio import Studio
+from perception.render.frame_renderer import FrameRenderer
+from perception.render.scene_sampler import compose_scene
 from perception.segment import network as segment_network
 from perception.segment.depth_plane import snap_to_edges
 from perception.segment.network import NetworkSegmenter
@@ -209,8 +209,8 @@ def test_the_truth_is_what_lies_beside_the_frame(tmp_path: Path) -> None:
 def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = UNet((4, 8, 8)).eval().requires_grad_(False)
-    header = export.header_of(network, (64, 32), {"update": 7})
-    export.write(tmp_path / "a.safetensors", network, header)
+    header = export.build_header(network, (64, 32), {"update": 7})
+    export.write_checkpoint(tmp_path / "a.safetensors", network, header)
     parity = export.write_onnx(tmp_path / "a.onnx", network, header, torch.rand(3, 3, 32, 64))
     assert parity < 1e-5
     view = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90))
@@ -229,11 +229,11 @@ def test_a_network_that_ships_is_loaded_by_its_name(
 ) -> None:
     torch.manual_seed(0)
     network = UNet((4, 8)).eval().requires_grad_(False)
-    header = export.header_of(network, (64, 32), {})
+    header = export.build_header(network, (64, 32), {})
     monkeypatch.setattr(segment_network, "SHIPPED", tmp_path)
     with pytest.raises(CheckpointError, match=r"in the package \(none\)"):
         option("perception/segmenter", "onnx").build()
-    export.write(tmp_path / export.TENSORS, network, header)
+    export.write_checkpoint(tmp_path / export.TENSORS, network, header)
     export.write_onnx(tmp_path / export.ONNX, network, header, torch.rand(1, 3, 32, 64))
     frame = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90)).frame
     one, other = (
@@ -248,10 +248,10 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
     shared, either = np.zeros(2), np.zeros(2)
     for seed in (101, 102, 103):
         chance, kind = np.random.default_rng(seed), option("scene", "clean")
-        studio = Studio(
+        studio = FrameRenderer(
             rig=rig, scene=kind, stereo=option("stereo", "sgbm"), depth="none", pair=False
         )
-        shot = studio.shot(compose(kind, rig, chance), chance)
+        shot = studio.shot(compose_scene(kind, rig, chance), chance)
         frame = Frame(
             color=shot.color,
             depth_m=shot.exact_depth_m,
@@ -283,7 +283,7 @@ def test_files_that_are_no_network_of_ours_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"there is no file 'nowhere\.onnx'"):
         replace(onnx, weights="nowhere.onnx").build()
     network = UNet((4, 8)).eval()
-    other = export.header_of(network, (64, 32), {}) | {"channels": ["cat", "dog"]}
+    other = export.build_header(network, (64, 32), {}) | {"channels": ["cat", "dog"]}
     export.write_onnx(tmp_path / "other.onnx", network, other, torch.rand(1, 3, 32, 64))
     with pytest.raises(CheckpointError, match="channels block, mouth"):
         replace(onnx, weights=str(tmp_path / "other.onnx")).build()

@@ -18,7 +18,7 @@ from composed import option
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
-from perception.render.rig import Rig
+from perception.render.stereo_camera import StereoRig
 from perception.sources import realsense, simulator, zed
 from perception.sources.folder import FrameFolder
 from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
@@ -508,7 +508,7 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
 
 
 def test_the_simulated_camera_sees_the_hole_of_the_task() -> None:
-    rig: Rig = replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
+    rig: StereoRig = replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
     spec: simulator.SimulatedCamera = replace(
         option("perception/source", "simulator"), rig=rig, num_frames=1
     )

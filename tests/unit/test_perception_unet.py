@@ -19,7 +19,7 @@ import perception
 from perception import dataset
 from perception.dataset import FrameLabel
 from perception.segment.unet import compute_loss, read_checkpoint
-from perception.train import data, report, training
+from perception.train import evaluation, samples, trainer
 
 SMALL = (
     "training.size_px=[64,40]", "training.widths=[6,12,16]", "training.batch=6", "training.rate=0.01",
@@ -77,7 +77,7 @@ def test_figures_of_a_worked_example_are_right() -> None:
     said[0, 0, 0, :, :5] = 0.9  # 20 px
     said[0, 1, 1, 3, 3:] = 0.9  # the second mouth, one pixel too much: overlap 2 / 3
     said[1, 1, 1, 0, 0] = 0.9  # a mouth where there is none
-    table = report.judged(said, known, ["clean", "empty"])
+    table = evaluation.compute_metrics(said, known, ["clean", "empty"])
     assert table["all"] == {
         "block": pytest.approx(0.8),
         "mouth": pytest.approx(0.4),
@@ -156,14 +156,14 @@ def test_a_training_keeps_the_mean_of_its_last_networks(
         "training.validate_every=4",
     )
     assert brokk(*command, "training.updates=1", "session.out=first").code == 0
-    seen, step = [], training._Training._step
+    seen, step = [], trainer._Training._step
 
     def watched(self: Any, *batch: torch.Tensor) -> torch.Tensor:
         value = step(self, *batch)
         seen.append((self, self._network.head.weight.detach().clone()))
         return value
 
-    monkeypatch.setattr(training._Training, "_step", watched)
+    monkeypatch.setattr(trainer._Training, "_step", watched)
     done = brokk(
         *command,
         "training.updates=4",
@@ -186,7 +186,7 @@ def test_an_interrupted_training_goes_on_exactly(
         "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=9", "training.validate_every=3",
     )  # fmt: skip
     assert brokk(*command, "session.out=whole").code == 0
-    step, count = training._Training._step, 0
+    step, count = trainer._Training._step, 0
 
     def until_the_fifth(self: Any, *batch: torch.Tensor) -> torch.Tensor:
         nonlocal count
@@ -196,7 +196,7 @@ def test_an_interrupted_training_goes_on_exactly(
         return step(self, *batch)
 
     with monkeypatch.context() as patch:
-        patch.setattr(training._Training, "_step", until_the_fifth)
+        patch.setattr(trainer._Training, "_step", until_the_fifth)
         assert brokk(*command, "session.out=parts").code == 130
     assert brokk(*command, "session.out=parts", "resume=parts").code == 0
     one, other = (
@@ -214,14 +214,12 @@ def test_an_interrupted_training_goes_on_exactly(
 def test_a_training_ends_in_time_with_its_rate_at_nothing(
     brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rates, rate = [], training._Training._rate
+    rates, rate = [], trainer._Training._rate
     monkeypatch.setattr(
-        training._Training, "_rate", lambda self: rates.append(rate(self)) or rates[-1]
+        trainer._Training, "_rate", lambda self: rates.append(rate(self)) or rates[-1]
     )
     clock = iter(range(1000))
-    monkeypatch.setattr(
-        training.time, "monotonic", lambda: float(next(clock))
-    )  # a second an update
+    monkeypatch.setattr(trainer.time, "monotonic", lambda: float(next(clock)))  # a second an update
     done = brokk(
         "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=10000", "training.max_seconds=8",
         "training.validate_every=3", "session.out=run",
@@ -252,6 +250,6 @@ def test_a_small_block_is_not_enlarged_beyond_what_its_frame_shows(
 ) -> None:
     known = np.zeros((270, 480, 2), np.uint8)
     known[50 : 50 + side_px, 60 : 60 + side_px, 0] = 255
-    _, closer = data._looks(known, (480, 288), 0.15, np.random.default_rng(0))
+    _, closer = samples._looks(known, (480, 288), 0.15, np.random.default_rng(0))
     assert closer.width == pytest.approx(width_px, abs=2)
     assert closer.left + closer.width / 2 == pytest.approx(60 + side_px / 2, abs=2)

@@ -15,19 +15,25 @@ from composed import option
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
-from actuators.excite.plan import account, picture
-from actuators.excite.plan.account import Track
-from actuators.excite.plan.drive import Nominal, drive
-from actuators.excite.plan.guard import Guards, predicted_tool_speed
-from actuators.excite.plan.runner import DONE, PLAY, Runner
-from actuators.excite.plan.schedule import Approach, Plan, schedule
+from actuators.excite import plan_report
+from actuators.excite.plan_report import PlanTrack
+from actuators.excite.player import (
+    DONE,
+    PLAY,
+    CommandGuards,
+    NominalLink,
+    PlanPlayer,
+    drive,
+    predict_tool_speed,
+)
+from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command, JointState
 
-OPEN = Guards(max_command=1.0, max_tool_speed_m_s=None)
+OPEN = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
 
 
 @pytest.fixture(scope="module")
@@ -52,13 +58,15 @@ def played(
     runs: Sequence[Sequence[Segment]],
     machine: Machine,
     approach: Approach,
-    guards: Guards = OPEN,
+    guards: CommandGuards = OPEN,
     link: Any = None,
     run_s: float = 120.0,
-) -> Track:
-    plan = Plan(runs=tuple(map(tuple, runs)), run_s=run_s, names=("a",))
-    link = link or Nominal(machine, len(runs))
-    return Track(drive(link, Runner(plan, machine, approach, guards), machine, len(runs), run_s))
+) -> PlanTrack:
+    plan = ExcitationPlan(runs=tuple(map(tuple, runs)), run_s=run_s, names=("a",))
+    link = link or NominalLink(machine, len(runs))
+    return PlanTrack(
+        drive(link, PlanPlayer(plan, machine, approach, guards), machine, len(runs), run_s)
+    )
 
 
 def anywhere(machine: Machine, seed: int) -> np.ndarray:
@@ -89,7 +97,7 @@ def test_a_program_is_played_unchanged_from_its_start_pose(
     ]
     track = played(runs, machine, approach)
     for n, (segment,) in enumerate(runs):
-        inside = track.stage[:, n] == account.PLAYING
+        inside = track.stage[:, n] == plan_report.PLAYING
         assert (track.u[inside, n] == segment.u).all()
         assert (
             np.abs(track.q[inside, n][0] - segment.start) <= 0.04 * (machine.upper - machine.lower)
@@ -104,16 +112,16 @@ def test_approaches_arrive_on_machines_slower_or_faster_than_their_file(
         [constant({}, 1.0, anywhere(machine, 10 * n + i), name=f"a_{i}") for i in range(3)]
         for n in range(5)
     ]
-    track = played(runs, machine, approach, link=Nominal(with_speed(machine, scale), 5))
+    track = played(runs, machine, approach, link=NominalLink(with_speed(machine, scale), 5))
     assert (
         not caplog.records
-        and (track.stage[-1] == account.PLAYING).any()
+        and (track.stage[-1] == plan_report.PLAYING).any()
         and track.segment[-1].tolist() == [2] * 5
     )
     for n in range(5):
         for i in range(3):
             begin = np.flatnonzero(
-                (track.segment[:, n] == i) & (track.stage[:, n] == account.PLAYING)
+                (track.segment[:, n] == i) & (track.stage[:, n] == plan_report.PLAYING)
             )[0]
             assert (
                 np.abs(track.q[begin, n] - runs[n][i].start)
@@ -141,7 +149,7 @@ def test_the_stops_are_kept_although_the_command_acts_late(
         for sign in (-1.0, 1.0):
             segments = [constant({0: sign, 2: sign, 3: sign, 4: sign}, 30.0, machine.home)]
             track = played(
-                [segments], machine, approach, link=Nominal(with_speed(machine, scale), 1)
+                [segments], machine, approach, link=NominalLink(with_speed(machine, scale), 1)
             )
             closest = np.minimum(track.q - machine.lower, machine.upper - track.q).min((0, 1)) / (
                 machine.upper - machine.lower
@@ -157,7 +165,7 @@ def test_inward_turns_a_joint_back_until_its_program_passes_zero(
     u[:, 4] = 0.8
     u[400:, 4] = -0.8
     (track,) = [played([[constant({}, 0.0, machine.home, u=u)]], machine, approach)]
-    inside = track.stage[:, 0] == account.PLAYING
+    inside = track.stage[:, 0] == plan_report.PLAYING
     sent = track.u[inside, 0, 4]
     assert set(np.abs(sent)) == {0.8}
     assert (np.diff(sent) != 0).sum() <= 3, "no chatter at the stop"
@@ -173,16 +181,16 @@ def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(
     )  # drives into the stop, then slowly back
     track = played([[constant({}, 0.0, machine.home, u=u, stops="home")]], machine, approach)
     stage = track.stage[:, 0]
-    begin = np.flatnonzero(stage != account.BEFORE)[0]
-    away = np.flatnonzero(stage == account.AWAY) - begin
+    begin = np.flatnonzero(stage != plan_report.BEFORE)[0]
+    away = np.flatnonzero(stage == plan_report.AWAY) - begin
     assert 100 < away[0] < 200, "1.4 rad from home to the margin at 0.9 * 0.26 rad/s"
     back = away[np.flatnonzero(np.diff(away) > 1)[0]] + 1
     assert back == 500 and track.u[begin + 500, 0, 2] == -0.2
     assert abs(track.q[begin + 499, 0, 2] - machine.home[2]) < 0.1
-    assert (stage != account.BEFORE).sum() == 2000, "a segment lasts as long as its program"
+    assert (stage != plan_report.BEFORE).sum() == 2000, "a segment lasts as long as its program"
 
 
-class Noisy(Nominal):
+class Noisy(NominalLink):
     """Measures with noise."""
 
     def read(self) -> JointState:
@@ -206,7 +214,7 @@ def test_a_repeat_plays_what_was_sent_although_the_stops_came_in_between(
     turned = 0
     for i, segment in enumerate(levels):
         first, again = (
-            track.u[(track.segment[:, 0] == k) & (track.stage[:, 0] != account.BEFORE), 0]
+            track.u[(track.segment[:, 0] == k) & (track.stage[:, 0] != plan_report.BEFORE), 0]
             for k in (i, i + len(levels))
         )
         assert (first == again).all()
@@ -215,7 +223,7 @@ def test_a_repeat_plays_what_was_sent_although_the_stops_came_in_between(
 
 
 def test_commands_keep_to_the_largest(machine: Machine, approach: Approach) -> None:
-    guards = Guards(max_command=0.3, max_tool_speed_m_s=None)
+    guards = CommandGuards(max_command=0.3, max_tool_speed_m_s=None)
     track = played(
         [[constant({0: 1.0, 3: -1.0}, 3.0, anywhere(machine, 1))]], machine, approach, guards
     )
@@ -227,13 +235,15 @@ def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(
 ) -> None:
     segment = constant({0: 1.0, 3: 0.5}, 4.0, machine.home)
     free, slow = (
-        played([[segment]], machine, approach, Guards(max_command=1.0, max_tool_speed_m_s=bound))
+        played(
+            [[segment]], machine, approach, CommandGuards(max_command=1.0, max_tool_speed_m_s=bound)
+        )
         for bound in (None, 0.4)
     )
-    fast, guarded = (predicted_tool_speed(machine, track.q[:, 0]) for track in (free, slow))
+    fast, guarded = (predict_tool_speed(machine, track.q[:, 0]) for track in (free, slow))
     assert fast is not None and guarded is not None
     assert fast.max() > 0.8 and 0.35 < guarded.max() < 0.42
-    u = slow.u[(slow.stage[:, 0] == account.PLAYING), 0]
+    u = slow.u[(slow.stage[:, 0] == plan_report.PLAYING), 0]
     assert u[:, 3] == pytest.approx(0.5 * u[:, 0]) and u[:, 0].max() < 1.0
 
 
@@ -249,7 +259,7 @@ def test_the_tool_speed_is_that_of_the_kinematics(machine: Machine) -> None:
         .tip_in_base_m[:2]
         .norm()
     )
-    assert predicted_tool_speed(machine, q) == pytest.approx(np.full(41, 0.1 * radius_m), rel=1e-3)
+    assert predict_tool_speed(machine, q) == pytest.approx(np.full(41, 0.1 * radius_m), rel=1e-3)
 
 
 def test_a_machine_without_bodies_has_no_tool_speed_to_bound(
@@ -261,17 +271,17 @@ def test_a_machine_without_bodies_has_no_tool_speed_to_bound(
         tool_m=None,
         mjcf=None,
     )
-    assert predicted_tool_speed(bare, np.zeros((3, 5))) is None
+    assert predict_tool_speed(bare, np.zeros((3, 5))) is None
     with pytest.raises(ConfigError, match="max_tool_speed_m_s"):
         played(
             [[constant({}, 1.0, bare.home)]],
             bare,
             approach,
-            Guards(max_command=1.0, max_tool_speed_m_s=0.5),
+            CommandGuards(max_command=1.0, max_tool_speed_m_s=0.5),
         )
 
 
-class Stuck(Nominal):
+class Stuck(NominalLink):
     """One joint does not move."""
 
     def send(self, command: Command) -> Command:
@@ -287,18 +297,18 @@ def test_an_approach_that_does_not_arrive_is_given_up_and_said(
     start = machine.home.copy()
     start[3] += 0.8
     track = played([[constant({0: 0.3}, 1.0, start)]], machine, approach, link=Stuck(machine, 1))
-    assert (track.u[track.stage[:, 0] == account.PLAYING, 0, 0] == 0.3).all()
+    assert (track.u[track.stage[:, 0] == plan_report.PLAYING, 0, 0] == 0.3).all()
     assert "start of a_00 given up, out of place: q4" in caplog.text
 
 
-class Silent(Nominal):
+class Silent(NominalLink):
     """Says nothing new after a second."""
 
     def send(self, command: Command) -> Command:
         return command if self.read().t_s > 1.0 else super().send(command)
 
 
-class Broken(Nominal):
+class Broken(NominalLink):
     """Loses its sensors."""
 
     def read(self) -> JointState:
@@ -310,13 +320,13 @@ class Broken(Nominal):
     ("link", "message"), [(Silent, "no state after"), (Broken, "finite positions")]
 )
 def test_a_link_that_fails_is_an_error(
-    link: type[Nominal],
+    link: type[NominalLink],
     message: str,
     machine: Machine,
     approach: Approach,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("actuators.excite.plan.drive.SILENCE_S", 0.05)
+    monkeypatch.setattr("actuators.excite.player.SILENCE_S", 0.05)
     with pytest.raises(LinkError, match=message):
         played([[constant({0: 0.3}, 5.0, machine.home)]], machine, approach, link=link(machine, 1))
 
@@ -326,12 +336,12 @@ def test_a_plan_fills_its_time_and_repeats_with_its_seed(
 ) -> None:
     chosen = {name: option("excitation", name) for name in ("levels", "ramps", "holds", "repeat")}
     plan, again, other = (
-        schedule(chosen, machine, approach, 2, 600.0, np.random.default_rng(seed))
+        plan_runs(chosen, machine, approach, 2, 600.0, np.random.default_rng(seed))
         for seed in (1, 1, 2)
     )
-    link = Nominal(machine, 2)
-    runner = Runner(plan, machine, approach, OPEN)
-    track = Track(drive(link, runner, machine, 2, 600.0))
+    link = NominalLink(machine, 2)
+    runner = PlanPlayer(plan, machine, approach, OPEN)
+    track = PlanTrack(drive(link, runner, machine, 2, 600.0))
     assert runner.done and len(track.t_s) > 0.75 * 600 * 20, "neither cut nor left empty"
     for run, same in zip(plan.runs, again.runs, strict=True):
         assert [segment.name for segment in run] == [segment.name for segment in same]
@@ -351,7 +361,7 @@ def test_a_plan_fills_its_time_and_repeats_with_its_seed(
 
 def test_no_excitation_is_an_error(machine: Machine, approach: Approach) -> None:
     with pytest.raises(ConfigError, match="none chosen"):
-        schedule({}, machine, approach, 1, 60.0, np.random.default_rng(0))
+        plan_runs({}, machine, approach, 1, 60.0, np.random.default_rng(0))
 
 
 def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach) -> None:
@@ -359,11 +369,11 @@ def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach
     u[:, 2] = np.where(np.arange(600) < 500, 0.9, -0.2)
     first = constant({}, 0.0, machine.home, u=u, stops="home")
     second = constant({}, 2.0, anywhere(machine, 3), name="a_01", repeat_of="elsewhere")
-    plan = Plan(runs=((first, second),), run_s=120.0, names=("a",))
+    plan = ExcitationPlan(runs=((first, second),), run_s=120.0, names=("a",))
     samples = list(
-        drive(Nominal(machine, 1), Runner(plan, machine, approach, OPEN), machine, 1, 120.0)
+        drive(NominalLink(machine, 1), PlanPlayer(plan, machine, approach, OPEN), machine, 1, 120.0)
     )
-    notes = account.notes(Track(samples), 0, plan.runs[0], 0.05)
+    notes = plan_report.describe_run(PlanTrack(samples), 0, plan.runs[0], 0.05)
     assert [(note["name"], note["part"]) for note in notes] == [
         ("a_00", "approach"), ("a_00", "program"), ("a_01", "approach"), ("a_01", "program"),
     ]  # fmt: skip
@@ -377,7 +387,7 @@ def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach
     playing = [
         k for k, sample in enumerate(samples) if sample.phase[0] == PLAY and sample.segment[0] == 0
     ]
-    later = account.notes(Track(samples[playing[0] + 100 :]), 0, plan.runs[0], 0.05)
+    later = plan_report.describe_run(PlanTrack(samples[playing[0] + 100 :]), 0, plan.runs[0], 0.05)
     assert later[0]["offset_s"] == 5.0 and later[0]["start_s"] == 0.0
     assert not any(sample.phase[0] == DONE for sample in samples)
 
@@ -390,9 +400,9 @@ def test_summary_and_picture_of_a_plan(
         constant({1: 0.2}, 100.0, anywhere(machine, 3), name="a_01"),
     )
     third = constant({}, 1.0, machine.home, name="a_02")
-    plan = Plan(runs=((first, second, third),), run_s=60.0, names=("a",))
+    plan = ExcitationPlan(runs=((first, second, third),), run_s=60.0, names=("a",))
     track = played(plan.runs, machine, approach, run_s=60.0)
-    found = account.summary(plan, track, machine)
+    found = plan_report.summarise_plan(plan, track, machine)
     json.dumps(found, allow_nan=False)
     one, two, three = found["runs"][0]
     assert (
@@ -404,7 +414,7 @@ def test_summary_and_picture_of_a_plan(
     assert one["joints"]["q1"]["travel_rad"] == pytest.approx(0.2 * (4.0 - 0.55), abs=0.02)
     assert two["cut_s"] > 40.0 and three["start_s"] is None and three["cut_s"] == 1.0
     assert found["run_time_unused_s"] == [0.0]
-    picture.draw_plan(
-        plan, track, machine, predicted_tool_speed(machine, track.q[:, 0]), tmp_path / "plan.png"
+    plan_report.draw_plan(
+        plan, track, machine, predict_tool_speed(machine, track.q[:, 0]), tmp_path / "plan.png"
     )
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")

@@ -43,7 +43,7 @@ def changed(path: Path, column: str, row: int, value: float) -> Path:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    record.write(recording(), tmp_path / "run.parquet")
+    record.write_recording(recording(), tmp_path / "run.parquet")
     return tmp_path / "run.parquet"
 
 
@@ -82,8 +82,8 @@ def test_what_is_written_is_read(
     before = recording(
         num_samples, t_s=t_s, extra=extra, metadata={"source": "test", "seed": str(seed)}
     )
-    record.write(before, tmp_path / "a.parquet")
-    after = record.read(tmp_path / "a.parquet", machine)
+    record.write_recording(before, tmp_path / "a.parquet")
+    after = record.read_recording(tmp_path / "a.parquet", machine)
     np.testing.assert_array_equal(after.t_s, t_s)
     np.testing.assert_array_equal(after.u, before.u.astype(np.float32))
     np.testing.assert_array_equal(after.q, before.q.astype(np.float32))
@@ -128,7 +128,7 @@ def test_a_bad_cell_is_refused_by_name(
     path: Path, machine: Machine, column: str, row: int, value: float, message: str
 ) -> None:
     with pytest.raises(RecordingError, match=message):
-        record.read(changed(path, column, row, value), machine)
+        record.read_recording(changed(path, column, row, value), machine)
 
 
 def test_every_breach_is_found_with_its_row_and_column(path: Path, machine: Machine) -> None:
@@ -142,7 +142,7 @@ def test_every_breach_is_found_with_its_row_and_column(path: Path, machine: Mach
         changed(path, column, row, value)
     table = pq.read_table(path)
     pq.write_table(table.drop_columns("q_q5_rad"), path)
-    recording_, found = record.examine(path, machine)
+    recording_, found = record.examine_recording(path, machine)
     assert recording_ is not None
     assert np.isnan(recording_.q[:, 4]).all()
     assert [(breach.column, breach.row, breach.num_rows) for breach in found] == [
@@ -162,7 +162,7 @@ def test_a_missing_column_is_refused_with_the_nearest_names(path: Path, machine:
         RecordingError,
         match=r"run\.parquet: column 'q_q4_rad' is missing; did you mean 'q_q\d_\w+'\?",
     ):
-        record.read(path, machine)
+        record.read_recording(path, machine)
 
 
 @pytest.mark.parametrize(
@@ -192,38 +192,38 @@ def test_wrong_metadata_is_refused(
 ) -> None:
     pq.write_table(pq.read_table(path).replace_schema_metadata(metadata), path)
     with pytest.raises(RecordingError, match=message):
-        record.read(path, machine)
+        record.read_recording(path, machine)
 
 
 def test_a_truncated_file_is_refused(path: Path, machine: Machine) -> None:
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(RecordingError, match=r"run\.parquet: truncated or not a Parquet file"):
-        record.read(path, machine)
+        record.read_recording(path, machine)
 
 
 def test_a_column_of_text_is_refused(path: Path, machine: Machine) -> None:
     table = pq.read_table(path)
     pq.write_table(table.set_column(1, "u_q1", pa.array(["0.1"] * len(table))), path)
     with pytest.raises(RecordingError, match="column 'u_q1' holds string, expected numbers"):
-        record.read(path, machine)
+        record.read_recording(path, machine)
 
 
 def test_a_glob_without_a_file_is_refused(tmp_path: Path, machine: Machine) -> None:
     with pytest.raises(RecordingError, match=r"no recording matches .*nothing"):
-        record.read_all(str(tmp_path / "nothing*.parquet"), machine)
+        record.read_recordings(str(tmp_path / "nothing*.parquet"), machine)
 
 
 def test_further_columns_are_kept_and_may_have_gaps(tmp_path: Path, machine: Machine) -> None:
     force = np.full(40, np.nan)
-    record.write(recording(extra={"force_n": force}), tmp_path / "a.parquet")
-    assert np.isnan(record.read(tmp_path / "a.parquet", machine).extra["force_n"]).all()
+    record.write_recording(recording(extra={"force_n": force}), tmp_path / "a.parquet")
+    assert np.isnan(record.read_recording(tmp_path / "a.parquet", machine).extra["force_n"]).all()
 
 
 def test_a_bad_recording_is_not_written(tmp_path: Path) -> None:
     bad = recording()
     bad.u[3, 1] = -1.5
     with pytest.raises(RecordingError, match="row 3, column 'u_q2'"):
-        record.write(bad, tmp_path / "a.parquet")
+        record.write_recording(bad, tmp_path / "a.parquet")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -234,9 +234,11 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(pq, "write_table", full)
     with pytest.raises(StorageError, match="No space left on device; nothing was left behind"):
-        record.write(recording(), tmp_path / "a.parquet")
+        record.write_recording(recording(), tmp_path / "a.parquet")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_later_adds_seconds() -> None:
-    assert record.later("2026-11-20T10:00:00.000+00:00", 90.5) == "2026-11-20T10:01:30.500+00:00"
+    assert (
+        record.add_seconds("2026-11-20T10:00:00.000+00:00", 90.5) == "2026-11-20T10:01:30.500+00:00"
+    )

@@ -12,9 +12,10 @@ import pytest
 import yaml
 from conftest import Done
 
-from diagnosis import downstream, story_page
+from diagnosis import retraining
 from diagnosis.answer import Answer, Estimate, Gap, Selected, Where
 from diagnosis.modes import rehearse
+from diagnosis.modes import rehearse as story_page
 
 SHARE = {"mean": 0.5, "ci95": [0.4, 0.6]}
 WITHHELD = {
@@ -113,7 +114,7 @@ def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
     ]
     assert blind == ["reference", "simulator", "policy", "believed", "diagnosis"]
     assert (folder / "case/field").readlink() == folder / "field/recordings"
-    assert "3.0" in (folder / story_page.PAGE).read_text(), "each stage took three minutes"
+    assert "3.0" in (folder / story_page.STORY_FILE).read_text(), "each stage took three minutes"
 
 
 def test_a_story_goes_on_where_it_failed(
@@ -173,8 +174,8 @@ def test_the_page_says_whether_the_diagnosis_was_right(
     )  # fmt: skip
     (tmp_path / "diagnosis").mkdir()
     answer.write(tmp_path / "diagnosis" / "diagnosis.json")
-    story_page.write(tmp_path, {"reference": "recorded"}, WITHHELD)
-    page = (tmp_path / story_page.PAGE).read_text()
+    story_page.write_story(tmp_path, {"reference": "recorded"}, WITHHELD)
+    page = (tmp_path / story_page.STORY_FILE).read_text()
     assert told in page and ('<td class="number">0.5</td>' in page) == (effect == "asymmetry")
 
 
@@ -192,11 +193,13 @@ def test_the_page_tells_success_that_fell_and_came_back(tmp_path: Path) -> None:
                 for name, three in rates.items()
             },
         }
-        for number, place in enumerate(downstream.PLANTS)
+        for number, place in enumerate(retraining.PLANTS)
     }
     for name in ("diagnosis", "repair"):
         (tmp_path / name).mkdir()
-    (tmp_path / "repair" / downstream.FILE).write_text(json.dumps(downstream.compare(evaluations)))
+    (tmp_path / "repair" / retraining.COMPARISON_FILE).write_text(
+        json.dumps(retraining.compare_policies(evaluations))
+    )
     answer = Answer(
         verdict="none",
         selected=(),
@@ -206,8 +209,8 @@ def test_the_page_tells_success_that_fell_and_came_back(tmp_path: Path) -> None:
         next_experiment=None,
     )
     answer.write(tmp_path / "diagnosis/diagnosis.json")
-    story_page.write(tmp_path, {}, WITHHELD)
+    story_page.write_story(tmp_path, {}, WITHHELD)
     assert (
         "found nothing; the machine has asymmetry on q3 and q4"
-        in (tmp_path / story_page.PAGE).read_text()
+        in (tmp_path / story_page.STORY_FILE).read_text()
     )

@@ -10,7 +10,7 @@ import matplotlib
 import pytest
 
 from brokk_rl.errors import StorageError
-from brokk_rl.report import Cell, Page
+from brokk_rl.report import Cell, Report
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
@@ -49,21 +49,21 @@ def figure() -> pyplot.Figure:
     return drawn
 
 
-def nasty_page() -> Page:
-    page = Page(NASTY, NASTY, "good")
-    page.heading(NASTY)
-    page.text(NASTY, "bad")
-    page.items([NASTY])
-    page.code(NASTY)
-    page.table([NASTY, "b"], [[NASTY, Cell(NASTY, note=NASTY)]], NASTY)
-    page.facts({NASTY: NASTY})
-    with page.details(NASTY):
-        page.picture(figure(), NASTY, NASTY)
+def nasty_page() -> Report:
+    page = Report(NASTY, NASTY, "good")
+    page.add_heading(NASTY)
+    page.add_text(NASTY, "bad")
+    page.add_list([NASTY])
+    page.add_code(NASTY)
+    page.add_table([NASTY, "b"], [[NASTY, Cell(NASTY, note=NASTY)]], NASTY)
+    page.add_facts({NASTY: NASTY})
+    with page.add_details(NASTY):
+        page.add_picture(figure(), NASTY, NASTY)
     return page
 
 
 def test_whatever_is_given_is_text_and_never_markup() -> None:
-    read = Reader(nasty_page().html())
+    read = Reader(nasty_page().render())
     assert not {"script", "link", "iframe"} & {tag for tag, _ in read.tags}
     assert (
         sum(NASTY in text for text in read.texts) == 16
@@ -72,7 +72,7 @@ def test_whatever_is_given_is_text_and_never_markup() -> None:
 
 
 def test_a_page_needs_nothing_from_elsewhere() -> None:
-    read = Reader(nasty_page().html())
+    read = Reader(nasty_page().render())
     addresses = [
         value
         for _, attributes in read.tags
@@ -90,9 +90,11 @@ def test_a_page_needs_nothing_from_elsewhere() -> None:
 
 def test_a_picture_file_is_in_the_page_byte_by_byte(tmp_path: Path) -> None:
     figure().savefig(tmp_path / "a.png")
-    page = Page("a")
-    page.picture(tmp_path / "a.png")
-    (source,) = (attributes["src"] for tag, attributes in Reader(page.html()).tags if tag == "img")
+    page = Report("a")
+    page.add_picture(tmp_path / "a.png")
+    (source,) = (
+        attributes["src"] for tag, attributes in Reader(page.render()).tags if tag == "img"
+    )
     assert source is not None
     kind, data = source.split(",")
     assert (
@@ -102,23 +104,25 @@ def test_a_picture_file_is_in_the_page_byte_by_byte(tmp_path: Path) -> None:
 
 
 def test_columns_of_figures_are_aligned_and_the_best_is_marked() -> None:
-    page = Page("a")
-    page.table(
+    page = Report("a")
+    page.add_table(
         ["joint", "error", "why"],
         [["q1", Cell(0.012345, best=True), "x"], ["q2", None, "y"], ["q3", "0.50", "z"]],
     )
-    cells = [attributes.get("class") for tag, attributes in Reader(page.html()).tags if tag == "td"]
+    cells = [
+        attributes.get("class") for tag, attributes in Reader(page.render()).tags if tag == "td"
+    ]
     assert cells == ["number best", None, "number", None, "number", None]
-    assert ">▸ 0.0123<" in page.html() and ">–<" in page.html()
+    assert ">▸ 0.0123<" in page.render() and ">–<" in page.render()
 
 
 def test_rows_of_another_length_are_refused() -> None:
     with pytest.raises(ValueError, match="expected 2 cells"):
-        Page("a").table(["a", "b"], [["only one"]])
+        Report("a").add_table(["a", "b"], [["only one"]])
 
 
 def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
-    page = Page("new")
+    page = Report("new")
     with pytest.raises(StorageError, match="cannot write"):
         page.write(tmp_path / "missing" / "page.html")
     (tmp_path / "page.html").write_text("old")
@@ -130,6 +134,6 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> Non
 
 def test_a_missing_picture_is_said(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot read picture"):
-        Page("a").picture(tmp_path / "none.png")
+        Report("a").add_picture(tmp_path / "none.png")
     with pytest.raises(StorageError, match="expected one of"):
-        Page("a").picture(tmp_path / "none.bmp")
+        Report("a").add_picture(tmp_path / "none.bmp")

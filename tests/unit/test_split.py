@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.split import by_run, check_commanded, commanded_s, split
+from brokk_rl.split import check_commanded, group_by_run, measure_commanded_s, split_runs
 
 
 def recording(
@@ -40,7 +40,7 @@ def test_parts_of_a_run_are_one_and_files_that_say_nothing_are_each_their_own() 
         recording([1.0], "a"),
         recording([1.0], path="y/b.parquet"),
     ]
-    assert {name: len(members) for name, members in by_run(parts).items()} == {
+    assert {name: len(members) for name, members in group_by_run(parts).items()} == {
         "a": 2,
         "x/b.parquet": 1,
         "y/b.parquet": 1,
@@ -50,7 +50,7 @@ def test_parts_of_a_run_are_one_and_files_that_say_nothing_are_each_their_own() 
 def test_two_collections_that_named_their_runs_alike_are_told_apart_by_their_seeds() -> None:
     assert (
         len(
-            by_run(
+            group_by_run(
                 [recording([1.0], "a", "1"), recording([1.0], "a", "2"), recording([1.0], "a", "1")]
             )
         )
@@ -59,7 +59,9 @@ def test_two_collections_that_named_their_runs_alike_are_told_apart_by_their_see
 
 
 def test_seconds_of_command_are_counted_joint_by_joint() -> None:
-    assert commanded_s([recording([2.0, 0.5]), recording([1.0, 0.0])]) == pytest.approx([3.0, 0.5])
+    assert measure_commanded_s([recording([2.0, 0.5]), recording([1.0, 0.0])]) == pytest.approx(
+        [3.0, 0.5]
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -74,16 +76,16 @@ def test_seconds_of_command_are_counted_joint_by_joint() -> None:
 def test_every_run_is_in_exactly_one_set_and_no_set_lacks_a_joint_that_could_be_shared(
     table: list[list[float]], count: int
 ) -> None:
-    runs = by_run([recording(seconds, f"run {n}") for n, seconds in enumerate(table)])
-    parts = split(runs, {str(part): 1.0 / count for part in range(count)})
+    runs = group_by_run([recording(seconds, f"run {n}") for n, seconds in enumerate(table)])
+    parts = split_runs(runs, {str(part): 1.0 / count for part in range(count)})
     assert sorted(name for members in parts.values() for name in members) == sorted(runs)
-    assert parts == split(
+    assert parts == split_runs(
         dict(reversed(runs.items())), {str(part): 1.0 / count for part in range(count)}
     ) or all(
         set(members) == set(again)
         for members, again in zip(
             parts.values(),
-            split(dict(reversed(runs.items())), dict.fromkeys(parts, 1.0 / count)).values(),
+            split_runs(dict(reversed(runs.items())), dict.fromkeys(parts, 1.0 / count)).values(),
             strict=True,
         )
     )
@@ -96,31 +98,31 @@ def test_every_run_is_in_exactly_one_set_and_no_set_lacks_a_joint_that_could_be_
 
 def test_runs_of_one_joint_each_are_shared_out_joint_by_joint() -> None:
     table = [[60.0 if joint == run % 5 else 0.0 for joint in range(5)] for run in range(30)]
-    runs = by_run([recording(seconds, f"run {n}") for n, seconds in enumerate(table)])
-    parts = split(runs, {"train": 4 / 6, "validation": 1 / 6, "test": 1 / 6})
+    runs = group_by_run([recording(seconds, f"run {n}") for n, seconds in enumerate(table)])
+    parts = split_runs(runs, {"train": 4 / 6, "validation": 1 / 6, "test": 1 / 6})
     assert {part: len(names) for part, names in parts.items()} == {
         "train": 20,
         "validation": 5,
         "test": 5,
     }
     for names in parts.values():
-        seconds = commanded_s([part for name in names for part in runs[name]])
+        seconds = measure_commanded_s([part for name in names for part in runs[name]])
         assert (seconds == seconds[0]).all()
 
 
 def test_unequal_runs_come_near_their_shares() -> None:
     generator = np.random.default_rng(0)
-    runs = by_run(
+    runs = group_by_run(
         [recording(list(generator.uniform(0.0, 100.0, 3)), f"run {n}") for n in range(40)]
     )
-    parts = split(runs, {"train": 0.7, "test": 0.3})
-    total = commanded_s([part for members in runs.values() for part in members])
-    share = commanded_s([part for name in parts["test"] for part in runs[name]]) / total
+    parts = split_runs(runs, {"train": 0.7, "test": 0.3})
+    total = measure_commanded_s([part for members in runs.values() for part in members])
+    share = measure_commanded_s([part for name in parts["test"] for part in runs[name]]) / total
     assert share == pytest.approx([0.3] * 3, abs=0.1)
 
 
 def test_a_joint_that_is_not_commanded_is_named_with_what_to_record(machine: Machine) -> None:
-    runs = by_run(
+    runs = group_by_run(
         [recording([9.0, 9.0, 9.0, 0.0, 9.0], "a"), recording([9.0, 9.0, 9.0, 9.0, 9.0], "b")]
     )
     check_commanded(runs, machine, 1, "why")

@@ -44,7 +44,7 @@ def study(
         person = int(trial.participant[1:])
         time_s = (4.0 if trial.condition == "guided" else 8.0) - (trial.period == 2) + 0.1 * person
         name = f"{folder.RECORDINGS}/{trial.name}.parquet"
-        record.write(trial_of(machine, time_s), folder_ / name)
+        record.write_recording(trial_of(machine, time_s), folder_ / name)
         facts = {
             "participant": trial.participant,
             "period": trial.period,

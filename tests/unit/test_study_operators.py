@@ -14,7 +14,7 @@ import pytest
 import torch
 from composed import every, option
 
-from actuators.person import Person
+from actuators.person import HumanFollower
 from brokk_rl.contracts.operator import OperatorView
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
@@ -49,7 +49,7 @@ def test_hands_are_those_of_the_follower(most: int, machine: Machine) -> None:
     proposed[..., 1] *= np.arange(80)[:, None] % 20 < 5
     proposed = np.repeat(proposed[::4], 4, 0)
     here = Hands(joints_at_once=most, **EXACT).build(machine, np.arange(3), 0)
-    there = Person(joints_at_once=most, attention_s=0.0, **EXACT).build(
+    there = HumanFollower(joints_at_once=most, attention_s=0.0, **EXACT).build(
         machine, 3, torch.device("cpu")
     )
     for row in proposed:

@@ -83,7 +83,7 @@ def test_a_sitting_from_consent_to_the_end_gives_what_a_report_reads(
     consent = read(tmp_path / "participants" / "P01.json")["consent"]
     assert consent["agreed"] and consent["language"] == "de" and consent["version"] == "v1"
     for trial in mine:
-        columns = record.read(tmp_path / trial.facts["recording"], MACHINE).extra
+        columns = record.read_recording(tmp_path / trial.facts["recording"], MACHINE).extra
         assert ("advice_q1" in columns) == (trial.facts["condition"] == "guided")
         assert trial.facts["start_error"] == [0.0] * 5
 
@@ -392,7 +392,7 @@ def test_a_simulated_participant_at_the_twin_in_real_time_goes_on_after_everythi
     guided = [trial for trial in trials if trial["condition"] == "guided"]
     assert [trial["outcome"] for trial in guided] == ["inserted", "inserted"]
     assert all(data.questionnaires["P01", period]["finished"] for period in (1, 2))
-    recording = record.read(tmp_path / "study" / guided[0]["recording"], MACHINE)
+    recording = record.read_recording(tmp_path / "study" / guided[0]["recording"], MACHINE)
     assert (
         max(np.nanmax(np.abs(recording.extra[f"advice_{joint}"])) for joint in recording.joints)
         > 0.1

@@ -1,0 +1,138 @@
+"""How excitations share the time of a run."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from brokk_rl.contracts.actuator import Excitation, Segment
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+NUM_TRIES = 6
+"""How often the length of the programs is fitted to the room that the ways between them leave; the
+longest that fits is taken."""
+
+
+@spec
+class Approach:
+    """How a segment's start pose is taken up.
+
+    Attributes:
+        level: Largest command on the way.
+        smallest: Smallest command, above any dead band.
+        settle_s: The command falls with the way that is left as if it were to take this time;
+            longer than the dead time.
+        tolerance: A joint this close, as a part of its travel, has arrived.
+        rest_s: Rest before the program begins; longer than the dead time, so that each program
+            begins at rest.
+        patience: An approach is given up after this many times what it should take.
+    """
+
+    level: float
+    smallest: float
+    settle_s: float
+    tolerance: float
+    rest_s: float
+    patience: float
+
+    def check(self) -> None:
+        if not 0 < self.smallest <= self.level <= 1:
+            raise ConfigError(
+                f"collect.approach: expected 0 < smallest <= level <= 1, got {self.smallest} and {self.level}"
+            )
+        if self.tolerance <= 0 or self.settle_s <= 0 or self.patience < 1:
+            raise ConfigError(
+                "collect.approach: expected tolerance and settle_s above 0, patience of 1 or more"
+            )
+
+    def duration_s(self, machine: Machine, start: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Returns how long the way from `start` to `target`, each `(…, J)`, should take, with the rest, at the machine's speeds."""
+        way = np.abs(target - start)
+        far = way > self.tolerance * (machine.upper - machine.lower)
+        slowing_s = self.settle_s * np.log(
+            1.0 + way / (self.level * machine.max_speed * self.settle_s)
+        )
+        each_s = np.where(
+            far, way / (self.level * machine.max_speed) + slowing_s + machine.dead_time_s, 0.0
+        )
+        first_s, then_s = (
+            each_s[..., machine.is_exclusive == one].max(-1, initial=0.0) for one in (False, True)
+        )
+        return first_s + then_s + self.rest_s
+
+
+@dataclass(frozen=True)
+class ExcitationPlan:
+    """What each run plays.
+
+    Attributes:
+        runs: Segments of each run, in order.
+        run_s: Time of a run.
+        names: Names of the excitations.
+    """
+
+    runs: tuple[tuple[Segment, ...], ...]
+    run_s: float
+    names: tuple[str, ...]
+
+
+def plan_runs(
+    excitations: Mapping[str, Excitation],
+    machine: Machine,
+    approach: Approach,
+    num_runs: int,
+    run_s: float,
+    generator: np.random.Generator,
+) -> ExcitationPlan:
+    """Returns a plan in which each run plays all excitations in order, with draws of its own, within `run_s`.
+
+    Raises:
+        ConfigError: there are no excitations, or one of them finds no room.
+    """
+    if not excitations:
+        raise ConfigError(
+            "excitation: none chosen; for example excitation=sine or excitation=[levels,ramps,holds,repeat]"
+        )
+    weights: dict[str, float] = {}
+    for name, excitation in excitations.items():
+        weights[name] = excitation.weight(sum(weights.values()))
+        if weights[name] <= 0:
+            raise ConfigError(
+                f"excitation.{name}: its share is {weights[name]:g}; expected more than 0, or leave it out"
+            )
+    parts = {name: weight / sum(weights.values()) for name, weight in weights.items()}
+    runs = []
+    for seed in generator.integers(2**63, size=num_runs):
+        programs_s, tries = run_s, []
+        for _ in range(NUM_TRIES):
+            segments = _collect_segments(excitations, parts, machine, programs_s, int(seed))
+            needed_s = _estimate_duration_s(segments, machine, approach)
+            tries.append(
+                (needed_s if needed_s <= run_s else run_s - needed_s, len(tries), tuple(segments))
+            )
+            programs_s *= run_s / needed_s
+        runs.append(max(tries)[-1])
+    return ExcitationPlan(runs=tuple(runs), run_s=run_s, names=tuple(excitations))
+
+
+def _collect_segments(
+    excitations: Mapping[str, Excitation],
+    parts: Mapping[str, float],
+    machine: Machine,
+    programs_s: float,
+    seed: int,
+) -> list[Segment]:
+    """Returns the segments of one run; the same seed draws the same."""
+    generator, found = np.random.default_rng(seed), []
+    for name, excitation in excitations.items():
+        found += excitation.segments(machine, parts[name] * programs_s, generator, tuple(found))
+    return found
+
+
+def _estimate_duration_s(segments: list[Segment], machine: Machine, approach: Approach) -> float:
+    """Returns the time that programs and approaches should take, from home on; motion within a segment is left out."""
+    at = np.stack([machine.home, *(segment.start for segment in segments[:-1])])
+    ways_s = approach.duration_s(machine, at, np.stack([segment.start for segment in segments]))
+    return float(ways_s.sum()) + sum(len(segment.u) for segment in segments) * machine.period_s

@@ -1,0 +1,448 @@
+"""One update of a fit, with everything it changes: on a GPU captured in a CUDA graph, on the CPU the same code called step by step.
+
+A free run of 60 steps is some thousand tiny kernels forth and back; launched one by one they take
+far longer than they run.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from rich.progress import Progress, TaskID
+
+from actuators.identify import training_data
+from actuators.identify.training_data import TrainingWindows
+from actuators.models import checkpoint
+from actuators.models.checkpoint import ResumeFile, hash_recordings
+from actuators.models.network import Coupled, JointNetworks, Mlp
+from brokk_rl.errors import BrokkError, ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.rl.execution import capture_graph
+from brokk_rl.spec import spec
+from brokk_rl.split import COMMANDED
+
+
+class FreeRunOptimizer:
+    """Adam on free runs, with a running average of the weights.
+
+    The windows of an update are named by a counter (`Windows.draw`), so that there is no generator
+    with a state to keep. Rates are tensors that the host fills before an update, so that a captured
+    update can be steered.
+
+    Args:
+        networks: What is fitted, on its device.
+        machine: Gives the ends of travel.
+        seed: Of the draws.
+
+    Attributes:
+        networks: The networks at work.
+        averaged: The running average of their weights, which is what is validated and kept.
+    """
+
+    def __init__(self, networks: JointNetworks, machine: Machine, seed: int) -> None:
+        self.networks, self.averaged = networks, copy.deepcopy(networks).requires_grad_(False)
+        self._device = networks.quiet.device
+        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=self._device)
+        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=self._device)
+        self._seed = seed % 2**31
+        self._key = torch.zeros((), dtype=torch.int64, device=self._device)
+        self._rate = torch.zeros((), device=self._device)
+        self._share_of_new = torch.zeros((), device=self._device)
+        self._parameters = list(networks.parameters())
+        on_gpu = self._device.type == "cuda"
+        self._adam = torch.optim.Adam(
+            self._parameters, lr=self._rate, fused=True, capturable=on_gpu
+        )
+        self._begin_adam()
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Returns all that an update changes, by name; the tensors themselves, to be copied from and into."""
+        found = {
+            f"networks.{name}": value.detach() for name, value in self.networks.named_parameters()
+        }
+        found |= {f"averaged.{name}": value for name, value in self.averaged.named_parameters()}
+        for number, parameter in enumerate(self._parameters):
+            found |= {
+                f"adam.{number}.{name}": value
+                for name, value in self._adam.state[parameter].items()
+            }
+        return found
+
+    def updater(
+        self, windows: TrainingWindows, batch: int, still_share: float, busy_share: float
+    ) -> Callable[[], None]:
+        """Returns one update on `batch` windows a joint as a function; capturing it, on a GPU, leaves the state as it was."""
+
+        def update() -> None:
+            self._update(
+                *windows.draw(
+                    batch, still_share, busy_share, self._key, together=self.networks.coupled
+                )
+            )
+
+        if self._device.type != "cuda":
+            return update
+        before = {name: value.clone() for name, value in self.state().items()}
+        graph = capture_graph(update, self._device, gradients=True)
+        for name, value in self.state().items():
+            value.copy_(before[name])
+        return graph.replay
+
+    def steer(self, number: int, rate: float, average: float) -> None:
+        """Sets number, learning rate and decay of the average of the update to come, without waiting for the device."""
+        self._key.fill_(self._seed * 2**20 + number)
+        self._rate.fill_(rate)
+        self._share_of_new.fill_(1.0 - average)
+
+    @torch.no_grad()
+    def run(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+        """Returns the free runs of the averaged networks through windows `(J, B, H + K)`, shape `(J, B, K)`."""
+        return self.averaged.roll_out(
+            u[..., :-1], q[..., : self.averaged.num_history], self._lower, self._upper
+        )
+
+    def _update(self, u: torch.Tensor, q: torch.Tensor) -> None:
+        networks, size = self.networks, self.networks.num_history
+        scale = networks.increment_scale[:, None, None]
+        horizon = q.shape[2] - size
+        if horizon == 1:
+            # before the dead zone, whose gradient is zero where it acts
+            output = networks(networks.inputs(u[..., :size], q[..., :size]))
+            loss = (
+                (output - (q[..., size] - q[..., size - 1]) / scale[..., 0]).square().mean(1).sum()
+            )
+        else:
+            path = networks.roll_out(u[..., :-1], q[..., :size], self._lower, self._upper)
+            ahead = torch.arange(1, horizon + 1, device=q.device)
+            # an error that grows with the square root of time counts the same early and late
+            loss = (((path - q[..., size:]) / scale).square() / ahead).mean((1, 2)).sum()
+        gradients = torch.autograd.grad(loss, self._parameters)
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            # joints are fitted independently: each has its own bound
+            norm = gradient.flatten(1).norm(dim=1).clamp(min=1.0)
+            parameter.grad = gradient / norm.view(-1, 1, 1)
+        self._adam.step()
+        with torch.no_grad():
+            for mean, value in zip(self.averaged.parameters(), self._parameters, strict=True):
+                mean.lerp_(value, self._share_of_new)
+
+    def _begin_adam(self) -> None:
+        """Makes Adam's state exist, with fixed addresses, before anything is captured: a step of rate and gradient zero."""
+        for parameter in self._parameters:
+            parameter.grad = torch.zeros_like(parameter)
+        self._adam.step()
+        for parameter in self._parameters:
+            for value in self._adam.state[parameter].values():
+                value.zero_()
+
+
+log = logging.getLogger(__name__)
+
+VALIDATED = 512
+"""Windows on which the weights of a network are chosen."""
+
+BEYOND_DEAD_BAND = 0.1
+"""Commands from which increments count for their normalisation."""
+
+
+@spec
+class NetworkFit:
+    """Actuator networks, fitted by free runs over growing horizons (`rollout`) or step by step as in the paper (`one_step`).
+
+    Attributes:
+        name: Name of the model in tables and of its checkpoint.
+        network: `mlp`, a network a joint, or `coupled`, in which each joint sees all.
+        loss: `rollout` or `one_step`.
+        width: Units a joint in each of the two hidden layers.
+        quiet: Increments up to this size are none (rad or m in a control period); `null`: the noise
+            of the resting sensor, estimated from the recordings joint by joint.
+        one_step_updates: Updates on single steps, before the free runs.
+        one_step_batch: Windows a joint in each of them.
+        horizons_s: Horizons of the free runs, one after another.
+        updates: Updates at each of the horizons.
+        batch: Windows a joint in each of them; with `coupled` each window is one of all joints.
+        learning_rate: Of Adam, at the start; falls along a cosine.
+        still_share: Part of the windows drawn from all times; most others are times at which the
+            joint is commanded.
+        busy_share: Part of the windows drawn from the tenth of all times in which most is commanded
+            at once: joints hinder each other rarely, and where recordings of single joints abound
+                hardly ever.
+        average: Decay of the running average of the weights, which is what is validated and kept.
+        validate_every: Updates between two validations.
+        validation_s: Horizon of the free run on which the weights are chosen.
+        patience: Validations without improvement after which a horizon is given up.
+        save_every_s: Time between two savings from which an interrupted fit goes on.
+    """
+
+    name: str
+    network: Literal["mlp", "coupled"]
+    loss: Literal["rollout", "one_step"]
+    width: int
+    quiet: float | None
+    one_step_updates: int
+    one_step_batch: int
+    horizons_s: tuple[float, ...]
+    updates: int
+    batch: int
+    learning_rate: float
+    still_share: float
+    busy_share: float
+    average: float
+    validate_every: int
+    validation_s: float
+    patience: int
+    save_every_s: float
+
+    def check(self) -> None:
+        if self.loss == "rollout" and not self.horizons_s:
+            raise ConfigError("fit.horizons_s: loss=rollout needs at least one horizon")
+        if min(self.width, self.batch, self.one_step_batch, self.validate_every, self.patience) < 1:
+            raise ConfigError("fit: width, batches, validate_every and patience must be 1 or more")
+        if min(self.still_share, self.busy_share) < 0 or self.still_share + self.busy_share >= 1:
+            raise ConfigError(
+                "fit: still_share and busy_share must leave room for times at which a joint is commanded"
+            )
+
+    def fit(
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        validation: Sequence[Recording],
+        folder: Path,
+        seed: int,
+        device: torch.device,
+    ) -> Mlp | Coupled:
+        """Fits to `train`, keeps the weights that run freely best on `validation`, writes `<name>.safetensors` into `folder`.
+
+        A fit that was interrupted goes on from `<name>.partial.safetensors`, saved every
+        `save_every_s` seconds: on a CPU bit for bit as if it had never stopped.
+
+        Raises:
+            RecordingError: too little data.
+            CheckpointError: `folder` holds an interrupted fit with other settings or data.
+            StorageError: a file could not be written.
+        """
+        training_data.check_enough(train, machine)
+        if self.network == "coupled":
+            training_data.check_together(train)
+        stamp = {
+            "fit": {**dataclasses.asdict(self), "save_every_s": None}, "machine": machine.fingerprint(), "seed": seed,
+            "device": device.type, "train": hash_recordings(train), "validation": hash_recordings(validation),
+        }  # fmt: skip
+        interruption = ResumeFile(folder / f"{self.name}.partial.safetensors", stamp)
+        fitting = _NetworkFitting(self, machine, train, validation, seed, device)
+        seconds = fitting.run(interruption)
+        tensors, errors = fitting.result
+        facts = {
+            "width": self.width,
+            "data": {
+                "recordings": len(train),
+                "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
+                "commanded_minutes": dict(
+                    zip(
+                        machine.joint_names,
+                        (training_data.measure_commanded_each_way_s(train).sum(0) / 60.0)
+                        .round(1)
+                        .tolist(),
+                        strict=True,
+                    )
+                ),
+                "sources": sorted(
+                    {recording.metadata.get("source", "unknown") for recording in train}
+                ),
+            },
+            "fit": {
+                "loss": self.loss,
+                "seed": seed,
+                "device": device.type,
+                "seconds": round(seconds, 1),
+                "validation_rmse": dict(zip(machine.joint_names, errors, strict=True)),
+                "validation_s": self.validation_s,
+            },
+        }
+        path = folder / f"{self.name}.safetensors"
+        checkpoint.write_checkpoint(path, self.network, machine, tensors, facts)
+        interruption.remove()
+        return (Coupled if self.network == "coupled" else Mlp)(checkpoint=str(path))
+
+
+@dataclasses.dataclass
+class _FitProgress:
+    """Where a fit is: stage, updates done in it, validations without improvement, and the time spent so far."""
+
+    stage: int = 0
+    update: int = 0
+    stale: int = 0
+    seconds: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class _HorizonStage:
+    """Updates with one horizon."""
+
+    horizon_s: float
+    updates: int
+    batch: int
+
+
+class _NetworkFitting:
+    """One fit at work."""
+
+    def __init__(
+        self,
+        config: NetworkFit,
+        machine: Machine,
+        train: Sequence[Recording],
+        validation: Sequence[Recording],
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self._config, self._machine, self._train, self._device = config, machine, train, device
+        generator = torch.Generator().manual_seed(seed)
+        coupled, joints = config.network == "coupled", machine.num_joints
+        networks = JointNetworks(joints, machine.num_history, config.width, coupled, generator)
+        self._normalise(networks)
+        self._descent = FreeRunOptimizer(networks.to(device), machine, seed)
+        self._kept = {
+            name: value.clone() for name, value in self._descent.averaged.named_parameters()
+        }
+        self._best = torch.full((joints,), math.inf, device=device)
+        held = TrainingWindows(
+            validation,
+            machine,
+            self._steps(config.validation_s),
+            device,
+            "held out to stop the fit by",
+        )
+        batch = max(1, VALIDATED // joints) if coupled else VALIDATED
+        self._held = held.draw(
+            batch,
+            0.2,
+            config.busy_share,
+            torch.zeros((), dtype=torch.int64, device=device),
+            together=coupled,
+        )
+        self._stages = [_HorizonStage(0.0, config.one_step_updates, config.one_step_batch)]
+        if config.loss == "rollout":
+            self._stages += [
+                _HorizonStage(horizon_s, config.updates, config.batch)
+                for horizon_s in config.horizons_s
+            ]
+
+    def run(self, interruption: ResumeFile) -> float:
+        """Fits, going on from `interruption` if there is one; returns the time it took in all, s."""
+        found = interruption.load(self._state())
+        if found:
+            log.info("going on with the fit that was interrupted after %.0f s", found["seconds"])
+        place = _FitProgress(**(found or {}))
+        with Progress(transient=True) as progress:
+            task = progress.add_task("fit", total=sum(stage.updates for stage in self._stages))
+            while place.stage < len(self._stages):
+                self._run_stage(place, interruption, progress, task)
+                place.stage, place.update, place.stale = place.stage + 1, 0, 0
+        return place.seconds
+
+    @property
+    def result(self) -> tuple[dict[str, torch.Tensor], list[float]]:
+        """The best averaged networks, normalisation included, and the error of each joint on the recordings held out."""
+        return {**self._descent.averaged.state_dict(), **self._kept}, self._best.tolist()
+
+    def _run_stage(
+        self, place: _FitProgress, interruption: ResumeFile, progress: Progress, task: TaskID
+    ) -> None:
+        """Runs what is left of the stage at `place`."""
+        config, stage = self._config, self._stages[place.stage]
+        windows = TrainingWindows(
+            self._train, self._machine, max(1, self._steps(stage.horizon_s)), self._device
+        )
+        update = self._descent.updater(windows, stage.batch, config.still_share, config.busy_share)
+        before, total = (
+            sum(earlier.updates for earlier in self._stages[: place.stage]),
+            progress.tasks[task].total or 1,
+        )
+        began = saved = time.monotonic()
+        spent_s = place.seconds
+        while place.update < stage.updates and place.stale < config.patience:
+            number = before + place.update
+            rate = config.learning_rate * (
+                0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * number / total))
+            )
+            self._descent.steer(number, rate, min(config.average, (number + 1.0) / (number + 11.0)))
+            update()
+            place.update += 1
+            if place.update % config.validate_every == 0 or place.update == stage.updates:
+                place.stale = 0 if self._validate() else place.stale + 1
+                error = self._best.mean().item()
+                progress.update(task, description=f"fit, {stage.horizon_s:g} s, error {error:.4f}")
+            progress.update(task, completed=number + 1)
+            now = time.monotonic()
+            place.seconds = spent_s + now - began
+            if now - saved > config.save_every_s:
+                interruption.save(self._state(), dataclasses.asdict(place))
+                saved = now
+
+    @torch.no_grad()
+    def _validate(self) -> bool:
+        """Runs the averaged weights freely on unseen recordings; keeps the best so far, joint by joint where they are separate."""
+        u, q = self._held
+        averaged, path = self._descent.averaged, self._descent.run(u, q)
+        error = (path - q[..., averaged.num_history :]).square().mean((1, 2)).sqrt()
+        if not bool(error.isfinite().all()):
+            raise BrokkError("the fit diverged (NaN in the validation); lower fit.learning_rate")
+        better = error < self._best
+        if averaged.coupled:
+            mean, best = (
+                (value / averaged.increment_scale).mean() for value in (error, self._best)
+            )
+            better = (mean < best).expand_as(error)
+        self._best.copy_(torch.where(better, error, self._best))
+        for name, value in averaged.named_parameters():
+            rows = better[: len(value)].view(-1, 1, 1)  # the joints, or one for all
+            self._kept[name].copy_(torch.where(rows, value, self._kept[name]))
+        return bool(better.any())
+
+    def _state(self) -> dict[str, torch.Tensor]:
+        return {
+            **self._descent.state(),
+            **{f"kept.{name}": value for name, value in self._kept.items()},
+            "best": self._best,
+        }
+
+    def _normalise(self, networks: JointNetworks) -> None:
+        """Sets the normalisation from the training data (increments, commands, noise) and from the machine (positions)."""
+        for joint in range(self._machine.num_joints):
+            commands = np.concatenate([r.u[1:, joint] for r in self._train])
+            moved = np.concatenate([np.diff(r.q[:, joint]) for r in self._train])
+            moved = moved[np.abs(commands) > min(BEYOND_DEAD_BAND, 0.5 * np.abs(commands).max())]
+            networks.increment_scale[joint] = max(
+                1e-6, float(np.sqrt(np.mean(np.square(moved, dtype=np.float64))))
+            )
+            commands = commands[np.abs(commands) > COMMANDED]
+            networks.command_scale[joint] = float(
+                np.sqrt(np.mean(np.square(commands, dtype=np.float64)))
+            )
+        lower, upper = (
+            torch.as_tensor(bound, dtype=torch.float32)
+            for bound in (self._machine.lower, self._machine.upper)
+        )
+        networks.position_center.copy_((lower + upper) / 2.0)
+        networks.position_scale.copy_((upper - lower) / 2.0)
+        if self._config.quiet is None:
+            networks.quiet.copy_(
+                torch.as_tensor(training_data.estimate_resting_noise(self._train, self._machine))
+            )
+        else:
+            networks.quiet.fill_(self._config.quiet)
+
+    def _steps(self, horizon_s: float) -> int:
+        return round(horizon_s / self._machine.period_s)

@@ -1,0 +1,427 @@
+"""What an identification says, in sentences: is the model good, on which joint is it worst, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from actuators.identify import dead_time, pictures
+from actuators.identify.dead_time import RESOLUTION_S
+from actuators.identify.scores import FreeRunScores, average_joints, bound_interval, score_regimes
+from actuators.identify.stages import FitStage, FittedModel, list_recordings
+from brokk_rl import open_loop
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.split import measure_commanded_s
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+HOLD, LINEAR = "hold", "arx"
+"""The baselines that stand beside every model."""
+HEADLINE_S = 5.0
+"""The horizon by which models are compared, where the recordings are long enough."""
+THIN_S = 120.0
+"""A joint that is commanded for less than this in the recordings to fit to is too little
+excited."""
+THIN_TRAVEL = 0.4
+"""So is one that saw less than this part of its travel, …"""
+THIN_COMMAND = 0.5
+"""… or no command larger than this both ways."""
+FEW_RUNS = 6
+"""Runs to judge by below which an interval from resampling them is coarse."""
+DELAY_TOLERANCE_S = 0.05
+"""The machine's dead time may differ from that of its joints by this much, s: a control period at
+20 Hz."""
+
+
+@dataclass(frozen=True)
+class VerdictSentence:
+    """A sentence of the verdict.
+
+    Attributes:
+        tone: Whether it is good news.
+        text: The sentence.
+    """
+
+    tone: Literal["good", "bad", "warn", "plain"]
+    text: str
+
+
+def write_verdict(result: Mapping[str, Any], machine: Machine) -> list[VerdictSentence]:
+    """Returns the sentences of the verdict on an `identification.json`, the answer first."""
+    given = [
+        horizon
+        for horizon, value in result["overall"][result["model"]].items()
+        if value is not None
+    ]
+    horizon = f"{HEADLINE_S:g}" if f"{HEADLINE_S:g}" in given else given[-1]
+    findings = [_judge_comparison(result, horizon), _judge_worst_joint(result, given[-1], machine)]
+    findings += (
+        _judge_dead_time(result, machine) + _judge_excitation(result) + _judge_test_data(result)
+    )
+    return findings
+
+
+def _judge_comparison(result: Mapping[str, Any], horizon: str) -> VerdictSentence:
+    model, joints = result["model"], list(result["joints"])
+    overall = {name: rows[horizon]["percent"] for name, rows in result["overall"].items()}
+    mine = f"{model}: {overall[model]:.2f} % of travel after {horizon} s in a free run, mean over joints"
+    rival = LINEAR if model != LINEAR else HOLD
+    if model == HOLD:
+        return VerdictSentence(
+            "plain", f"{mine}; this is the error of a machine that stands still, and no model."
+        )
+    against = result["against"][rival]
+    total, rows = against["overall"][horizon], [against[joint][horizon] for joint in joints]
+    better = [
+        joint for joint, row in zip(joints, rows, strict=True) if row["ci95"] and row["ci95"][1] < 0
+    ]
+    worse = [
+        joint for joint, row in zip(joints, rows, strict=True) if row["ci95"] and row["ci95"][0] > 0
+    ]
+    change = total["reduction_percent"]
+    text = f"{mine}, against {overall[rival]:.2f} % of {rival}: {abs(change):.0f} % {'less' if change >= 0 else 'more'}"
+    if total["reduction_ci95"]:
+        low, high = total["reduction_ci95"]
+        text += f" (95 %: {low:.0f} to {high:.0f} % less)"
+    if total["ci95"] is None:
+        return VerdictSentence(
+            "warn",
+            f"{text}. Judged by one run only, so there is no saying whether that holds for others.",
+        )
+    text += f". Better beyond doubt on {_name_joints(better, joints)}"
+    text += f", worse on {_name_joints(worse, joints)}." if worse else "."
+    strongest = min(overall, key=lambda name: overall[name])
+    if strongest not in (model, rival):
+        text += f" The best of those compared is {strongest} with {overall[strongest]:.2f} %."
+    tone = (
+        "good"
+        if total["ci95"][1] < 0 and not worse
+        else "bad"
+        if total["ci95"][0] > 0 or len(worse) > len(better)
+        else "warn"
+    )
+    return VerdictSentence(tone, text)
+
+
+def _judge_worst_joint(
+    result: Mapping[str, Any], horizon: str, machine: Machine
+) -> VerdictSentence:
+    model = result["model"]
+    rows = {joint: models[model][horizon] for joint, models in result["joints"].items()}
+    joint = max(rows, key=lambda name: rows[name]["percent"])
+    unit = machine.joints[machine.joint_names.index(joint)].unit
+    row = rows[joint]
+    text = (
+        f"Worst joint: {joint}, {row['percent']:.2f} % of its travel"
+        f" ({row['rmse']:.2g} {unit}) after {horizon} s."
+    )
+    shares = {
+        name: cell["models"][model]["share"] / cell["time"]
+        for name, cell in result["regimes"][joint].items()
+    }
+    if shares:
+        regime = max(shares, key=lambda name: shares[name])
+        cell = result["regimes"][joint][regime]
+        text += (
+            f" It drifts most {_phrase_regime(regime)}: {100 * cell['time']:.0f} % of the time, "
+            f"{100 * cell['models'][model]['share']:.0f} % of the squared drift."
+        )
+    return VerdictSentence("plain", text)
+
+
+def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[VerdictSentence]:
+    known = {joint: delay for joint, delay in result["delay_s"].items() if delay is not None}
+    if not known:
+        return []
+    history_s = machine.num_history * machine.period_s
+    values = [delay["value"] for delay in known.values()]
+    span = (
+        f"{min(values):.2f} s"
+        if max(values) - min(values) < RESOLUTION_S / 2
+        else f"{min(values):.2f} to {max(values):.2f} s"
+    )
+    stated = f"machine '{machine.name}' says {machine.dead_time_s:g} s"
+    found: list[VerdictSentence] = []
+    lost = [joint for joint, delay in known.items() if not delay["found"]]
+    if lost:
+        found.append(
+            VerdictSentence(
+                "warn",
+                f"The dead time of {', '.join(lost)} is not found: the motion does not follow the command.",
+            )
+        )
+    long = [
+        joint for joint, delay in known.items() if delay["found"] and delay["ci95"][1] > history_s
+    ]
+    if long:
+        count = int(np.ceil(max(known[joint]["ci95"][1] for joint in long) / machine.period_s)) + 2
+        text = f"The dead time of {', '.join(long)} may exceed the history of {history_s:.2f} s: models miss the command that acts."
+        found.append(
+            VerdictSentence(
+                "bad",
+                f"{text} Set num_history of machine '{machine.name}' to {count} or more and fit again.",
+            )
+        )
+    off = [
+        joint
+        for joint, delay in known.items()
+        if abs(delay["value"] - machine.dead_time_s) > DELAY_TOLERANCE_S
+    ]
+    if off:
+        text = f"Dead time {span}, but {stated}: correct dead_time_s ({', '.join(off)})."
+        found.append(VerdictSentence("warn", text))
+    elif not found:
+        text = f"Dead time {span}: inside the history of {history_s:.2f} s, and {stated}."
+        found.append(VerdictSentence("good", text))
+    return found
+
+
+def _judge_excitation(result: Mapping[str, Any]) -> list[VerdictSentence]:
+    found = []
+    for joint, facts in result["data"]["excitation"].items():
+        lacks = []
+        if facts["commanded_s"] < THIN_S:
+            lacks.append(f"commanded for {facts['commanded_s']:.0f} s only")
+        if facts["travel"] < THIN_TRAVEL:
+            lacks.append(f"seen over {100 * facts['travel']:.0f} % of its travel")
+        for sign, value in (
+            ("+", facts["largest_command"][1]),
+            ("-", -facts["largest_command"][0]),
+        ):
+            if value < THIN_COMMAND:
+                lacks.append(f"no command beyond {sign}{value:.2g}")
+        if lacks:
+            found.append(
+                VerdictSentence(
+                    "warn",
+                    f"{joint} is too little excited: {'; '.join(lacks)}. Record more of it before trusting its model.",
+                )
+            )
+    return found
+
+
+def _judge_test_data(result: Mapping[str, Any]) -> list[VerdictSentence]:
+    found, data = [], result["data"]
+    idle = [joint for joint, facts in data["excitation"].items() if facts["judged_s"] <= 0]
+    if idle:
+        found.append(
+            VerdictSentence(
+                "warn",
+                f"{', '.join(idle)} never moves by command in the runs judged by: its errors there say nothing.",
+            )
+        )
+    if data["test"]["runs"] < FEW_RUNS:
+        found.append(
+            VerdictSentence(
+                "warn",
+                f"Judged by {data['test']['runs']} runs: intervals from so few are coarse, most likely too narrow.",
+            )
+        )
+    found += [
+        VerdictSentence("warn", f"No figure at {horizon} s: {reason}.")
+        for horizon, reason in result["missing"].items()
+    ]
+    return found
+
+
+def _name_joints(some: list[str], every: list[str]) -> str:
+    if not some:
+        return "no joint"
+    return (
+        f"all {len(every)} joints"
+        if len(some) == len(every)
+        else f"{len(some)} of {len(every)} joints ({', '.join(some)})"
+    )
+
+
+def _phrase_regime(regime: str) -> str:
+    return {
+        "at rest": "when it should rest",
+        "alone": "when it moves alone",
+        "with others": "when it moves with others",
+    }.get(regime, regime if regime.startswith(("after", "near")) else f"at {regime}")
+
+
+@dataclass(frozen=True)
+class IdentificationRun:
+    """All that was fitted.
+
+    Attributes:
+        machine: The machine.
+        model: Name of the model that is kept; the others are what it is compared with.
+        stages: Fits in their order; the last one made the model that is kept.
+        cuts: Windows of each stage, `None` where it judges nothing.
+        done: What each stage's fits left, by model.
+        horizons_s: Horizons that fit into the recordings judged by.
+        wanted_s: Horizons that were wanted.
+    """
+
+    machine: Machine
+    model: str
+    stages: Sequence[FitStage]
+    cuts: Sequence[open_loop.FreeRunWindows | None]
+    done: Sequence[dict[str, FittedModel]]
+    horizons_s: tuple[float, ...]
+    wanted_s: tuple[float, ...]
+
+
+def build_results(
+    identified: IdentificationRun, resampling: np.random.Generator, delaying: np.random.Generator
+) -> tuple[dict[str, Any], list[VerdictSentence], dict[str, Figure]]:
+    """Returns the fields of `identification.json`, the verdict, and the pictures by file stem.
+
+    Args:
+        identified: What was fitted.
+        resampling: Draws the resamples of the errors.
+        delaying: Draws those of the dead times.
+
+    Raises:
+        RecordingError: no recording is long enough to search for a dead time in.
+    """
+    machine, model = identified.machine, identified.model
+    judging = [
+        (cut, done)
+        for cut, done in zip(identified.cuts, identified.done, strict=True)
+        if cut is not None
+    ]
+    cut = open_loop.join_windows([cut for cut, _ in judging])
+    predicted = {
+        name: np.concatenate([done[name].predicted for _, done in judging])
+        for name in judging[0][1]
+    }
+    scores = FreeRunScores(predicted, cut, machine, resampling)
+    kept = identified.done[-1][model]
+    last = identified.stages[-1]
+    fitted_to = list_recordings(last.train) + list_recordings(last.validation)
+    delays = dead_time.estimate_dead_times(fitted_to, machine, delaying)
+    acting_s = np.array(
+        [
+            delay.value_s if delay and delay.is_found else machine.dead_time_s
+            for delay in delays.values()
+        ]
+    )
+    result: dict[str, Any] = {
+        "schema": 1, "machine": machine.name, "model": model, "fit_seconds": round(kept.seconds, 2), "use": kept.use,
+        "fold_seconds": [round(done[model].seconds, 2) for done in identified.done[:-1]],
+    }  # fmt: skip
+    result |= _tabulate_errors(scores, identified)
+    result["delay_s"] = {
+        joint: delay
+        and {
+            "value": delay.value_s,
+            "ci95": list(delay.ci95_s),
+            "explained": delay.explained,
+            "found": delay.is_found,
+        }
+        for joint, delay in delays.items()
+    }
+    result["regimes"] = score_regimes(scores, acting_s)
+    result["data"] = _describe_data(identified, fitted_to, scores)
+    findings = write_verdict(result, machine)
+    result["verdict"] = [{"tone": finding.tone, "text": finding.text} for finding in findings]
+    drawings = {
+        "prediction": pictures.draw_prediction(scores, model),
+        "error_over_horizon": pictures.draw_error_over_horizon(scores, model),
+        "regimes": pictures.draw_regimes(result["regimes"], machine, model, list(predicted)),
+        "dead_time": pictures.draw_dead_times(delays, machine),
+    }
+    return result, findings, drawings
+
+
+def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> dict[str, Any]:
+    """Returns `joints`, `overall`, `one_step`, `against` and `missing`."""
+    machine, model = identified.machine, identified.model
+    names, units = machine.joint_names, [joint.unit for joint in machine.joints]
+    found: dict[str, Any] = {
+        "joints": {joint: {} for joint in names},
+        "overall": {},
+        "one_step": {joint: {} for joint in names},
+    }
+    keys = {horizon_s: f"{horizon_s:g}" for horizon_s in identified.wanted_s}
+    for name in scores.predicted:
+        rows = {key: scores.at(name, h) for h, key in keys.items() if h in identified.horizons_s}
+        for j, joint in enumerate(names):
+            found["joints"][joint][name] = {
+                key: rows[key][j] if key in rows else None for key in keys.values()
+            }
+        found["overall"][name] = {
+            key: average_joints(rows[key], units) if key in rows else None for key in keys.values()
+        }
+        rmse, again = scores.rmse(name)
+        for j, joint in enumerate(names):
+            first = float(rmse[0, j])
+            found["one_step"][joint][name] = {
+                "rmse": first, "ci95": bound_interval(again[:, 0, j]), "percent": float(100 * first / scores.travel[j])
+            }  # fmt: skip
+    found["against"] = {
+        rival: {joint: {} for joint in (*names, "overall")}
+        for rival in scores.predicted
+        if rival != model
+    }
+    for rival, table in found["against"].items():
+        for h, key in keys.items():
+            rows = (
+                scores.against(model, rival, h)
+                if h in identified.horizons_s
+                else [None] * (len(names) + 1)
+            )
+            for joint, row in zip(table, rows, strict=True):
+                table[joint][key] = row
+    judged = [recording for stage in identified.stages for recording in list_recordings(stage.test)]
+    longest_s, before_s = (
+        open_loop.find_longest_horizon_s(judged, machine),
+        open_loop.count_samples_before(machine) * machine.period_s,
+    )
+    reason = f"the longest recording judged by leaves {longest_s:.1f} s after the {before_s:.2f} s before a free run"
+    found["missing"] = {key: reason for h, key in keys.items() if h not in identified.horizons_s}
+    return found
+
+
+def _describe_data(
+    identified: IdentificationRun, fitted_to: Sequence[Recording], scores: FreeRunScores
+) -> dict[str, Any]:
+    """Returns what was fitted to and judged by: how much, which runs, and how far each joint was excited."""
+    machine, last = identified.machine, identified.stages[-1]
+    judged = [recording for stage in identified.stages for recording in list_recordings(stage.test)]
+    u, q = (
+        np.concatenate([getattr(recording, name) for recording in fitted_to]) for name in ("u", "q")
+    )
+    moved_s, judged_s = measure_commanded_s(fitted_to), measure_commanded_s(judged)
+    tested = {name for stage in identified.stages for name in stage.test}
+    return {
+        "train": _count_recordings(list_recordings(last.train), len(last.train)),
+        "validation": _count_recordings(list_recordings(last.validation), len(last.validation)),
+        "test": _count_recordings(judged, len(tested)),
+        "windows": len(scores.cut.q),
+        "runs": [
+            {"stage": stage.name or "fit"}
+            | {part: list(getattr(stage, part)) for part in ("train", "validation", "test")}
+            for stage in identified.stages
+        ],
+        "excitation": {
+            joint: {
+                "commanded_s": float(moved_s[j]),
+                "judged_s": float(judged_s[j]),
+                "travel": float(np.ptp(q[:, j]) / scores.travel[j]),
+                "largest_command": [float(min(0.0, u[:, j].min())), float(max(0.0, u[:, j].max()))],
+            }
+            for j, joint in enumerate(machine.joint_names)
+        },
+    }
+
+
+def _count_recordings(recordings: Sequence[Recording], num_runs: int) -> dict[str, Any]:
+    return {
+        "runs": num_runs,
+        "recordings": len(recordings),
+        "minutes": round(sum(recording.duration_s for recording in recordings) / 60.0, 1),
+        "sources": sorted(
+            {recording.metadata.get("source", "unknown") for recording in recordings}
+        ),
+    }

@@ -1,0 +1,250 @@
+"""Recordings as training data: all of them end to end, and where in them a window may begin."""
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch.nn.utils.rnn import pad_sequence
+
+from actuators.models.random_draws import hash_uniform
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.split import COMMANDED
+
+
+class TrainingWindows:
+    """Windows of `H + K` samples from a set of recordings, joint by joint.
+
+    Args:
+        recordings: Where from; no window crosses from one into the next.
+        machine: Gives joints and history.
+        horizon: Steps to predict, `K`.
+        device: Where the tensors live.
+        purpose: What they are for, in error messages.
+
+    Attributes:
+        u: Commands of all recordings, `(J, T)`.
+        q: Positions of all recordings, `(J, T)`.
+        starts: Samples at which a window may begin, `(S,)`.
+
+    Raises:
+        RecordingError: no recording is long enough for a single window, or a joint is never
+            commanded.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        machine: Machine,
+        horizon: int,
+        device: torch.device,
+        purpose: str = "to fit to",
+    ) -> None:
+        self.u = (
+            torch.cat([torch.as_tensor(recording.u) for recording in recordings])
+            .T.contiguous()
+            .to(device)
+        )
+        self.q = (
+            torch.cat([torch.as_tensor(recording.q) for recording in recordings])
+            .T.contiguous()
+            .to(device)
+        )
+        self.num_history, self.horizon = machine.num_history, horizon
+        self._length = machine.num_history + horizon
+        starts, begin = [], 0
+        for recording in recordings:
+            starts.append(
+                torch.arange(begin, begin + max(0, recording.num_samples - self._length + 1))
+            )
+            begin += recording.num_samples
+        self.starts = torch.cat(starts).to(device)
+        if not len(self.starts):
+            longest = max((recording.num_samples for recording in recordings), default=0)
+            raise RecordingError(
+                f"too little data: the longest of {len(recordings)} recordings {purpose} has {longest} samples, one window needs "
+                f"{self._length} ({machine.num_history} of history and {horizon} to predict)"
+            )
+        moving = [self._within(u.abs() > COMMANDED) for u in self.u]
+        for joint, found in zip(machine.joint_names, moving, strict=True):
+            if not len(found):
+                raise RecordingError(
+                    f"too little data: joint {joint} is never commanded in the {len(recordings)} recordings {purpose}"
+                )
+        self._moving = pad_sequence(moving, batch_first=True)  # (J, most)
+        self._num_moving = torch.tensor([[len(found)] for found in moving], device=device)
+        self._busy = self._busiest()
+        self._joint = torch.arange(len(self.u), device=device)[:, None]
+
+    def draw(
+        self,
+        batch: int,
+        still_share: float,
+        busy_share: float,
+        key: torch.Tensor,
+        together: bool = False,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draws windows for each joint, mostly of times at which it is commanded. Fixed shapes, no host: a CUDA graph may hold it.
+
+        Args:
+            batch: Number of windows drawn a joint.
+            still_share: Part drawn from all times instead.
+            busy_share: Part drawn from the tenth of all times in which most is commanded at once.
+            key: Names the draw, int64 of shape `()`: the same key gives the same windows.
+            together: Each joint gets the windows of all, so that `B` is `J` times `batch`; else its
+                own ones.
+
+        Returns:
+            Commands and positions, each `(J, B, H + K)`.
+        """
+        index = self._index(batch, still_share, busy_share, key)
+        index = index.flatten()[None] if together else index
+        return (
+            self.u.unfold(1, self._length, 1)[self._joint, index],
+            self.q.unfold(1, self._length, 1)[self._joint, index],
+        )
+
+    def _index(
+        self, batch: int, still_share: float, busy_share: float, key: torch.Tensor
+    ) -> torch.Tensor:
+        still, busy = round(batch * still_share), round(batch * busy_share)
+        place = torch.arange(len(self.u) * batch, device=key.device)
+        chance = hash_uniform(key * 1_048_576 + place).view(-1, batch)
+
+        def pick(chance: torch.Tensor, count: torch.Tensor | int) -> torch.Tensor:
+            return (chance.double() * count).long()
+
+        rows = (
+            self.starts[pick(chance[:, :still], len(self.starts))],
+            self._busy[pick(chance[:, still : still + busy], len(self._busy))],
+            self._moving.gather(1, pick(chance[:, still + busy :], self._num_moving)),
+        )
+        return torch.cat(rows, 1)
+
+    def _within(self, condition: torch.Tensor) -> torch.Tensor:
+        """Returns the starts of windows in which `condition`, `(T,)` bool, holds at some time."""
+        count = torch.cat(
+            [torch.zeros(1, dtype=torch.int64, device=condition.device), condition.cumsum(0)]
+        )
+        return self.starts[count[self.starts + self._length] > count[self.starts]]
+
+    def _busiest(self) -> torch.Tensor:
+        """Returns the tenth of the starts in whose windows the sum of all commands rises highest."""
+        total = self.u.abs().sum(0).unfold(0, self._length, 1).amax(1)[self.starts]
+        return self.starts[total.argsort(descending=True, stable=True)[: max(1, len(total) // 10)]]
+
+
+log = logging.getLogger(__name__)
+
+NEEDED_S = 15.0
+"""Commanded time each way below which a fit is refused. Measured with `fit=mlp` on random levels of
+the hydraulic plant: with 10 s each way the error of a free run of 5 s is three times that of an
+ample fit, no better than a linear model; with 30 s 1.7 times."""
+AMPLE_S = 200.0
+"""Commanded time each way below which a warning stands: with 80 s that error is 1.15, with 200 s
+1.07 times an ample fit's."""
+SETTLED = 3
+"""Histories without a command after which a joint is at rest: its dead time is over and what swung
+has died away."""
+
+
+def measure_commanded_each_way_s(recordings: Sequence[Recording]) -> np.ndarray:
+    """Returns for how long each joint is commanded forth and back, s, shape `(2, J)`."""
+    both = [
+        np.stack([(r.u > COMMANDED).sum(0), (r.u < -COMMANDED).sum(0)]) / r.rate_hz
+        for r in recordings
+    ]
+    return np.sum(both, 0)
+
+
+def check_enough(recordings: Sequence[Recording], machine: Machine) -> None:
+    """Says where there is too little to fit to.
+
+    Raises:
+        RecordingError: a joint is hardly commanded, in figures.
+    """
+    found = measure_commanded_each_way_s(recordings)
+    for needed_s, fatal in ((NEEDED_S, True), (AMPLE_S, False)):
+        lacking = "; ".join(
+            f"{name} {forth_s / 60:.1f} min forth and {back_s / 60:.1f} min back"
+            for name, (forth_s, back_s) in zip(machine.joint_names, found.T.tolist(), strict=True)
+            if min(forth_s, back_s) < needed_s
+        )
+        if not lacking:
+            continue
+        found_text = f"{lacking} commanded (|u| > {COMMANDED:g}) in the {len(recordings)} recordings to fit to"
+        advice = "Record more of these joints: small and large commands both ways over their whole travel (mode=collect)."
+        if fatal:
+            raise RecordingError(
+                f"too little data: {found_text}, needed are {needed_s / 60:.2g} min each way. {advice}"
+            )
+        log.warning(
+            "thin data: %s; errors hardly fall beyond %.2g min each way. %s",
+            found_text,
+            needed_s / 60,
+            advice,
+        )
+        break
+
+
+def check_together(recordings: Sequence[Recording]) -> None:
+    """Warns where joints hardly move at the same time, so that nothing can be learned of what they do to each other."""
+    together_s = float(
+        sum(((np.abs(r.u) > COMMANDED).sum(1) > 1).sum() / r.rate_hz for r in recordings)
+    )
+    if together_s < AMPLE_S:
+        log.warning(
+            "thin data: several joints are commanded at once for %.1f min; how they share the pump shows in %.2g min or more. "
+            "Record some (mode=collect excitation=levels), or fit=mlp, a network a joint",
+            together_s / 60,
+            AMPLE_S / 60,
+        )
+
+
+def estimate_resting_noise(recordings: Sequence[Recording], machine: Machine) -> np.ndarray:
+    """Returns the size of an increment that is none, rad or m, shape `(J,)`: what the sensor shows of a joint at rest.
+
+    The larger of two: the spread of the increments where the joint has long been without a command
+    (68 of 100 are smaller; one standard deviation of normal noise), and the error of an increment
+    from the sensor's own step, where it has a visible one: a difference of two values, each off by
+    a step over the root of 12, is off by a step over the root of 6.
+    """
+    wait = SETTLED * machine.num_history
+    noise = np.zeros(machine.num_joints)
+    for joint, name in enumerate(machine.joint_names):
+        still, moving = [], []
+        for recording in recordings:
+            commanded = np.abs(recording.u[:, joint]) > COMMANDED
+            count = np.concatenate([np.zeros(wait), np.cumsum(commanded)])
+            quiet = np.cumsum(commanded) == count[: len(commanded)]
+            quiet[:wait] = False  # what came before the recording is not known
+            q = recording.q[:, joint].astype(np.float64)
+            still.append(np.diff(q)[quiet[:-1]])
+            moving.append(q[~quiet])
+        still, step = np.concatenate(still), _estimate_sensor_step(np.concatenate(moving))
+        if not len(still):
+            log.warning(
+                "%s is never at rest in the recordings to fit to: its drift at rest will not be learned",
+                name,
+            )
+        noise[joint] = max(
+            float(np.quantile(np.abs(still), 0.68)) if len(still) else 0.0, step / np.sqrt(6.0)
+        )
+    return noise
+
+
+def _estimate_sensor_step(q: np.ndarray) -> float:
+    """Returns the step of a sensor that knows certain values only, `(T,)`; 0 where the values are continuous.
+
+    Neighbours among the values that occur are then whole multiples of the step apart, most often
+    one.
+    """
+    apart = np.diff(np.unique(q))
+    apart = apart[apart > 1e-9]
+    if len(apart) < 10:
+        return 0.0
+    step = float(np.quantile(apart, 0.05))
+    multiple = apart / step
+    return step if np.abs(multiple - np.round(multiple)).mean() < 0.1 else 0.0

@@ -1,0 +1,127 @@
+"""Growth of the error over the time of a free run, and the kind of cause that its slope suggests.
+
+A sensor's error does not grow. Play and an offset are there at once and then stay. A wrong gain or
+dead band adds up with the distance, an unmodelled load faster. Commands go to and fro, so growth is
+slower than for one step; the bounds are wide.
+Axes: `W` windows, `K` steps, `J` joints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.machine import Machine
+from diagnosis.free_runs import WindowedRuns
+
+HORIZONS_S = (0.05, 0.5, 2.0, 5.0)
+READINGS = {
+    "none": "no more than the floor",
+    "flat": "there at once and constant: a sensor's noise, steps or offset",
+    "step": "a step that then stays: play, or timing",
+    "slow": "grows slowly: a wandering speed, or timing with commands that go to and fro",
+    "linear": "grows with the way: gain, dead band or saturation",
+    "quadratic": "grows faster than the way: load, drift, or one error on top of another",
+}
+FLAT, STEP, LINEAR, QUADRATIC = 0.2, 0.35, 0.65, 1.3
+"""Bounds of the slope of log(error) over log(time)."""
+MIN_EXCESS_RATIO = 1.2
+"""Error over floor from which there is a growth to read."""
+
+
+@dataclass(frozen=True)
+class ErrorGrowth:
+    """Error of one joint over the time of a free run.
+
+    Attributes:
+        horizon_s: Times of the free run, s.
+        rmse: Error at each, rad or m.
+        floor: The same on the reference; `None` without one.
+        early: Slope of log(what exceeds the floor) over log(time), from the first horizon to the
+            second.
+        late: The same from the second to the last.
+        reading: One of `READINGS`.
+        whole_run: Error over whole recordings in one free run each; `None` where that was not
+            computed.
+    """
+
+    horizon_s: tuple[float, ...]
+    rmse: tuple[float, ...]
+    floor: tuple[float, ...] | None
+    early: float | None
+    late: float | None
+    reading: str
+    whole_run: float | None
+
+    def plain(self) -> dict[str, Any]:
+        """Returns it as plain JSON data."""
+        plain = {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in self.__dict__.items()
+        }
+        return plain | {"meaning": READINGS[self.reading]}
+
+
+def measure_growth(
+    runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine, whole: WindowedRuns | None
+) -> dict[str, ErrorGrowth]:
+    """Returns the growth of each joint's error."""
+    steps = runs.simulated.shape[1]
+    at = [
+        min(max(round(h / machine.period_s), 1), steps) - 1
+        for h in HORIZONS_S
+        if round(h / machine.period_s) <= steps
+    ]
+    rmse = compute_rmse_curve(runs)[at]
+    floor = compute_rmse_curve(reference)[at] if reference else None
+    overall = None if whole is None else np.sqrt(np.nanmean(whole.error**2, (0, 1)))
+    found = {}
+    for j, name in enumerate(machine.joint_names):
+        beyond = np.sqrt(
+            np.maximum(rmse[:, j] ** 2 - (0.0 if floor is None else floor[:, j] ** 2), 0.0)
+        )
+        is_sizeable = floor is None or rmse[-1, j] > MIN_EXCESS_RATIO * floor[-1, j]
+        early, late = (
+            fit_log_slopes(np.array([(k + 1) * machine.period_s for k in at]), beyond)
+            if is_sizeable
+            else (None, None)
+        )
+        found[name] = ErrorGrowth(
+            tuple((k + 1) * machine.period_s for k in at),
+            tuple(map(float, rmse[:, j])),
+            None if floor is None else tuple(map(float, floor[:, j])),
+            early,
+            late,
+            classify_growth(early, late),
+            None if overall is None else float(overall[j]),
+        )
+    return found
+
+
+def compute_rmse_curve(runs: WindowedRuns) -> np.ndarray:
+    """Returns the root mean square error after each step, `(K, J)`, over the windows that go so far; NaN where none does."""
+    given = np.isfinite(runs.error)
+    with np.errstate(invalid="ignore"):
+        return np.sqrt((np.where(given, runs.error, 0.0) ** 2).sum(0) / given.sum(0))
+
+
+def fit_log_slopes(horizon_s: np.ndarray, beyond: np.ndarray) -> tuple[float | None, float | None]:
+    """Returns the slope of log(error) over log(time) from the first horizon to the second, and from the second to the last."""
+    if len(horizon_s) < 3 or not np.isfinite(beyond[1:]).all() or beyond[1] <= 0 or beyond[-1] <= 0:
+        return None, None
+    log_s, log_error = np.log(horizon_s), np.log(np.maximum(beyond, 1e-3 * beyond[-1]))
+    return (
+        float((log_error[1] - log_error[0]) / (log_s[1] - log_s[0])),
+        float((log_error[-1] - log_error[1]) / (log_s[-1] - log_s[1])),
+    )
+
+
+def classify_growth(early: float | None, late: float | None) -> str:
+    """Returns what a pair of slopes says, one of `READINGS`."""
+    if early is None or late is None:
+        return "none"
+    if late < STEP:
+        return "flat" if early < FLAT else "step"
+    return "slow" if late < LINEAR else "linear" if late < QUADRATIC else "quadratic"

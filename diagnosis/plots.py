@@ -1,0 +1,380 @@
+"""Figures of a diagnosis: size of the gap, location, paths, growth, rivals and tip error.
+
+Black is the measurement, red the simulator as it was, blue the simulator with the effects, grey the
+floor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter, NullFormatter
+
+from brokk_rl.machine import Machine
+from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_joint_panels, remove_frame
+from brokk_rl.split import COMMANDED
+from diagnosis.answer import Answer, Outcome, format_error
+from diagnosis.error_growth import READINGS, compute_rmse_curve
+from diagnosis.free_runs import WindowedRuns
+from diagnosis.sanity import name_recording
+
+BEFORE, AFTER, FLOOR = RED, BLUE, GREY
+HEAT = LinearSegmentedColormap.from_list("heat", ["#ffffff", "#fde3c8", "#f4a36b", RED, "#7a2e00"])
+IDLE = "#c3cbd3"
+MAX_JOINTS = 3
+"""Joints whose paths are drawn."""
+NUM_AGES = 16
+"""Columns of the picture over time."""
+
+
+def draw_gap_bars(answer: Answer) -> Figure | None:
+    """Draws the error before and after over the floor; `None` where there is none to draw."""
+    gap = answer.gap
+    if gap is None or not max(gap.before, gap.floor or 0.0):
+        return None
+    figure = Figure(figsize=(9.5, 2.0), layout="constrained")
+    axis = figure.add_subplot()
+    rows = [("before", gap.before, BEFORE)]
+    rows += [("after", gap.after, AFTER)] if answer.selected else []
+    rows += (
+        []
+        if gap.floor is None
+        else [
+            (
+                "floor" if gap.floor_of == "reference" else f"{gap.floor_of}\n(floor)",
+                gap.floor,
+                FLOOR,
+            )
+        ]
+    )
+    scale = 100.0 if gap.unit == "travel" else 1e3
+    for place, (_, width, colour) in enumerate(rows):
+        axis.barh(place, scale * width, color=colour, height=0.62)
+        told = format_error(width, gap.unit)
+        axis.annotate(told, (scale * width, place), (6, 0), textcoords="offset points", va="center")
+    axis.set_yticks(range(len(rows)), [row[0] for row in rows])
+    axis.invert_yaxis()
+    if gap.floor is not None:
+        axis.axvline(scale * gap.floor, color=FLOOR, lw=1.0, ls=":")
+    axis.set_xlim(0.0, scale * max(width for _, width, _ in rows) * 1.16)
+    unit = "% of travel" if gap.unit == "travel" else f"m{gap.unit}"
+    axis.set_xlabel(f"error over 5 s free runs, all joints, RMS [{unit}]")
+    remove_frame(axis)
+    return figure
+
+
+def draw_gap_map(answer: Answer, before: WindowedRuns, machine: Machine) -> Figure:
+    """Draws which joint and regime the gap lies in, and how large the error of each joint is over the running time."""
+    location = answer.more["location"]
+    parts = location["parts"]["regime"]
+    joints, regimes = (
+        list(machine.joint_names),
+        list(dict.fromkeys(part["category"] for part in parts)),
+    )
+    share = np.array(
+        [[_find_part(parts, joint, regime)["gap"] for regime in regimes] for joint in joints]
+    )
+    figure = Figure(figsize=(12.0, 1.5 + 0.52 * len(joints)), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
+    left.imshow(
+        100.0 * share, cmap=HEAT, vmin=0.0, vmax=max(30.0, 100.0 * share.max()), aspect="auto"
+    )
+    for y, joint in enumerate(joints):
+        for x, regime in enumerate(regimes):
+            part = _find_part(parts, joint, regime)
+            if share[y, x] >= 0.005 or part["is_sure"]:
+                text = f"{100 * share[y, x]:.0f} %" + (" ●" if part["is_sure"] else "")
+                dark = share[y, x] > 0.6 * max(0.3, share.max())
+                left.text(
+                    x,
+                    y,
+                    text,
+                    ha="center",
+                    va="center",
+                    fontsize=8.5,
+                    color="white" if dark else "black",
+                )
+    left.set_xticks(np.arange(len(regimes) - 1) + 0.5, minor=True)
+    left.set_yticks(np.arange(len(joints) - 1) + 0.5, minor=True)
+    left.grid(which="minor", color="#d7dce1", lw=0.8)
+    left.set_xticks(
+        range(len(regimes)), [regime.replace(" ", "\n", 1) for regime in regimes], fontsize=8
+    )
+    left.set_yticks(range(len(joints)), joints)
+    left.set_title("part of the gap by joint and regime (● beyond chance)", loc="left", fontsize=10)
+    _draw_error_over_time(right, before, machine)
+    for axis in (left, right):
+        axis.tick_params(length=0)
+        axis.tick_params(which="minor", length=0)
+        axis.spines[:].set_visible(False)
+    return figure
+
+
+def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
+    """Draws measured against simulated positions of the joints with the largest gaps: a whole recording, and the worst windows."""
+    before = outcome.before
+    error = np.sqrt(np.nanmean(before.error**2, 1))  # (W, J)
+    located = outcome.answer.where.joints
+    foremost = [-located[name].share if name in located else 0.0 for name in machine.joint_names]
+    shown = np.argsort(foremost, kind="stable")[: min(MAX_JOINTS, machine.num_joints)]
+    height = 2.6 * len(shown) + 0.6
+    figure = Figure(figsize=(12.0, height))
+    rows = figure.add_gridspec(
+        len(shown), 3, left=0.075, right=0.99, bottom=0.5 / height, top=1.0 - 0.65 / height, wspace=0.16, hspace=0.34,
+        width_ratios=[1.9, 1.0, 1.0],
+    )  # fmt: skip
+    for line, joint in enumerate(shown):
+        worst = np.argsort(-np.nan_to_num(error[:, joint]))
+        second = next(
+            (w for w in worst[1:] if before.source[w] != before.source[worst[0]]),
+            worst[min(1, len(worst) - 1)],
+        )
+        whole = np.flatnonzero(before.source == before.source[worst[0]])
+        for column, (title, windows) in enumerate(
+            (
+                ("a whole recording", whole),
+                ("worst window", worst[:1]),
+                ("elsewhere", np.array([second])),
+            )
+        ):
+            grid = rows[line, column].subgridspec(2, 1, height_ratios=[3.2, 1.0], hspace=0.1)
+            above = figure.add_subplot(grid[0])
+            below = figure.add_subplot(grid[1], sharex=above)
+            _draw_path(above, below, outcome, windows, int(joint), machine)
+            above.set_title(
+                f"{title}: {name_recording(before.recordings[int(before.source[windows[0]])])}",
+                fontsize=8.5,
+                loc="left",
+            )
+            if column == 0:
+                above.set_ylabel(f"{machine.joints[joint].name} [{machine.joints[joint].unit}]")
+                below.set_ylabel("u", rotation=0, va="center")
+            if line == len(shown) - 1:
+                below.set_xlabel("time [s]")
+    add_legend(figure, figure.axes[0])
+    return figure
+
+
+def draw_growth(outcome: Outcome, machine: Machine) -> Figure:
+    """Draws the error over the time of a free run, one panel a joint, with what its shape says."""
+    figure, axes = make_joint_panels(machine, "xy")
+    curves = {"before": outcome.before, "after": outcome.after, "floor": outcome.floor}
+    t_s = machine.period_s * np.arange(1, outcome.before.simulated.shape[1] + 1)
+    told = outcome.answer.more["location"]["growth"]
+    for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
+        for (name, runs), colour in zip(curves.items(), (BEFORE, AFTER, FLOOR), strict=True):
+            if runs is not None:
+                rmse = (
+                    100.0 * compute_rmse_curve(runs)[:, j] / (machine.upper[j] - machine.lower[j])
+                )
+                axis.plot(
+                    t_s[: len(rmse)], np.maximum(rmse, 1e-4), color=colour, lw=1.8, label=name
+                )
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
+        axis.set_xlim(t_s[0], t_s[-1])
+        axis.grid(alpha=0.3)
+        reading = READINGS[told[joint.name]["reading"]].split(":")[0]
+        axis.set_title(f"{joint.name}: {reading}", loc="left", fontsize=9)
+        remove_frame(axis)
+    figure.supxlabel("time of the free run [s]", fontsize=10)
+    figure.supylabel("RMSE [% of travel]", fontsize=10)
+    add_legend(figure, axes[0])
+    return figure
+
+
+def draw_rivals(evidence: Mapping[str, Any]) -> Figure | None:
+    """Draws what each rival earned, those that were chosen in blue, and what chance alone earns.
+
+    Args:
+        evidence: `rivals`: a list of `name`, `score`, `selected`; `threshold`: from which a rival
+            is believed; `null`: scores of simulated cases without a gap; `unit`: of the scores. All
+            but `rivals` may be missing.
+    """
+    rows = sorted(evidence.get("rivals", []), key=lambda row: -row["score"])[:14]
+    if not rows:
+        return None
+    null, threshold = evidence.get("null") or [], evidence.get("threshold")
+    figure = Figure(figsize=(9.5, 1.2 + 0.3 * len(rows)), layout="constrained")
+    axis = figure.add_subplot()
+    for place, row in enumerate(rows):
+        axis.barh(place, row["score"], color=BLUE if row.get("selected") else IDLE, height=0.7)
+        axis.annotate(
+            f"{row['score']:.{0 if abs(row['score']) >= 100 else 1}f}",
+            (max(row["score"], 0.0), place),
+            (5, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
+    if len(null):
+        low, high = np.percentile(null, (2.5, 97.5))
+        axis.axvspan(
+            low, high, color="#999999", alpha=0.25, lw=0, label="chance: cases without a gap (95 %)"
+        )
+    if threshold is not None:
+        axis.axvline(threshold, color="black", ls="--", lw=1.0, label="to be believed")
+    axis.set_yticks(range(len(rows)), [row["name"].replace("_", " ") for row in rows], fontsize=9)
+    axis.invert_yaxis()
+    axis.set_xlabel(evidence.get("unit", "what it earns on recordings that it was not fitted to"))
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(frameon=False, loc="lower right", fontsize=9)
+    remove_frame(axis)
+    return figure
+
+
+def draw_tip_budget(budget: Mapping[str, Any]) -> Figure:
+    """Draws how the joints' errors add up to the mean squared error of the tip, and what is left after the effects."""
+    before, after, floor = (budget[name] for name in ("before", "after", "floor"))
+    parts = sorted(before["joint_part"].items(), key=lambda pair: -pair[1])
+    whole = before["tip_rms_mm"]
+    figure = Figure(figsize=(9.5, 3.3), layout="constrained")
+    axis = figure.add_subplot()
+    level, names = 0.0, []
+    for place, (joint, part) in enumerate(parts):
+        top = level + part
+        ends = [np.sqrt(max(value, 0.0)) * whole for value in (level, top)]
+        axis.bar(
+            place,
+            ends[1] - ends[0],
+            bottom=ends[0],
+            color=BEFORE,
+            alpha=0.35 + 0.65 * min(1.0, abs(part)),
+            width=0.62,
+        )
+        axis.annotate(
+            f"{round(100 * part)} %",
+            (place, max(ends)),
+            (0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize=9,
+        )
+        axis.plot([place + 0.31, place + 0.69], [ends[1]] * 2, color="#777777", lw=0.8)
+        level = top
+        names.append(joint)
+    totals = [("before", before, BEFORE), ("after", after, AFTER), ("floor", floor, FLOOR)]
+    totals += [
+        (name, {"tip_rms_mm": value}, "#cc79a7") for name, value in budget["stages_mm"].items()
+    ]
+    for name, account, colour in totals:
+        if account is not None:
+            axis.bar(len(names), account["tip_rms_mm"], color=colour, width=0.62)
+            text = (
+                f"{account['tip_rms_mm']:.0f} mm"
+                if account["tip_rms_mm"] >= 10
+                else f"{account['tip_rms_mm']:.1f} mm"
+            )
+            axis.annotate(
+                text,
+                (len(names), account["tip_rms_mm"]),
+                (0, 3),
+                textcoords="offset points",
+                ha="center",
+                fontsize=9,
+            )
+            names.append(name)
+    axis.set_xticks(range(len(names)), names)
+    axis.set_ylabel("at the tool, RMS [mm]")
+    axis.set_ylim(
+        0.0, 1.15 * max(whole, *(one["tip_rms_mm"] for _, one, _ in totals if one is not None))
+    )
+    remove_frame(axis)
+    return figure
+
+
+def _draw_error_over_time(axis: Axes, before: WindowedRuns, machine: Machine) -> None:
+    """Fills the axis with the error of each joint over running time, in parts of its travel."""
+    square = np.nanmean(before.error**2, 1) / (machine.upper - machine.lower) ** 2
+    order = np.lexsort((before.row, before.source))
+    groups = np.array_split(order, min(NUM_AGES * 2, len(order)))
+    shade = 100.0 * np.sqrt(np.array([square[group].mean(0) for group in groups]).T)
+    image = axis.imshow(shade, cmap=HEAT, vmin=0.0, aspect="auto")
+    cuts = [
+        i
+        for i in range(1, len(groups))
+        if before.source[groups[i][0]] != before.source[groups[i - 1][0]]
+    ]
+    for place in cuts:
+        axis.axvline(place - 0.5, color="black", lw=0.8)
+    starts = [0, *cuts]
+    labels = [name_recording(before.recordings[int(before.source[groups[i][0]])]) for i in starts]
+    axis.set_xticks(
+        starts, labels if len(labels) <= 6 else [""] * len(labels), fontsize=8, ha="left"
+    )
+    axis.set_yticks(range(machine.num_joints), machine.joint_names)
+    axis.set_title(
+        "error over the running time, by recording [% of travel]", loc="left", fontsize=10
+    )
+    axis.figure.colorbar(image, ax=axis, pad=0.01, fraction=0.04).outline.set_visible(False)  # type: ignore[union-attr]
+
+
+def _draw_path(
+    above: Axes,
+    below: Axes,
+    outcome: Outcome,
+    windows: Sequence[int] | np.ndarray,
+    joint: int,
+    machine: Machine,
+) -> None:
+    before, after = outcome.before, outcome.after
+    recording = before.recordings[int(before.source[windows[0]])]
+    steps = before.simulated.shape[1]
+    first, last = (
+        int(before.row[windows].min()),
+        int(min(before.row[windows].max() + steps, recording.num_samples)),
+    )
+    t_s = recording.t_s[first:last]
+    above.plot(t_s, recording.q[first:last, joint], color="black", lw=1.6, label="measured")
+    for runs, colour, label in (
+        (before, BEFORE, "simulated before"),
+        (after, AFTER, "simulated after"),
+    ):
+        if runs is None:
+            continue
+        for number, window in enumerate(windows):
+            begin = int(before.row[window])
+            end = min(begin + steps, recording.num_samples)
+            above.plot(
+                recording.t_s[begin:end],
+                runs.simulated[window, : end - begin, joint],
+                color=colour,
+                lw=1.3,
+                label=None if number else label,
+            )
+    if len(windows) > 1:
+        for window in windows:
+            above.axvline(float(recording.t_s[before.row[window]]), color="#bbbbbb", lw=0.4)
+    u = recording.u[first:last, joint]
+    below.fill_between(
+        t_s,
+        u,
+        step="post",
+        color="#555555",
+        alpha=0.4 if (np.abs(u) > COMMANDED).any() else 0.1,
+        lw=0,
+    )
+    below.set_ylim(-1.05, 1.05)
+    below.set_yticks([-1, 0, 1])
+    below.axhline(0.0, color="#555555", lw=0.5)
+    above.tick_params(labelbottom=False)
+    above.set_xlim(t_s[0], t_s[-1])
+    span = machine.upper[joint] - machine.lower[joint]
+    low, high = above.get_ylim()
+    if high - low < 0.02 * span:
+        above.set_ylim((low + high - 0.02 * span) / 2.0, (low + high + 0.02 * span) / 2.0)
+    for axis in (above, below):
+        remove_frame(axis)
+
+
+def _find_part(parts: Sequence[Mapping[str, Any]], joint: str, category: str) -> Mapping[str, Any]:
+    return next(part for part in parts if part["joint"] == joint and part["category"] == category)

@@ -1,0 +1,295 @@
+"""Distribution of the cases of an exam: kinds, effects, joints and sizes, drawn from a seed.
+
+`PlantFamily` is the seam to the plants: the configuration puts a family into the exam.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+
+from brokk_rl.contracts.link import Link
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+@dataclass(frozen=True)
+class UnknownFault:
+    """Something outside the library that a machine has.
+
+    Attributes:
+        kind: Its name in the family.
+        severity: By joint, `(J,)`: 0 not at all, 1 plainly.
+    """
+
+    kind: str
+    severity: np.ndarray
+
+
+@dataclass(frozen=True)
+class PlantRun:
+    """One run of one machine.
+
+    Attributes:
+        seed: The machine: same seed, same machine.
+        roughness: Name of how much of the machine no tidy model has (`mild`, `strong`).
+        chance: Seed of the run's own chance.
+        elapsed_s: Time the machine has run before.
+        faults: Effects it has, by name: parameters in the library's words, `(J,)` each.
+        ailment: What it has besides that no library knows.
+        tracked: Whether its tool point is measured.
+    """
+
+    seed: int
+    roughness: str
+    chance: int
+    elapsed_s: float
+    faults: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    ailment: UnknownFault | None = None
+    tracked: bool = False
+
+
+class PlantFamily(Protocol):
+    """A spec in `conf/exam_plants`: machines of many makes, none of which shares equations with what is examined."""
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that its plants can have."""
+        ...
+
+    @property
+    def ailments(self) -> tuple[str, ...]:
+        """Names of what its plants can have that no library knows."""
+        ...
+
+    def makes(self, machine: Machine, specimens: Sequence[PlantRun]) -> list[str]:
+        """Returns the make of each specimen; those of one make can run side by side."""
+        ...
+
+    def build(self, machine: Machine, specimens: Sequence[PlantRun], run_s: float) -> Link:
+        """Returns a link to specimens of one make, side by side, that runs for `run_s`, with what else is measured as `extra()`."""
+        ...
+
+
+KINDS = ("none", "faint", "one", "several", "outside")
+"""No gap; an effect too small to be seen; one effect; two or three; something that no library
+has."""
+
+
+@spec
+class EffectDistribution:
+    """How an effect is drawn.
+
+    Attributes:
+        numbers: Parameter to its value that changes nothing and its typical value.
+        shape: Parameters that only shape it, at the value they have.
+        joints: `some` one or two, or `all` that can have it.
+        not_on: Joints on which nothing of it would be seen.
+        mirrored: The other sign is as likely.
+        only_one: One of the numbers is drawn, the others change nothing.
+        needs_tool: It cannot be seen without the measured tool point.
+    """
+
+    numbers: dict[str, tuple[float, float]]
+    shape: dict[str, float]
+    joints: Literal["some", "all"]
+    not_on: tuple[str, ...]
+    mirrored: bool
+    only_one: bool
+    needs_tool: bool
+
+
+@dataclass(frozen=True)
+class CaseFault:
+    """One effect of a case.
+
+    Attributes:
+        effect: Its name.
+        joints: The joints that have it.
+        size: Of typical.
+        parameters: `(J,)` by name.
+        drawn: The parameters that were drawn, and so can be asked for, with the value that changes
+            nothing.
+    """
+
+    effect: str
+    joints: tuple[str, ...]
+    size: float
+    parameters: dict[str, np.ndarray]
+    drawn: dict[str, float]
+
+
+@dataclass(frozen=True)
+class CaseDesign:
+    """One case before it is recorded.
+
+    Attributes:
+        kind: See `KINDS`.
+        machine_seed: Draws the machine.
+        chance: Draws everything else about its recordings.
+        faults: Effects that the field has and the reference has not.
+        ailment: The same for what no library knows.
+        size: Of the ailment.
+        tracked: Whether the tool point is recorded.
+        joints: Joints with the ailment.
+    """
+
+    kind: str
+    machine_seed: int
+    chance: int
+    faults: tuple[CaseFault, ...] = ()
+    ailment: UnknownFault | None = None
+    size: float | None = None
+    tracked: bool = False
+    joints: tuple[str, ...] = ()
+
+
+@spec
+class CaseDistribution:
+    """Kinds of cases and how effects are drawn.
+
+    Attributes:
+        num_cases: Cases in all.
+        shares: Share of each kind.
+        sizes: Range of sizes, of typical.
+        faint_sizes: Range of sizes of effects that are too small to be seen.
+        tracked_share: Part of the cases with measured tool point; those that need it have it.
+        second_joint: Chance that another joint has an effect too.
+        classes: Effects that commands and joint positions cannot tell apart; a case has one of each
+            at most.
+        troubles: How each effect is drawn; those that are not named do not occur.
+    """
+
+    num_cases: int
+    shares: dict[str, float]
+    sizes: tuple[float, float]
+    faint_sizes: tuple[float, float]
+    tracked_share: float
+    second_joint: float
+    classes: tuple[tuple[str, ...], ...]
+    troubles: dict[str, EffectDistribution]
+
+    def check(self) -> None:
+        if set(self.shares) != set(KINDS) or not math.isclose(
+            sum(self.shares.values()), 1.0, abs_tol=1e-6
+        ):
+            raise ConfigError(
+                f"exam.mix.shares: expected {', '.join(KINDS)} with sum 1, got {self.shares}"
+            )
+        if self.num_cases < 1 or not self.troubles:
+            raise ConfigError("exam.mix: expected num_cases of 1 or more, and some troubles")
+
+    def questions(
+        self, machine: Machine, ailments: Sequence[str], generator: np.random.Generator
+    ) -> list[CaseDesign]:
+        """Returns the cases in random order; each effect, and each ailment, occurs about as often as any other."""
+        kinds = [kind for kind, count in self._counts().items() for _ in range(count)]
+        effects, strange = (
+            _cycle_shuffled(list(self.troubles), generator),
+            _cycle_shuffled(list(ailments), generator),
+        )
+        found = []
+        for kind in kinds:
+            tracked, faults, ailment, size = (
+                bool(generator.random() < self.tracked_share),
+                [],
+                None,
+                None,
+            )
+            joints: tuple[str, ...] = ()
+            if kind in ("one", "faint"):
+                faults = [
+                    self._fault(
+                        next(effects),
+                        machine,
+                        self.faint_sizes if kind == "faint" else self.sizes,
+                        generator,
+                    )
+                ]
+            elif kind == "several":
+                names = self._distinct(effects, int(generator.integers(2, 4)))
+                faults = [self._fault(name, machine, self.sizes, generator) for name in names]
+            elif kind == "outside":
+                size = float(generator.uniform(*self.sizes))
+                chosen = self._some(
+                    np.flatnonzero(~machine.is_exclusive), generator
+                )  # much of it shows in company only
+                ailment = UnknownFault(
+                    next(strange), size * np.isin(np.arange(machine.num_joints), chosen)
+                )
+                joints = tuple(machine.joint_names[j] for j in chosen)
+            tracked = tracked or any(self.troubles[fault.effect].needs_tool for fault in faults)
+            machine_seed, chance = generator.integers(2**62, size=2).tolist()
+            found.append(
+                CaseDesign(
+                    kind, machine_seed, chance, tuple(faults), ailment, size, tracked, joints
+                )
+            )
+        return [found[i] for i in generator.permutation(len(found))]
+
+    def _counts(self) -> dict[str, int]:
+        """Returns the number of cases of each kind: whole parts of the shares, the largest remainders get what is left."""
+        exact = {kind: self.shares[kind] * self.num_cases for kind in KINDS}
+        counts = {kind: int(value + 1e-9) for kind, value in exact.items()}
+        for kind in sorted(KINDS, key=lambda kind: counts[kind] - exact[kind])[
+            : self.num_cases - sum(counts.values())
+        ]:
+            counts[kind] += 1
+        return counts
+
+    def _distinct(self, effects: Iterator[str], count: int) -> list[str]:
+        found: list[str] = []
+        while len(found) < count:
+            name = next(effects)
+            taken = {
+                other for group in self.classes if any(f in group for f in found) for other in group
+            }
+            if name not in found and name not in taken:
+                found.append(name)
+        return found
+
+    def _some(self, able: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+        count = 1 + (len(able) > 1 and generator.random() < self.second_joint)
+        return np.sort(generator.choice(able, count, replace=False))
+
+    def _fault(
+        self,
+        name: str,
+        machine: Machine,
+        sizes: tuple[float, float],
+        generator: np.random.Generator,
+    ) -> CaseFault:
+        trouble, size = self.troubles[name], float(generator.uniform(*sizes))
+        able = np.flatnonzero([joint not in trouble.not_on for joint in machine.joint_names])
+        chosen = able if trouble.joints == "all" else self._some(able, generator)
+        has = np.isin(np.arange(machine.num_joints), chosen)
+        drawn = tuple(trouble.numbers)
+        if trouble.only_one:
+            drawn = (drawn[int(generator.integers(len(drawn)))],)
+        sign = float(generator.choice([-1.0, 1.0])) if trouble.mirrored else 1.0
+        parameters = {
+            key: np.full(machine.num_joints, value) for key, value in trouble.shape.items()
+        }
+        for key, (none, typical) in trouble.numbers.items():
+            # where nothing changes a threshold is not there at all, rather than where it begins to
+            # count
+            away = none if none in (0.0, 1.0) else 0.0
+            parameters[key] = np.where(
+                has & (key in drawn), none + sign * size * (typical - none), away
+            )
+        nothing = {key: trouble.numbers[key][0] for key in drawn}
+        return CaseFault(
+            name, tuple(machine.joint_names[j] for j in chosen), size, parameters, nothing
+        )
+
+
+def _cycle_shuffled(names: list[str], generator: np.random.Generator) -> Iterator[str]:
+    """Yields all names in random order, again and again."""
+    while True:
+        for i in generator.permutation(len(names)):
+            yield names[i]

@@ -1,0 +1,150 @@
+"""Cases of an exam on disk: recordings, labels, and the sealed file of the labels.
+
+The labels lie in one file that only its owner can read. Its hash lies beside it before any answer
+is given.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.errors import RecordingError, StorageError
+from brokk_rl.machine import Machine
+from brokk_rl.session import write_text
+from exam.case_distribution import CaseDesign
+from exam.generate import CaseRecorder, HalfPlan, RecordedHalf
+
+LABELS_FILE, HASH_FILE = "labels.sealed.json", "labels.sha256"
+
+
+def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
+    """Writes labels and hash into `folder`; returns the hash. The salt keeps anyone from guessing labels and comparing hashes.
+
+    Raises:
+        StorageError: there are labels already, or the file cannot be written.
+    """
+    path = folder / LABELS_FILE
+    text = json.dumps({"salt": salt, **labels}, indent=1, allow_nan=False, sort_keys=True) + "\n"
+    found = hashlib.sha256(text.encode()).hexdigest()
+    try:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write(text)
+        write_text(folder / HASH_FILE, f"{found}  {LABELS_FILE}\n")  # as sha256sum writes it
+    except FileExistsError as error:
+        raise StorageError(
+            f"{path} exists: the exam in this folder is sealed; choose another session.out=<folder>"
+        ) from error
+    except OSError as error:
+        raise StorageError(f"cannot seal the labels in {folder}: {error.strerror}") from error
+    return found
+
+
+def open_labels(folder: Path) -> dict[str, Any]:
+    """Returns the labels in `folder`, after comparing them with the published hash.
+
+    Raises:
+        RecordingError: labels or hash are missing, or do not belong together.
+    """
+    try:
+        text, published = (
+            (folder / LABELS_FILE).read_text(),
+            (folder / HASH_FILE).read_text().split()[0],
+        )
+    except (OSError, IndexError) as error:
+        raise RecordingError(
+            f"{folder}: expected {LABELS_FILE} and {HASH_FILE}, as exam.do=make leaves them ({error})"
+        ) from error
+    if hashlib.sha256(text.encode()).hexdigest() != published:
+        raise RecordingError(
+            f"{folder / LABELS_FILE} is not what was sealed: its SHA-256 is not that of {HASH_FILE}; make the exam again"
+        )
+    return json.loads(text)
+
+
+CASES_FOLDER = "cases"
+HORIZON_S = 5.0
+
+
+def write_cases(
+    workshop: CaseRecorder,
+    questions: Sequence[CaseDesign],
+    reference: HalfPlan,
+    field: HalfPlan,
+    machine: Machine,
+    folder: Path,
+    workers: int,
+    advance: Callable[[int], None],
+) -> list[dict[str, Any]]:
+    """Records all cases into `folder/cases/<id>`, in so many `workers`; returns their labels, plain JSON, in the same order."""
+    names = [f"{number:04d}" for number in range(len(questions))]
+    folders = [folder / CASES_FOLDER / name for name in names]
+    halves = [
+        workshop.planned(questions, half, is_field)
+        for half, is_field in ((reference, False), (field, True))
+    ]
+    _, made = (workshop.record(jobs, folders, workers, advance) for jobs in halves)
+    return [
+        make_label(name, question, half, machine)
+        for name, question, half in zip(names, questions, made, strict=True)
+    ]
+
+
+def make_label(
+    name: str, question: CaseDesign, field: RecordedHalf, machine: Machine
+) -> dict[str, Any]:
+    """Returns what is true about a case.
+
+    `moved_rad`: root mean square of what its cause changes of the measured motion in 5 s from equal
+    beginnings, by joint.
+    """
+    return {
+        "case": name,
+        "kind": question.kind,
+        "tracked": question.tracked,
+        "effects": [
+            {
+                "effect": fault.effect,
+                "joints": list(fault.joints),
+                "size": fault.size,
+                "parameters": {
+                    key: {
+                        joint: float(fault.parameters[key][machine.joint_names.index(joint)])
+                        for joint in fault.joints
+                    }
+                    for key in fault.drawn
+                },
+                "nothing": fault.drawn,
+            }
+            for fault in question.faults
+        ],
+        "outside": None
+        if question.ailment is None
+        else {
+            "ailment": question.ailment.kind,
+            "joints": list(question.joints),
+            "size": question.size,
+        },
+        "moved_rad": dict(
+            zip(machine.joint_names, measure_motion_change(field, machine).tolist(), strict=True)
+        ),
+        "machine_seed": question.machine_seed,
+        "chance": question.chance,
+    }
+
+
+def measure_motion_change(field: RecordedHalf, machine: Machine) -> np.ndarray:
+    """Returns what the cause changes of the motion in windows of 5 s that begin alike, root mean square, `(J,)`."""
+    steps, total, count = round(HORIZON_S / machine.period_s), 0.0, 0
+    for q, without in zip(field.q, field.without_q, strict=True):
+        apart = (q - without).astype(float)
+        for begin in range(0, len(apart) - steps, steps // 2):
+            growth = apart[begin + 1 : begin + 1 + steps] - apart[begin]
+            total, count = total + (growth**2).sum(0), count + steps
+    return np.sqrt(total / max(count, 1))

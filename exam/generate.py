@@ -1,0 +1,299 @@
+"""Recordings of cases: a plan for each run, machines of one make side by side, files of measurements."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from actuators.excite.plan_report import PlanTrack
+from actuators.excite.player import CommandGuards, PlanPlayer, drive
+from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
+from brokk_rl import record
+from brokk_rl.contracts.actuator import Excitation
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.machine import Machine
+from brokk_rl.signals import Command
+from brokk_rl.spec import spec
+from exam.case_distribution import CaseDesign, PlantFamily, PlantRun
+
+SIDE_BY_SIDE = 240
+"""Runs simulated at once; their random numbers lie in memory."""
+NUM_PLANS = 4
+"""Plans drawn before a file is said to be too short: now and then the ways between distant poses
+leave no room."""
+FIRST_DAY = datetime(2026, 1, 5, 8, 0, tzinfo=UTC)
+"""Recordings say when they were made, so that warm-up can be read across files; all cases say the
+same."""
+EPOCH_S = FIRST_DAY.timestamp()
+
+
+@spec
+class HalfPlan:
+    """How one half of a case, `reference` or `field`, is recorded.
+
+    Attributes:
+        programs: Names of the excitations of each file.
+        file_s: Length of a file.
+        elapsed_s: Range of the time that the machine has run before a file begins.
+    """
+
+    programs: tuple[tuple[str, ...], ...]
+    file_s: float
+    elapsed_s: tuple[float, float]
+
+    def check(self) -> None:
+        if not self.programs or not all(self.programs):
+            raise ConfigError(
+                "exam: each file needs one or more excitations, e.g. [[levels], [levels, holds]]"
+            )
+
+
+@dataclass(frozen=True)
+class RecordedHalf:
+    """What was recorded of one half of all cases.
+
+    Attributes:
+        u: Commands, `(T, J)` a file.
+        q: Measured positions.
+        without_q: Where the same machine would have gone, by the same commands and chance, without
+            what the case is about.
+    """
+
+    u: list[np.ndarray]
+    q: list[np.ndarray]
+    without_q: list[np.ndarray]
+
+
+@contextmanager
+def _silence_runner() -> Iterator[None]:
+    """Leaves out what the runner says of ways to start poses that took too long: an ailing machine may well be slow."""
+    logger = logging.getLogger(PlanPlayer.__module__)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+class RecordingJob:
+    """One file of one case.
+
+    Attributes:
+        question: The case.
+        case: Its number.
+        number: Number of the file in its half.
+        half: How that is recorded.
+        is_field: Whether it is the field.
+        elapsed_s: How long the machine has run before.
+        created: When, as recordings say it.
+        plan: What is played.
+    """
+
+    plan: ExcitationPlan
+
+    def __init__(
+        self, question: CaseDesign, case: int, number: int, half: HalfPlan, is_field: bool
+    ) -> None:
+        self.question, self.case, self.number, self.half, self.is_field = (
+            question,
+            case,
+            number,
+            half,
+            is_field,
+        )
+        share = (number + float(self.stream("elapsed").random())) / len(half.programs)
+        low_s, high_s = half.elapsed_s
+        self.elapsed_s = low_s + share * (
+            high_s - low_s
+        )  # files follow one another through the day
+        self.created = record.add_seconds(
+            FIRST_DAY.isoformat(timespec="milliseconds"), self.elapsed_s + 86400.0 * is_field
+        )
+
+    def stream(self, name: str) -> np.random.Generator:
+        """Returns a stream of chance that is this file's alone."""
+        return np.random.default_rng(
+            [self.question.chance, self.number, int(self.is_field), *name.encode()]
+        )
+
+
+class CaseRecorder:
+    """Records cases.
+
+    Args:
+        machine: The machine.
+        plants: Its doubles.
+        roughness: Which of the family's.
+        excitations: By name.
+        approach: How start poses are taken up.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        plants: PlantFamily,
+        roughness: str,
+        excitations: Mapping[str, Excitation],
+        approach: Approach,
+    ) -> None:
+        self._machine, self._plants, self._roughness = machine, plants, roughness
+        self._excitations, self._approach = excitations, approach
+        self._guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
+
+    def planned(
+        self, questions: Sequence[CaseDesign], half: HalfPlan, is_field: bool
+    ) -> list[RecordingJob]:
+        """Returns the files of one half of all cases with their plans, before anything is recorded.
+
+        Raises:
+            ConfigError: an excitation is unknown, or finds no room in a file.
+        """
+        jobs = [
+            RecordingJob(question, n, k, half, is_field)
+            for n, question in enumerate(questions)
+            for k in range(len(half.programs))
+        ]
+        for job in jobs:
+            job.plan = self._plan(job)
+        return jobs
+
+    def record(
+        self,
+        jobs: Sequence[RecordingJob],
+        folders: Sequence[Path],
+        workers: int,
+        advance: Callable[[int], None],
+    ) -> list[RecordedHalf]:
+        """Writes the files of one half of each case into its folder; returns what is in them, by case.
+
+        Args:
+            jobs: The files.
+            folders: Where each case's files go.
+            workers: Processes; files are the same however many there are.
+            advance: Told how many files are done.
+        """
+        specimens = [self._specimen(job) for job in jobs]
+        makes = self._plants.makes(self._machine, specimens)
+        size, batches = min(SIDE_BY_SIDE, -(-len(jobs) // workers)), []
+        for make in sorted(set(makes)):
+            mine = [i for i, other in enumerate(makes) if other == make]
+            batches += [mine[begin : begin + size] for begin in range(0, len(mine), size)]
+        found: dict[int, RecordedHalf] = {}
+        with ExitStack() as stack:
+            run = map if workers == 1 else stack.enter_context(ProcessPoolExecutor(workers)).map
+            parts = (
+                [[items[i] for i in batch] for batch in batches] for items in (jobs, specimens)
+            )
+            for batch, made in zip(
+                batches, run(self._batch, *parts, [folders] * len(batches)), strict=True
+            ):
+                found |= dict(zip(batch, made, strict=True))
+                advance(len(batch))
+        done = [RecordedHalf([], [], []) for _ in folders]
+        for i, job in enumerate(jobs):  # a case's files are in order
+            for name in ("u", "q", "without_q"):
+                getattr(done[job.case], name).extend(getattr(found[i], name))
+        return done
+
+    def _specimen(self, job: RecordingJob) -> PlantRun:
+        question = job.question
+        faults = (
+            {fault.effect: fault.parameters for fault in question.faults} if job.is_field else {}
+        )
+        return PlantRun(
+            seed=question.machine_seed,
+            roughness=self._roughness,
+            chance=int(job.stream("chance").integers(2**62)),
+            elapsed_s=job.elapsed_s,
+            faults=faults,
+            ailment=question.ailment if job.is_field else None,
+            tracked=question.tracked,
+        )
+
+    def _plan(self, job: RecordingJob) -> ExcitationPlan:
+        names = job.half.programs[job.number]
+        for name in names:
+            if name not in self._excitations:
+                raise ConfigError(
+                    f"exam: programs: no excitation '{name}'; {list_choices(name, self._excitations)}"
+                )
+        chosen = {name: self._excitations[name] for name in names}
+        stream = job.stream("plan")
+        tried = 1
+        while True:
+            try:
+                return plan_runs(chosen, self._machine, self._approach, 1, job.half.file_s, stream)
+            except ConfigError:
+                if tried == NUM_PLANS:
+                    raise
+                tried += 1
+
+    def _batch(
+        self, jobs: Sequence[RecordingJob], specimens: Sequence[PlantRun], folders: Sequence[Path]
+    ) -> list[RecordedHalf]:
+        """Records files of one half, of machines of one make; returns what is in each."""
+        half, is_field = jobs[0].half, jobs[0].is_field
+        machine = self._machine
+        plan = ExcitationPlan(
+            runs=tuple(job.plan.runs[0] for job in jobs),
+            run_s=half.file_s,
+            names=tuple(self._excitations),
+        )
+        link = self._plants.build(machine, specimens, half.file_s)
+        runner = PlanPlayer(plan, machine, self._approach, self._guards)
+        with link as opened, _silence_runner():
+            samples = list(drive(opened, runner, machine, len(jobs), half.file_s))
+        track = PlanTrack(samples)
+        extra = {
+            name: np.stack([sample.extra[name] for sample in samples], 1)
+            for name in samples[0].extra
+        }
+        u, q = track.u.astype(np.float32), track.q.astype(np.float32)
+        without = self._without(specimens, u, half) if is_field else q
+        for n, job in enumerate(jobs):
+            columns = (
+                {name: values[n] for name, values in extra.items()} if job.question.tracked else {}
+            )
+            recording = record.Recording(
+                machine=machine.name,
+                joints=machine.joint_names,
+                units=tuple(joint.unit for joint in machine.joints),
+                rate_hz=1.0 / machine.period_s,
+                t_s=track.t_s - track.t_s[0],
+                u=u[:, n],
+                q=q[:, n],
+                extra=columns,
+                metadata={
+                    "created": job.created,
+                    "fingerprint": record.format_fingerprint(machine),
+                },
+            )
+            path = (
+                folders[job.case]
+                / ("field" if is_field else "reference")
+                / f"{job.number:02d}.parquet"
+            )
+            record.write_recording(recording, path)
+            os.utime(path, (EPOCH_S, EPOCH_S))
+        return [RecordedHalf([u[:, n]], [q[:, n]], [without[:, n]]) for n in range(len(jobs))]
+
+    def _without(self, specimens: Sequence[PlantRun], u: np.ndarray, half: HalfPlan) -> np.ndarray:
+        """Returns the positions of the same machines without faults, under the same commands and chance, `(T, N, J)`."""
+        healthy = [
+            replace(specimen, faults={}, ailment=None, tracked=False) for specimen in specimens
+        ]
+        link, path = self._plants.build(self._machine, healthy, half.file_s), []
+        with link as opened:
+            for command in u:
+                path.append(opened.read().q)
+                opened.send(Command(command.astype(float)))
+        return np.stack(path).astype(np.float32)

@@ -1,0 +1,174 @@
+"""Answers of a candidate to all cases: one process a case, which sees a copy of that case only."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Protocol
+
+from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.session import write_json
+from brokk_rl.spec import spec
+from diagnosis.answer import ANSWER_FILE
+
+log = logging.getLogger(__name__)
+
+NOTE_FILE = "sitting.json"
+LAST_CHARACTERS = 2000
+
+
+class Candidate(Protocol):
+    """A spec in `conf/exam_candidate`: whatever answers a case."""
+
+    def answer(self, case: Path, out: Path, machine: Machine) -> None:
+        """Writes `diagnosis.json` for the folder `case` into the folder `out`, which is its own and empty.
+
+        Raises:
+            RecordingError: it could not.
+        """
+        ...
+
+
+@spec
+class CommandCandidate:
+    """A program that diagnoses one case, started anew for each, without a way to the labels.
+
+    Attributes:
+        command: Program and arguments; `{case}` and `{out}` stand for the two folders. `brokk` is
+            the one that runs now.
+        limit_s: Time after which it is ended.
+        threads: CPU threads for its numerical libraries.
+    """
+
+    command: tuple[str, ...]
+    limit_s: float
+    threads: int
+
+    def check(self) -> None:
+        text = " ".join(self.command)
+        if "{case}" not in text or "{out}" not in text:
+            raise ConfigError(
+                f"candidate.command: expected {{case}} and {{out}} among its arguments, got {list(self.command)}"
+            )
+
+    def answer(self, case: Path, out: Path, machine: Machine) -> None:
+        """Starts the program in an empty folder and waits for it."""
+        words = [word.format(case=case, out=out) for word in self.command]
+        if words[0] == "brokk":
+            words[:1] = [sys.executable, "-P", "-m", "brokk_rl"]
+        environment = {
+            **os.environ,
+            **{
+                name: str(self.threads)
+                for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+            },
+        }
+        for name in ("OLDPWD", "PWD"):
+            environment.pop(name, None)
+        with tempfile.TemporaryDirectory(prefix="brokk") as empty:
+            try:
+                done = subprocess.run(
+                    words,
+                    cwd=empty,
+                    env=environment,
+                    capture_output=True,
+                    text=True,
+                    timeout=self.limit_s,
+                )
+            except subprocess.TimeoutExpired as error:
+                raise RecordingError(f"no answer within {self.limit_s:g} s") from error
+            except OSError as error:
+                raise RecordingError(f"{words[0]} cannot be started: {error.strerror}") from error
+        if done.returncode:
+            raise RecordingError(
+                (done.stderr or done.stdout)[-LAST_CHARACTERS:].strip()
+                or f"exit status {done.returncode}"
+            )
+
+
+def answer_cases(
+    candidate: Candidate,
+    cases: Sequence[Path],
+    folder: Path,
+    machine: Machine,
+    workers: int,
+    advance: Callable[[], None],
+) -> int:
+    """Has every case answered that is not yet; returns how many have no answer in the end.
+
+    `folder/<case>/diagnosis.json` is the answer, `sitting.json` beside it says how long it took, or
+    why there is none. A case without an answer is tried again by the next run, an answer that
+    stands is kept.
+
+    Args:
+        candidate: Who answers.
+        cases: Folders of the cases.
+        folder: Where the answers go.
+        machine: The machine.
+        workers: Cases answered at once.
+        advance: Told when a case is done.
+    """
+    todo = [case for case in cases if not (folder / case.name / ANSWER_FILE).is_file()]
+    for _ in range(len(cases) - len(todo)):
+        advance()
+    is_alone = workers == 1 or isinstance(
+        candidate, CommandCandidate
+    )  # a program has processes of its own
+    with ThreadPoolExecutor(workers) if is_alone else ProcessPoolExecutor(workers) as pool:
+        pending = [
+            pool.submit(_answer_case, candidate, case, folder / case.name, machine) for case in todo
+        ]
+        try:
+            for done in as_completed(pending):
+                done.result()
+                advance()
+        except BaseException:
+            for job in pending:
+                job.cancel()  # those that run are waited for; the rest is for the next time
+            raise
+    return sum(not (folder / case.name / ANSWER_FILE).is_file() for case in cases)
+
+
+def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
+    """Answers one case from a copy under a neutral name: no path leads from there to the labels."""
+    begun, error = time.monotonic(), None
+    with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
+        copy, place = Path(scratch) / "case", Path(scratch) / "answer"
+        shutil.copytree(case, copy)
+        try:
+            candidate.answer(copy, place, machine)
+            if not (place / ANSWER_FILE).is_file():
+                error = f"it left no {ANSWER_FILE}"
+        except Exception as failure:  # whoever answers may break in any way: that is an answer missed, and no end of the exam
+            error = str(failure) or repr(failure)
+        seconds = time.monotonic() - begun
+        if error is None:
+            shutil.copytree(place, out, dirs_exist_ok=True)
+        else:
+            out.mkdir(parents=True, exist_ok=True)
+            log.warning("case %s: no answer: %s", case.name, error.splitlines()[-1])
+    write_json(out / NOTE_FILE, {"seconds": round(seconds, 2), "error": error})
+
+
+def is_begun(answer: Path) -> bool:
+    """Says whether anybody answered the case, or tried to, whose answer belongs into a folder."""
+    return (answer / NOTE_FILE).is_file() or (answer / ANSWER_FILE).is_file()
+
+
+def read_seconds(answer: Path) -> float | None:
+    """Returns how long the answer in a folder took, `None` where there is none."""
+    try:
+        note = json.loads((answer / NOTE_FILE).read_text())
+    except (OSError, ValueError):
+        return None
+    return None if note["error"] else float(note["seconds"])

@@ -1,0 +1,242 @@
+"""The block: its faces, holes and chips, the discs that are none, and the marks of its life."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from perception.render.drilled_block import FRONT, Chip, Disc, DrilledBlock, DrilledHole
+from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
+from perception.render.solids import Cylinder, Solid, SolidPose
+
+if TYPE_CHECKING:
+    from perception.render.scene_ranges import BlockRanges
+
+MARK_M = 0.002
+"""Texel of painted marks: stains, wet patches, cracks."""
+_TRIES = 60
+_SPACING = 1.3
+"""Two discs or holes are farther apart than the sum of their radii by this factor."""
+
+
+def build_frame(normal: np.ndarray, turn_rad: float) -> np.ndarray:
+    """Returns a rotation whose third column is along `normal`, `(3,)`, turned about it."""
+    normal = normal / np.linalg.norm(normal)
+    first = np.cross(
+        np.array([0.0, 1.0, 0.0]) if abs(normal[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), normal
+    )
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
+    return np.stack([cos * first + sin * second, cos * second - sin * first, normal], 1)
+
+
+def draw_block(
+    kind: BlockRanges,
+    target: np.ndarray,
+    normal: np.ndarray,
+    turn_rad: float,
+    generator: np.random.Generator,
+) -> DrilledBlock:
+    """Returns a block whose drilled face looks along `normal` and has its first hole, or its middle, at `target`."""
+    half = (
+        np.array(
+            [
+                generator.uniform(*kind.length_m),
+                generator.uniform(*kind.width_m),
+                generator.uniform(*kind.thickness_m),
+            ]
+        )
+        / 2
+    )
+    radius = float(generator.uniform(*kind.radius_m))
+    edge = float(generator.uniform(*kind.edge_m))
+    num_holes = int(generator.integers(kind.holes[0], kind.holes[1] + 1))
+    num_discs = int(generator.integers(kind.decoys[0], kind.decoys[1] + 1))
+    radii = [radius] * num_holes + [
+        float(generator.uniform(*kind.decoy_radius_m)) for _ in range(num_discs)
+    ]
+    places = _scattered(half[:2], radii, edge, generator)
+    holes = [
+        _hole(kind, np.array([*place, half[2]]), radius, FRONT, generator)
+        for place in places[:num_holes]
+    ]
+    for _ in range(int(generator.integers(kind.side_holes[0], kind.side_holes[1] + 1))):
+        holes.append(_side_hole(kind, half, radius, edge, generator))
+    discs = tuple(
+        Disc(np.array([*place, half[2]]), size, "paint")
+        for place, size in zip(places[num_holes:], radii[num_holes:], strict=False)
+    )
+    chips = tuple(chip for hole in holes[:num_holes] for chip in _chips(kind, hole, generator))
+    rotation = build_frame(normal, turn_rad)
+    first = np.array([*places[0], half[2]]) if places else np.array([0.0, 0.0, half[2]])
+    pose = SolidPose(rotation, target - rotation @ first)
+    return DrilledBlock(
+        pose,
+        half,
+        draw_block_materials(kind, half, holes, discs, generator),
+        tuple(holes),
+        chips,
+        discs,
+    )
+
+
+def _scattered(
+    half_m: np.ndarray, radii: list[float], edge_m: float, generator: np.random.Generator
+) -> list[np.ndarray]:
+    """Returns places on the face for discs of these radii; those that find no room are left out, the first always has it."""
+    found: list[np.ndarray] = []
+    for number, radius in enumerate(radii):
+        room = np.maximum(half_m - radius - edge_m, 0.0)
+        for _ in range(_TRIES):
+            place = generator.uniform(-room, room)
+            if all(
+                np.linalg.norm(place - other) > _SPACING * (radius + radii[k])
+                for k, other in enumerate(found)
+            ):
+                found.append(place)
+                break
+        if len(found) <= number:
+            break
+    return found
+
+
+def _hole(
+    kind: BlockRanges, center: np.ndarray, radius: float, part: int, generator: np.random.Generator
+) -> DrilledHole:
+    lamp = (
+        float(generator.uniform(*kind.lamp)) if generator.random() < kind.lamp_probability else 0.0
+    )
+    return DrilledHole(center, radius, float(generator.uniform(*kind.depth_m)), part, lamp)
+
+
+def _side_hole(
+    kind: BlockRanges, half: np.ndarray, radius: float, edge: float, generator: np.random.Generator
+) -> DrilledHole:
+    """Returns a hole in one of the four faces beside the drilled one; shallow, so that it meets no other."""
+    part = int(generator.integers(4))
+    axis = part // 2
+    center = np.zeros(3)
+    center[axis] = half[axis] if part % 2 else -half[axis]
+    for other in {0, 1, 2} - {axis}:
+        room = max(half[other] - radius - edge, 0.0)
+        center[other] = generator.uniform(-room, room)
+    return DrilledHole(center, radius, min(0.05, kind.depth_m[0]), part, 0.0)
+
+
+def draw_bars(
+    kind: BlockRanges, block: DrilledBlock, generator: np.random.Generator
+) -> list[Solid]:
+    """Returns reinforcing bars, cut bare by some of the holes: cylinders in the concrete, seen through a rim only."""
+    bars: list[Solid] = []
+    for hole in block.holes:
+        if hole.part != FRONT or generator.random() >= kind.bar_probability:
+            continue
+        angle, below = (
+            generator.uniform(-np.pi, np.pi),
+            float(generator.uniform(0.03, hole.depth_m + 0.02)),
+        )
+        along = block.pose.rotation @ [np.cos(angle), np.sin(angle), 0.0]
+        aside = (
+            0.7
+            * hole.radius_m
+            * generator.uniform(-1, 1)
+            * np.array([-np.sin(angle), np.cos(angle), 0.0])
+        )
+        place = block.pose.point(hole.center_m + aside - [0.0, 0.0, below])
+        rust = Material((0.25, 0.16, 0.1), 0.3, 0.001, 2)
+        bars.append(
+            Cylinder(
+                "block",
+                SolidPose(build_frame(along, 0.0), place),
+                float(generator.uniform(0.005, 0.012)),
+                1.2 * hole.radius_m,
+                (rust,),
+            )
+        )
+    return bars
+
+
+def _chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
+    """Returns pieces broken off a rim: balls whose bowls are centred near it and as wide along the face as `chip_m` says."""
+    found = []
+    for _ in range(int(generator.integers(kind.chips[0], kind.chips[1] + 1))):
+        angle, wide = generator.uniform(-np.pi, np.pi), float(generator.uniform(*kind.chip_m))
+        out = hole.radius_m * np.array([np.cos(angle), np.sin(angle)])
+        height = wide * float(generator.uniform(0.2, 1.5))
+        found.append(Chip(hole.center_m + np.array([*out, height]), float(np.hypot(wide, height))))
+    return found
+
+
+def draw_block_materials(
+    kind: BlockRanges,
+    half: np.ndarray,
+    holes: Sequence[DrilledHole],
+    discs: tuple[Disc, ...],
+    generator: np.random.Generator,
+) -> tuple[Material, ...]:
+    """Returns the materials of all parts of the block; see `Block`."""
+    bright, grain = (
+        float(generator.uniform(*kind.brightness)),
+        float(generator.uniform(*kind.grain)),
+    )
+    tint = 1.0 + 0.04 * generator.standard_normal(3)
+    texture, marks = int(generator.integers(NUM_TEXTURES)), _marks(kind, half, generator)
+
+    def stone(brightness: float, contrast: float, with_marks: bool = False) -> Material:
+        red, green, blue = np.clip(brightness * tint, 0.005, 0.95)
+        shift = generator.uniform(0, TEXTURE_SIDE, 2)
+        return Material(
+            (float(red), float(green), float(blue)),
+            contrast,
+            0.0006,
+            texture,
+            (float(shift[0]), float(shift[1])),
+            (marks, MARK_M) if with_marks else None,
+        )
+
+    face, drilled = stone(bright, grain, True), stone(0.8 * bright, grain)
+    parts = [face] * 6
+    for _ in holes:
+        parts += [drilled, stone(float(generator.uniform(*kind.fill_brightness)), grain)]
+    parts.append(stone(1.1 * bright, 1.5 * grain))
+    parts += [stone(float(generator.uniform(*kind.decoy_brightness)), grain) for _ in discs]
+    return tuple(parts)
+
+
+def _marks(kind: BlockRanges, half: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Paints stains, wet patches, cracks and traces of formwork: relative brightness over the block's faces, `(h, w)` float32."""
+    size = (2.4 * half[[1, 0]] / MARK_M).astype(int)
+    marks = np.ones(tuple(size), np.float32)
+    for _ in range(int(generator.integers(kind.stains[0], kind.stains[1] + 1))):
+        blotch = cv2.resize(
+            generator.standard_normal((8, 8)).astype(np.float32),
+            (size[1], size[0]),
+            interpolation=cv2.INTER_CUBIC,
+        )
+        center, spread = generator.uniform(0, size[::-1]), generator.uniform(15, 120)
+        x, y = np.arange(size[1], dtype=np.float32), np.arange(size[0], dtype=np.float32)
+        far = np.sqrt((x[None] - center[0]) ** 2 + (y[:, None] - center[1]) ** 2) / spread
+        soft = float(generator.uniform(0.02, 0.4))
+        cover = np.clip((1.0 - far + 0.35 * blotch) / soft, 0.0, 1.0)
+        marks *= 1.0 - cover * (1.0 - float(generator.uniform(*kind.stain_brightness)))
+    for _ in range(int(generator.integers(kind.cracks[0], kind.cracks[1] + 1))):
+        steps = (
+            generator.standard_normal((12, 2)).cumsum(0) * 6
+            + generator.uniform(-1, 1, 2) * np.arange(12)[:, None] * 25
+        )
+        line = (steps + generator.uniform(0, size[::-1])).astype(np.int32)
+        dark = float(generator.uniform(0.3, 0.8))
+        painted = cv2.polylines(
+            np.zeros_like(marks),
+            [line[:, None]],
+            False,
+            1.0,
+            int(generator.integers(1, 3)),
+            cv2.LINE_AA,
+        )
+        marks *= 1.0 - (1.0 - dark) * np.minimum(painted, 1.0)
+    return marks

@@ -1,0 +1,156 @@
+"""The studio: draws a scene, takes both pictures of it, matches them, and writes frame and truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import spec
+from perception import dataset
+from perception.dataset import FrameLabel, SceneTruth, TrueCircle
+from perception.render.ray_tracer import Tracer
+from perception.render.scene_ranges import Scene, SceneRanges
+from perception.render.scene_sampler import compose_scene
+from perception.render.stereo_camera import StereoRig, draw_dust, take_picture
+from perception.stereo import Stereo
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """A rendered frame.
+
+    Attributes:
+        color: Left picture, RGB, `(h, w, 3)` uint8.
+        right: Right picture, `None` where there is none.
+        depth_m: As a camera would tell it, `(h, w)` float32, NaN where unknown.
+        exact_depth_m: As it is.
+        label: Masks.
+        truth: Holes, decoys, block.
+    """
+
+    color: np.ndarray
+    right: np.ndarray | None
+    depth_m: np.ndarray
+    exact_depth_m: np.ndarray
+    label: FrameLabel
+    truth: SceneTruth
+
+
+@spec
+class FrameRenderer:
+    """Renders frames of a kind of scene for a stereo camera, with their truth.
+
+    Attributes:
+        rig: The camera pair.
+        scene: What there is to see.
+        stereo: Makes the depth.
+        depth: `matched` makes depth of the two pictures; `exact` writes the mathematical one;
+            `none` leaves it to the reader.
+        pair: Whether the right picture is taken; left alone, in half the time, is enough to train a
+            segmenter on.
+    """
+
+    rig: StereoRig
+    scene: SceneRanges
+    stereo: Stereo
+    depth: Literal["matched", "exact", "none"]
+    pair: bool
+
+    def check(self) -> None:
+        if self.depth == "matched" and not self.pair:
+            raise ConfigError(
+                "studio.pair=false: there is no pair to match; choose studio.depth=exact or none"
+            )
+
+    def prepare(self, folder: Path) -> None:
+        """Writes what all frames of a folder share."""
+        dataset.write_camera(
+            folder, self.rig.left.matrix, self.rig.base_from_camera, self.rig.baseline_m
+        )
+
+    def has(self, stem: Path) -> bool:
+        """Says whether the frame at `stem` is there, whole."""
+        return dataset.is_whole(stem)
+
+    def shoot(self, stem: Path, generator: np.random.Generator) -> None:
+        """Draws, renders and writes one frame; the same generator makes the same files.
+
+        Raises:
+            StorageError: a file could not be written.
+        """
+        shot = self.shot(compose_scene(self.scene, self.rig, generator), generator)
+        depth = {"matched": shot.depth_m, "exact": shot.exact_depth_m, "none": None}[self.depth]
+        dataset.write_frame(stem, shot.color, depth, shot.right, shot.label, shot.truth)
+
+    def shot(self, scene: Scene, generator: np.random.Generator) -> RenderedFrame:
+        """Returns the frame of a scene."""
+        tracer = Tracer(scene.solids, scene.light, scene.sky)
+        left = tracer.view(self.rig.left)
+        density = draw_dust(scene.exposure.patchiness, generator)
+        color, partner = (
+            take_picture(left.radiance, left.depth_m, scene.exposure, density, generator),
+            None,
+        )
+        if self.pair:
+            right = tracer.view(self.rig.right)
+            partner = take_picture(
+                right.radiance, right.depth_m, scene.exposure, density, generator
+            )
+        depth = left.depth_m
+        if partner is not None and self.depth == "matched":
+            depth = self.stereo.depth_m(color, partner, self.rig.focal_px, self.rig.baseline_m)
+        roles = np.array([solid.role for solid in scene.solids] + ["nothing"])[left.solid]
+        label = FrameLabel(roles == "block", left.mouth, roles == "arm")
+        return RenderedFrame(color, partner, depth, left.depth_m, label, self._truth(scene))
+
+    def _truth(self, scene: Scene) -> SceneTruth:
+        block = scene.block
+        if block is None:
+            return SceneTruth(self.scene.name, scene.conditions, (), (), {})
+        holes = tuple(
+            self._circle(
+                block.pose.point(hole.center_m),
+                block.pose.rotation @ hole.outward,
+                hole.radius_m,
+                hole.depth_m,
+                hidden,
+            )
+            for hole, hidden in zip(block.holes, scene.hidden, strict=True)
+        )
+        decoys = tuple(
+            self._circle(
+                block.pose.point(disc.center_m),
+                block.pose.rotation[:, 2],
+                disc.radius_m,
+                0.0,
+                hidden,
+            )
+            for disc, hidden in zip(block.discs, scene.hidden_discs, strict=True)
+        )
+        place = {name: np.asarray(value).tolist() for name, value in
+                 (("center_m", block.pose.center_m), ("rotation", block.pose.rotation), ("half_m", block.half_m))}  # fmt: skip
+        return SceneTruth(self.scene.name, scene.conditions, holes, decoys, place)
+
+    def _circle(
+        self, center: np.ndarray, axis: np.ndarray, radius_m: float, depth_m: float, hidden: float
+    ) -> TrueCircle:
+        base = self.rig.base_from_camera
+        first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        first /= np.linalg.norm(first)
+        angle = np.linspace(0, 2 * np.pi, 64)[:, None]
+        rim = center + radius_m * (np.cos(angle) * first + np.sin(angle) * np.cross(axis, first))
+        in_view = False
+        if rim[:, 2].min() > 0.05:
+            pixel = self.rig.left.project(rim)
+            in_view = bool(
+                (pixel.min(0) >= 0).all()
+                and (pixel.max(0) <= [self.rig.width - 1, self.rig.height - 1]).all()
+            )
+        return TrueCircle(
+            tuple(center.tolist()), tuple(axis.tolist()), tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
+            tuple((base[:3, :3] @ axis).tolist()), float(radius_m), float(depth_m), float(hidden), in_view,
+        )  # fmt: skip

@@ -1,0 +1,291 @@
+"""Rays through pixels: what each hits, how deep, and how bright that is.
+
+Every pixel has one exact ray through its centre, which gives depth and masks. Colour comes from
+that ray where the pixel shows one surface, filtered to the pixel's size, and from `OVER` x `OVER`
+rays where edges of solids, rims or shadows cross it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception.render.solids import Solid
+
+OVER = 4
+CHUNK = 1 << 17
+"""Rays at a time, so that what they need stays in the cache."""
+FAR_M = 80.0
+NOTHING = -1
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera without distortion at `origin_m`, `(3,)`, looking along z of the left camera's coordinates.
+
+    Attributes:
+        width: Pixels.
+        height: Pixels.
+        focal_px: Focal length.
+        origin_m: Centre of projection.
+    """
+
+    width: int
+    height: int
+    focal_px: float
+    origin_m: np.ndarray
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Camera matrix, `(3, 3)`; the axis goes through the middle of the picture, pixel centres lie at whole numbers."""
+        return np.array(
+            [
+                [self.focal_px, 0, (self.width - 1) / 2],
+                [0, self.focal_px, (self.height - 1) / 2],
+                [0, 0, 1.0],
+            ]
+        )
+
+    def project(self, point_m: np.ndarray) -> np.ndarray:
+        """Returns the pixels, `(…, 2)`, of points, `(…, 3)`, in front of the camera."""
+        away = point_m - self.origin_m
+        center = self.matrix[:2, 2]
+        return self.focal_px * away[..., :2] / away[..., 2:] + center
+
+    def rays(self, pixel: np.ndarray) -> np.ndarray:
+        """Returns directions with z = 1, `(M, 3)` float32, through pixels, `(M, 2)`."""
+        flat = (pixel - self.matrix[:2, 2]) / self.focal_px
+        return np.concatenate([flat, np.ones((len(flat), 1))], 1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Light:
+    """Sunlight, or a lamp far away, and light from everywhere.
+
+    Attributes:
+        to_sun: Unit vector to it, `(3,)`, camera coordinates.
+        sun: Its strength on a surface that faces it.
+        ambient: Strength of the light from everywhere.
+        shade: Solids that throw shadows though they are not seen.
+    """
+
+    to_sun: np.ndarray
+    sun: float
+    ambient: float
+    shade: tuple[Solid, ...] = ()
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """What a camera sees, without noise.
+
+    Attributes:
+        radiance: Linear light, `(h, w, 3)` float32.
+        depth_m: Along z, at the pixel centres, `(h, w)` float32, NaN where nothing is.
+        solid: Number of the solid at the pixel centre, `(h, w)` int16, `NOTHING` for none.
+        mouth: The ray through the pixel centre goes through the rim of a hole, `(h, w)` bool.
+    """
+
+    radiance: np.ndarray
+    depth_m: np.ndarray
+    solid: np.ndarray
+    mouth: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Rays' ends: depth, solid, part, through a rim, in sunlight, `(M,)` each."""
+
+    depth_m: np.ndarray
+    solid: np.ndarray
+    part: np.ndarray
+    mouth: np.ndarray
+    radiance: np.ndarray
+    sunlit: np.ndarray
+
+    @property
+    def label(self) -> np.ndarray:
+        """A number for each surface, lit or not: where it changes, there is an edge."""
+        return (
+            self.solid.astype(np.int32) * 4096 + self.part * 4 + self.mouth * 2 + self.sunlit
+        ).astype(np.int32)
+
+
+class Tracer:
+    """Draws solids in a light, from any camera.
+
+    Args:
+        solids: What there is to see; bars in a block come after it.
+        light: How it is lit.
+        sky: Radiance where nothing is, RGB.
+    """
+
+    def __init__(
+        self, solids: Sequence[Solid], light: Light, sky: tuple[float, float, float]
+    ) -> None:
+        self.solids, self.light, self.sky = tuple(solids), light, np.array(sky, np.float32)
+        self._casters = [
+            Caster(solid, light.to_sun)
+            for solid in (*solids, *light.shade)
+            if solid.corners_m is not None
+        ]
+
+    def view(self, camera: Pinhole) -> RenderedView:
+        """Returns what `camera` sees."""
+        size = (camera.height, camera.width)
+        rows = max(1, CHUNK // camera.width)
+        columns = np.arange(camera.width, dtype=np.float64)
+        bands = []
+        for top in range(0, camera.height, rows):
+            ys = np.arange(top, min(top + rows, camera.height), dtype=np.float64)
+            pixel = np.stack(np.broadcast_arrays(columns[None], ys[:, None]), -1).reshape(-1, 2)
+            bands.append(self._shoot(camera, pixel))
+        whole = _Seen(
+            *(
+                np.concatenate([getattr(band, name) for band in bands])
+                for name in _Seen.__dataclass_fields__
+            )
+        )
+        radiance = whole.radiance
+        edges = np.flatnonzero(_edges(whole.label.reshape(size)).ravel())
+        offsets = (
+            np.stack(np.meshgrid(*[np.arange(OVER)] * 2), -1).reshape(-1, 2) + 0.5
+        ) / OVER - 0.5
+        for part in np.array_split(edges, max(1, len(edges) * OVER**2 // CHUNK)):
+            pixel = np.stack([part % camera.width, part // camera.width], 1)[:, None] + offsets
+            radiance[part] = (
+                self._shoot(camera, pixel.reshape(-1, 2))
+                .radiance.reshape(len(part), OVER**2, 3)
+                .mean(1)
+            )
+        depth = np.where(whole.solid == NOTHING, np.nan, whole.depth_m).astype(np.float32)
+        return RenderedView(
+            radiance.reshape(*size, 3),
+            depth.reshape(size),
+            whole.solid.reshape(size),
+            whole.mouth.reshape(size),
+        )
+
+    def first(
+        self, origin_m: np.ndarray, direction: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns factor on the direction, solid and part of the first hit of rays, `(M, 3)` float32, from one point."""
+        t, solid, part, _ = self._cast(origin_m, direction, None)
+        return t, solid, part
+
+    def _cast(
+        self, origin_m: np.ndarray, direction: np.ndarray, camera: Pinhole | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        count = len(direction)
+        t, solid = np.full(count, FAR_M, np.float32), np.full(count, NOTHING, np.int16)
+        part, mouth = np.zeros(count, np.int16), np.zeros(count, bool)
+        for number, thing in enumerate(self.solids):
+            rows = _candidates(thing, camera, direction)
+            hits = thing.hit(origin_m, direction if rows is None else direction[rows])
+            nearer = np.flatnonzero(hits.t < (t if rows is None else t[rows]))
+            if not len(nearer):
+                continue
+            to = nearer if rows is None else rows[nearer]
+            t[to], solid[to], part[to] = hits.t[nearer], number, hits.part[nearer]
+            if hits.mouth is not None:
+                mouth[to] = hits.mouth[nearer]
+            elif thing.role != "block":  # a bar inside a hole is still seen through its rim
+                mouth[to] = False
+        return t, solid, part, mouth
+
+    def _shoot(self, camera: Pinhole, pixel: np.ndarray) -> _Seen:
+        direction = camera.rays(pixel)
+        t, solid, part, mouth = self._cast(camera.origin_m, direction, camera)
+        radiance = np.broadcast_to(self.sky, (len(t), 3)).copy()
+        lit = np.zeros(len(t), bool)
+        point = camera.origin_m.astype(np.float32) + t[:, None] * direction
+        for number, thing in enumerate(self.solids):
+            rows = np.flatnonzero(solid == number)
+            if len(rows):
+                radiance[rows], lit[rows] = self._shaded(
+                    thing, point[rows], part[rows], direction[rows], t[rows] / camera.focal_px
+                )
+        return _Seen(t, solid, part, mouth, radiance, lit)
+
+    def _shaded(
+        self,
+        thing: Solid,
+        point: np.ndarray,
+        part: np.ndarray,
+        direction: np.ndarray,
+        pixel_m: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the radiance of points of one solid, `(M, 3)`, and whether the sun reaches them, `(M,)`."""
+        surface = thing.surface(point, part, self.light.to_sun)
+        along = np.einsum("ij,ij->i", surface.normal, direction)
+        away = np.sign(along)
+        facing = np.abs(along) / np.sqrt(np.einsum("ij,ij->i", direction, direction))
+        slope = surface.normal @ self.light.to_sun.astype(np.float32) * -away
+        lit = slope > 0
+        if surface.sunlit is not None:
+            lit &= surface.sunlit
+        for caster in self._casters:
+            if lit.any() and caster.solid is not thing:
+                caster.darken(point, lit)
+        ambient = self.light.ambient * (1.0 if surface.openness is None else surface.openness)
+        bright = ambient + self.light.sun * np.where(lit, slope, 0.0)
+        albedo = np.empty((len(part), 3), np.float32)
+        size_m = pixel_m / np.sqrt(np.maximum(facing, 0.1))
+        for number in np.flatnonzero(np.bincount(part)):
+            rows = np.flatnonzero(part == number)
+            material = thing.materials[min(int(number), len(thing.materials) - 1)]
+            albedo[rows] = material.albedo(surface.uv_m[rows], size_m[rows])
+        return albedo * bright[:, None].astype(np.float32), lit
+
+
+class Caster:
+    """A solid that throws a shadow; only points within its silhouette, seen from the sun, are looked at closely."""
+
+    def __init__(self, solid: Solid, to_sun: np.ndarray) -> None:
+        self.solid, self._to_sun = solid, to_sun.astype(np.float32)
+        first = np.cross(to_sun, np.eye(3)[np.argmin(np.abs(to_sun))])
+        first /= np.linalg.norm(first)
+        self._across = np.stack([first, np.cross(to_sun, first)], 1).astype(np.float32)
+        corners = solid.corners_m @ self._across  # type: ignore[operator]
+        self._low, self._high = corners.min(0).astype(np.float32), corners.max(0).astype(np.float32)
+
+    def darken(self, point: np.ndarray, lit: np.ndarray) -> None:
+        """Clears `lit`, `(M,)` bool, at the points, `(M, 3)`, that the solid shades."""
+        x, y = point @ self._across[:, 0], point @ self._across[:, 1]
+        rows = np.flatnonzero(
+            lit
+            & (x > self._low[0])
+            & (x < self._high[0])
+            & (y > self._low[1])
+            & (y < self._high[1])
+        )
+        if len(rows):
+            sun = np.broadcast_to(self._to_sun, (len(rows), 3))
+            lit[rows[np.isfinite(self.solid.hit(point[rows], sun).t)]] = False
+
+
+def _candidates(thing: Solid, camera: Pinhole | None, direction: np.ndarray) -> np.ndarray | None:
+    """Returns the rays that may hit the solid, `None` for all: those within the box around its corners in the picture."""
+    corners = thing.corners_m
+    if camera is None or corners is None:
+        return None
+    away = corners - camera.origin_m
+    if (away[:, 2] < 0.05).any():
+        return None
+    flat = away[:, :2] / away[:, 2:]
+    low, high = flat.min(0) - 1e-5, flat.max(0) + 1e-5
+    x, y = direction[:, 0], direction[:, 1]
+    return np.flatnonzero((x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]))
+
+
+def _edges(label: np.ndarray) -> np.ndarray:
+    """Returns the pixels next to another label, and their neighbours, `(h, w)` bool."""
+    edge = np.zeros(label.shape, np.uint8)
+    down, right = label[1:] != label[:-1], label[:, 1:] != label[:, :-1]
+    edge[1:] |= down
+    edge[:-1] |= down
+    edge[:, 1:] |= right
+    edge[:, :-1] |= right
+    return edge.astype(bool)

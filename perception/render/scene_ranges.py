@@ -1,0 +1,238 @@
+"""Scenes to look at: which blocks, holes, stains, arms, lights and dust there may be, each drawn from a range."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import spec
+from perception.render.drilled_block import DrilledBlock
+from perception.render.ray_tracer import Light
+from perception.render.solids import Solid
+from perception.render.stereo_camera import CameraExposure
+
+Range = tuple[float, float]
+Count = tuple[int, int]
+
+
+@spec
+class ViewpointRanges:
+    """From where the block is seen.
+
+    Attributes:
+        distance_m: Camera to the first hole's rim (or the middle of the face).
+        obliquity_rad: Between the face's normal and the line of sight.
+        azimuth_rad: Direction in the picture towards which the face leans; 0 leans up, as a block
+            on the ground does.
+        margin: Part of the picture along its border where the first hole never is.
+    """
+
+    distance_m: Range
+    obliquity_rad: Range
+    azimuth_rad: Range
+    margin: float
+
+
+@spec
+class BlockRanges:
+    """The block and what has been done to it.
+
+    Attributes:
+        present: Probability that there is a block.
+        length_m: Its longer side on the drilled face.
+        width_m: Its shorter side.
+        thickness_m: Along the holes.
+        brightness: Reflected part of the light.
+        grain: Contrast of its texture.
+        holes: Number of holes in the drilled face, the first of them where the camera looks.
+        side_holes: Number of holes in other faces.
+        radius_m: Of the holes.
+        depth_m: Of the holes, down to whatever fills them.
+        fill_brightness: Of the floor.
+        lamp: Light inside a hole, relative to daylight.
+        lamp_probability: That there is any.
+        bar_probability: That a reinforcing bar crosses a hole.
+        edge_m: Concrete left between a hole and the edge of the face.
+        chips: Pieces broken off each rim.
+        chip_m: Size of each, along the face.
+        decoys: Flat dark discs on the face.
+        decoy_radius_m: Of the discs.
+        decoy_brightness: Of the discs.
+        stains: Stains and wet patches.
+        stain_brightness: Of a stain, relative to the dry face.
+        cracks: Cracks and traces of formwork.
+    """
+
+    present: float
+    length_m: Range
+    width_m: Range
+    thickness_m: Range
+    brightness: Range
+    grain: Range
+    holes: Count
+    side_holes: Count
+    radius_m: Range
+    depth_m: Range
+    fill_brightness: Range
+    lamp: Range
+    lamp_probability: float
+    bar_probability: float
+    edge_m: Range
+    chips: Count
+    chip_m: Range
+    decoys: Count
+    decoy_radius_m: Range
+    decoy_brightness: Range
+    stains: Count
+    stain_brightness: Range
+    cracks: Count
+
+    def check(self) -> None:
+        need = 2 * (max(self.radius_m[1], self.decoy_radius_m[1]) + self.edge_m[0])
+        if need > min(self.width_m[0], self.length_m[0]):
+            raise ConfigError(
+                f"scene.block: a face of {self.width_m[0]} m has no room for a hole that needs {need:g} m"
+            )
+        if self.depth_m[1] >= self.thickness_m[0]:
+            raise ConfigError(
+                f"scene.block: holes of {self.depth_m[1]} m go through a block of {self.thickness_m[0]} m"
+            )
+
+
+@spec
+class SurroundingsRanges:
+    """What else is there.
+
+    Attributes:
+        arm: Probability that the machine's arm is in the picture.
+        hidden: Part of the first rim that the arm hides.
+        clutter: Other things on the ground.
+        backdrop_m: Distance of the wall behind everything.
+        ground_brightness: Of the ground.
+    """
+
+    arm: float
+    hidden: Range
+    clutter: Count
+    backdrop_m: Range
+    ground_brightness: Range
+
+    def check(self) -> None:
+        if self.hidden[1] > 0 and self.arm < 1 and self.hidden[0] > 0:
+            raise ConfigError(
+                f"scene.around: hidden {self.hidden} needs an arm in every picture (arm: 1.0), got {self.arm}"
+            )
+
+
+@spec
+class LightRanges:
+    """How it is lit and how the camera takes it.
+
+    Attributes:
+        sun: Strength of the sun or a lamp.
+        ambient: Strength of the light from everywhere.
+        elevation_rad: Of the sun above the ground.
+        shadows: Things out of sight that throw a shadow on the block.
+        level: Light there is, relative to what the exposure is set for; drawn evenly on a
+            logarithmic scale.
+        exposure: Brightness of the block's lit face in the picture at level 1, 1 saturates.
+        transmission: Light that the air lets through on the way to the block; 1 is clear.
+        patchiness: Standard deviation of the dust's density.
+        airlight: Brightness of the dust, relative to a lit white surface.
+        blur_px: Point spread.
+        full_well_e: Electrons at saturation.
+        read_noise_e: Electrons in the dark.
+        gamma: Exponent of the camera's response.
+        vignetting: Light missing in the corners.
+    """
+
+    sun: Range
+    ambient: Range
+    elevation_rad: Range
+    shadows: Count
+    level: Range
+    exposure: Range
+    transmission: Range
+    patchiness: Range
+    airlight: Range
+    blur_px: Range
+    full_well_e: Range
+    read_noise_e: Range
+    gamma: Range
+    vignetting: Range
+
+    def check(self) -> None:
+        if not 0 < self.transmission[0] <= self.transmission[1] <= 1:
+            raise ConfigError(
+                f"scene.light.transmission: expected values above 0 and up to 1, got {self.transmission}"
+            )
+        if min(self.level[0], self.full_well_e[0], self.gamma[0]) <= 0:
+            raise ConfigError("scene.light: expected level, full_well_e and gamma above 0")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One scene in the left camera's coordinates.
+
+    Attributes:
+        solids: All that can be seen; the block, if there is one, among them.
+        block: The block, `None` without.
+        light: How it is lit.
+        exposure: How the pictures are taken.
+        sky: Radiance where nothing is.
+        hidden: Part of each rim that something else hides from the left camera, one for each hole.
+        hidden_discs: Likewise for the discs.
+        conditions: What was drawn, for statistics.
+    """
+
+    solids: tuple[Solid, ...]
+    block: DrilledBlock | None
+    light: Light
+    exposure: CameraExposure
+    sky: tuple[float, float, float]
+    hidden: tuple[float, ...]
+    hidden_discs: tuple[float, ...]
+    conditions: dict[str, float]
+
+
+@spec
+class SceneRanges:
+    """A kind of scene; `perception.render.scene_sampler.compose_scene` draws one.
+
+    Attributes:
+        name: What it is called in truth files and tables.
+        sight: From where the block is seen.
+        block: The block and its holes.
+        around: What else is there.
+        light: Light, air and camera.
+    """
+
+    name: str
+    sight: ViewpointRanges
+    block: BlockRanges
+    around: SurroundingsRanges
+    light: LightRanges
+
+    def check(self) -> None:
+        for part in (self.sight, self.block, self.around, self.light):
+            for field, value in vars(part).items():
+                if isinstance(value, tuple) and value[0] > value[1]:
+                    raise ConfigError(f"scene: {field} {value} ends before it begins")
+
+
+def draw_uniform(value: Range, generator: np.random.Generator) -> float:
+    """Draws evenly from a range."""
+    return float(generator.uniform(*value))
+
+
+def draw_log_uniform(value: Range, generator: np.random.Generator) -> float:
+    """Draws from a range, each factor as likely as any other."""
+    return math.exp(generator.uniform(math.log(value[0]), math.log(value[1])))
+
+
+def draw_integer(value: Count, generator: np.random.Generator) -> int:
+    """Draws a whole number, both ends included."""
+    return int(generator.integers(value[0], value[1] + 1))

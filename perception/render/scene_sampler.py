@@ -1,0 +1,395 @@
+"""The machine's arm before the block, pushed so far over a rim that it hides a given part of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from perception.render.block_sampler import build_frame, draw_bars, draw_block
+from perception.render.drilled_block import Disc, DrilledBlock, DrilledHole
+from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
+from perception.render.ray_tracer import Light
+from perception.render.scene_ranges import (
+    Scene,
+    SceneRanges,
+    draw_integer,
+    draw_log_uniform,
+    draw_uniform,
+)
+from perception.render.solids import Box, Cylinder, PlaneSolid, Solid, SolidPose
+from perception.render.stereo_camera import CameraExposure, StereoRig
+
+# --- from drawing: One scene out of the ranges of `perception.render.scene_ranges`: where
+# everything stands, and how it is lit.
+
+_CLEAR = 1.6
+"""Where the arm hides nothing it stays away from the rim's centre by this factor of the rim's size
+at least."""
+_BISECTIONS = 14
+
+
+def place_arm(
+    rim: np.ndarray, rig: StereoRig, hidden: float, generator: np.random.Generator
+) -> list[Solid]:
+    """Returns boom, hose and chisel, coming from a random side, that hide the part `hidden` of the rim, `(P, 3)`, from the left."""
+    middle = rim.mean(0)
+    ray = middle / np.linalg.norm(middle)
+    angle = generator.uniform(-np.pi, np.pi)
+    sideways = build_frame(ray, float(angle))[:, 0]
+    nearness = float(generator.uniform(0.45, 0.8))
+    parts = _build_arm(nearness * middle, ray, sideways, generator)
+
+    def covered(push: float) -> float:
+        shut = np.zeros(len(rim), bool)
+        for solid in _shift_solids(parts, -push * sideways):
+            shut |= solid.hit(np.zeros(3), rim.astype(np.float32)).t < 1.0
+        return float(shut.mean())
+
+    size = float(np.linalg.norm(rim - middle, axis=1).max()) * nearness
+    if hidden <= 0:
+        low = -_CLEAR * size
+        return _shift_solids(parts, -(low - generator.uniform(0.0, 3.0) * size) * sideways)
+    low, high = -2.0 * size, 2.0 * size
+    for _ in range(_BISECTIONS):
+        middle_push = (low + high) / 2
+        low, high = (middle_push, high) if covered(middle_push) < hidden else (low, middle_push)
+    return _shift_solids(parts, -high * sideways)
+
+
+def _build_arm(
+    start: np.ndarray, ray: np.ndarray, sideways: np.ndarray, generator: np.random.Generator
+) -> list[Solid]:
+    """Returns the arm with its edge along the line of sight through `start`; it lies on the side that `sideways` points to."""
+    along = np.cross(ray, sideways)
+    wide = float(generator.uniform(0.06, 0.16))
+    thick = float(generator.uniform(0.05, 0.12))
+    yellow = np.clip(
+        np.array([0.75, 0.45, 0.08]) * generator.uniform(0.3, 1.2)
+        + 0.05 * generator.standard_normal(3),
+        0.02,
+        0.9,
+    )
+    paint = Material(
+        (float(yellow[0]), float(yellow[1]), float(yellow[2])),
+        0.08,
+        0.002,
+        int(generator.integers(4)),
+    )
+    grey = float(generator.uniform(0.03, 0.3))
+    steel = Material((grey, grey, grey), 0.15, 0.001, int(generator.integers(4)))
+    length = float(generator.uniform(0.6, 1.5))
+    pose = np.stack([sideways, along, np.cross(sideways, along)], 1)
+    if generator.random() < 0.5:
+        boom: Solid = Box(
+            "arm",
+            SolidPose(pose, start + wide * sideways),
+            np.array([wide, length, thick]),
+            (paint,),
+        )
+    else:
+        turn = np.stack([sideways, np.cross(along, sideways), along], 1)
+        boom = Cylinder("arm", SolidPose(turn, start + wide * sideways), wide, length, (paint,))
+    hose_turn = np.stack([sideways, np.cross(along, sideways), along], 1)
+    hose = Cylinder(
+        "arm",
+        SolidPose(hose_turn, start + 2.3 * wide * sideways + 0.08 * ray),
+        0.025,
+        length,
+        (steel,),
+    )
+    chisel_axis = 0.8 * ray + 0.6 * along
+    chisel_place = start + 3.2 * wide * sideways + 0.1 * along
+    chisel = Cylinder(
+        "arm", SolidPose(build_frame(chisel_axis, 0.0), chisel_place), 0.04, 0.25, (steel,)
+    )
+    return [boom, hose, chisel]
+
+
+def _shift_solids(parts: list[Solid], shift_m: np.ndarray) -> list[Solid]:
+    """Returns the arm elsewhere."""
+    found: list[Solid] = []
+    for part in parts:
+        pose = SolidPose(part.pose.rotation, part.pose.center_m + shift_m)  # type: ignore[attr-defined]
+        if isinstance(part, Box):
+            found.append(Box(part.role, pose, part.half_m, part.materials))
+        elif isinstance(part, Cylinder):
+            found.append(
+                Cylinder(part.role, pose, part.radius_m, part.half_length_m, part.materials)
+            )
+    return found
+
+
+NUM_RIM_POINTS = 360
+_CLUTTER_TRIES = 30
+_GREY = 1 / 3
+
+
+def compose_scene(kind: SceneRanges, rig: StereoRig, generator: np.random.Generator) -> Scene:
+    """Returns a scene: first the block before the camera, then the arm, then all the rest; the generator is the only chance."""
+    target, normal, turn = _draw_target(kind, rig, generator)
+    block, arm = None, []
+    if generator.random() < kind.block.present:
+        block = draw_block(kind.block, target, normal, turn, generator)
+    hidden = draw_uniform(kind.around.hidden, generator)
+    if generator.random() < kind.around.arm:
+        rim = (
+            sample_rim(block, block.holes[0])
+            if block and block.holes
+            else target + 0.05 * build_frame(normal, turn)[:, :2].T
+        )
+        arm = place_arm(rim, rig, hidden, generator)
+    return add_surroundings(kind, rig, block, arm, target, normal, generator)
+
+
+def add_surroundings(
+    kind: SceneRanges,
+    rig: StereoRig,
+    block: DrilledBlock | None,
+    arm: Sequence[Solid],
+    target: np.ndarray,
+    normal: np.ndarray,
+    generator: np.random.Generator,
+    ground_m: float | None = None,
+) -> Scene:
+    """Returns a scene of this kind around a block and an arm that stand already.
+
+    Args:
+        kind: Says what else there is, and how it is lit.
+        rig: The camera pair.
+        block: The block, `None` for none.
+        arm: Parts of the arm.
+        target: What the camera is pointed at, `(3,)`, camera coordinates.
+        normal: Normal of the face there, `(3,)`.
+        generator: The only source of chance.
+        ground_m: How far below the camera the ground lies; `None` for where the block stands on it.
+    """
+    down = rig.down_in_camera
+    if ground_m is None:
+        ground_m = (
+            max(0.5, float((block.corners_m @ down).max())) if block else float(target @ down) + 0.2
+        )
+    solids: list[Solid] = [*_setting(kind, down, ground_m, generator)]
+    if block:
+        solids += [block, *draw_bars(kind.block, block, generator)]
+    solids += arm
+    solids += _clutter(kind, rig, block, down, ground_m, generator)
+    light = _light(kind, down, target, generator)
+    exposure, level = _exposure(kind, light, normal, target, generator)
+    sky = (0.8 * light.ambient, 0.8 * light.ambient, 0.8 * light.ambient)
+    hidden_parts = (
+        tuple(compute_hidden_share(solids, block, hole) for hole in block.holes) if block else ()
+    )
+    hidden_discs = (
+        tuple(compute_hidden_share(solids, block, disc) for disc in block.discs) if block else ()
+    )
+    sight = target / np.linalg.norm(target)
+    conditions = {
+        "distance_m": float(np.linalg.norm(target)),
+        "obliquity_rad": float(np.arccos(np.clip(-normal @ sight, -1, 1))),
+        "hidden": hidden_parts[0] if hidden_parts else 0.0,
+        "light": level,
+        "transmission": math.exp(-exposure.extinction_per_m * float(target[2])),
+        "arm": float(bool(arm)),
+        "decoys": float(len(block.discs)) if block else 0.0,
+    }
+    return Scene(tuple(solids), block, light, exposure, sky, hidden_parts, hidden_discs, conditions)
+
+
+def sample_rim(block: DrilledBlock, circle: DrilledHole | Disc) -> np.ndarray:
+    """Returns points on the rim of a hole or disc of the block in camera coordinates, `(NUM_RIM_POINTS, 3)`."""
+    axis = circle.axis if isinstance(circle, DrilledHole) else 2
+    angle = np.linspace(0, 2 * np.pi, NUM_RIM_POINTS, endpoint=False)
+    local = np.repeat(circle.center_m[None], NUM_RIM_POINTS, 0)
+    local[:, (axis + 1) % 3] += circle.radius_m * np.cos(angle)
+    local[:, (axis + 2) % 3] += circle.radius_m * np.sin(angle)
+    return block.pose.point(local)
+
+
+def compute_hidden_share(
+    solids: Sequence[Solid], block: DrilledBlock, circle: DrilledHole | Disc
+) -> float:
+    """Returns the part of the rim of a hole or disc that other solids, or the block itself, hide from the left camera."""
+    rim = sample_rim(block, circle)
+    outward = block.pose.rotation @ (
+        circle.outward if isinstance(circle, DrilledHole) else np.array([0.0, 0.0, 1.0])
+    )
+    if (outward @ rim.mean(0)) >= 0:  # on a face that looks away
+        return 1.0
+    shut = np.zeros(len(rim), bool)
+    for solid in solids:
+        if solid is not block:
+            shut |= solid.hit(np.zeros(3), rim.astype(np.float32)).t < 0.999
+    return float(shut.mean())
+
+
+def _draw_target(
+    kind: SceneRanges, rig: StereoRig, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Returns the point on the face that is looked at, the face's normal (both `(3,)`), and the turn of the block about it."""
+    inner = 1.0 - 2.0 * kind.sight.margin
+    size = np.array([rig.width, rig.height])
+    pixel = (0.5 + inner * (generator.random(2) - 0.5)) * (size - 1)
+    ray = rig.left.rays(pixel[None])[0].astype(np.float64)
+    ray /= np.linalg.norm(ray)
+    up = -np.array([0.0, 1.0, 0.0])
+    up -= ray * (up @ ray)
+    up /= np.linalg.norm(up)
+    side = np.cross(ray, up)
+    azimuth, obliquity = (
+        draw_uniform(kind.sight.azimuth_rad, generator),
+        draw_uniform(kind.sight.obliquity_rad, generator),
+    )
+    lean = math.cos(azimuth) * up + math.sin(azimuth) * side
+    normal = -math.cos(obliquity) * ray + math.sin(obliquity) * lean
+    return (
+        ray * draw_uniform(kind.sight.distance_m, generator),
+        normal,
+        float(generator.uniform(-np.pi, np.pi)),
+    )
+
+
+def draw_material(
+    brightness: float,
+    contrast: float,
+    texel_m: float,
+    generator: np.random.Generator,
+    tint: float = 0.06,
+    texture: int | None = None,
+) -> Material:
+    """Returns a material of about this brightness, of a random pattern and a slight tint."""
+    color = brightness * (1.0 + tint * generator.standard_normal(3))
+    pattern = int(generator.integers(NUM_TEXTURES)) if texture is None else texture
+    shift = tuple(generator.uniform(0, TEXTURE_SIDE, 2))
+    red, green, blue = np.clip(color, 0.01, 0.95)
+    return Material(
+        (float(red), float(green), float(blue)),
+        contrast,
+        texel_m,
+        pattern,
+        (float(shift[0]), float(shift[1])),
+    )
+
+
+def _setting(
+    kind: SceneRanges, down: np.ndarray, lowest_m: float, generator: np.random.Generator
+) -> tuple[PlaneSolid, PlaneSolid]:
+    """Returns ground and backdrop."""
+    soil = draw_material(
+        draw_uniform(kind.around.ground_brightness, generator),
+        generator.uniform(0.15, 0.4),
+        0.002,
+        generator,
+        0.12,
+    )
+    wall = draw_material(
+        generator.uniform(0.2, 0.6), generator.uniform(0.1, 0.3), 0.006, generator, 0.1
+    )
+    ground = PlaneSolid("ground", SolidPose(build_frame(-down, 0.0), down * lowest_m), (soil,))
+    level = np.array([0.0, 0.0, 1.0]) - down * down[2]
+    level /= np.linalg.norm(level)
+    backdrop = PlaneSolid(
+        "ground",
+        SolidPose(
+            build_frame(-level, 0.0), level * draw_uniform(kind.around.backdrop_m, generator)
+        ),
+        (wall,),
+    )
+    return ground, backdrop
+
+
+def _clutter(
+    kind: SceneRanges,
+    rig: StereoRig,
+    block: DrilledBlock | None,
+    down: np.ndarray,
+    lowest_m: float,
+    generator: np.random.Generator,
+) -> list[Solid]:
+    """Returns things on the ground, in the picture, not in front of a rim and not inside the block."""
+    wanted, found = draw_integer(kind.around.clutter, generator), []
+    for _ in range(_CLUTTER_TRIES):
+        if len(found) == wanted:
+            break
+        pixel = generator.random((1, 2)) * [rig.width, rig.height]
+        ray = rig.left.rays(pixel)[0].astype(np.float64)
+        way = lowest_m / (ray @ down) if ray @ down > 0.05 else generator.uniform(2.0, 8.0)
+        half = generator.uniform(0.03, 0.25, 3) * [1.0, 1.0, 0.7]
+        place = ray * way * generator.uniform(0.9, 1.0) - down * half[2]
+        if not 0.8 < place[2] < 12.0:
+            continue
+        tilt = build_frame(
+            -down + 0.15 * generator.standard_normal(3), float(generator.uniform(-np.pi, np.pi))
+        )
+        stuff = draw_material(
+            generator.uniform(0.05, 0.6), generator.uniform(0.05, 0.3), 0.001, generator, 0.25
+        )
+        thing = Box("clutter", SolidPose(tilt, place), half, (stuff,))
+        reach = float(np.linalg.norm(half))
+        if block and np.linalg.norm(place - block.pose.center_m) < reach + np.linalg.norm(
+            block.half_m
+        ):
+            continue
+        if block and any(compute_hidden_share([thing], block, hole) > 0 for hole in block.holes):
+            continue
+        found.append(thing)
+    return found
+
+
+def _light(
+    kind: SceneRanges, down: np.ndarray, target: np.ndarray, generator: np.random.Generator
+) -> Light:
+    """Returns sun and sky, and things out of sight that throw shadows on the face."""
+    elevation, azimuth = (
+        draw_uniform(kind.light.elevation_rad, generator),
+        generator.uniform(-np.pi, np.pi),
+    )
+    frame = build_frame(-down, 0.0)
+    to_sun = frame @ [
+        math.cos(elevation) * math.cos(azimuth),
+        math.cos(elevation) * math.sin(azimuth),
+        math.sin(elevation),
+    ]
+    shade = []
+    for _ in range(draw_integer(kind.light.shadows, generator)):
+        beam = build_frame(
+            to_sun + 0.3 * generator.standard_normal(3), float(generator.uniform(-np.pi, np.pi))
+        )
+        beside = beam[:, :2] @ generator.uniform(-0.25, 0.25, 2)
+        half = np.array([generator.uniform(0.03, 0.25), 1.5, 0.02])
+        dark = draw_material(0.3, 0.1, 0.01, generator)
+        shade.append(Box("clutter", SolidPose(beam, target + beside + 3.0 * to_sun), half, (dark,)))
+    return Light(
+        to_sun,
+        draw_uniform(kind.light.sun, generator),
+        draw_uniform(kind.light.ambient, generator),
+        tuple(shade),
+    )
+
+
+def _exposure(
+    kind: SceneRanges,
+    light: Light,
+    normal: np.ndarray,
+    target: np.ndarray,
+    generator: np.random.Generator,
+) -> tuple[CameraExposure, float]:
+    """Returns how the pictures are taken, and the level of light; the exposure is set for the face as it is lit without dust."""
+    ranges = kind.light
+    lit = light.ambient + light.sun * max(0.0, float(normal @ light.to_sun))
+    face = lit * float(np.mean(kind.block.brightness))
+    level = draw_log_uniform(ranges.level, generator)
+    extinction = -math.log(draw_uniform(ranges.transmission, generator)) / float(target[2])
+    exposure = CameraExposure(
+        gain=draw_uniform(ranges.exposure, generator) / face * level,
+        extinction_per_m=extinction,
+        airlight=draw_uniform(ranges.airlight, generator) * (light.ambient + light.sun * _GREY),
+        patchiness=draw_uniform(ranges.patchiness, generator),
+        blur_px=draw_uniform(ranges.blur_px, generator),
+        full_well_e=draw_uniform(ranges.full_well_e, generator),
+        read_noise_e=draw_uniform(ranges.read_noise_e, generator),
+        gamma=draw_uniform(ranges.gamma, generator),
+        vignetting=draw_uniform(ranges.vignetting, generator),
+    )
+    return exposure, level

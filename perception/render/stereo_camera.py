@@ -1,0 +1,158 @@
+"""The camera pair that pictures are rendered for: its lens, its baseline, and where it stands on the machine."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import spec
+from perception.render.ray_tracer import Pinhole
+
+# --- from sensor: From light to numbers: dust in the air, the lens, exposure, noise, and eight
+# bits.
+
+
+@spec
+class StereoRig:
+    """A rectified stereo camera, fixed to the machine.
+
+    Attributes:
+        width: Pixels.
+        height: Pixels.
+        focal_px: Focal length.
+        baseline_m: From the left camera to the right one.
+        position_in_base_m: Left camera's centre of projection in the base frame.
+        yaw_rad: Turn of the view about the vertical, from base x towards y.
+        pitch_rad: How far it looks down.
+    """
+
+    width: int
+    height: int
+    focal_px: float
+    baseline_m: float
+    position_in_base_m: tuple[float, float, float]
+    yaw_rad: float
+    pitch_rad: float
+
+    def check(self) -> None:
+        if min(self.width, self.height) < 16 or self.focal_px <= 0 or self.baseline_m <= 0:
+            raise ConfigError(
+                f"rig: expected width and height of 16 or more, focal_px and baseline_m above 0, got {self.width} x {self.height}, "
+                f"{self.focal_px}, {self.baseline_m}"
+            )
+
+    @property
+    def left(self) -> Pinhole:
+        """The camera in whose coordinates everything is told."""
+        return Pinhole(self.width, self.height, self.focal_px, np.zeros(3))
+
+    @property
+    def right(self) -> Pinhole:
+        """Its partner."""
+        return Pinhole(
+            self.width, self.height, self.focal_px, np.array([self.baseline_m, 0.0, 0.0])
+        )
+
+    @property
+    def base_from_camera(self) -> np.ndarray:
+        """Pose of the left camera in the base frame, `(4, 4)`: x right, y down, z forward."""
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        down, ahead = math.sin(self.pitch_rad), math.cos(self.pitch_rad)
+        forward = np.array([cos * ahead, sin * ahead, -down])
+        right = np.array([sin, -cos, 0.0])
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+        pose[:3, 3] = self.position_in_base_m
+        return pose
+
+    @property
+    def down_in_camera(self) -> np.ndarray:
+        """Direction of gravity, `(3,)`, camera coordinates."""
+        return -self.base_from_camera[2, :3]
+
+
+@dataclass(frozen=True)
+class CameraExposure:
+    """How one picture of a scene is taken.
+
+    Attributes:
+        gain: Signal for unit radiance; 1 saturates.
+        extinction_per_m: Of the dusty air: what is left of the light after z metres is
+            exp(-extinction z).
+        airlight: Radiance of the dust itself.
+        patchiness: Standard deviation of the dust's density over the picture, relative; it drifts
+            before the block.
+        blur_px: Standard deviation of the point spread.
+        full_well_e: Electrons at saturation; decides the shot noise.
+        read_noise_e: Noise in the dark, electrons.
+        gamma: Exponent of the camera's response; 1 is linear, 2.2 that of most colour cameras.
+        vignetting: Part of the light that is missing in the corners.
+    """
+
+    gain: float
+    extinction_per_m: float
+    airlight: float
+    patchiness: float
+    blur_px: float
+    full_well_e: float
+    read_noise_e: float
+    gamma: float
+    vignetting: float
+
+
+def take_picture(
+    radiance: np.ndarray,
+    depth_m: np.ndarray,
+    exposure: CameraExposure,
+    density: np.ndarray,
+    generator: np.random.Generator,
+) -> np.ndarray:
+    """Returns the picture that a camera takes of a view, RGB, `(h, w, 3)` uint8.
+
+    Args:
+        radiance: Linear light, `(h, w, 3)` float32.
+        depth_m: `(h, w)`, NaN where nothing is.
+        exposure: How it is taken.
+        density: Small picture of the dust's density, about 1; see `dust`.
+        generator: Source of the noise.
+    """
+    height, width = depth_m.shape
+    light = radiance
+    if exposure.extinction_per_m > 0:
+        thick = cv2.resize(density, (width, height), interpolation=cv2.INTER_CUBIC)
+        way = np.nan_to_num(depth_m, nan=1e3) * exposure.extinction_per_m * np.maximum(thick, 0.0)
+        left = np.exp(-way)[..., None].astype(np.float32)
+        light = light * left + np.float32(exposure.airlight) * (1.0 - left)
+    if exposure.blur_px > 0:
+        light = cv2.GaussianBlur(light, (0, 0), exposure.blur_px)
+    if exposure.vignetting > 0:
+        x, y = (
+            np.linspace(-1, 1, width, dtype=np.float32),
+            np.linspace(-1, 1, height, dtype=np.float32),
+        )
+        light = (
+            light
+            * (1.0 - np.float32(exposure.vignetting / 2) * (x[None] ** 2 + y[:, None] ** 2))[
+                ..., None
+            ]
+        )
+    signal = np.clip(light * np.float32(exposure.gain), 0.0, 1.0)
+    spread = np.sqrt(
+        signal / np.float32(exposure.full_well_e)
+        + np.float32((exposure.read_noise_e / exposure.full_well_e) ** 2)
+    )
+    signal = np.clip(
+        signal + spread * generator.standard_normal(signal.shape, np.float32), 0.0, 1.0
+    )
+    if exposure.gamma != 1.0:
+        signal = signal ** np.float32(1.0 / exposure.gamma)
+    return (255.0 * signal + 0.5).astype(np.uint8)
+
+
+def draw_dust(patchiness: float, generator: np.random.Generator) -> np.ndarray:
+    """Returns the density of drifting dust over a picture, `(6, 10)` float32, mean about 1."""
+    return (1.0 + patchiness * generator.standard_normal((6, 10))).astype(np.float32)

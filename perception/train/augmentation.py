@@ -1,0 +1,381 @@
+"""What JPEG leaves of pictures, in torch, for a whole batch at once and without files (ITU-T T.81; colours at full resolution)."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from typing import Protocol
+
+import torch
+from torch.nn import functional
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import spec
+
+# --- from augment: Augmentations: what light, dust, lens, sensor and file do to pictures, without
+# moving anything in them. The paper's five are blur, crop, contrast, gamma and noise; crop
+# changes the geometry and is `training_data.Crop`. All take and return a batch of RGB pictures in
+# [0, 1], `(B, 3, h, w)` float32 on any device, each picture changed by a draw of its own from the
+# generator that they are given, which is of the same device, and from nothing else.
+
+LUMINANCE_STEPS = (
+    (16, 11, 10, 16, 24, 40, 51, 61), (12, 12, 14, 19, 26, 58, 60, 55), (14, 13, 16, 24, 40, 57, 69, 56),
+    (14, 17, 22, 29, 51, 87, 80, 62), (18, 22, 37, 56, 68, 109, 103, 77), (24, 35, 55, 64, 81, 104, 113, 92),
+    (49, 64, 78, 87, 103, 121, 120, 101), (72, 92, 95, 98, 112, 100, 103, 99),
+)  # fmt: skip
+COLOUR_STEPS = (
+    (17, 18, 24, 47, 99, 99, 99, 99), (18, 21, 26, 66, 99, 99, 99, 99), (24, 26, 56, 99, 99, 99, 99, 99),
+    (47, 66, 99, 99, 99, 99, 99, 99), *((99,) * 8,) * 4,
+)  # fmt: skip
+"""Steps of quantisation at quality 50 (annex K)."""
+YCC = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
+"""Luminance and two colour differences of RGB (JFIF)."""
+
+
+def recompress_jpeg(pictures: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
+    """Returns RGB pictures in [0, 1], `(B, 3, h, w)`, as files of a quality, `(B, 1, 1, 1)` from 1 to 100, give them back."""
+    height, width = pictures.shape[2:]
+    percent = torch.where(quality < 50.0, 5000.0 / quality, 200.0 - 2.0 * quality) / 100.0
+    tables, matrix, inverse, middle, wave = _build_jpeg_constants(pictures.device)
+    steps = (tables * percent).round().clamp(1.0, 255.0)[:, :, None, None]  # (B, 3, 1, 1, 8, 8)
+    ycc = torch.einsum("ij,bjhw->bihw", matrix, pictures.clamp(0.0, 1.0) * 255.0)
+    ycc = functional.pad(ycc, (0, -width % 8, 0, -height % 8), mode="replicate")
+    blocks = (
+        ycc.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)
+    )  # (B, 3, rows, columns, 8, 8)
+    kept = (wave @ (blocks - middle) @ wave.T / steps).round() * steps
+    back = (
+        (wave.T @ kept @ wave + middle)
+        .transpose(3, 4)
+        .flatten(4, 5)
+        .flatten(2, 3)[..., :height, :width]
+    )
+    return torch.einsum("ij,bjhw->bihw", inverse, back) / 255.0
+
+
+@functools.cache
+def _build_jpeg_constants(device: torch.device) -> tuple[torch.Tensor, ...]:
+    """Returns, on a device, the steps at quality 50, YCC of RGB and back, the middle of each channel and the cosines."""
+    number = torch.arange(8.0)
+    wave = ((number + 0.5) * number[:, None] * (math.pi / 8.0)).cos()
+    wave = wave * torch.where(number > 0, 0.5, 0.125**0.5)[:, None]  # orthonormal
+    matrix, middle = torch.tensor(YCC), torch.tensor([128.0, 0.0, 0.0]).reshape(3, 1, 1, 1, 1)
+    tables = torch.tensor([LUMINANCE_STEPS, COLOUR_STEPS, COLOUR_STEPS], dtype=torch.float32)
+    return tuple(one.to(device) for one in (tables, matrix, torch.linalg.inv(matrix), middle, wave))
+
+
+Range = tuple[float, float]
+
+
+class Augmentation(Protocol):
+    """Changes pictures at random."""
+
+    @property
+    def probability(self) -> float:
+        """How often it does; 0 switches it off."""
+        ...
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns changed pictures; values may leave [0, 1], they are clipped after the last one."""
+        ...
+
+
+def apply_augmentations(
+    pictures: torch.Tensor,
+    steps: Mapping[str, Augmentation],
+    chance: torch.Generator,
+    generator: torch.Generator,
+) -> torch.Tensor:
+    """Returns the pictures after all augmentations in their order, each with its probability, clipped to [0, 1].
+
+    `chance`, on the CPU, says which pictures each one changes (whoever asks a graphics card for
+    that waits); `generator` says how.
+    """
+    for step in steps.values():
+        chosen = torch.nonzero(torch.rand(len(pictures), generator=chance) < step.probability)[:, 0]
+        if len(chosen):
+            chosen = chosen.to(pictures.device, non_blocking=True)
+            pictures = pictures.index_copy(0, chosen, step.changed(pictures[chosen], generator))
+    return pictures.clamp(0.0, 1.0)
+
+
+@spec
+class Exposure:
+    """More or less light on the sensor, with one gain for each colour.
+
+    Attributes:
+        probability: How often.
+        gain: Range of the gain, drawn evenly in its logarithm.
+        tint: Largest relative difference of a colour's gain.
+    """
+
+    probability: float
+    gain: Range
+    tint: float
+
+    def check(self) -> None:
+        _check(self, gain=self.gain)
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with another exposure."""
+        gain = _drawn((math.log(self.gain[0]), math.log(self.gain[1])), pictures, generator).exp()
+        return pictures * gain * _drawn((1.0 - self.tint, 1.0 + self.tint), pictures, generator, 3)
+
+
+@spec
+class Contrast:
+    """Stretches or squeezes about the mean.
+
+    Attributes:
+        probability: How often.
+        gain: Range of the factor.
+    """
+
+    probability: float
+    gain: Range
+
+    def check(self) -> None:
+        _check(self, gain=self.gain)
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with another contrast."""
+        mean = pictures.mean((1, 2, 3), keepdim=True)
+        return mean + (pictures - mean) * _drawn(self.gain, pictures, generator)
+
+
+@spec
+class Gamma:
+    """Another tone curve.
+
+    Attributes:
+        probability: How often.
+        exponent: Range of the exponent.
+    """
+
+    probability: float
+    exponent: Range
+
+    def check(self) -> None:
+        _check(self, exponent=self.exponent)
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with another tone curve."""
+        return pictures.clamp(0.0, 1.0) ** _drawn(self.exponent, pictures, generator)
+
+
+@spec
+class Shadow:
+    """The shadow of something long: a band with soft edges, darker than the rest.
+
+    Attributes:
+        probability: How often.
+        depth: Range of what is left of the light.
+        width: Range of the band's width, as a part of the picture's.
+        softness: Range of the edge's width, as a part of the picture's.
+    """
+
+    probability: float
+    depth: Range
+    width: Range
+    softness: Range
+
+    def check(self) -> None:
+        _check(self, width=self.width, softness=self.softness)
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with a shadow across them."""
+        height, width = pictures.shape[2:]
+        angle_rad = _drawn((0.0, math.pi), pictures, generator)
+        x, y = (_drawn((0.2, 0.8), pictures, generator) for _ in range(2))
+        across = torch.arange(width, device=pictures.device) / width - x
+        down = torch.arange(height, device=pictures.device)[:, None] / width - y * height / width
+        half, soft = (
+            _drawn(self.width, pictures, generator) / 2.0,
+            _drawn(self.softness, pictures, generator),
+        )
+        inside = (
+            (half - (across * angle_rad.cos() + down * angle_rad.sin()).abs()) / soft + 0.5
+        ).clamp(0.0, 1.0)
+        return pictures * (1.0 - inside * (1.0 - _drawn(self.depth, pictures, generator)))
+
+
+@spec
+class Haze:
+    """Dust in the air: the picture fades into the dust's colour, unevenly (Koschmieder's law with a transmission that drifts).
+
+    Attributes:
+        probability: How often.
+        transmission: Range of what comes through.
+        brightness: Range of the dust's brightness.
+        unevenness: Largest change of the transmission across the picture.
+    """
+
+    probability: float
+    transmission: Range
+    brightness: Range
+    unevenness: float
+
+    def check(self) -> None:
+        _check(self, transmission=self.transmission, brightness=self.brightness)
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures through dust."""
+        coarse = _drawn((-self.unevenness, self.unevenness), pictures, generator, 20).reshape(
+            -1, 1, 4, 5
+        )
+        drift = functional.interpolate(
+            coarse, pictures.shape[2:], mode="bicubic", align_corners=False
+        )
+        through = (_drawn(self.transmission, pictures, generator) + drift).clamp(0.05, 1.0)
+        tint = torch.cat([_drawn((low, 1.0), pictures, generator) for low in (0.95, 0.9, 0.85)], 1)
+        return pictures * through + _drawn(self.brightness, pictures, generator) * tint * (
+            1.0 - through
+        )
+
+
+@spec
+class Blur:
+    """Out of focus.
+
+    Attributes:
+        probability: How often.
+        sigma_px: Range of the standard deviation, px of the network's picture.
+    """
+
+    probability: float
+    sigma_px: Range
+
+    def check(self) -> None:
+        _check(self, sigma_px=self.sigma_px)
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures out of focus."""
+        kernel = _gaussian(_drawn(self.sigma_px, pictures, generator), self.sigma_px[1])
+        return _filtered(_filtered(pictures, kernel), kernel.transpose(2, 3))
+
+
+@spec
+class MotionBlur:
+    """The camera moved along a line while the shutter was open.
+
+    Attributes:
+        probability: How often.
+        length_px: Range of the way, px of the network's picture.
+    """
+
+    probability: float
+    length_px: Range
+
+    def check(self) -> None:
+        _check(self, length_px=self.length_px)
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures smeared along a line; what is shown stays where it was, in the middle of the way."""
+        half = math.ceil(self.length_px[1] / 2.0) + 1
+        length, angle_rad = (
+            _drawn(one, pictures, generator) for one in (self.length_px, (0.0, math.pi))
+        )
+        way = (
+            length * torch.linspace(-0.5, 0.5, 8 * half + 1, device=pictures.device)[:, None, None]
+        )
+        place = torch.arange(-half, half + 1, device=pictures.device).float()
+        # each step along the way falls on the four pixels around it
+        near = (1.0 - (place - way * angle_rad.cos()).abs()).clamp_min(0.0)
+        near = near * (1.0 - (place[:, None] - way * angle_rad.sin()).abs()).clamp_min(0.0)
+        return _filtered(pictures, near.mean(1, keepdim=True))
+
+
+@spec
+class SensorNoise:
+    """Noise of the sensor: a constant part and one that grows with the root of the light, partly grainy.
+
+    Attributes:
+        probability: How often.
+        constant: Range of the constant part's standard deviation, of full scale.
+        photon: Range of the standard deviation at full light.
+        grain_px: Range of the grain's size.
+    """
+
+    probability: float
+    constant: Range
+    photon: Range
+    grain_px: Range
+
+    def check(self) -> None:
+        _check(self, grain_px=self.grain_px)
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures with noise."""
+        noise = torch.randn(pictures.shape, device=pictures.device, generator=generator)
+        kernel = _gaussian(_drawn(self.grain_px, pictures, generator), self.grain_px[1])
+        noise = _filtered(_filtered(noise, kernel), kernel.transpose(2, 3)) / kernel.square().sum(
+            (2, 3), keepdim=True
+        )
+        constant, photon = (
+            _drawn(one, pictures, generator) for one in (self.constant, self.photon)
+        )
+        return (
+            pictures
+            + noise * (constant.square() + photon.square() * pictures.clamp(0.0, 1.0)).sqrt()
+        )
+
+
+@spec
+class Jpeg:
+    """Compression of a video stream.
+
+    Attributes:
+        probability: How often.
+        quality: Range of JPEG's quality, 1 to 100.
+    """
+
+    probability: float
+    quality: Range
+
+    def check(self) -> None:
+        _check(self, quality=self.quality)
+
+    def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Returns the pictures as a JPEG file gives them back."""
+        return recompress_jpeg(pictures, _drawn(self.quality, pictures, generator))
+
+
+def _drawn(
+    limits: Range, pictures: torch.Tensor, generator: torch.Generator, count: int = 1
+) -> torch.Tensor:
+    """Returns evenly drawn numbers, `(B, count, 1, 1)`, for a batch of pictures."""
+    low, high = limits
+    drawn = torch.rand((len(pictures), count, 1, 1), device=pictures.device, generator=generator)
+    return low + (high - low) * drawn
+
+
+def _gaussian(sigma_px: torch.Tensor, largest_px: float) -> torch.Tensor:
+    """Returns kernels, `(B, 1, 1, k)`, of standard deviations `(B, 1, 1, 1)` up to `largest_px`."""
+    half = max(1, math.ceil(3.0 * largest_px))
+    place = torch.arange(-half, half + 1, device=sigma_px.device)
+    kernel = (-0.5 * (place / sigma_px.clamp_min(0.05)).square()).exp()
+    return kernel / kernel.sum(3, keepdim=True)
+
+
+def _filtered(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
+    """Returns each picture filtered by its own kernel, `(B, 1, k, l)`; what lies beyond a border is like the border."""
+    down, across = kernels.shape[2] // 2, kernels.shape[3] // 2
+    wide = functional.pad(pictures, (across, across, down, down), mode="replicate").flatten(0, 1)[
+        None
+    ]
+    each = kernels.repeat_interleave(pictures.shape[1], 0)
+    return functional.conv2d(wide, each, groups=len(each))[0].unflatten(0, pictures.shape[:2])
+
+
+def _check(step: Augmentation, **ranges: Range) -> None:
+    """Raises a `ConfigError` for a probability outside [0, 1] and for ranges that are empty or reach below 0."""
+    if not 0.0 <= step.probability <= 1.0:
+        raise ConfigError(
+            f"{type(step).__name__}.probability: expected 0 to 1, got {step.probability}"
+        )
+    for name, (low, high) in ranges.items():
+        if not 0.0 <= low <= high:
+            raise ConfigError(
+                f"{type(step).__name__}.{name}: expected 0 <= lowest <= highest, got [{low}, {high}]"
+            )

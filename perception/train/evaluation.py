@@ -1,0 +1,194 @@
+"""How good a segmenter is on frames it has not seen, as numbers and as pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from perception.segment.network import THRESHOLD
+from perception.segment.unet import CHANNELS, UNet
+from perception.segment.window import center_window, cover_picture
+from perception.train.samples import LOOKS, ROOM, TrainingViews
+
+BATCH = 32
+ALIKE = 0.5
+"""Overlap from which on a mouth counts as found."""
+SHOWN = 12
+"""Frames in the picture of samples."""
+COLOURS = {"block": (0, 114, 178), "mouth": (213, 94, 0)}
+
+
+def crop_segmenter_views(
+    views: TrainingViews, size_px: tuple[int, int]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns what the segmenter would see of each frame, `(F, 2, 3, h, w)` uint8, and what is there, `(F, 2, 2, h, w)` bool."""
+    width, height = size_px
+    full = tuple(views.layers.shape[3:])
+    room = (
+        full[1] * (1.0 - 1.0 / ROOM) / 2.0,
+        full[0] * (1.0 - 1.0 / ROOM) / 2.0,
+        full[1] / ROOM,
+        full[0] / ROOM,
+    )
+    seen = np.empty((len(views), len(LOOKS), 5, height, width), np.uint8)
+    for look, window in enumerate(
+        (cover_picture(full, size_px), center_window(room, size_px, 0.0))
+    ):
+        for frame in range(len(views)):
+            layers = views.layers[frame, look].numpy().transpose(1, 2, 0)
+            for part in (slice(0, 3), slice(3, 5)):
+                seen[frame, look, part] = window.take(
+                    np.ascontiguousarray(layers[..., part]), size_px
+                ).transpose(2, 0, 1)
+    layers = torch.from_numpy(seen)
+    return layers[:, :, :3], layers[:, :, 3:] > 127
+
+
+@torch.no_grad()
+def predict(network: UNet, pictures: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """Returns the probabilities for pictures `(F, 2, 3, h, w)` uint8, `(F, 2, 2, h, w)`, on the CPU."""
+    network.eval()
+    flat, found = pictures.flatten(0, 1), []
+    for first in range(0, len(flat), BATCH):
+        found.append(
+            torch.sigmoid(network(flat[first : first + BATCH].to(device).float() / 255.0))
+            .float()
+            .cpu()
+        )
+    return torch.cat(found).unflatten(0, pictures.shape[:2])
+
+
+def compute_metrics(
+    probabilities: torch.Tensor, known: torch.Tensor, conditions: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Returns figures for each condition, and for all frames under `all`.
+
+    `block`: intersection over union of the block, seen as a whole. `mouth`: that of mouths, in the
+    closer view; both over all
+    pixels of all frames, `None` where there is nothing to find. `found`: part of the mouths that
+    one piece of the prediction covers
+    with an overlap above one half. `false`: predicted pieces per frame that touch no mouth.
+    `frames`: how many.
+    """
+    said = probabilities > THRESHOLD
+    block, mouth = (said[:, 0, 0], known[:, 0, 0]), (said[:, 1, 1], known[:, 1, 1])
+    counts = np.array(
+        [match_pieces(a.numpy(), b.numpy()) for a, b in zip(*mouth, strict=True)]
+    ).reshape(-1, 3)
+    table = {}
+    for name in ("all", *sorted(set(conditions))):
+        chosen = np.array([name in ("all", condition) for condition in conditions])
+        index = torch.from_numpy(chosen)
+        found, there, false = counts[chosen].sum(0)
+        table[name] = {
+            "block": _iou(block[0][index], block[1][index]),
+            "mouth": _iou(mouth[0][index], mouth[1][index]),
+            "found": float(found / there) if there else None,
+            "false": float(false / chosen.sum()),
+            "frames": int(chosen.sum()),
+        }
+    return table
+
+
+def _iou(said: torch.Tensor, known: torch.Tensor) -> float | None:
+    return float((said & known).sum() / (said | known).sum()) if known.any() else None
+
+
+def match_pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
+    """Returns how many mouths were found, how many there are, and how many pieces of `said` touch none."""
+    num_said, said_labels = cv2.connectedComponents(said.astype(np.uint8))
+    num_known, known_labels = cv2.connectedComponents(known.astype(np.uint8))
+    found = 0
+    for label in range(1, num_known):
+        there = known_labels == label
+        touching = said_labels[there]
+        best = (
+            np.bincount(touching[touching > 0], minlength=1).argmax() if (touching > 0).any() else 0
+        )
+        piece = said_labels == best
+        found += bool(best and (there & piece).sum() / (there | piece).sum() > ALIKE)
+    false = sum(not known[said_labels == label].any() for label in range(1, num_said))
+    return found, num_known - 1, false
+
+
+@contextmanager
+def show_progress(done: int, total: int) -> Iterator[Callable[[], None]]:
+    """Shows how far a training is; yields what says that it is one update farther."""
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, transient=True) as bar:
+        task = bar.add_task("training", total=total, completed=done)
+        yield lambda: bar.advance(task)
+
+
+def draw_samples(
+    path: Path, pictures: torch.Tensor, probabilities: torch.Tensor, known: torch.Tensor
+) -> None:
+    """Draws some frames in both views: what is there as a thin line, what the network says as colour; writes a PNG."""
+    rows = []
+    for frame in np.linspace(0, len(pictures) - 1, min(SHOWN, len(pictures))).round().astype(int):
+        tiles = []
+        for look in range(len(LOOKS)):
+            picture = np.ascontiguousarray(pictures[frame, look].numpy().transpose(1, 2, 0))
+            for channel, name in enumerate(CHANNELS):
+                weight = 0.45 * probabilities[frame, look, channel].numpy()[..., None]
+                picture = (picture * (1 - weight) + np.array(COLOURS[name]) * weight).astype(
+                    np.uint8
+                )
+                there = known[frame, look, channel].numpy().astype(np.uint8)
+                outlines, _ = cv2.findContours(there, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+                cv2.drawContours(picture, outlines, -1, (255, 255, 255), 1)
+            tiles.append(picture)
+        rows.append(np.concatenate(tiles, axis=1))
+    if len(rows) % 2:
+        rows.append(np.zeros_like(rows[0]))
+    sheet = np.concatenate(
+        [np.concatenate(rows[k : k + 2], axis=1) for k in range(0, len(rows), 2)]
+    )
+    cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
+
+
+def draw_curve(path: Path, curve: Sequence[dict[str, float | None]]) -> None:
+    """Draws loss and overlaps over the updates; writes a PNG."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    fitted = [
+        entry for entry in curve if entry["loss"] is not None
+    ]  # the network that it began with was not fitted yet
+    left.plot(
+        [entry["update"] for entry in fitted], [entry["loss"] for entry in fitted], color="black"
+    )
+    left.set(xlabel="update", ylabel="loss (cross-entropy + Dice)", yscale="log")
+    for name, colour in COLOURS.items():
+        right.plot(
+            [entry["update"] for entry in curve],
+            [entry[name] for entry in curve],
+            color=tuple(c / 255 for c in colour),
+            label=name,
+        )
+    right.set(xlabel="update", ylabel="intersection over union, unseen frames", ylim=(0, 1))
+    right.legend(frameon=False, loc="lower right")
+    for axis in (left, right):
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=100)

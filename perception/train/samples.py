@@ -1,0 +1,279 @@
+"""Pictures to train on: each frame becomes the two views at which the segmenter looks, with room to crop.
+
+A batch is a function of the seed and its number alone, so a training goes on exactly where it
+stopped. All of it is made by torch
+where the network is: a processor's cores took five times as long to make a batch as a graphics card
+takes to learn from it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from rich.progress import track
+from torch.nn import functional
+
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.spec import spec
+from perception import dataset
+from perception.segment.network import SMALLEST_PIECE, THRESHOLD
+from perception.segment.window import Window, bound_block, center_window, cover_picture
+from perception.train.augmentation import Augmentation, apply_augmentations
+
+ROOM = 1.5
+"""Size of a stored view over the network's picture: what a crop can take away without loss of
+detail."""
+LOOKS = ("whole", "closer")
+SEEN = (1.0, 1.0 / ROOM)
+"""Part of the width of each view that the segmenter sees."""
+FINER = 2
+"""Places at which a pixel of a sample is looked at, in each direction: it may be larger than one of
+the view."""
+ENLARGED = 1.5
+"""By how much a closer view is larger than its frame, at most: of a small one it shows more than
+the block instead, as sharp as the segmenter sees one in a large frame."""
+PART_OF_MEMORY = 0.5
+"""Views that take no more of a device's free memory are kept there."""
+THREADS = 16
+"""That read frames, at most: a machine may count more processors than it lends."""
+
+
+@spec
+class Crop:
+    """What a sample shows, beside what the segmenter would see.
+
+    Attributes:
+        width: Range of its width, as a part of the width that the segmenter sees; beyond the view
+            it is black.
+        shift: Largest shift of its middle, likewise.
+        roll_rad: Largest turn about the line of sight.
+        mirror: How often left and right are swapped.
+    """
+
+    width: tuple[float, float]
+    shift: float
+    roll_rad: float
+    mirror: float
+
+    def check(self) -> None:
+        if not 0 < self.width[0] <= self.width[1]:
+            raise ConfigError(
+                f"training.crop.width: expected 0 < lowest <= highest, got {list(self.width)}"
+            )
+
+    def windows(
+        self, seen: torch.Tensor, shape: tuple[int, int], generator: torch.Generator
+    ) -> torch.Tensor:
+        """Returns random parts of views, `(B, 2, 3)`: maps from a sample's places to the view's.
+
+        Both run from -1 to 1 from border to border, as `torch.nn.functional.affine_grid` wants
+        them.
+
+        Args:
+            seen: Part of each view's width that the segmenter would see, `(B,)`.
+            shape: Height and width of the views.
+            generator: Draws them.
+        """
+        draw = torch.rand((5, len(seen)), device=generator.device, generator=generator)
+        scale = seen * (self.width[0] + (self.width[1] - self.width[0]) * draw[0])
+        shift = 2.0 * self.shift * seen * (2.0 * draw[1:3] - 1.0)
+        roll_rad, slant = self.roll_rad * (2.0 * draw[3] - 1.0), shape[1] / shape[0]
+        side = torch.where(draw[4] < self.mirror, -scale, scale)
+        cos, sin = roll_rad.cos(), roll_rad.sin()
+        rows = (
+            (side * cos, -scale * sin / slant, shift[0]),
+            (side * sin * slant, scale * cos, shift[1]),
+        )
+        return torch.stack([torch.stack(row, -1) for row in rows], 1)
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """Views of all frames, in memory.
+
+    Attributes:
+        layers: `(F, 2, 5, H, W)` uint8: of the whole frame, and of the block with room around it,
+            RGB, and how much of each pixel shows block and mouth, 255 for all of it.
+        conditions: Under what each frame was taken.
+        names: Path of each frame without its endings.
+    """
+
+    layers: torch.Tensor
+    conditions: Sequence[str]
+    names: Sequence[str]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def part(self, chosen: slice) -> TrainingViews:
+        """Returns the chosen frames."""
+        return TrainingViews(self.layers[chosen], self.conditions[chosen], self.names[chosen])
+
+
+class Samples:
+    """Endless batches by number, cut and changed where the network is trained.
+
+    Args:
+        views: What they are cut from; kept on the device where it has room for them, else in the
+            computer's memory.
+        crop: How.
+        steps: What happens to them.
+        size_px: Width and height of a sample.
+        closer: How often a sample is cut from the closer view.
+        seed: Of all draws.
+        device: Where samples are made.
+    """
+
+    def __init__(
+        self,
+        views: TrainingViews,
+        crop: Crop,
+        steps: Mapping[str, Augmentation],
+        size_px: tuple[int, int],
+        closer: float,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        layers = views.layers
+        if (
+            device.type == "cuda"
+            and layers.nbytes < PART_OF_MEMORY * torch.cuda.mem_get_info(device)[0]
+        ):
+            layers = layers.to(device)
+        self._layers, self._crop, self._steps, self._size_px = layers, crop, steps, size_px
+        self._closer, self._seed, self._device = closer, seed, device
+
+    def batch(self, number: int, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns pictures `(count, 3, h, w)` and shares of block and mouth `(count, 2, h, w)` of a batch, float32 in [0, 1]."""
+        seed = (self._seed * 0x9E3779B97F4A7C15 + number) % 2**63
+        chance = torch.Generator().manual_seed(seed)
+        frame = torch.randint(len(self._layers), (count,), generator=chance)
+        look = (torch.rand(count, generator=chance) < self._closer).long()
+        generator = torch.Generator(self._device).manual_seed(seed)
+        # nothing here asks the device for an answer, nor waits until it has taken something: it is
+        # to be told of the next batch while it works at this one
+        place = (index.to(self._layers.device, non_blocking=True) for index in (frame, look))
+        taken = self._layers[tuple(place)].to(self._device, non_blocking=True)
+        seen = torch.tensor(SEEN)[look].to(self._device, non_blocking=True)
+        windows = self._crop.windows(seen, (taken.shape[2], taken.shape[3]), generator)
+        layers = cut_windows(taken, windows, self._size_px)
+        return apply_augmentations(layers[:, :3], self._steps, chance, generator), layers[:, 3:]
+
+
+def cut_windows(
+    layers: torch.Tensor, windows: torch.Tensor, size_px: tuple[int, int]
+) -> torch.Tensor:
+    """Returns parts of pictures `(B, C, H, W)` uint8 in the size of a sample, `(B, C, h, w)` float32 in [0, 1].
+
+    Args:
+        layers: Pictures.
+        windows: Which part, `(B, 2, 3)`, see `Crop.windows`; what lies beyond the picture is black.
+        size_px: Width and height.
+    """
+    width, height = size_px
+    fine = [len(layers), layers.shape[1], FINER * height, FINER * width]
+    grid = functional.affine_grid(windows, fine, align_corners=False)
+    seen = functional.grid_sample(layers.float() / 255.0, grid, align_corners=False)
+    return functional.avg_pool2d(seen, FINER)
+
+
+def list_frames(folders: str | Sequence[str]) -> list[Path]:
+    """Returns the frames with a mask in a folder, or in some, and those below them, as paths without endings, sorted.
+
+    Raises:
+        FrameError: a folder holds none.
+    """
+    stems: list[Path] = []
+    for folder in (folders,) if isinstance(folders, str) else folders:
+        here = sorted(Path(folder).rglob(f"*{dataset.MASK}"))
+        here = [
+            path.with_name(path.name.removesuffix(dataset.MASK))
+            for path in here
+            if not path.name.startswith(".")
+        ]
+        if not here:
+            raise FrameError(
+                f"training.frames: no *{dataset.MASK} in '{folder}' (seen from {Path.cwd()}); `brokk mode=render` and "
+                "`brokk mode=label` make frames with masks"
+            )
+        stems += here
+    return stems
+
+
+def read_views(
+    stems: Sequence[Path], size_px: tuple[int, int], margin: float, seed: int
+) -> TrainingViews:
+    """Reads frames, some at a time, and keeps their two views.
+
+    Args:
+        stems: Frames, paths without endings.
+        size_px: Width and height of the network's picture.
+        margin: Room around the block in the closer view, as a part of its box, before the room to
+            crop.
+        seed: Of the closer view of frames without a block, which shows any part of them.
+    """
+    width, height = (round(ROOM * side) for side in size_px)
+    layers = np.empty((len(stems), len(LOOKS), 5, height, width), np.uint8)
+
+    def fill(number: int) -> str:
+        picture, known, condition = _frame(stems[number])
+        generator = np.random.default_rng((seed, number))
+        for look, window in enumerate(_looks(known, (width, height), margin, generator)):
+            layers[number, look, :3] = window.take(picture, (width, height)).transpose(2, 0, 1)
+            layers[number, look, 3:] = window.take(known, (width, height)).transpose(2, 0, 1)
+        return condition
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # on each of many threads as many again would get in each other's way
+    try:
+        with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
+            work = pool.map(fill, range(len(stems)))
+            conditions = list(track(work, "reading frames", total=len(stems), transient=True))
+    finally:
+        cv2.setNumThreads(threads)
+    return TrainingViews(
+        torch.from_numpy(layers), tuple(conditions), tuple(str(stem) for stem in stems)
+    )
+
+
+def _frame(stem: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """Returns picture `(H, W, 3)`, shares `(H, W, 2)` and condition of one frame."""
+    path = Path(f"{stem}{dataset.COLOR}")
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    if picture is None:
+        raise FrameError(
+            f"{path}: {'no picture' if path.is_file() else 'there is no such file'}, but a mask lies beside it"
+        )
+    label = dataset.read_label(stem)
+    if label.block.shape != picture.shape[:2]:
+        raise FrameError(
+            f"{path}: {picture.shape[1::-1]} px, its mask {label.block.shape[::-1]} px"
+        )
+    condition = dataset.read_truth(stem).scene if dataset.is_whole(stem) else "unknown"
+    known = np.stack([label.block, label.hole_mask], axis=-1).astype(np.uint8) * np.uint8(255)
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), known, condition
+
+
+def _looks(
+    known: np.ndarray, size_px: tuple[int, int], margin: float, generator: np.random.Generator
+) -> list[Window]:
+    """Returns the windows of both views of a frame."""
+    first = cover_picture(known.shape, size_px)
+    box = bound_block(known[..., 0] / 255.0, THRESHOLD, SMALLEST_PIECE)
+    if box is None:
+        side = generator.uniform(0.2, 0.8) * np.array([known.shape[1], known.shape[0]])
+        corner = generator.uniform(0.0, 1.0, 2) * (
+            np.array([known.shape[1], known.shape[0]]) - side
+        )
+        box = (*corner, *side)
+    room = ROOM * (1.0 + 2.0 * margin)
+    closer = center_window(box, size_px, (room - 1.0) / 2.0)
+    room *= max(1.0, size_px[0] / ENLARGED / closer.width)
+    return [first, center_window(box, size_px, (room - 1.0) / 2.0)]

@@ -1,0 +1,342 @@
+"""Training the segmenter: samples and network on whatever device there is, best by unseen frames."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import logging
+import math
+import time
+from typing import Any
+
+import torch
+
+from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from perception.segment.network import find_weights
+from perception.segment.unet import UNet, compute_loss, read_checkpoint
+from perception.train import evaluation, export
+from perception.train import samples as training_data
+from perception.train.augmentation import Augmentation
+from perception.train.samples import Crop, Samples, TrainingViews
+
+STATE = "training.pt"
+"""What an interrupted training goes on from."""
+FREE = ("frames", "validation", "hold_out", "max_seconds", "validate_every")
+"""Settings that may be others when it does; frames and validation are compared by what they
+hold."""
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class SegmenterTraining:
+    """Fits a U-Net to frames with masks.
+
+    Attributes:
+        frames: Folder, or list of folders, of frames with masks, those below them too.
+        validation: Folders to judge by; `null` sets a part of `frames` aside.
+        hold_out: Without `validation`, one part in so many is kept from the training: a run of
+            frames at the end.
+        size_px: Width and height of the network's picture.
+        widths: Channels of the network at each size, the full picture first.
+        start: Checkpoint whose weights it begins with, to go on with other frames: a path, or the
+            name of one that ships with the package; `null` begins with chance.
+        updates: Steps of the optimiser.
+        max_seconds: It ends after as many seconds too, those before a resume included; `null` for
+            no such end. What was learned until then depends on the speed of the machine.
+        batch: Samples a step.
+        rate: Learning rate at its highest; it rises for a twentieth of the updates, then falls as a
+            cosine to nothing.
+        decay: Weight decay.
+        average: The network is the mean of what it was lately, over about this part of the
+            training: the steps of the last batches are as much chance as gain.
+        bfloat16: Whether the network is trained in sixteen bits: in half the time on a graphics
+            card or a processor that can.
+        closer: How often a sample is cut from the closer view of the block.
+        margin: Room around the block in that view, as a part of its box; that of the segmenter.
+        validate_every: Updates between two judgements, after each of which the training can go on
+            if it is stopped.
+        crop: What a sample shows, beside what the segmenter would see.
+        augment: What happens to its picture, by name, in this order.
+    """
+
+    frames: str | tuple[str, ...]
+    validation: str | tuple[str, ...] | None
+    hold_out: int
+    size_px: tuple[int, int]
+    widths: tuple[int, ...]
+    start: str | None
+    updates: int
+    max_seconds: float | None
+    batch: int
+    rate: float
+    decay: float
+    average: float
+    bfloat16: bool
+    closer: float
+    margin: float
+    validate_every: int
+    crop: Crop
+    augment: dict[str, Augmentation]
+
+    def check(self) -> None:
+        multiple = 2 ** (len(self.widths) - 1)
+        if any(side % multiple for side in self.size_px) or min(self.size_px, default=0) <= 0:
+            raise ConfigError(
+                f"training.size_px: {len(self.widths)} widths halve it {len(self.widths) - 1} times, so expected multiples of "
+                f"{multiple}, got {list(self.size_px)}"
+            )
+        if min(self.updates, self.batch, self.validate_every) < 1 or self.hold_out < 2:
+            raise ConfigError(
+                "training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or more"
+            )
+        if (
+            min(self.average, self.rate, math.inf if self.max_seconds is None else self.max_seconds)
+            <= 0
+        ):
+            raise ConfigError("training: expected average, rate and max_seconds above 0")
+
+    def fit(self, session: Session, resume: bool) -> dict[str, Any]:
+        """Trains; leaves the network as safetensors and ONNX, curve and samples as PNG in the session's folder.
+
+        Returns:
+            What `training.json` says: `conditions` (see `training_report.judged`), `best_update`,
+                `parameters`, `parity`, …
+
+        Raises:
+            FrameError: frames or masks cannot be used.
+            CheckpointError: there is nothing to go on from, it is another training, or the export
+                says something else.
+        """
+        return _Training(self, session, resume).run()
+
+
+class _Training:
+    """A training under way."""
+
+    def __init__(self, settings: SegmenterTraining, session: Session, resume: bool) -> None:
+        self._settings, self._session, self._folder = settings, session, session.folder
+        self._device = session.torch_device()
+        session.seed_all()
+        self._train, self._unseen = self._views()
+        self._network = self._begun().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._optimizer = torch.optim.AdamW(
+            self._network.parameters(), lr=settings.rate, weight_decay=settings.decay, fused=True
+        )
+        self._mean = {name: value.clone() for name, value in self._network.state_dict().items()}
+        self._update, self._best, self._curve = 0, {"score": -1.0, "update": 0}, []
+        self._seconds = 0.0
+        self._best_tensors: dict[str, torch.Tensor] = {}
+        self._stamp = self._identity()
+        if resume:
+            self._load()
+
+    def run(self) -> dict[str, Any]:
+        settings = self._settings
+        pictures, known = evaluation.crop_segmenter_views(self._unseen, settings.size_px)
+        total = torch.zeros((), device=self._device)
+        log.info(
+            "%d frames to train on, %d to judge by, %s",
+            len(self._train),
+            len(self._unseen),
+            self._device,
+        )
+        begun = time.monotonic() - self._seconds
+        samples = Samples(
+            self._train, settings.crop, settings.augment, settings.size_px, settings.closer, self._session.stream("samples"),
+            self._device,
+        )  # fmt: skip
+        if settings.start is not None and self._update == 0:
+            self._validate(pictures, known, None)  # a training may make a good network worse
+        with evaluation.show_progress(self._update, settings.updates) as advance:
+            while self._spent() < 1.0:
+                before = self._spent()
+                total += self._step(*samples.batch(self._update, settings.batch))
+                self._update += 1
+                self._seconds = time.monotonic() - begun
+                self._remember(1.0 - math.exp((before - self._spent()) / settings.average))
+                advance()
+                over = self._spent() >= 1.0
+                if self._update % settings.validate_every == 0 or over:
+                    since = self._update - (self._curve[-1]["update"] if self._curve else 0)
+                    self._validate(pictures, known, float(total) / since)
+                    total.zero_()
+                    self._save()
+        return self._finish(pictures, known)
+
+    def _begun(self) -> UNet:
+        """Returns the network as the training begins with it."""
+        network, settings = UNet(self._settings.widths), self._settings
+        if settings.start is not None:
+            first, _ = read_checkpoint(find_weights(settings.start))
+            if first.widths != network.widths:
+                raise CheckpointError(
+                    f"training.start: {settings.start} has widths {list(first.widths)}, training.widths are "
+                    f"{list(network.widths)}; both must be the same"
+                )
+            network.load_state_dict(first.state_dict())
+        return network
+
+    def _views(self) -> tuple[TrainingViews, TrainingViews]:
+        settings, seed = self._settings, self._session.stream("views")
+        stems = training_data.list_frames(settings.frames)
+        if settings.validation is None:
+            last = max(1, len(stems) // settings.hold_out)
+            stems, unseen = stems[:-last], stems[-last:]
+        else:
+            unseen = training_data.list_frames(settings.validation)
+            if shared := {path.resolve() for path in stems} & {path.resolve() for path in unseen}:
+                raise ConfigError(
+                    f"training.validation: {min(shared)} is also among training.frames; judge by other frames"
+                )
+        if not stems:
+            raise ConfigError("training.frames: one frame is too few to train on and to judge by")
+        both = training_data.read_views([*stems, *unseen], settings.size_px, settings.margin, seed)
+        return both.part(slice(0, len(stems))), both.part(slice(len(stems), None))
+
+    def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        self._network.train()
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._rate()
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._settings.bfloat16):
+            logits = self._network(picture.to(memory_format=torch.channels_last))
+        value = compute_loss(logits.float(), target)
+        self._optimizer.zero_grad(set_to_none=True)
+        value.backward()
+        torch.nn.utils.clip_grad_norm_(self._network.parameters(), 1.0)
+        self._optimizer.step()
+        return value.detach()
+
+    @torch.no_grad()
+    def _remember(self, part: float) -> None:
+        """Moves the mean network by a part of the way to the one under training."""
+        now = self._network.state_dict()
+        moving = [name for name, value in now.items() if value.is_floating_point()]
+        # all at once: a graphics card takes longer to be told of each of a hundred small tensors
+        # than to move them
+        torch._foreach_lerp_(
+            [self._mean[name] for name in moving], [now[name] for name in moving], part
+        )
+
+    def _spent(self) -> float:
+        """Returns which part of the training is over, by updates or by seconds, in [0, 1]."""
+        in_time = self._seconds / (self._settings.max_seconds or math.inf)
+        return min(1.0, max(self._update / self._settings.updates, in_time))
+
+    def _rate(self) -> float:
+        fall = 0.5 * (1.0 + math.cos(math.pi * self._spent()))
+        rise = 20.0 * (self._spent() + 1.0 / self._settings.updates)
+        return self._settings.rate * min(1.0, rise) * fall
+
+    def _validate(
+        self, pictures: torch.Tensor, known: torch.Tensor, mean_loss: float | None
+    ) -> None:
+        network = UNet(self._settings.widths).to(self._device)
+        network.load_state_dict(self._mean)
+        probabilities = evaluation.predict(network, pictures, self._device)
+        figures = evaluation.compute_metrics(probabilities, known, self._unseen.conditions)["all"]
+        block, mouth = figures["block"] or 0.0, figures["mouth"] or 0.0
+        self._curve.append(
+            {"update": self._update, "loss": mean_loss, "block": block, "mouth": mouth}
+        )
+        if mean_loss is not None and not math.isfinite(mean_loss):
+            raise CheckpointError(
+                f"the training diverged before update {self._update}; try a smaller training.rate"
+            )
+        if block + mouth > self._best["score"]:
+            self._best = {"score": block + mouth, "update": self._update}
+            self._best_tensors = {name: value.cpu().clone() for name, value in self._mean.items()}
+        passed = "" if mean_loss is None else f"loss {mean_loss:.4f}, "
+        log.info(
+            "update %d: %soverlap of blocks %.3f, of mouths %.3f",
+            self._update,
+            passed,
+            block,
+            mouth,
+        )
+
+    def _finish(self, pictures: torch.Tensor, known: torch.Tensor) -> dict[str, Any]:
+        network = UNet(self._settings.widths)
+        network.load_state_dict(self._best_tensors)
+        network.eval().requires_grad_(False)
+        probabilities = evaluation.predict(network.to(self._device), pictures, self._device)
+        conditions = evaluation.compute_metrics(probabilities, known, self._unseen.conditions)
+        network.cpu()
+        facts = {
+            "overlap": {name: conditions["all"][name] for name in ("block", "mouth")},
+            "frames": len(self._train),
+            "update": self._best["update"],
+            "margin": self._settings.margin,
+            "data": self._stamp["data"],
+        }
+        header = export.build_header(network, self._settings.size_px, facts)
+        export.write_checkpoint(self._folder / export.TENSORS, network, header)
+        compared = pictures[: min(len(pictures), 8)].flatten(0, 1).float() / 255.0
+        parity = export.write_onnx(self._folder / export.ONNX, network, header, compared)
+        evaluation.draw_curve(self._folder / "curve.png", self._curve)
+        evaluation.draw_samples(self._folder / "samples.png", pictures, probabilities, known)
+        return {
+            "schema": 1,
+            "conditions": conditions,
+            "best_update": self._best["update"],
+            "updates": self._update,
+            "seconds": self._seconds,
+            "parameters": sum(value.numel() for value in network.parameters()),
+            "onnx_bytes": (self._folder / export.ONNX).stat().st_size,
+            "parity": parity,
+            "frames": {"train": len(self._train), "validation": len(self._unseen)},
+            "device": str(self._device),
+            "curve": self._curve,
+        }
+
+    def _identity(self) -> dict[str, str]:
+        """Returns what must be the same for a training to go on."""
+        same = {name: value for name, value in vars(self._settings).items() if name not in FREE}
+        data = hashlib.sha256()
+        for views in (self._train, self._unseen):
+            data.update(views.layers[:: max(1, len(views) // 50)].numpy().tobytes())
+        return {
+            "settings": hashlib.sha256(repr((same, self._session.seed)).encode()).hexdigest()[:16],
+            "data": data.hexdigest()[:16],
+        }
+
+    def _save(self) -> None:
+        content = io.BytesIO()
+        torch.save(
+            {
+                "stamp": self._stamp, "update": self._update, "best": self._best, "curve": self._curve, "seconds": self._seconds,
+                "network": self._network.state_dict(), "optimizer": self._optimizer.state_dict(), "mean": self._mean,
+                "best_tensors": self._best_tensors,
+            },
+            content,
+        )  # fmt: skip
+        export.write_bytes(self._folder / STATE, content.getvalue())
+
+    def _load(self) -> None:
+        path = self._folder / STATE
+        if not path.is_file():
+            log.info("%s: nothing was kept yet, the training begins anew", path)
+            return
+        try:
+            state = torch.load(path, map_location=self._device, weights_only=True)
+        except Exception as error:  # torch raises whatever its unpickler meets
+            raise CheckpointError(
+                f"{path}: corrupt ({error}); delete it to begin the training again"
+            ) from error
+        if state["stamp"] != self._stamp:
+            differing = [
+                name for name, value in self._stamp.items() if state["stamp"].get(name) != value
+            ]
+            raise CheckpointError(
+                f"{path}: an interrupted training that cannot go on: its {' and '.join(differing)} differ. Train with what it "
+                "began with, or choose another folder (session.out=…)."
+            )
+        self._network.load_state_dict(state["network"])
+        self._mean = state["mean"]
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._update, self._best, self._curve, self._seconds = (
+            state[key] for key in ("update", "best", "curve", "seconds")
+        )
+        self._best_tensors = {name: value.cpu() for name, value in state["best_tensors"].items()}

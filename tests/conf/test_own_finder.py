@@ -1,0 +1,136 @@
+"""A finder of a package of one's own works in the checker, in `mode=perceive` and beside the loop."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from composed import option
+from drawn import CENTER, K, drawn
+from packages import install_package
+
+from brokk_rl.checks import check_finder
+from brokk_rl.signals import Frame
+from deploy.runtime import perception_process
+from deploy.runtime.perception_process import CameraConfig
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.target import read_holes
+from perception import dataset
+
+FINDER = '''"""A finder of another package."""
+
+import numpy as np
+
+from brokk_rl.contracts.vision import FrameDetections, HolePose
+from brokk_rl.spec import spec
+
+
+@spec
+class DarkestSpot:
+    """Take the darkest place of a bright face for a hole."""
+
+    radius_m: float
+    std_m: float
+
+    def build(self):
+        return self
+
+    def find(self, frame):
+        known = np.isfinite(frame.depth_m)
+        if not known.any():
+            return FrameDetections(holes=[])
+        gray = frame.color.mean(axis=2)
+        rows, columns = np.nonzero(gray < 0.5 * np.median(gray))
+        if len(rows) == 0:
+            return FrameDetections(holes=[])
+        ray = np.linalg.solve(frame.camera_matrix, [columns.mean(), rows.mean(), 1.0])
+        hole = HolePose(
+            center_m=np.median(frame.depth_m[known]) * ray,
+            axis=np.array([0.0, 0.0, -1.0]),
+            radius_m=self.radius_m,
+            cov_m2=np.eye(3) * self.std_m**2,
+            axis_cov_rad2=np.zeros((3, 3)),
+            frame="camera",
+            score=0.5,
+            t_s=frame.t_s,
+        )
+        return FrameDetections(holes=[hole])
+'''
+OPTION = "_target_: spots.finder.DarkestSpot\nradius_m: 0.05   # m\nstd_m: 0.05      # m, a guess\n"
+
+
+@pytest.fixture
+def finder_spec(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The spec of a finder in an installed package `spots`."""
+    folder = tmp_path_factory.mktemp("site")
+    install_package(folder, "spots", {"finder.py": FINDER, "conf/perception/darkest.yaml": OPTION})
+    monkeypatch.syspath_prepend(str(folder))
+    return importlib.import_module("spots.finder").DarkestSpot(radius_m=0.05, std_m=0.05)
+
+
+def test_it_passes_the_checker(finder_spec: Any) -> None:
+    check_finder(finder_spec)
+
+
+def test_mode_perceive_takes_it_by_name(finder_spec: Any, brokk: Callable, tmp_path: Path) -> None:
+    frame, _, _ = drawn()
+    dataset.write_camera(tmp_path / "frames", K, np.eye(4), None)
+    for number in range(3):
+        dataset.write_frame(tmp_path / "frames" / f"{number:05d}", frame.color, frame.depth_m)
+    done = brokk("mode=perceive", "perceive.input=frames", "perception=darkest", "session.out=out")
+    assert done.code == 0, done.err
+    frames = json.loads(Path("out/holes.json").read_text())["frames"]
+    assert [len(one["holes"]) for one in frames] == [1, 1, 1]
+    assert frames[0]["holes"][0]["frame"] == "base"
+    assert frames[0]["holes"][0]["center_m"] == pytest.approx(CENTER, abs=0.1)
+    assert [one["target"] and one["target"]["num_frames"] for one in frames] == [None, None, 3]
+    assert Path("out/overlays/00002.png").exists() and Path("out/explain.txt").exists()
+
+
+class TwoFrames:
+    """A source of two frames."""
+
+    num_frames = 2
+
+    def __init__(self, frame: Frame) -> None:
+        self._frames = [frame, frame]
+
+    def build(self) -> TwoFrames:
+        return self
+
+    def __enter__(self) -> TwoFrames:
+        return self
+
+    def __exit__(self, *exc: Any) -> None: ...
+
+    def read_latest(self) -> Frame | None:
+        return self._frames.pop() if self._frames else None
+
+
+@pytest.mark.parametrize("name", ["own", "truth"])
+def test_the_camera_process_publishes_its_holes(name: str, finder_spec: Any) -> None:
+    frame, _, _ = drawn()
+    camera = CameraConfig(
+        source=TwoFrames(frame),
+        finder=finder_spec if name == "own" else option("perception", "truth"),
+        tracker=option("perception/tracker", "fusion"),
+        rate_hz=100.0,
+        num_px=frame.depth_m.size,
+        stale_s=1.0,
+        record_hz=0.0,
+    )
+    num_joints = option("machine", "brokk170").num_joints
+    memory = LoopMemory.new(num_joints, commands=False, frame_px=frame.depth_m.size)
+    try:
+        perception_process.run(lambda: False, camera, memory)
+        (hole,) = read_holes(memory.holes)
+        expected_m = CENTER if name == "own" else [2.6, 0.0, 0.4]
+        assert hole["center_in_base_m"] == pytest.approx(expected_m, abs=0.1)
+        assert int(hole["name"]) == 1
+    finally:
+        memory.close()

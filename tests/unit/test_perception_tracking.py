@@ -1,0 +1,149 @@
+"""The tracker averages what agrees, keeps names, forgets, and never averages a shared error away."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from composed import option
+
+from brokk_rl.contracts.vision import HolePose
+from brokk_rl.errors import ConfigError
+from perception.calibrate import transforms
+
+FUSION = option("perception/tracker", "fusion")
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def detect(
+    center_m: tuple[float, float, float], std_m: float = 0.004, score: float = 0.8
+) -> HolePose:
+    cov = np.eye(3) * std_m**2
+    return HolePose(np.array(center_m), UP, 0.05, cov, np.diag([1e-4, 1e-4, 0]), "base", score, 0.0)
+
+
+def test_a_hole_is_confirmed_by_enough_detections() -> None:
+    tracker = FUSION.build()
+    (one,), (two,), (three,) = (
+        tracker.update([detect((2, 0, 0.4))], 0.1 * number) for number in range(3)
+    )
+    assert FUSION.confirm == 3
+    assert [one.confirmed, two.confirmed, three.confirmed] == [False, False, True]
+    assert [one.num_frames, two.num_frames, three.num_frames] == [1, 2, 3]
+
+
+def test_holes_keep_their_names_are_averaged_by_variance_and_forgotten() -> None:
+    tracker = replace(FUSION, forget_s=10.0).build()
+    tracker.update([detect((2.6, 0, 0.75), 0.004), detect((2.2, 0.4, 0.75))], 1.0)
+    first, second = tracker.update([detect((2.2, 0.4, 0.75)), detect((2.61, 0, 0.75), 0.008)], 2.0)
+    assert (first.name, second.name) == (1, 2)
+    # four times the variance, a fifth of the weight
+    assert first.pose.center_m[0] == pytest.approx(2.6 + 0.01 / 5, abs=1e-9)
+    assert first.std_m == pytest.approx(0.004 * np.sqrt(0.8), abs=1e-9)
+    assert [one.name for one in tracker.update([detect((2.6, 0, 0.75))], 11.9)] == [1, 2]
+    # the second was not seen for more than 10 s
+    assert [one.name for one in tracker.update([detect((2.9, -0.4, 0.75))], 12.5)] == [1, 3]
+
+
+def test_averaging_takes_noise_away_as_far_as_the_memory_reaches() -> None:
+    tracker, generator = replace(FUSION, memory=1000).build(), np.random.default_rng(0)
+    for number in range(50):
+        center = np.array([2, 0, 0.4]) + generator.normal(0, 0.002, 3)
+        (hole,) = tracker.update([detect(tuple(center), 0.002)], 0.1 * number)
+    assert np.linalg.norm(hole.pose.center_m - [2, 0, 0.4]) < 0.0015
+    assert hole.std_m == pytest.approx(0.002 / np.sqrt(50))
+    assert np.diag(hole.pose.cov_m2) == pytest.approx(0.002**2 / 50)
+    tracker = FUSION.build()
+    for number in range(50):
+        (hole,) = tracker.update([detect((2, 0, 0.4), 0.002)], 0.1 * number)
+    assert hole.std_m == pytest.approx(0.002 / np.sqrt(FUSION.memory + 1))
+    assert np.diag(hole.pose.cov_m2) == pytest.approx(0.002**2 / (FUSION.memory + 1))
+
+
+def test_a_direction_that_is_measured_badly_stays_the_worst() -> None:
+    cov = np.diag([0.001, 0.001, 0.004]) ** 2
+    tracker = FUSION.build()
+    for number in range(4):
+        (hole,) = tracker.update([replace(detect((2, 0, 0.4)), cov_m2=cov)], 0.1 * number)
+    np.testing.assert_allclose(hole.pose.cov_m2, cov / 4)
+    assert hole.std_m**2 == pytest.approx(np.trace(hole.pose.cov_m2) / 3)
+
+
+def test_a_base_that_moved_is_noticed_within_a_few_detections() -> None:
+    tracker = FUSION.build()
+    for number in range(200):
+        tracker.update([detect((2.6, 0, 0.75))], 0.1 * number)
+    for number in range(30):
+        (hole,) = tracker.update([detect((2.65, 0, 0.75))], 20.0 + 0.1 * number)
+    assert hole.pose.center_m[0] > 2.645
+
+
+def test_the_error_of_the_calibration_is_never_averaged_away() -> None:
+    calibrated = replace(
+        detect((2.6, 0, 0.75)),
+        cov_m2=(0.004**2 + 0.003**2) * np.eye(3),
+        shared_m2=0.003**2 * np.eye(3),
+    )
+    tracker = FUSION.build()
+    for number in range(4):
+        (hole,) = tracker.update([calibrated], float(number))
+    # of its own 4 mm, over four frames 2 mm; of the calibration 3 mm, in all of them: sqrt(4 + 9)
+    assert hole.std_m == pytest.approx(0.001 * np.sqrt(13.0), abs=1e-9)
+    np.testing.assert_allclose(hole.pose.cov_m2, 13e-6 * np.eye(3))
+    surer = replace(
+        calibrated, center_m=np.array([2.605, 0, 0.75]), cov_m2=(0.002**2 + 0.003**2) * np.eye(3)
+    )
+    # 2 mm of its own, as what is known: half way
+    (hole,) = tracker.update([surer], 4.0)
+    assert hole.pose.center_m[0] == pytest.approx(2.6025, abs=1e-9)
+
+
+def test_the_shared_covariance_is_what_a_displaced_camera_does() -> None:
+    camera = np.eye(4)
+    camera[:3, :3], camera[:3, 3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), [0.1, 0.2, 1.5]
+    cov = np.diag([0.002, 0.001, 0.003, 0.0005, 0.001, 0.0008]) ** 2
+    inside = replace(
+        detect((0.3, -0.2, 2.5), 1e-6),
+        frame="camera",
+        axis=np.array([0.0, -0.6, -0.8]),
+        axis_cov_rad2=np.zeros((3, 3)),
+    )
+    pose, generator = inside.moved(camera, cov), np.random.default_rng(0)
+    steps = generator.multivariate_normal(np.zeros(6), cov, 20_000)
+    # as if the camera really stood there
+    moved = [inside.moved(transforms.apply_motion(camera, step)) for step in steps]
+    spread, turned = (
+        np.cov(np.array([getattr(one, name) for one in moved]).T) for name in ("center_m", "axis")
+    )
+    np.testing.assert_allclose(pose.cov_m2, spread, atol=0.03 * np.trace(spread))
+    np.testing.assert_allclose(pose.axis_cov_rad2, turned, atol=0.03 * np.trace(turned))
+
+    tracker, noise = replace(FUSION, memory=1000).build(), np.eye(3) * 0.002**2
+    for number in range(20):
+        (hole,) = tracker.update([replace(pose, cov_m2=pose.cov_m2 + noise)], 0.1 * number)
+    assert pose.shared_m2 is not None
+    np.testing.assert_allclose(hole.pose.cov_m2, pose.shared_m2 + noise / 20, rtol=1e-3, atol=1e-9)
+
+
+def test_another_hole_moves_nothing() -> None:
+    tracker = FUSION.build()
+    for number in range(5):
+        tracker.update([detect((2, 0, 0.4))], 0.1 * number)
+    far, *_ = tracker.update([detect((2.0 + 1.01 * FUSION.near_m, 0, 0.4))], 0.6)
+    assert far.pose.center_m == pytest.approx([2, 0, 0.4])
+    assert far.seen_s == pytest.approx(0.4)
+
+
+def test_a_hole_that_nobody_sees_becomes_stale_and_is_forgotten() -> None:
+    tracker = FUSION.build()
+    (hole,) = tracker.update([detect((2, 0, 0.4))], 0.2)
+    assert not hole.stale
+    (hole,) = tracker.update([], 0.2 + 1.01 * FUSION.stale_s)
+    assert hole.stale
+    assert tracker.update([], 0.3 + FUSION.forget_s) == []
+
+
+def test_absurd_times_are_refused() -> None:
+    with pytest.raises(ConfigError, match="stale_s"):
+        replace(FUSION, stale_s=60.0)
