@@ -25,7 +25,7 @@ from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
 from diagnosis.refine import FittedSet
 from diagnosis.residual_model import CLUES
-from diagnosis.stages import survey_gap
+from diagnosis.stages import examine_gap
 
 RIVAL_SHARE = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
@@ -94,7 +94,7 @@ class DiagnosisPipeline:
         told = "unknown" if unknown else "effects" if selected else "none"
         after = field.runs(paths) if selected else None
         machine = self.case.machine
-        seen = survey_gap(
+        seen = examine_gap(
             before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
         )
         remainder = self._remainder(result, reach) if selected else None

@@ -27,7 +27,7 @@ SIZES = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 
 
 @pytest.fixture
-def penalties() -> Penalties:
+def prices() -> Penalties:
     return option("prices", "default")
 
 
@@ -36,7 +36,7 @@ def weights() -> ProbabilityModel:
     return option("certainty", "default")
 
 
-def found(machine: Machine, penalties: Penalties, strength: float, seed: int) -> DetectionResult:
+def found(machine: Machine, prices: Penalties, strength: float, seed: int) -> DetectionResult:
     """Returns findings on a machine whose first joint has a lag of some strength, in noise."""
     random, kinds = (
         np.random.default_rng(seed),
@@ -54,12 +54,12 @@ def found(machine: Machine, penalties: Penalties, strength: float, seed: int) ->
         tables[-1].explore({"lag": 2.0, "dead_band": 2.0}, 2)
 
     def price(j: int, subset: frozenset[str]) -> float:
-        return penalties.joint * len(subset) + penalties.reference * 1.5
+        return prices.joint * len(subset) + prices.reference * 1.5
 
-    residuals = cast(Residuals, SimpleNamespace(z=np.zeros((len(tables), 800)), block=block))
-    chosen, still = decision.choose_again(tables, price, penalties, kinds), np.zeros(len(tables))
+    evidence = cast(Residuals, SimpleNamespace(z=np.zeros((len(tables), 800)), block=block))
+    chosen, still = decision.choose_again(tables, price, prices, kinds), np.zeros(len(tables))
     return DetectionResult(
-        residuals,
+        evidence,
         tables,
         {"lag": [], "dead_band": []},
         price,
@@ -75,15 +75,15 @@ def found(machine: Machine, penalties: Penalties, strength: float, seed: int) ->
 
 
 def test_what_was_weighed_is_chosen_from_again_as_it_was(
-    machine: Machine, penalties: Penalties
+    machine: Machine, prices: Penalties
 ) -> None:
-    first, kinds = found(machine, penalties, 0.5, 0), effect_library.load_effects(machine)
-    told = json.loads(json.dumps(decision.record_weights(first, penalties)))
-    again = decision.restore_result(told, penalties, kinds)
+    first, kinds = found(machine, prices, 0.5, 0), effect_library.load_effects(machine)
+    told = json.loads(json.dumps(decision.record_weights(first, prices)))
+    again = decision.restore_result(told, prices, kinds)
     assert first.chosen.names == {"lag"} and again.chosen.subsets == first.chosen.subsets
     assert again.chosen.net_gain == pytest.approx(first.chosen.net_gain, abs=0.1)
     assert not decision.restore_result(
-        told, dataclasses.replace(penalties, joint=500.0), kinds
+        told, dataclasses.replace(prices, joint=500.0), kinds
     ).chosen.names
 
 
@@ -98,9 +98,9 @@ def label(kind: str, effects: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def test_prices_are_found_that_name_what_is_there_and_nothing_else(
-    machine: Machine, penalties: Penalties, weights: ProbabilityModel
+    machine: Machine, prices: Penalties, weights: ProbabilityModel
 ) -> None:
-    cheap = dataclasses.replace(penalties, joint=2.0, name=2.0, reference=0.5)
+    cheap = dataclasses.replace(prices, joint=2.0, name=2.0, reference=0.5)
     lag = {"effect": "lag", "joints": ["q1"], "size": 1.0, "parameters": {}, "nothing": {}}
     cases = [
         *(
@@ -126,7 +126,7 @@ def test_prices_are_found_that_name_what_is_there_and_nothing_else(
 
 
 def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothing_stands_above_it(
-    machine: Machine, penalties: Penalties, weights: ProbabilityModel
+    machine: Machine, prices: Penalties, weights: ProbabilityModel
 ) -> None:
     outside = {
         **dict.fromkeys(weights.outside, 0.0),
@@ -135,12 +135,12 @@ def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothin
     weights = dataclasses.replace(
         weights, outside=outside, none={"constant": 2.0, "nearest": 0.0, "outside": 0.0}
     )
-    named, silent = found(machine, penalties, 0.5, 0), found(machine, penalties, 0.0, 1)
-    assert decision.is_unknown(named, penalties, weights), (
+    named, silent = found(machine, prices, 0.5, 0), found(machine, prices, 0.0, 1)
+    assert decision.is_unknown(named, prices, weights), (
         "a fifth of causes lies outside, so few are missed only so"
     )
-    assert not decision.is_unknown(silent, penalties, weights)
-    rows = decision.rank_hypotheses(named, [], penalties, weights, machine, 0.4)
+    assert not decision.is_unknown(silent, prices, weights)
+    rows = decision.rank_hypotheses(named, [], prices, weights, machine, 0.4)
     assert max(rows, key=lambda row: row.probability).probability == pytest.approx(0.4)
     assert {row.effect for row in rows} >= {"lag", "unknown", "none"}
 
