@@ -54,7 +54,7 @@ TUNING_PRIOR = 4.0
 
 
 def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
-    """Returns by how much the simulator's numbers should change, by name, each `(J,)`; empty where they cannot be set."""
+    """Return by how much the simulator's numbers should change, by name, each `(J,)`; empty where they cannot be set."""
     first = parts[0].simulator
     model: Any = first.base.build(first.machine, 1, torch.device("cpu"))
     if not (own := getattr(model, "parameters", None)):
@@ -92,25 +92,19 @@ def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
 
 
 def apply_changes(actuator: Actuator, by: dict[str, np.ndarray], machine: Machine) -> Actuator:
-    """Returns `actuator` with its numbers changed."""
+    """Return `actuator` with its numbers changed."""
     model: Any = actuator.build(machine, 1, torch.device("cpu"))
-    tables: Any = {
-        name: dict(
-            zip(
-                machine.joint_names,
-                (model.parameters[name][0].numpy() + row).clip(0.0).tolist(),
-                strict=True,
-            )
-        )
-        for name, row in by.items()
-    }
+    tables: Any = {}
+    for name, row in by.items():
+        values = (model.parameters[name][0].numpy() + row).clip(0.0).tolist()
+        tables[name] = dict(zip(machine.joint_names, values, strict=True))
     return dataclasses.replace(actuator, **tables)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
 def _linearise_parameters(
     parts: Sequence[Residuals], names: list[str], now: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns errors over the noise of all parts, `(J, E)`, and what a finite difference of each number takes off, `(J, P, E)`."""
+    """Return errors over the noise of all parts, `(J, E)`, and what a finite difference of each number takes off, `(J, P, E)`."""
     count = len(names)
     varied = np.repeat(now[None], count + 1, 0)  # (P + 1, P, J)
     for p in range(count):
@@ -149,13 +143,13 @@ class SimulatorComparison:
     row: np.ndarray
 
     def with_base(self, actuator: Actuator) -> SimulatorComparison:
-        """Returns another simulator held against the same recordings; its noise is still to be found."""
+        """Return another simulator held against the same recordings; its noise is still to be found."""
         residuals = self.residuals
         simulator = replace(residuals.simulator, base=actuator)
         return replace(self, residuals=Residuals(simulator, None, residuals.valid_mask))
 
     def runs(self, paths: np.ndarray) -> WindowedRuns:
-        """Returns free runs `(W, K, J)` beside their recordings."""
+        """Return free runs `(W, K, J)` beside their recordings."""
         return WindowedRuns(self.recordings, self.source, self.row, paths.astype(float))
 
 
@@ -185,7 +179,7 @@ StartedRecordings = Sequence[tuple[Recording, float]]
 def compare_simulator(
     actuator: Actuator, begun: StartedRecordings, machine: Machine, seed: int
 ) -> SimulatorComparison:
-    """Returns `actuator` held against all whole windows of recordings."""
+    """Return `actuator` held against all whole windows of recordings."""
     before, steps = open_loop.count_samples_before(machine), round(HORIZON_S / machine.period_s)
     cuts, source, row, running = [], [], [], []
     for number, (recording, begun_s) in enumerate(begun):
@@ -204,12 +198,8 @@ def compare_simulator(
     windows = open_loop.join_windows(cuts)
     valid_mask = np.ones((len(windows.q), machine.num_joints), dtype=bool)
     simulator = EffectSimulator(actuator, machine, windows, np.array(running), seed)
-    return SimulatorComparison(
-        [recording for recording, _ in begun],
-        Residuals(simulator, None, valid_mask),
-        np.array(source),
-        np.array(row),
-    )
+    recordings, residuals = [one for one, _ in begun], Residuals(simulator, None, valid_mask)
+    return SimulatorComparison(recordings, residuals, np.array(source), np.array(row))
 
 
 def fit_baseline(
@@ -220,7 +210,7 @@ def fit_baseline(
     device: torch.device,
     refined: Callable[[Baseline], Baseline] = lambda base: base,
 ) -> Baseline:
-    """Returns a simulator fitted to the reference, and fits that leave a part of it out.
+    """Return a simulator fitted to the reference, and fits that leave a part of it out.
 
     A fit that knows how to `refit` is fitted anew to each rest, all others once to two thirds: the
     price of a fit that takes long. `refined` may change the simulator before what it gets wrong is
@@ -257,7 +247,7 @@ def fit_baseline(
 
 
 def learn_errors(base: Baseline, machine: Machine) -> Baseline:
-    """Returns the same simulator, with what it gets wrong on the reference taken off, and the noise of what is left."""
+    """Return the same simulator, with what it gets wrong on the reference taken off, and the noise of what is left."""
     biases, of_field = residual_model.learn_discrepancy(
         [one.residuals for one in base.left_out], base.field.residuals
     )
@@ -282,7 +272,7 @@ def accept_simulator(
     seed: int,
     device: torch.device,
 ) -> Baseline:
-    """Returns a configured simulator held against the field, and flexible models of the field that leave a part of it out.
+    """Return a configured simulator held against the field, and flexible models of the field that leave a part of it out.
 
     There is no reference that would tell how a machine errs that lacks nothing: what `fit` does not
     explain of recordings that it was not fitted to takes its place, as noise, price and floor.
@@ -314,7 +304,7 @@ def _cross_validate(
     seed: int,
     device: torch.device,
 ) -> tuple[Actuator, list[SimulatorComparison]]:
-    """Returns a fit, and fits that left out a part of the recordings' `pieces`, each held against that part, their noise known."""
+    """Return a fit, and fits that left out a part of the recordings' `pieces`, each held against that part, their noise known."""
     begun = _list_started(pieces)
     fold = (
         np.arange(len(pieces)) % FOLDS
@@ -350,7 +340,7 @@ def _list_started(recordings: Sequence[Recording]) -> StartedRecordings:
 def fit_covariances(
     left_out: Sequence[SimulatorComparison], machine: Machine
 ) -> list[ErrorCovariance]:
-    """Returns the noise of each joint from a simulator's errors on recordings that it was not fitted to."""
+    """Return the noise of each joint from a simulator's errors on recordings that it was not fitted to."""
     found = []
     for j in range(machine.num_joints):
         error, way = (
@@ -362,13 +352,13 @@ def fit_covariances(
 
 
 def _join_windows(values: np.ndarray) -> np.ndarray:
-    """Returns increments `(W, I)` with several windows in a row, `(W / TOGETHER, TOGETHER I)`."""
+    """Return increments `(W, I)` with several windows in a row, `(W / TOGETHER, TOGETHER I)`."""
     together = min(COVARIANCE_WINDOWS, len(values))
     return values[: len(values) // together * together].reshape(-1, together * values.shape[1])
 
 
 def _find_known_windows(case: GapCase, field: SimulatorComparison) -> np.ndarray:
-    """Returns which field windows stay within the poses and commands that the reference visited, `(W, J)` bool."""
+    """Return which field windows stay within the poses and commands that the reference visited, `(W, J)` bool."""
     q, u = (np.concatenate([getattr(r, name) for r in case.reference]) for name in ("q", "u"))
     cut, travel = field.residuals.simulator.cut, case.machine.upper - case.machine.lower
     low, high = q.min(0) - 0.03 * travel, q.max(0) + 0.03 * travel
@@ -392,7 +382,7 @@ RaysByTrial = Mapping[str, Sequence[ParameterRay]]
 def add_reference_effects(
     base: Baseline, kinds: Sequence[EffectType], machine: Machine
 ) -> Baseline:
-    """Returns the simulator with the effects around it that the reference shows.
+    """Return the simulator with the effects around it that the reference shows.
 
     Args:
         base: A simulator, and fits that left out parts of the reference, their noise known, before
@@ -414,17 +404,18 @@ def add_reference_effects(
 
 
 def _is_one_sided(kind: EffectType) -> bool:
-    """Says whether free runs show the effect on a joint by itself, and only one way: what goes both ways a fit has settled."""
-    ways = (
-        []
-        if kind.target.stochastic or kind.target.side not in ("speed", "command")
-        else build_rays(kind, REFERENCE_SIZES)
-    )
-    return bool(ways) and all(ray.sizes.min() >= 0.0 for ray in ways)
+    """Return True where free runs show the effect on a joint alone, and sizes have one sign only.
+
+    Sizes of both signs have been settled by the fit of the simulator.
+    """
+    if kind.target.stochastic or kind.target.side not in ("speed", "command"):
+        return False
+    rays = build_rays(kind, REFERENCE_SIZES)
+    return bool(rays) and all(ray.sizes.min() >= 0.0 for ray in rays)
 
 
 def _list_trials(kind: EffectType) -> dict[str, list[ParameterRay]]:
-    """Returns the ways in which an effect can grow, by a name for each of its shapes."""
+    """Return the ways in which an effect can grow, by a name for each of its shapes."""
     trials: list[dict[str, float]] = [
         {},
         *({number: part} for number in kind.shaping for part in SHAPE_FACTORS),
@@ -441,7 +432,7 @@ def _list_trials(kind: EffectType) -> dict[str, list[ParameterRay]]:
 def _find_effects(
     parts: Sequence[Residuals], ways: RaysByTrial, joint_names: Sequence[str]
 ) -> list[tuple[EffectType, EffectValues]]:
-    """Returns the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
+    """Return the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
     responses = {
         key: [[part.response(ray) for ray in way] for part in parts] for key, way in ways.items()
     }
@@ -483,7 +474,7 @@ def _find_effects(
 def _expand_values(
     kind: EffectType, ways: Sequence[ParameterRay], sizes: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Returns the numbers of an effect at sizes along its rays, the same on all joints, each `(1, J)`."""
+    """Return the numbers of an effect at sizes along its rays, the same on all joints, each `(1, J)`."""
     found = {
         name: np.full((1, kind.num_joints), kind.numbers[name].typical) for name in kind.shaping
     }
@@ -497,7 +488,7 @@ def _expand_values(
 def _wrap_simulator(
     base: Baseline, effects: Sequence[tuple[EffectType, EffectValues]], machine: Machine
 ) -> Baseline:
-    """Returns the simulator with effects around it, and the noise of what it errs by then."""
+    """Return the simulator with effects around it, and the noise of what it errs by then."""
 
     def around(one: SimulatorComparison) -> SimulatorComparison:
         simulator = one.residuals.simulator

@@ -79,22 +79,22 @@ class ProbabilityModel:
 
 
 def compute_probability(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
-    """Returns the probability that goes with signs."""
+    """Return the probability that goes with signs."""
     return float(1.0 / (1.0 + np.exp(-compute_log_odds(weights, signs))))
 
 
 def compute_log_odds(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
-    """Returns the logarithm of the odds, within what answers can tell."""
+    """Return the logarithm of the odds, within what answers can tell."""
     return float(np.clip(sum(weights[name] * value for name, value in signs.items()), -6.0, 6.0))
 
 
 def subtract_reference_clues(result: DetectionResult) -> np.ndarray:
-    """Returns what clues earn on what is left, beyond what they may on the reference, `(clues, J)`."""
+    """Return what clues earn on what is left, beyond what they may on the reference, `(clues, J)`."""
     return np.maximum(result.clue_gains - REFERENCE_FACTOR * result.reference_clue_gains, 0.0)
 
 
 def collect_outside_signs(result: DetectionResult) -> dict[str, float]:
-    """Returns the signs that something is there which no effect of the library is."""
+    """Return the signs that something is there which no effect of the library is."""
     stages, left = {one.kind.stage for one in result.detected}, subtract_reference_clues(result)
     subsets = zip(result.tables, result.chosen.subsets, strict=True)
     gained = np.array([table.score(subset).total if subset else 0.0 for table, subset in subsets])
@@ -129,7 +129,7 @@ def _log_excess(ratios: np.ndarray) -> float:
 def collect_effect_signs(
     margin: float, adds: float, size: float, names: int, outside: float
 ) -> dict[str, float]:
-    """Returns the signs that an effect is rightly named.
+    """Return the signs that an effect is rightly named.
 
     Args:
         margin: By how much more it is worth than nothing in its place, and than any other effect.
@@ -149,7 +149,7 @@ def collect_effect_signs(
 
 
 def collect_none_signs(nearest: float, outside: float) -> dict[str, float]:
-    """Returns the signs that there is nothing to find.
+    """Return the signs that there is nothing to find.
 
     Args:
         nearest: What the best effect is worth; it was not enough.
@@ -163,7 +163,7 @@ def collect_none_signs(nearest: float, outside: float) -> dict[str, float]:
 
 
 def widen_interval(ends: np.ndarray, form: float) -> np.ndarray:
-    """Returns low end, value and high end of a size `(3, …)` with the error of its form added to both sides."""
+    """Return low end, value and high end of a size `(3, …)` with the error of its form added to both sides."""
     low, value, high = ends
     more = 1.96 * form * np.abs(value)
     return np.stack(

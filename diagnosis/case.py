@@ -45,7 +45,7 @@ class GapCase:
     unseen: Sequence[Recording] = ()
 
     def doubts(self) -> list[str]:
-        """Returns reasons why these recordings cannot tell anything, in words for people; none where they can."""
+        """Return reasons why these recordings cannot tell anything, in words for people; none where they can."""
         found = []
         total_s = sum(recording.duration_s for recording in self.field)
         if total_s < MIN_TOTAL_S:
@@ -66,13 +66,13 @@ class GapCase:
         return found
 
     def resting(self) -> np.ndarray:
-        """Returns which joints are never commanded in the field recordings, `(J,)` bool."""
+        """Return which joints are never commanded in the field recordings, `(J,)` bool."""
         commanded = np.abs(np.concatenate([recording.u for recording in self.field])) > COMMANDED
         return np.logical_not(np.any(commanded, axis=0))
 
 
 def load_case(folder: Path, machine: Machine) -> GapCase:
-    """Reads a gap case: `reference/*.parquet` and `field/*.parquet`.
+    """Read a gap case: `reference/*.parquet` and `field/*.parquet`.
 
     Raises:
         RecordingError: a part is missing, or a recording cannot be used (another machine, NaN,
@@ -96,7 +96,7 @@ def load_case(folder: Path, machine: Machine) -> GapCase:
 
 
 def read_recordings(where: str | tuple[str, ...], machine: Machine) -> list[Recording]:
-    """Reads recordings of the machine.
+    """Read recordings of the machine.
 
     Raises:
         RecordingError: there are none, or one cannot be used (another machine, NaN, gaps, …).
@@ -109,7 +109,7 @@ def read_recordings(where: str | tuple[str, ...], machine: Machine) -> list[Reco
 
 
 def _check_stamp(stamp: str, recording: Recording, machine: Machine) -> None:
-    """Raises a `RecordingError` when a recording was made on a machine with other joints, limits or control rate."""
+    """Raise a `RecordingError` when a recording was made on a machine with other joints, limits or control rate."""
     try:
         machine.check_fingerprint(json.loads(stamp), str(recording.path))
     except (CheckpointError, ValueError) as error:
@@ -117,7 +117,7 @@ def _check_stamp(stamp: str, recording: Recording, machine: Machine) -> None:
 
 
 def estimate_running_s(recordings: Sequence[Recording]) -> list[float]:
-    """Returns how long the machine had been running at the beginning of each recording, as far as their dates tell."""
+    """Return how long the machine had been running at the beginning of each recording, as far as their dates tell."""
     dates = [recording.metadata.get("created") for recording in recordings]
     if not all(dates):
         return [0.0] * len(recordings)
@@ -132,7 +132,7 @@ def estimate_running_s(recordings: Sequence[Recording]) -> list[float]:
 
 
 def split_recordings(recordings: Sequence[Recording]) -> list[Recording]:
-    """Returns the recordings, those longer than `PART_S` cut into equal parts, each part a run by itself."""
+    """Return the recordings, those longer than `PART_S` cut into equal parts, each part a run by itself."""
     found = []
     for number, recording in enumerate(recordings):
         count = max(1, round(recording.duration_s / MAX_PART_S))

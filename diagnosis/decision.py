@@ -34,7 +34,7 @@ from diagnosis.search import (
 
 
 def record_weights(result: DetectionResult, penalties: Penalties) -> dict[str, Any]:
-    """Returns what was weighed."""
+    """Return what was weighed."""
     joints, common = (
         [],
         list_shared_effects(ways[0].kind for ways in result.rays.values() if ways),
@@ -75,7 +75,7 @@ def _record_subset(table: SubsetTable, subset: Subset) -> dict[str, Any]:
 def restore_result(
     told: Mapping[str, Any], penalties: Penalties, kinds: Sequence[EffectType]
 ) -> DetectionResult:
-    """Returns the findings at other prices; evidence, repair and rays are those that choosing and saying need, no more."""
+    """Return the findings at other prices; evidence, repair and rays are those that choosing and saying need, no more."""
     tables, left_out, count = [], [], told["blocks"]
     for joint in told["joints"]:
         table = SubsetTable(
@@ -111,30 +111,22 @@ def restore_result(
                 )
             )
     residuals = cast(Residuals, SimpleNamespace(z=np.zeros((len(tables), told["entries"]))))
-    left, reference_clue_gains, scatter, strays = (
-        np.array(told[name]) for name in ("left", "left_null", "scatter", "strays")
-    )
+    arrays = {
+        "clue_gains": np.array(told["left"]),
+        "reference_clue_gains": np.array(told["left_null"]),
+        "scatter": np.array(told["scatter"]),
+        "strays": np.array(told["strays"]),
+    }
     rays = {name: [] for joint in told["joints"] for name in joint["felt"]}
     return DetectionResult(
-        residuals,
-        tables,
-        rays,
-        price,
-        chosen,
-        None,
-        others,
-        left,
-        reference_clue_gains,
-        scatter,
-        strays,
-        told["tool_left"],
+        residuals, tables, rays, price, chosen, None, others, tool_left=told["tool_left"], **arrays
     )
 
 
 def choose_again(
     tables: Sequence[SubsetTable], price: Any, penalties: Penalties, kinds: Sequence[EffectType]
 ) -> EffectSet:
-    """Returns the set that is worth most at these prices."""
+    """Return the set that is worth most at these prices."""
     return choose_set(
         tables,
         price,
@@ -181,7 +173,7 @@ class Substitution:
 
 
 def rank_substitutions(result: DetectionResult, name: str) -> list[Substitution]:
-    """Returns what each other effect would earn in the place of `name`, the best first."""
+    """Return what each other effect would earn in the place of `name`, the best first."""
     found, subsets, own = [], result.chosen.subsets, 0.0
     places = [j for j, subset in enumerate(subsets) if name in subset]
     without = {j: result.tables[j].score(subsets[j] - {name}).total for j in places}
@@ -199,14 +191,14 @@ def rank_substitutions(result: DetectionResult, name: str) -> list[Substitution]
 
 
 def list_equivalents(swaps: Sequence[Substitution], own: float) -> tuple[str, ...]:
-    """Returns the effects that cannot be told from one that earns `own`, at most three."""
+    """Return the effects that cannot be told from one that earns `own`, at most three."""
     return tuple(
         swap.name for swap in swaps if swap.share > SAME_SHARE or own - swap.earned < SAME_NATS
     )[:3]
 
 
 def look_up_values(result: DetectionResult, name: str, other: str) -> dict[str, np.ndarray]:
-    """Returns the numbers of `other` in the place of the chosen effect `name`, each `(1, J)` or `(1, 1)`."""
+    """Return the numbers of `other` in the place of the chosen effect `name`, each `(1, J)` or `(1, 1)`."""
     ways = result.rays[other]
     sizes = np.zeros((len(ways), len(result.tables)))
     for j, subset in enumerate(result.chosen.subsets):
@@ -219,7 +211,7 @@ def look_up_values(result: DetectionResult, name: str, other: str) -> dict[str, 
 
 
 def compute_own_gain(result: DetectionResult, name: str) -> float:
-    """Returns what a chosen effect adds to the rest of the set, on all joints that have it."""
+    """Return what a chosen effect adds to the rest of the set, on all joints that have it."""
     subsets = [
         (t, s) for t, s in zip(result.tables, result.chosen.subsets, strict=True) if name in s
     ]
@@ -235,7 +227,7 @@ def compute_margin(
     swaps: Sequence[Substitution],
     like: Sequence[str],
 ) -> float:
-    """Returns by how much a chosen effect is worth more than nothing in its place, and than what is not like it."""
+    """Return by how much a chosen effect is worth more than nothing in its place, and than what is not like it."""
     own, subsets = compute_own_gain(result, name), result.chosen.subsets
     saved = sum(
         result.price(j, s) - result.price(j, s - {name}) for j, s in enumerate(subsets) if name in s
@@ -252,7 +244,7 @@ def read_chosen_signs(
     swaps: Sequence[Substitution],
     like: Sequence[str],
 ) -> dict[str, float]:
-    """Returns the signs that a chosen effect is rightly named."""
+    """Return the signs that a chosen effect is rightly named."""
     places = [
         (t, s) for t, s in zip(result.tables, result.chosen.subsets, strict=True) if name in s
     ]
@@ -270,7 +262,7 @@ def read_chosen_signs(
 def read_detected_signs(
     result: DetectionResult, weights: ProbabilityModel, found: DetectedEffect
 ) -> dict[str, float]:
-    """Returns the same of an effect that sensors, frames or tool points show."""
+    """Return the same of an effect that sensors, frames or tool points show."""
     outside = calibration.compute_log_odds(
         weights.outside, calibration.collect_outside_signs(result)
     )
@@ -280,7 +272,7 @@ def read_detected_signs(
 def read_none_signs(
     result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
 ) -> dict[str, float]:
-    """Returns the signs that there is nothing to find."""
+    """Return the signs that there is nothing to find."""
     nearest = max(
         (_score_alone(result, penalties, name)[0] for name in result.rays), default=-penalties.name
     )
@@ -293,7 +285,7 @@ def read_none_signs(
 def estimate_numbers(
     result: DetectionResult, kind: EffectType, machine: Machine, form: float
 ) -> dict[str, dict[str, Estimate]]:
-    """Returns the numbers of a selected effect by joint; `form`: what its real forms add to the error, over its size."""
+    """Return the numbers of a selected effect by joint; `form`: what its real forms add to the error, over its size."""
     fitted = result.fitted
     assert fitted is not None, "a selected effect has been simulated"
     found: dict[str, dict[str, Estimate]] = {}
@@ -323,7 +315,7 @@ def estimate_numbers(
 def rank_chosen_effects(
     result: DetectionResult, kinds: Mapping[str, EffectType]
 ) -> list[EffectType]:
-    """Returns the chosen effects, the ones that earn most first."""
+    """Return the chosen effects, the ones that earn most first."""
     return [
         kinds[name]
         for name in sorted(result.chosen.names, key=lambda name: -compute_own_gain(result, name))
@@ -331,7 +323,7 @@ def rank_chosen_effects(
 
 
 def find_unexplained_joints(result: DetectionResult) -> np.ndarray:
-    """Returns which joints have something left, `(J,)` bool: predicted by a flexible model, or scattered too much."""
+    """Return which joints have something left, `(J,)` bool: predicted by a flexible model, or scattered too much."""
     late = any(one.kind.stage == "timing" for one in result.detected)
     return (calibration.subtract_reference_clues(result).max(0) > MIN_CLUE_NATS) | (
         (result.scatter > MAX_SCATTER) & (not late)
@@ -341,7 +333,7 @@ def find_unexplained_joints(result: DetectionResult) -> np.ndarray:
 def compute_unknown_probability(
     result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
 ) -> float:
-    """Returns the probability that the cause lies outside the library."""
+    """Return the probability that the cause lies outside the library."""
     found = calibration.compute_probability(
         weights.outside, calibration.collect_outside_signs(result)
     )
@@ -352,7 +344,7 @@ def compute_unknown_probability(
 def compute_effect_probabilities(
     result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
 ) -> dict[str, float]:
-    """Returns the probability of each effect that was found."""
+    """Return the probability of each effect that was found."""
     found = {
         one.kind.name: calibration.compute_probability(
             weights.right, read_detected_signs(result, weights, one)
@@ -374,7 +366,7 @@ def compute_effect_probabilities(
 
 
 def is_unknown(result: DetectionResult, penalties: Penalties, weights: ProbabilityModel) -> bool:
-    """Says whether an unknown cause is told: where effects were found from `SAID` on, else where it is more probable than none.
+    """Return True where an unknown cause is told: where effects were found from `SAID` on, else where it is more probable than none.
 
     What sensors, frames or tool points show for sure is there whatever moves a joint besides: that
     is then a remainder.
@@ -398,7 +390,7 @@ def is_unknown(result: DetectionResult, penalties: Penalties, weights: Probabili
 def drop_unlikely_effects(
     result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
 ) -> DetectionResult:
-    """Returns the findings without effects that are more probably not there, dropped one by one; the most probable one stays.
+    """Return the findings without effects that are more probably not there, dropped one by one; the most probable one stays.
 
     What is left is judged anew each time: an effect may have been named only for what it was worth
     beside another.
@@ -430,7 +422,7 @@ def drop_unlikely_effects(
 def describe_detected_effect(
     result: DetectionResult, found: DetectedEffect, weights: ProbabilityModel, machine: Machine
 ) -> Selected:
-    """Returns what is said of an effect that sensors, frames or tool points show."""
+    """Return what is said of an effect that sensors, frames or tool points show."""
     near = sorted(found.rivals, key=lambda name: -found.rivals[name])
     like = tuple(
         name
@@ -475,7 +467,7 @@ def rank_hypotheses(
     machine: Machine,
     unknown: float,
 ) -> list[Ranked]:
-    """Returns all rivals worth naming, most probable first; `none` and `unknown` among them, none above an unknown that is told."""
+    """Return all rivals worth naming, most probable first; `none` and `unknown` among them, none above an unknown that is told."""
     named = {one.effect: Ranked(one.effect, one.joints, one.probability) for one in selected}
     is_told = is_unknown(result, penalties, weights)
     most = min(unknown, 1.0 - unknown) if is_told else 1.0 - unknown
@@ -499,7 +491,7 @@ def rank_hypotheses(
 def _score_alone(
     result: DetectionResult, penalties: Penalties, name: str
 ) -> tuple[float, list[int]]:
-    """Returns what an effect by itself is worth, and the joints on which it is worth something."""
+    """Return what an effect by itself is worth, and the joints on which it is worth something."""
     only, worth, places = frozenset({name}), -penalties.name, []
     for j, table in enumerate(result.tables):
         if only in table.scores and table.scores[only].total > penalties.joint:

@@ -139,7 +139,7 @@ class EffectSearch:
     tell: ProgressCallback
 
     def run(self) -> DetectionResult:
-        """Returns what is found."""
+        """Return what is found."""
         penalties, left_out = self.penalties, [one.residuals for one in self.base.left_out]
         self.tell("sensors", 0.32)
         on_sensors = sensors.find_sensor_effects(
@@ -230,7 +230,7 @@ class EffectSearch:
     def _simulated(
         self, residuals: Residuals, tracked: bool
     ) -> tuple[dict[str, list[ParameterRay]], list[dict[str, list[Response]]]]:
-        """Returns the rays of each effect that free runs can show, and what it does to each joint."""
+        """Return the rays of each effect that free runs can show, and what it does to each joint."""
         grown: dict[str, list[ParameterRay]] = {}
         shapes: list[dict[str, list[Response]]] = [{} for _ in range(residuals.increments.shape[2])]
         for number, kind in enumerate(self.kinds):
@@ -250,7 +250,7 @@ class EffectSearch:
         scatter: np.ndarray,
         z: np.ndarray | None = None,
     ) -> tuple[list[SubsetTable], EffectSet, FittedSet | None]:
-        """Searches sets where errors scatter more than the noise says: they are worth less by as much; `z`: errors to explain."""
+        """Search sets where errors scatter more than the noise says: they are worth less by as much; `z`: errors to explain."""
         tables = self._tables(residuals, grown, shapes, scatter, z)
         self.tell("the same on the reference", 0.7)
         penalties = self.penalties
@@ -305,7 +305,7 @@ class EffectSearch:
         scatter: np.ndarray,
         z: np.ndarray | None,
     ) -> list[SubsetTable]:
-        """Returns what sets earn on each joint."""
+        """Return what sets earn on each joint."""
         tables, flat = (
             [],
             {name: self.penalties.joint * (name not in self.shared) for name in grown},
@@ -331,7 +331,7 @@ class EffectSearch:
         fitted: FittedSet,
         price: PenaltyFunction,
     ) -> tuple[nonadditive_refit.WideResponses, list[SubsetTable], EffectSet, FittedSet | None]:
-        """Goes on from a set whose effects do not add up: simulates all others in its company, fits sizes together."""
+        """Continue from a set whose effects do not add up: simulates all others in its company, fits sizes together."""
         tried, scatter = [fitted], np.ones(self.case.machine.num_joints)
         wide = nonadditive_refit.simulate_beside(residuals, grown, fitted)
         for turn in range(MAX_REFITS):
@@ -372,7 +372,7 @@ class EffectSearch:
         )
 
     def _scatter(self, z: np.ndarray) -> np.ndarray:
-        """Returns the mean square of errors over the noise `(J, E)` over that of the reference, outliers cut, `(J,)`."""
+        """Return the mean square of errors over the noise `(J, E)` over that of the reference, outliers cut, `(J,)`."""
         left_out = [one.residuals.z for one in self.base.left_out]
         usual = (
             np.mean(np.minimum(np.concatenate(left_out, 1) ** 2, MAX_SQUARE), 1)
@@ -382,7 +382,7 @@ class EffectSearch:
         return np.mean(np.minimum(z**2, MAX_SQUARE), 1) / usual
 
     def _left(self, beside: Residuals) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what clues earn on what is left and, at most, on reference recordings, both `(clues, J)`."""
+        """Return what clues earn on what is left and, at most, on reference recordings, both `(clues, J)`."""
         left_out = [one.residuals for one in self.base.left_out]
         earned, on_nulls = (
             residual_model.score_clues(beside, beside.z),
@@ -412,7 +412,7 @@ def _sum_scores(tables: Sequence[SubsetTable], chosen: EffectSet) -> float:
 def _adjust_residuals(
     residuals: Residuals, case: GapCase, found: Sequence[DetectedEffect]
 ) -> Residuals:
-    """Returns the evidence where encoders err as was found, and where sensors that scatter more say less."""
+    """Return the evidence where encoders err as was found, and where sensors that scatter more say less."""
     steady = [
         (one.kind, one.values())
         for one in found

@@ -98,21 +98,21 @@ class EffectType:
     def wrap(
         self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
     ) -> Any:
-        """Returns `model` with the effect around it, at its neutral value; numbers are written into `parameters`."""
+        """Return `model` with the effect around it, at its neutral value; numbers are written into `parameters`."""
         return self.neutral.wrap(model, machine, num_envs, device)
 
     def size(self, name: str) -> float:
-        """Returns typical less neutral value: the natural unit of a number. One without a neutral value: its typical value."""
+        """Return typical less neutral value: the natural unit of a number. One without a neutral value: its typical value."""
         number = self.numbers[name]
         return number.typical - (number.none or 0.0)
 
     def clipped(self, name: str, value: np.ndarray) -> np.ndarray:
-        """Returns `value` within the bounds of number `name`."""
+        """Return `value` within the bounds of number `name`."""
         return np.clip(value, *self.numbers[name].bounds)
 
 
 def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[EffectType]:
-    """Returns the effects of the registry that can be simulated on `machine`, or of these `names`.
+    """Return the effects of the registry that can be simulated on `machine`, or of these `names`.
 
     Raises:
         ConfigError: a name is unknown, or an effect cannot be imported.
@@ -147,12 +147,12 @@ def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[E
 
 
 def list_shared_effects(kinds: Iterable[EffectType]) -> frozenset[str]:
-    """Returns the effects with one cause for all joints."""
+    """Return the effects with one cause for all joints."""
     return frozenset(kind.name for kind in kinds if getattr(kind.target, "shared", False))
 
 
 def _check_simulable(kind: EffectType, machine: Machine) -> None:
-    """Raises a `ConfigError` when the effect needs what is not known of the machine."""
+    """Raise a `ConfigError` when the effect needs what is not known of the machine."""
     device = torch.device("cpu")
     rest = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32).expand(
         1, machine.num_history, -1
@@ -175,7 +175,7 @@ class StationaryModel:
         """Nothing to forget."""
 
     def step(self, history: Any) -> torch.Tensor:
-        """Returns the positions as they are."""
+        """Return the positions as they are."""
         return history.q[:, -1]
 
 
@@ -202,7 +202,7 @@ class DetectedEffect:
     rivals: Mapping[str, float]
 
     def values(self, count: int = 1) -> dict[str, np.ndarray]:
-        """Returns the numbers of `count` candidates that all have the effect, each `(C, J)` or `(C, 1)`."""
+        """Return the numbers of `count` candidates that all have the effect, each `(C, J)` or `(C, 1)`."""
         found = {}
         for name, estimates in self.parameters.items():
             if "machine" in estimates:
@@ -215,7 +215,7 @@ class DetectedEffect:
 
 
 def estimate_interval(sizes: np.ndarray, likelihood: np.ndarray) -> tuple[float, float, float]:
-    """Returns the most likely size and the ends of its 95 % interval from log likelihoods at rising `sizes`."""
+    """Return the most likely size and the ends of its 95 % interval from log likelihoods at rising `sizes`."""
     fine = np.interp(np.linspace(0, len(sizes) - 1, 401), np.arange(len(sizes)), np.log(sizes))
     curve = np.interp(fine, np.log(sizes), likelihood)
     best = int(np.argmax(likelihood))
@@ -262,7 +262,7 @@ class EffectSimulator:
         count: int = 1,
         own: EffectValues = MappingProxyType({}),
     ) -> np.ndarray:
-        """Returns measured positions of free runs, `(C, W, K, J)`.
+        """Return measured positions of free runs, `(C, W, K, J)`.
 
         Args:
             effects: Effects with the numbers of each candidate.
@@ -296,7 +296,7 @@ class EffectSimulator:
         candidate: np.ndarray,
         window: np.ndarray,
     ) -> np.ndarray:
-        """Returns one free run a row, `(N, K, J)`."""
+        """Return one free run a row, `(N, K, J)`."""
         cut, count, device = self.cut, len(window), torch.device("cpu")
         size, before = cut.num_history, cut.num_before
         with torch.random.fork_rng(devices=[]):

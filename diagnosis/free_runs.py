@@ -45,7 +45,7 @@ class WindowedRuns:
         return len(self.row)
 
     def cut(self, values: Sequence[np.ndarray]) -> np.ndarray:
-        """Returns the part of each recording's values, `(T, …)`, that lies in each window, `(W, K, …)`; NaN after the end."""
+        """Return the part of each recording's values, `(T, …)`, that lies in each window, `(W, K, …)`; NaN after the end."""
         steps = self.simulated.shape[1]
         found = np.full((self.num_windows, steps, *values[0].shape[1:]), np.nan)
         for window, (source, row) in enumerate(zip(self.source, self.row, strict=True)):
@@ -84,7 +84,7 @@ def simulate_free_runs(
     horizon_s: float,
     device: torch.device,
 ) -> WindowedRuns:
-    """Runs a simulator through recordings from one end to the other, begun anew every `horizon_s`; the last may be shorter.
+    """Run a simulator through recordings from one end to the other, begun anew every `horizon_s`; the last may be shorter.
 
     Raises:
         RecordingError: no recording is long enough.

@@ -33,13 +33,13 @@ MIN_GAP_RATIO = 1.1
 
 
 def choose_unit(machine: Machine) -> str:
-    """Returns the unit of errors of all joints together: that of the joints, or `travel`, the joint's, where they differ."""
+    """Return the unit of errors of all joints together: that of the joints, or `travel`, the joint's, where they differ."""
     units = {joint.unit for joint in machine.joints}
     return units.pop() if len(units) == 1 else "travel"
 
 
 def compute_squares(paths: np.ndarray, measured: np.ndarray, machine: Machine) -> np.ndarray:
-    """Returns the mean square error of each window, all joints together, `(W,)`, in the square of `unit_of`."""
+    """Return the mean square error of each window, all joints together, `(W,)`, in the square of `unit_of`."""
     size = machine.upper - machine.lower if choose_unit(machine) == "travel" else 1.0
     return np.square((paths - measured) / size).mean((1, 2))
 
@@ -47,7 +47,7 @@ def compute_squares(paths: np.ndarray, measured: np.ndarray, machine: Machine) -
 def draw_windows(
     field: int, floor: int, generator: np.random.Generator
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns windows of field and floor in bootstraps over blocks, as many as each has."""
+    """Return windows of field and floor in bootstraps over blocks, as many as each has."""
     return [
         (_draw_blocks(field, generator), _draw_blocks(floor, generator)) for _ in range(NUM_DRAWS)
     ]
@@ -59,7 +59,7 @@ def compute_shares(
     floor: np.ndarray,
     drawn: Sequence[tuple[np.ndarray, np.ndarray]],
 ) -> np.ndarray:
-    """Returns the share of the gap that is closed, then the same of each draw, `(1 + B,)`."""
+    """Return the share of the gap that is closed, then the same of each draw, `(1 + B,)`."""
     found = [_compute_share(compute_rmse(before), compute_rmse(after), compute_rmse(floor))]
     return np.array(
         found
@@ -71,20 +71,20 @@ def compute_shares(
 
 
 def summarise_draws(values: np.ndarray) -> Estimate:
-    """Returns the first of values `(1 + B,)` with the 95 % interval of the others."""
+    """Return the first of values `(1 + B,)` with the 95 % interval of the others."""
     low, high = np.nanquantile(values[1:], [0.025, 0.975])
     return Estimate(float(values[0]), (float(min(low, values[0])), float(max(high, values[0]))))
 
 
 def compute_rmse(square: np.ndarray) -> float:
-    """Returns the root of the mean over windows."""
+    """Return the root of the mean over windows."""
     return float(np.sqrt(square.mean()))
 
 
 def estimate_closed(
     before: np.ndarray, after: np.ndarray, floor: np.ndarray, generator: np.random.Generator
 ) -> Estimate | None:
-    """Returns the share of the gap that is closed, with the interval of a bootstrap over blocks of windows.
+    """Return the share of the gap that is closed, with the interval of a bootstrap over blocks of windows.
 
     Args:
         before: Mean square errors of field windows, `(W,)`.
@@ -102,7 +102,7 @@ def estimate_closed(
 def compute_shapley(
     names: Sequence[str], closed_by: Callable[[frozenset[str]], Any]
 ) -> dict[str, Any]:
-    """Returns what each effect closes, a number or an array of them: the mean over all orders of adding them."""
+    """Return what each effect closes, a number or an array of them: the mean over all orders of adding them."""
     count, found = len(names), dict.fromkeys(names, 0.0)
     value = {
         frozenset(s): closed_by(frozenset(s))
@@ -185,7 +185,7 @@ class GapClosure:
         return np.zeros(1) if self.floor is None else self.floor
 
     def shares(self, paths: np.ndarray) -> np.ndarray:
-        """Returns the share of the gap that free runs close, then the same of each draw, `(1 + B,)`."""
+        """Return the share of the gap that free runs close, then the same of each draw, `(1 + B,)`."""
         return compute_shares(
             self.before,
             compute_squares(paths, self._measured, self.machine),
@@ -201,7 +201,7 @@ class GapClosure:
         )
 
     def gap(self) -> Gap:
-        """Returns the errors, all joints together and joint by joint."""
+        """Return the errors, all joints together and joint by joint."""
         left = compute_squares(self.after, self._measured, self.machine)
         closed = summarise_draws(self.shares(self.after)) if self.has_gap else None
         floor = None if self.floor is None else compute_rmse(self.floor)
@@ -217,7 +217,7 @@ class GapClosure:
         )
 
     def foretold(self) -> Estimate | None:
-        """Returns the share that should be closed, as the parts that were fitted to say; `None` without a gap or a fit."""
+        """Return the share that should be closed, as the parts that were fitted to say; `None` without a gap or a fit."""
         return (
             summarise_draws(self.shares(self.own))
             if self.has_gap and self.own is not None
@@ -225,12 +225,12 @@ class GapClosure:
         )
 
     def by_effect(self, result: DetectionResult, names: Sequence[str]) -> dict[str, Estimate]:
-        """Returns what each chosen effect closes, its Shapley value; without a floor of the whole error."""
+        """Return what each chosen effect closes, its Shapley value; without a floor of the whole error."""
         values = compute_shapley(names, lambda some: self.shares(self._with(result, some)))
         return {name: summarise_draws(value) for name, value in values.items()}
 
     def beyond(self) -> list[str]:
-        """Returns the joints whose error after repair exceeds the floor for sure."""
+        """Return the joints whose error after repair exceeds the floor for sure."""
         if self.floor is None:
             return []
         left = np.square(self.after - self._measured).mean(1)  # (W, J)
@@ -250,7 +250,7 @@ class GapClosure:
         ]
 
     def _with(self, result: DetectionResult, names: frozenset[str]) -> np.ndarray:
-        """Returns free runs with some of the chosen effects, their sizes fitted anew."""
+        """Return free runs with some of the chosen effects, their sizes fitted anew."""
         if not names:
             return self.base.field.residuals.base
         if names == result.chosen.names:
@@ -278,7 +278,7 @@ class GapClosure:
 def evaluate_unseen(
     result: DetectionResult, recordings: Sequence[Recording], machine: Machine
 ) -> dict[str, Any]:
-    """Returns how far the effects carry on recordings that nothing was fitted to, as plain JSON data.
+    """Return how far the effects carry on recordings that nothing was fitted to, as plain JSON data.
 
     Raises:
         RecordingError: no recording is long enough.
@@ -312,7 +312,7 @@ def _is_long(recording: Recording, machine: Machine) -> bool:
 
 
 def _compute_joint_rmse(paths: Sequence[np.ndarray], measured: Sequence[np.ndarray]) -> np.ndarray:
-    """Returns the root mean square error of each joint, `(J,)`."""
+    """Return the root mean square error of each joint, `(J,)`."""
     squares = np.concatenate(
         [np.square(one - other).mean(1) for one, other in zip(paths, measured, strict=True)]
     )

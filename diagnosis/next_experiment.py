@@ -45,7 +45,7 @@ def choose_experiment(
     machine: Machine,
     generator: np.random.Generator,
 ) -> NextExperiment | None:
-    """Returns the excitation that separates the rivals best; `None` where none does, or nothing is left to separate."""
+    """Return the excitation that separates the rivals best; `None` where none does, or nothing is left to separate."""
     steps, before = round(EXPERIMENT_S / machine.period_s), open_loop.count_samples_before(machine)
     programs = {}
     for name, excitation in excitations.items() if len(rivals) > 1 else ():
@@ -81,7 +81,7 @@ def choose_experiment(
 def _compute_distances(
     simulator: EffectSimulator, noises: Sequence[ErrorCovariance], rivals: Sequence[RivalEffect]
 ) -> dict[tuple[str, str], np.ndarray]:
-    """Returns the expected difference in log likelihood of each pair of rivals in each window, `(W,)`."""
+    """Return the expected difference in log likelihood of each pair of rivals in each window, `(W,)`."""
     cut = simulator.cut
     at, count = cut.q[:, cut.num_before - 1], len(cut.q)
     base = to_increments(simulator.simulate([])[0], at)

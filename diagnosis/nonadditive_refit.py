@@ -57,7 +57,7 @@ joint."""
 
 
 def is_needed(residuals: Residuals, fitted: FittedSet, promised: float) -> bool:
-    """Says whether effects hardly add up: sizes are far beyond the typical, and some hide others, or earn far less than `promised`.
+    """Return True where effects hardly add up: sizes are far beyond the typical, and some hide others, or earn far less than `promised`.
 
     What acts on the command hides what else does: nothing shows within a dead band. A speed that is
     far off hides nothing.
@@ -78,7 +78,7 @@ def is_needed(residuals: Residuals, fitted: FittedSet, promised: float) -> bool:
 def simulate_beside(
     residuals: Residuals, grown: Mapping[str, Sequence[ParameterRay]], fitted: FittedSet
 ) -> WideResponses:
-    """Returns what effects do in the company of a set."""
+    """Return what effects do in the company of a set."""
     joints = residuals.increments.shape[2]
     shapes: Shapes = [{} for _ in range(joints)]
     left = residuals.whiten(
@@ -110,7 +110,7 @@ def simulate_beside(
 def _simulate_response(
     residuals: Residuals, ray: ParameterRay, ways: Sequence[ParameterRay], fitted: FittedSet
 ) -> np.ndarray:
-    """Returns what a ray changes at each of its sizes, in the company of the set, over the noise, `(J, C, E)`."""
+    """Return what a ray changes at each of its sizes, in the company of the set, over the noise, `(J, C, E)`."""
     has = any(one.kind.name == ray.kind.name for one in fitted.rays)
     company = [*fitted.rays, *([] if has else ways)]
     place = next(
@@ -133,7 +133,7 @@ def add_effect(
     fitted: FittedSet,
     price: float,
 ) -> FittedSet | None:
-    """Returns the set with one more effect, on the joints where it pays, all sizes fitted together; `None` where none pays.
+    """Return the set with one more effect, on the joints where it pays, all sizes fitted together; `None` where none pays.
 
     A saturation pays only when dead band and speed move along with it: adding up does not show
     that, a joint fit does. `price` is that of a joint with an effect, in the part of the recordings
@@ -172,7 +172,7 @@ def combine_best(
     tried: Sequence[FittedSet],
     price: PenaltyFunction,
 ) -> FittedSet | None:
-    """Returns the repair that takes for each joint the best of those `tried`, none where errors of free runs only grow by it.
+    """Return the repair that takes for each joint the best of those `tried`, none where errors of free runs only grow by it.
 
     `price` is what a set costs on a joint. `None` where no joint is left.
     """
@@ -205,7 +205,7 @@ def drop_unneeded(
     price: PenaltyFunction,
     name_price: float,
 ) -> tuple[frozenset[str], ...]:
-    """Returns the sets without effects that add less than they cost, dropped one by one: of two that are alike one stays."""
+    """Return the sets without effects that add less than they cost, dropped one by one: of two that are alike one stays."""
     while names := frozenset().union(*subsets):
         own = dict.fromkeys(names, -name_price)
         for j, (table, subset) in enumerate(zip(tables, subsets, strict=True)):
@@ -222,7 +222,7 @@ def drop_unneeded(
 def _compute_losses(
     residuals: Residuals, rays_: Sequence[ParameterRay], sizes: np.ndarray
 ) -> np.ndarray:
-    """Returns the loss of each joint at sizes `(R, J)`, `(J,)`."""
+    """Return the loss of each joint at sizes `(R, J)`, `(J,)`."""
     paths = simulate_sizes(residuals.simulator, rays_, sizes[None])
     return compute_loss(residuals.whiten(residuals.compute_error(paths))[:, 0], 1)
 
@@ -230,7 +230,7 @@ def _compute_losses(
 def _rank_additions(
     tables: Sequence[SubsetTable], chosen: EffectSet, ways: Mapping[str, Sequence[ParameterRay]]
 ) -> list[str]:
-    """Returns effects that some joint with a set lacks: those on the command, which hide behind each other, then what adds most."""
+    """Return effects that some joint with a set lacks: those on the command, which hide behind each other, then what adds most."""
     found: dict[str, float] = {}
     for table, subset in zip(tables, chosen.subsets, strict=True):
         own = table.score(subset).total

@@ -65,7 +65,7 @@ class DiagnosisPipeline:
     generator: np.random.Generator
 
     def run(self, tell: ProgressCallback) -> Outcome:
-        """Returns the outcome; `tell` is told what is being done and how much of the whole is done."""
+        """Return the outcome; `tell` is told what is being done and how much of the whole is done."""
         if doubts := self.case.doubts():
             return self._cannot_tell("; ".join(doubts))
         search = detection.EffectSearch(self.case, self.base, self.kinds, self.penalties, tell)
@@ -155,7 +155,7 @@ class DiagnosisPipeline:
         return sorted(found, key=lambda one: -one.probability)
 
     def _remainder(self, result: DetectionResult, reach: GapClosure) -> dict[str, Any] | None:
-        """Returns what is left beside the effects that were named and has no name; `None` where that is nothing."""
+        """Return what is left beside the effects that were named and has no name; `None` where that is nothing."""
         predictable = decision.find_unexplained_joints(result)
         names = self.case.machine.joint_names
         beyond = reach.beyond()
@@ -170,13 +170,13 @@ class DiagnosisPipeline:
         return {"joints": joints, "reason": "; ".join(filter(None, (why, over)))}
 
     def _unseen(self, result: DetectionResult, fitted: FittedSet | None) -> dict[str, Any]:
-        """Returns how far the effects carry on recordings apart."""
+        """Return how far the effects carry on recordings apart."""
         if not self.case.unseen or fitted is None:
             return {}
         return {"unseen": evaluate_unseen(result, self.case.unseen, self.case.machine)}
 
     def _next(self, result: DetectionResult, selected: Sequence[Selected]) -> NextExperiment | None:
-        """Returns the experiment that would separate what is left open: classes, and rivals that earn nearly as much."""
+        """Return the experiment that would separate what is left open: classes, and rivals that earn nearly as much."""
         kinds, rivals = {kind.name: kind for kind in self.kinds}, []
         undecided = next((one for one in selected if one.same_as), None)
         for one in selected:
@@ -317,7 +317,7 @@ class DiagnosisPipeline:
         return "no effect earns more on the field recordings than it would by chance"
 
     def _cannot_tell(self, why: str) -> Outcome:
-        """Returns the answer of recordings that cannot tell anything."""
+        """Return the answer of recordings that cannot tell anything."""
         field = self.base.field
         runs, floor = field.runs(field.residuals.base), self._floor()
         known = GapClosure(
@@ -335,7 +335,7 @@ EFFECTS_FILE = "effects.yaml"
 
 
 def write_effects(answer: Answer, kinds: Sequence[EffectType], path: Path) -> None:
-    """Writes the selected effects, the one nearest to the machine first; a note alone where nothing was selected.
+    """Write the selected effects, the one nearest to the machine first; a note alone where nothing was selected.
 
     Raises:
         StorageError: it could not be written.

@@ -77,17 +77,17 @@ class FittedSet:
         return list({ray.kind.name: ray.kind for ray in self.rays}.values())
 
     def effects(self) -> list[tuple[EffectType, dict[str, np.ndarray]]]:
-        """Returns the effects with their numbers, each `(1, J)` or `(1, 1)`."""
+        """Return the effects with their numbers, each `(1, J)` or `(1, 1)`."""
         return _collect_effects(self.rays, self.sizes[None])
 
     def joints_of(self, kind: EffectType) -> np.ndarray:
-        """Returns which joints have an effect, `(J,)` bool."""
+        """Return which joints have an effect, `(J,)` bool."""
         return np.any(
             [mask for ray, mask in zip(self.rays, self.mask, strict=True) if ray.kind is kind], 0
         )
 
     def size(self, name: str, joint: int) -> float:
-        """Returns the largest size of an effect on a joint, along any of its rays."""
+        """Return the largest size of an effect on a joint, along any of its rays."""
         return max(
             (
                 abs(float(row[joint]))
@@ -101,7 +101,7 @@ class FittedSet:
 def simulate_sizes(
     simulator: EffectSimulator, rays: Sequence[ParameterRay], sizes: np.ndarray
 ) -> np.ndarray:
-    """Returns free runs `(C, W, K, J)` with the effects at sizes `(C, R, J)`."""
+    """Return free runs `(C, W, K, J)` with the effects at sizes `(C, R, J)`."""
     return simulator.simulate(_collect_effects(rays, sizes), len(sizes))
 
 
@@ -121,7 +121,7 @@ def fit_set(
     start: Sequence[Mapping[str, np.ndarray]],
     steps: int = MAX_FIT_STEPS,
 ) -> FittedSet:
-    """Fits a set of effects by simulation, all sizes of a joint at once.
+    """Fit a set of effects by simulation, all sizes of a joint at once.
 
     The fit to all entries begins at the best of several multiples of `start`; those to all but one
     half begin where it ended, and
@@ -171,7 +171,7 @@ def simulate_refit(
     rays: Mapping[str, Sequence[ParameterRay]],
     start: Sequence[Mapping[str, np.ndarray]],
 ) -> np.ndarray:
-    """Returns free runs `(W, K, J)` with a set of effects, sizes fitted to all entries in a few steps from `start`."""
+    """Return free runs `(W, K, J)` with a set of effects, sizes fitted to all entries in a few steps from `start`."""
     found, mask, sizes = _lay_out(subsets, rays, start)
     fit = _Fit(residuals, found, mask)
     sizes = fit.descended(fit.nearest(sizes)[None], np.ones((1, len(residuals.fold))), REFIT_STEPS)
@@ -183,7 +183,7 @@ def _lay_out(
     rays: Mapping[str, Sequence[ParameterRay]],
     start: Sequence[Mapping[str, np.ndarray]],
 ) -> tuple[list[ParameterRay], np.ndarray, np.ndarray]:
-    """Returns the rays of a set, which joints have them `(R, J)`, and sizes to begin at `(R, J)`."""
+    """Return the rays of a set, which joints have them `(R, J)`, and sizes to begin at `(R, J)`."""
     chosen = [
         (ray, place)
         for name in sorted(frozenset().union(*subsets))
@@ -207,7 +207,7 @@ def search_sizes(
     known: np.ndarray,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Returns sizes `(R, J)` fitted from many starts about those `known`; where these are 0, about the typical one."""
+    """Return sizes `(R, J)` fitted from many starts about those `known`; where these are 0, about the typical one."""
     drawn = np.exp(SPREAD * generator.standard_normal((DRAWN, *known.shape)))
     starts = np.where(known == 0.0, drawn**2, known * drawn) * mask
     fit = _Fit(residuals, rays, mask)
@@ -235,7 +235,7 @@ class _Fit:
         return np.where(low < 0, by * low, low), by * high
 
     def simulated(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns errors over the noise `(F, J, E)` and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
+        """Return errors over the noise `(F, J, E)` and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
         paths = simulate_sizes(self.residuals.simulator, self.rays, sizes)
         return self.residuals.whiten(self.residuals.compute_error(paths)).swapaxes(0, 1), paths
 
@@ -248,7 +248,7 @@ class _Fit:
     def descended(
         self, now: np.ndarray, used: np.ndarray, steps: int, about: np.ndarray | float = 0.0
     ) -> np.ndarray:
-        """Returns the best sizes from `now` `(F, R, J)` on, entries weighed by `used` `(F, E)`, sizes a priori `about` so large."""
+        """Return the best sizes from `now` `(F, R, J)` on, entries weighed by `used` `(F, E)`, sizes a priori `about` so large."""
         damping, weights = np.full((len(now), now.shape[2]), 1e-2), used[:, None]
         for _ in range(steps):
             z, slopes, _ = _linearise(self.residuals, self.rays, now)
@@ -292,7 +292,7 @@ class _Fit:
         used: np.ndarray,
         damping: np.ndarray,
     ) -> np.ndarray:
-        """Returns how far sizes should change, `(F, R, J)`; `off`: how far they are from what they are a priori."""
+        """Return how far sizes should change, `(F, R, J)`; `off`: how far they are from what they are a priori."""
         step = np.zeros_like(off)
         for f, j in np.ndindex(damping.shape):
             rows = self.mask[:, j]
@@ -306,7 +306,7 @@ class _Fit:
 
 
 def _compute_totals(z: np.ndarray, sizes: np.ndarray, used: np.ndarray | float) -> np.ndarray:
-    """Returns the loss of errors `(F, J, E)` and sizes `(F, R, J)`, `(F, J)`."""
+    """Return the loss of errors `(F, J, E)` and sizes `(F, R, J)`, `(F, J)`."""
     return (compute_loss(z[..., None], -1) * used).sum(-1) + 0.5 * np.square(
         sizes / SIZE_PRIOR
     ).sum(1)
@@ -315,7 +315,7 @@ def _compute_totals(z: np.ndarray, sizes: np.ndarray, used: np.ndarray | float) 
 def _linearise(
     residuals: Residuals, rays: Sequence[ParameterRay], sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns errors `(F, J, E)`, their slopes over the sizes `(F, J, R, E)`, and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
+    """Return errors `(F, J, E)`, their slopes over the sizes `(F, J, R, E)`, and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
     fits, count, joints = sizes.shape
     sign = np.array(
         [
@@ -342,7 +342,7 @@ def _linearise(
 def _estimate_deviations(
     z: np.ndarray, slopes: np.ndarray, residuals: Residuals, mask: np.ndarray
 ) -> np.ndarray:
-    """Returns standard errors of the sizes, `(R, J)`.
+    """Return standard errors of the sizes, `(R, J)`.
 
     The larger of what the likelihood says and the spread between blocks, and what small faults of
     the simulator would make of them: a constant fault shows in no spread.
@@ -366,7 +366,7 @@ def _estimate_deviations(
 
 
 def compute_gain(before: np.ndarray, after: np.ndarray) -> float:
-    """Returns by how much the loss of errors over the noise fell."""
+    """Return by how much the loss of errors over the noise fell."""
     return float(compute_loss(before) - compute_loss(after))
 
 
@@ -378,7 +378,7 @@ def prune_set(
     scatter: np.ndarray,
     shared: Subset,
 ) -> tuple[Subset, ...]:
-    """Returns the set without effects of no size worth naming, and without joints where it does not pay when it is simulated.
+    """Return the set without effects of no size worth naming, and without joints where it does not pay when it is simulated.
 
     Args:
         evidence: Errors of the simulator.
@@ -413,12 +413,12 @@ def drop_effects(
     fitted: FittedSet,
     subsets: Sequence[frozenset[str]],
 ) -> FittedSet:
-    """Returns the repair with fewer effects, fitted anew from its sizes."""
+    """Return the repair with fewer effects, fitted anew from its sizes."""
     return refit_from(residuals, ways, subsets, fitted.rays, fitted.sizes)
 
 
 def list_subsets(fitted: FittedSet) -> tuple[frozenset[str], ...]:
-    """Returns the effects of each joint."""
+    """Return the effects of each joint."""
     return tuple(
         frozenset(ray.kind.name for ray, has in zip(fitted.rays, mask, strict=True) if has)
         for mask in fitted.mask.T
@@ -432,7 +432,7 @@ def refit_from(
     rays_: Sequence[ParameterRay],
     sizes: np.ndarray,
 ) -> FittedSet:
-    """Returns the repair with `subsets` whose fit begins at `sizes` `(R, J)` of `rays_`."""
+    """Return the repair with `subsets` whose fit begins at `sizes` `(R, J)` of `rays_`."""
     place = {(ray.kind.name, ray.name): k for k, ray in enumerate(rays_)}
     start = [
         {n: np.array([sizes[place[n, ray.name], j] for ray in ways[n]]) for n in s}
@@ -442,7 +442,7 @@ def refit_from(
 
 
 def drop_windows(residuals: Residuals, each: int) -> Residuals:
-    """Returns the simulator held against one of `each` parts of the recordings."""
+    """Return the simulator held against one of `each` parts of the recordings."""
     rows = np.concatenate(residuals.groups[::each])
     simulator = residuals.simulator
     cut = replace(
@@ -461,7 +461,7 @@ def drop_windows(residuals: Residuals, each: int) -> Residuals:
 
 
 def look_up_sizes(rays_: Sequence[ParameterRay], fitted: FittedSet) -> np.ndarray:
-    """Returns the sizes that are known already, 0 where none is, `(R, J)`."""
+    """Return the sizes that are known already, 0 where none is, `(R, J)`."""
     sizes = {(ray.kind.name, ray.name): fitted.sizes[k] for k, ray in enumerate(fitted.rays)}
     return np.stack(
         [sizes.get((ray.kind.name, ray.name), np.zeros(fitted.sizes.shape[1])) for ray in rays_]

@@ -46,7 +46,7 @@ WARM_S = 900.0
 
 
 def build_features(residuals: Residuals, j: int) -> np.ndarray:
-    """Returns what an error of joint `j` could depend on, in the simulator's own motion, `(W, I, F)`."""
+    """Return what an error of joint `j` could depend on, in the simulator's own motion, `(W, I, F)`."""
     way, machine = residuals.increments, residuals.simulator.machine
     full = machine.max_speed * machine.period_s * INCREMENT_SAMPLES
     own, speed = way[..., j], way / full
@@ -78,7 +78,7 @@ def build_features(residuals: Residuals, j: int) -> np.ndarray:
 
 
 def fit_ridge(x: np.ndarray, z: np.ndarray, pull: float) -> np.ndarray:
-    """Returns coefficients `(F,)` of a robust ridge regression of `z` `(E,)` on features `(E, F)` of about unit size."""
+    """Return coefficients `(F,)` of a robust ridge regression of `z` `(E,)` on features `(E, F)` of about unit size."""
     beta = np.zeros(x.shape[1])
     for _ in range(3):
         weighted = x * weigh_residuals(z - x @ beta)[:, None]
@@ -89,7 +89,7 @@ def fit_ridge(x: np.ndarray, z: np.ndarray, pull: float) -> np.ndarray:
 def learn_discrepancy(
     parts: Sequence[Residuals], field: Residuals
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Returns the discrepancy of each part, learned on the others, and of the field, learned on all, each `(W, I, J)`.
+    """Return the discrepancy of each part, learned on the others, and of the field, learned on all, each `(W, I, J)`.
 
     Joints of which no part predicts the others have none.
 
@@ -137,7 +137,7 @@ def learn_discrepancy(
 
 
 def estimate_fault_scales(parts: Sequence[Residuals]) -> np.ndarray:
-    """Returns how far the simulator's own numbers are off on parts of the reference, over what is usual, `(P,)`, 1 at least.
+    """Return how far the simulator's own numbers are off on parts of the reference, over what is usual, `(P,)`, 1 at least.
 
     All joints and parts together, less what chance alone does to an estimate.
     """
@@ -219,7 +219,7 @@ class SimulatedMotion:
         return np.abs(self.share).sum(-1)
 
     def faded(self, column: np.ndarray, kept: float) -> np.ndarray:
-        """Returns the mean of what came before in the recording, the longer ago the less; windows follow one another."""
+        """Return the mean of what came before in the recording, the longer ago the less; windows follow one another."""
         runs, found = self.residuals.simulator.cut.run, np.empty_like(column)
         for run in np.unique(runs):
             mine = runs == run
@@ -238,7 +238,7 @@ class SimulatedMotion:
 
 
 def apply_fitted_set(residuals: Residuals, fitted: FittedSet | None) -> Residuals:
-    """Returns the evidence of the simulator with the effects that were found, sizes from the half that they were not fitted to."""
+    """Return the evidence of the simulator with the effects that were found, sizes from the half that they were not fitted to."""
     if fitted is None:
         return residuals
     simulator, mean = (
@@ -346,7 +346,7 @@ FORMS = (STARTS, CURVE)
 
 
 def score_clues(residuals: Residuals, z: np.ndarray) -> np.ndarray:
-    """Returns what each clue earns on errors over the noise `z` `(J, E)`, `(clues, J)`."""
+    """Return what each clue earns on errors over the noise `z` `(J, E)`, `(clues, J)`."""
     found, order = (
         np.zeros((len(CLUES), len(z))),
         [*FORMS, *(name for name in CLUES if name not in FORMS)],
@@ -366,7 +366,7 @@ def score_clues(residuals: Residuals, z: np.ndarray) -> np.ndarray:
 def scale_reference_gains(
     earned: np.ndarray, left_out: Sequence[np.ndarray], entries: Sequence[float]
 ) -> np.ndarray:
-    """Returns the most that clues earn on reference recordings at the length of the field, `(clues, J)`; 0 without any.
+    """Return the most that clues earn on reference recordings at the length of the field, `(clues, J)`; 0 without any.
 
     Args:
         earned: What they earn in the field.
@@ -379,7 +379,7 @@ def scale_reference_gains(
 
 
 def measure_straying(residuals: Residuals, error: np.ndarray) -> np.ndarray:
-    """Returns how far free runs stray over what the noise lets expect, `(J,)`: mean squares of windows, cut at `FAR`.
+    """Return how far free runs stray over what the noise lets expect, `(J,)`: mean squares of windows, cut at `FAR`.
 
     Args:
         evidence: The simulator against recordings.
@@ -403,7 +403,7 @@ def measure_straying(residuals: Residuals, error: np.ndarray) -> np.ndarray:
 
 
 def _score_ridge(x: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
-    """Returns by how much features `(E, F)` make errors `(E,)` more likely, by Laplace's approximation, and what they leave."""
+    """Return by how much features `(E, F)` make errors `(E,)` more likely, by Laplace's approximation, and what they leave."""
     best, least = 0.0, z
     for pull in CLUE_RIDGES:
         beta = fit_ridge(x, z, pull)
@@ -419,7 +419,7 @@ def _score_ridge(x: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _build_hats(values: np.ndarray, high: float, count: int) -> list[np.ndarray]:
-    """Returns `count` + 1 tents over 0 to `high`, whose sum is 1."""
+    """Return `count` + 1 tents over 0 to `high`, whose sum is 1."""
     return [
         np.maximum(1.0 - np.abs(np.minimum(values, high) / high * count - place), 0.0)
         for place in range(count + 1)
@@ -427,7 +427,7 @@ def _build_hats(values: np.ndarray, high: float, count: int) -> list[np.ndarray]
 
 
 def _shift_later(column: np.ndarray, by: int) -> np.ndarray:
-    """Returns a column by so many increments later; 0 where a window has nothing before."""
+    """Return a column by so many increments later; 0 where a window has nothing before."""
     moved = np.roll(column, by, 1)
     moved[:, : max(by, 0)] = 0.0
     if by < 0:

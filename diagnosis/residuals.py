@@ -33,7 +33,7 @@ MIN_TYPICAL_ERROR = 0.1
 
 
 def to_increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Returns the ways in `SPAN` samples each of positions `(…, W, K, J)` that begin at `start` `(W, J)`: `(…, W, I, J)`."""
+    """Return the ways in `SPAN` samples each of positions `(…, W, K, J)` that begin at `start` `(W, J)`: `(…, W, I, J)`."""
     count = paths.shape[-2] // INCREMENT_SAMPLES
     ends = paths[..., INCREMENT_SAMPLES - 1 : count * INCREMENT_SAMPLES : INCREMENT_SAMPLES, :]
     first = np.broadcast_to(start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
@@ -41,12 +41,12 @@ def to_increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 
 def compute_loss(z: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """Returns the negative log likelihood of whitened errors, up to a constant, summed."""
+    """Return the negative log likelihood of whitened errors, up to a constant, summed."""
     return 0.5 * (T_FREEDOM + 1.0) * np.log1p(np.square(z) / T_FREEDOM).sum(axis)
 
 
 def weigh_residuals(z: np.ndarray) -> np.ndarray:
-    """Returns the weights that turn squares of `z` into `loss` (iteratively reweighted least squares)."""
+    """Return the weights that turn squares of `z` into `loss` (iteratively reweighted least squares)."""
     return (T_FREEDOM + 1.0) / (T_FREEDOM + np.square(z))
 
 
@@ -70,7 +70,7 @@ class ErrorCovariance:
     reading: float = 0.0
 
     def covariance(self, increments: np.ndarray) -> np.ndarray:
-        """Returns the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `increments` `(B, S)`."""
+        """Return the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `increments` `(B, S)`."""
         lag = np.abs(
             np.subtract.outer(np.arange(increments.shape[1]), np.arange(increments.shape[1]))
         )
@@ -87,16 +87,16 @@ class ErrorCovariance:
         )
 
     def strayed(self, increments: np.ndarray) -> np.ndarray:
-        """Returns the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
+        """Return the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
         return np.diagonal(self.covariance(increments).cumsum(1).cumsum(2), axis1=1, axis2=2)
 
     def whitener(self, increments: np.ndarray) -> np.ndarray:
-        """Returns the inverse Cholesky factors of the covariance, `(B, S, S)`."""
+        """Return the inverse Cholesky factors of the covariance, `(B, S, S)`."""
         return np.linalg.inv(np.linalg.cholesky(self.covariance(increments)))
 
 
 def fit_noise(error: np.ndarray, increments: np.ndarray) -> ErrorCovariance:
-    """Returns the noise of one joint: maximum likelihood on errors and simulated increments, `(W, I)`, with outliers cut."""
+    """Return the noise of one joint: maximum likelihood on errors and simulated increments, `(W, I)`, with outliers cut."""
     # a joint that stands still most of the time, read by a coarse sensor, has a median error of 0
     typical = (
         max(1.4826 * np.median(np.abs(error)), MIN_TYPICAL_ERROR * np.sqrt(np.mean(error**2)))
@@ -163,7 +163,7 @@ class ParameterRay:
     is_tied: bool = False
 
     def values(self, size: np.ndarray) -> dict[str, np.ndarray]:
-        """Returns the numbers at sizes `(C, J)`, each `(C, J)` or `(C, 1)`."""
+        """Return the numbers at sizes `(C, J)`, each `(C, J)` or `(C, 1)`."""
         found = {}
         for name in (self.name,) if self.name else self.kind.fitted:
             number = self.kind.numbers[name]
@@ -179,7 +179,7 @@ class ParameterRay:
 
 
 def build_rays(kind: EffectType, grid: Sequence[float] = SIZE_GRID) -> list[ParameterRay]:
-    """Returns the ways in which an effect can grow."""
+    """Return the ways in which an effect can grow."""
     found = []
     for name in kind.fitted if kind.target.smooth else ("",):
         ends = [_find_size_bounds(kind, one) for one in ((name,) if name else kind.fitted)]
@@ -192,7 +192,7 @@ def build_rays(kind: EffectType, grid: Sequence[float] = SIZE_GRID) -> list[Para
 
 
 def _find_size_bounds(kind: EffectType, name: str) -> tuple[float, float]:
-    """Returns the smallest and largest size of a number within its bounds."""
+    """Return the smallest and largest size of a number within its bounds."""
     number = kind.numbers[name]
     ends = [(bound - number.none) / kind.size(name) for bound in number.bounds]
     return min(ends), max(ends)
@@ -246,7 +246,7 @@ class Residuals:
         return self.compute_error(self.base)
 
     def compute_error(self, paths: np.ndarray) -> np.ndarray:
-        """Returns measured less simulated increments, `(…, W, I, J)`, of free runs `(…, W, K, J)`."""
+        """Return measured less simulated increments, `(…, W, I, J)`, of free runs `(…, W, K, J)`."""
         still = np.zeros_like(self.start)
         known = 0.0 if self.mean is None else to_increments(self.mean, still)
         known = known if self.bias is None else known + self.bias
@@ -294,7 +294,7 @@ class Residuals:
         ]
 
     def _covariance(self, group: np.ndarray, j: int) -> np.ndarray:
-        """Returns the covariance of the increments of joint `j` in windows in a row, `(S, S)`."""
+        """Return the covariance of the increments of joint `j` in windows in a row, `(S, S)`."""
         assert self.noise is not None, "noise is found before anything is whitened"
         found = self.noise[j].covariance(self.increments[group, :, j].reshape(1, -1))[0]
         for place, window in enumerate(group if self.late is not None else ()):
@@ -307,7 +307,7 @@ class Residuals:
         return found
 
     def rewhiten(self, other: Residuals, values: np.ndarray, j: int) -> np.ndarray:
-        """Returns values of joint `j` over the noise of `other`, `(…, E)`, over this one's: the same windows, another noise."""
+        """Return values of joint `j` over the noise of `other`, `(…, E)`, over this one's: the same windows, another noise."""
         found, steps = np.empty_like(values), self.increments.shape[1]
         for group, mine, theirs in zip(self.groups, self._whiteners, other._whiteners, strict=True):
             entries = slice(group[0] * steps, (group[-1] + 1) * steps)
@@ -315,7 +315,7 @@ class Residuals:
         return found
 
     def whiten(self, ways: np.ndarray) -> np.ndarray:
-        """Returns increments `(C, W, I, J)` over their noise, `(J, C, E)`; 0 where a window says nothing."""
+        """Return increments `(C, W, I, J)` over their noise, `(J, C, E)`; 0 where a window says nothing."""
         count, _, steps, joints = ways.shape
         ways = ways * self.valid_mask[:, None]
         found = np.empty((joints, count, len(self.increments) * steps), dtype=np.float64)
@@ -326,7 +326,7 @@ class Residuals:
         return found
 
     def whiten_joint(self, columns: np.ndarray, j: int) -> np.ndarray:
-        """Returns columns of increments of joint `j`, `(W, I, F)`, over its noise, `(E, F)`."""
+        """Return columns of increments of joint `j`, `(W, I, F)`, over its noise, `(E, F)`."""
         count, steps, size = columns.shape
         columns, found = (
             columns * self.valid_mask[:, j, None, None],
@@ -367,7 +367,7 @@ class Residuals:
         return np.concatenate([lines, self.whiten(MEAN_FORM_ERROR * known[None])], 1)
 
     def response(self, ray: ParameterRay) -> np.ndarray:
-        """Returns what an effect on all joints changes at each size of the ray, over the noise, `(J, C, E)`."""
+        """Return what an effect on all joints changes at each size of the ray, over the noise, `(J, C, E)`."""
         joints = self.increments.shape[2]
         sizes = ray.sizes[ray.sizes != 0.0]
         paths = self.simulator.simulate(

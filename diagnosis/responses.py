@@ -46,7 +46,7 @@ class Response:
     change: np.ndarray
 
     def at(self, size: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the change at a size and its slope over the size, each `(E,)`."""
+        """Return the change at a size and its slope over the size, each `(E,)`."""
         cell = min(
             max(int(np.searchsorted(self.sizes, size, side="right")) - 1, 0), len(self.sizes) - 2
         )
@@ -57,7 +57,7 @@ class Response:
 
 
 def sum_responses(shapes: Sequence[Response], sizes: np.ndarray) -> np.ndarray:
-    """Returns the sum of the changes, `(E,)`."""
+    """Return the sum of the changes, `(E,)`."""
     return np.sum([shape.at(size)[0] for shape, size in zip(shapes, sizes, strict=True)], 0)
 
 
@@ -68,7 +68,7 @@ def fit_sizes(
     faults: np.ndarray | None = None,
     used: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Returns the sizes that explain the errors best: most likely under a t distribution and a wide prior.
+    """Return the sizes that explain the errors best: most likely under a t distribution and a wide prior.
 
     Args:
         z: Errors over the noise, `(E,)`.
@@ -144,7 +144,7 @@ def _stack_slopes(shapes: Sequence[Response], lines: np.ndarray, size: np.ndarra
 
 
 def fit_single_size(z: np.ndarray, shape: Response, used: np.ndarray | None = None) -> float:
-    """Returns the best of the simulated sizes and those `PARTS` of the way between them: some begin just there."""
+    """Return the best of the simulated sizes and those `PARTS` of the way between them: some begin just there."""
     used = np.ones(len(z)) if used is None else used
     between = [(1.0 - part) * shape.change[:-1] + part * shape.change[1:] for part in BETWEEN]
     trials = np.concatenate(
@@ -178,7 +178,7 @@ class JointResiduals:
 
 
 def fit_faults(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray) -> JointResiduals:
-    """Returns a joint's errors with the simulator's faults, `(P, E)`, fitted."""
+    """Return a joint's errors with the simulator's faults, `(P, E)`, fitted."""
     lines = np.reshape(np.asarray(faults, dtype=float), (-1, len(z)))
     whole = fit_sizes(z, [], faults=lines)
     left = z - whole @ lines
@@ -190,7 +190,7 @@ def fit_faults(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray) -> Join
 def score_responses(
     joint: JointResiduals, shapes: Sequence[Response], start: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns by how much shapes make the errors more likely, entry by entry `(E,)`, and their best sizes.
+    """Return by how much shapes make the errors more likely, entry by entry `(E,)`, and their best sizes.
 
     Prices of sizes and faults are spread over the entries.
     """
@@ -208,7 +208,7 @@ def score_responses(
 def _compute_penalty(
     left: np.ndarray, shapes: Sequence[Response], lines: np.ndarray, size: np.ndarray
 ) -> float:
-    """Returns the loss of sizes and faults under their priors, and Occam's factor: how much narrower the recordings make them."""
+    """Return the loss of sizes and faults under their priors, and Occam's factor: how much narrower the recordings make them."""
     slope = _stack_slopes(shapes, lines, size)
     precision = np.concatenate([np.full(len(shapes), SIZE_PRIOR**-2.0), np.ones(len(lines))])
     told = (slope * weigh_residuals(left)) @ slope.T / precision + np.eye(len(size))
@@ -218,7 +218,7 @@ def _compute_penalty(
 def cross_validate_change(
     z: np.ndarray, shapes: Sequence[Response], fold: np.ndarray
 ) -> np.ndarray:
-    """Returns what shapes change, `(E,)`, on each half `fold` with sizes fitted to the other."""
+    """Return what shapes change, `(E,)`, on each half `fold` with sizes fitted to the other."""
     change = np.zeros(len(z))
     for half in (0, 1):
         other = fold == half
@@ -242,7 +242,7 @@ MIN_RESPONSE = 1e-3
 
 
 def choose_rays(kind: EffectType, grid: Sequence[float] = SIZE_GRID) -> list[ParameterRay]:
-    """Returns the ways in which an effect can grow, at sizes as close as it has to be simulated; none beyond those of `grid`."""
+    """Return the ways in which an effect can grow, at sizes as close as it has to be simulated; none beyond those of `grid`."""
     fine = [size for size in FINE_GRID if size <= grid[-1]]
     return build_rays(kind, fine if kind.shaping and not list_shared_effects([kind]) else grid)
 
@@ -253,7 +253,7 @@ def add_responses(
     ways: Sequence[ParameterRay],
     residuals: Residuals,
 ) -> list[ParameterRay]:
-    """Adds the shapes of an effect to the joints that it does something to.
+    """Add the shapes of an effect to the joints that it does something to.
 
     Numbers that only shape the effect are tried at several values; each joint keeps the best, and
     the rays remember them.
@@ -301,7 +301,7 @@ def add_responses(
 def fit_joint_faults(
     residuals: Residuals, scatter: np.ndarray | None = None, z: np.ndarray | None = None
 ) -> list[JointResiduals]:
-    """Returns the errors of each joint with small faults of the simulator, in units of `scatter` times the noise.
+    """Return the errors of each joint with small faults of the simulator, in units of `scatter` times the noise.
 
     Args:
         evidence: Errors over the noise.

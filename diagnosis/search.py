@@ -88,7 +88,7 @@ class SubsetTable:
     single: dict[int, float] = field(default_factory=dict)
 
     def score(self, subset: Subset) -> SubsetScore:
-        """Returns what a subset earns."""
+        """Return what a subset earns."""
         if subset not in self.scores:
             names = sorted(subset)
             shapes = [shape for name in names for shape in self.shapes[name]]
@@ -103,7 +103,7 @@ class SubsetTable:
         return self.scores[subset]
 
     def _starts(self, names: Sequence[str]) -> list[np.ndarray]:
-        """Returns sizes at which a fit of several effects may begin: all somewhat smaller than alone, and the best smaller set.
+        """Return sizes at which a fit of several effects may begin: all somewhat smaller than alone, and the best smaller set.
 
         What begins at a threshold does nothing below it, and a fit that begins there stays there.
         So a set also begins where the best set with one effect less ended, with the other at what
@@ -132,13 +132,13 @@ class SubsetTable:
         return starts
 
     def alone(self, shape: Response) -> float:
-        """Returns the size of a shape that explains the joint's errors best by itself."""
+        """Return the size of a shape that explains the joint's errors best by itself."""
         if id(shape) not in self.single:
             self.single[id(shape)] = fit_single_size(self.joint.z, shape)
         return self.single[id(shape)]
 
     def explore(self, price: Mapping[str, float], most: int) -> None:
-        """Tries all single effects, and larger subsets that contain one of the best of the size below."""
+        """Try all single effects, and larger subsets that contain one of the best of the size below."""
 
         def net(subset: Subset) -> float:
             return self.score(subset).total - sum(price[name] for name in subset)
@@ -188,7 +188,7 @@ def choose_set(
     partial: float = 0.0,
     least: float = 0.0,
 ) -> EffectSet:
-    """Returns the set that is worth most, or one of fewer effects that is not surely worth less.
+    """Return the set that is worth most, or one of fewer effects that is not surely worth less.
 
     Args:
         tables: What was tried on each joint.
@@ -222,7 +222,7 @@ def _find_best_set(
     name_price: float,
     partial: float,
 ) -> EffectSet:
-    """Returns the set of at most `MOST` names that is worth most; each joint takes the best subset of them."""
+    """Return the set of at most `MOST` names that is worth most; each joint takes the best subset of them."""
     names = sorted(
         {name for by_subset in worth for subset in by_subset for name in subset},
         key=lambda n: -_sum_best(worth, n),
@@ -251,7 +251,7 @@ def _find_simpler_set(
     partial: float,
     share: float,
 ) -> EffectSet | None:
-    """Returns a set with fewer names whose loss is within what chance does between blocks, or a small part of the whole."""
+    """Return a set with fewer names whose loss is within what chance does between blocks, or a small part of the whole."""
     for name in sorted(best.names):
         other = _find_best_set(
             [{s: value for s, value in w.items() if name not in s} for w in worth],
@@ -275,7 +275,7 @@ def _find_simpler_set(
 def list_promising_subsets(
     table: SubsetTable, least: float, share: float, shared: Subset = frozenset()
 ) -> list[Subset]:
-    """Returns the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most.
+    """Return the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most.
 
     An effect that is `shared` by all joints may earn little on each.
     """
@@ -292,7 +292,7 @@ def list_promising_subsets(
 
 
 def _adds_each(subset: Subset, own: Subset, table: SubsetTable, share: float) -> bool:
-    """Says whether each of the effects `own` has a size worth naming and adds its share: else it mends the form of another."""
+    """Return True where each of the effects `own` has a size worth naming and adds its share: else it mends the form of another."""
     total, sizes = table.scores[subset].total, table.scores[subset].sizes
     if any(np.abs(sizes[name]).max() < MIN_SIZE for name in own):
         return False
@@ -302,7 +302,7 @@ def _adds_each(subset: Subset, own: Subset, table: SubsetTable, share: float) ->
 
 
 def _sum_best(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
-    """Returns the most that a subset with `name` is worth, summed over joints."""
+    """Return the most that a subset with `name` is worth, summed over joints."""
     return sum(
         max([value for subset, value in by_subset.items() if name in subset], default=0.0)
         for by_subset in worth
@@ -336,7 +336,7 @@ class ReferenceScores:
     known: set[str] = field(default_factory=set)
 
     def _scored(self, j: int, subset: frozenset[str]) -> list[tuple[SubsetScore, float]]:
-        """Returns what the subset earns on joint `j` in each part of the reference, and the length of the field over the part's."""
+        """Return what the subset earns on joint `j` in each part of the reference, and the length of the field over the part's."""
         if not self.tables:
             self.tables = [
                 [SubsetTable(joint, {}, part.block) for joint in fit_joint_faults(part)]
@@ -356,7 +356,7 @@ class ReferenceScores:
         return found
 
     def earned(self, j: int, subset: frozenset[str]) -> float:
-        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
+        """Return the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
 
         Of a cause that all joints share the mean: its price adds up over the joints, and the most
         of each adds up to too much.
@@ -365,7 +365,7 @@ class ReferenceScores:
         return float((np.mean if subset <= self.shared else max)(found)) if found else 0.0
 
     def repeated(self, j: int, subset: frozenset[str]) -> float:
-        """Returns what the subset earns in the field at the sizes that it has on the reference already; 0 where it has none."""
+        """Return what the subset earns in the field at the sizes that it has on the reference already; 0 where it has none."""
         parts = [scored for scored, _ in self._scored(j, subset)]
         if not parts or sum(scored.total for scored in parts) < ALREADY_THERE:
             return 0.0
@@ -388,7 +388,7 @@ Shapes = Sequence[Mapping[str, Sequence[Response]]]
 def bind_shared_sizes(
     names: Subset, tables: Sequence[SubsetTable], grown: Rays, shapes: Shapes
 ) -> tuple[dict[str, list[ParameterRay]], list[dict[str, list[Response]]]]:
-    """Returns rays and shapes with those of the effects `names` bounded to about the size that the joints agree on."""
+    """Return rays and shapes with those of the effects `names` bounded to about the size that the joints agree on."""
     rays, narrow = (
         {name: list(ways) for name, ways in grown.items()},
         [{n: list(s) for n, s in mine.items()} for mine in shapes],
@@ -415,7 +415,7 @@ def bind_shared_sizes(
 
 
 def find_weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    """Returns the weighted median: a joint that has another effect too is far off."""
+    """Return the weighted median: a joint that has another effect too is far off."""
     order = np.argsort(values)
     below = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(below, 0.5 * below[-1])]) if below[-1] > 0 else 0.0

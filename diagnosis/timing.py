@@ -64,7 +64,7 @@ class FrameDelays:
     joint: np.ndarray
 
     def of(self, joint: int) -> FrameDelays:
-        """Returns those of one joint."""
+        """Return those of one joint."""
         mine = self.joint == joint
         return FrameDelays(self.value[mine], self.error[mine], self.joint[mine])
 
@@ -83,7 +83,7 @@ class DelayErrorModel:
 
     @classmethod
     def of(cls, known: Sequence[FrameDelays]) -> DelayErrorModel:
-        """Returns the most likely one for the delays of recordings in which no frame is late."""
+        """Return the most likely one for the delays of recordings in which no frame is late."""
         tried = [cls(scale, freedom) for scale in SCALES for freedom in FREEDOMS]
         return max(
             tried,
@@ -91,12 +91,12 @@ class DelayErrorModel:
         )
 
     def log(self, off: np.ndarray, error: np.ndarray) -> np.ndarray:
-        """Returns the logarithm of the density of what delays with these standard errors are off by."""
+        """Return the logarithm of the density of what delays with these standard errors are off by."""
         width = np.hypot(self.scale * error, TIMING_ERROR)
         return stats.t.logpdf(off / width, self.freedom) - np.log(width)
 
     def gain(self, seen: FrameDelays, drawn: np.ndarray) -> float:
-        """Returns the log likelihood of the delays seen, where true ones are like those `drawn`, over that without any."""
+        """Return the log likelihood of the delays seen, where true ones are like those `drawn`, over that without any."""
         if not len(seen.value):
             return 0.0
         among = np.exp(self.log(seen.value[:, None] - drawn[None], seen.error[:, None])).mean(1)
@@ -186,7 +186,7 @@ class CommandChanges:
         return found
 
     def delays(self, error: np.ndarray, without: int | None = None) -> FrameDelays:
-        """Returns the delays that explain errors `(W, I, J)` (measured less simulated increments) best.
+        """Return the delays that explain errors `(W, I, J)` (measured less simulated increments) best.
 
         What a joint alone is late by on average is none of them; `without`: a joint whose errors do
         not count.
@@ -216,7 +216,7 @@ class CommandChanges:
         )
 
     def spread(self, error: np.ndarray) -> np.ndarray:
-        """Returns what each change does when it comes late by the standard deviation of the delays seen, `(W, C, I, J)`."""
+        """Return what each change does when it comes late by the standard deviation of the delays seen, `(W, C, I, J)`."""
         seen = self.delays(error)
         by = np.sqrt(max(0.0, float(np.mean(np.square(seen.value) - np.square(seen.error)))))
         return by * self.responses.swapaxes(0, 1)
@@ -230,7 +230,7 @@ def detect_timing_effect(
     price: float,
     name_price: float,
 ) -> DetectedEffect | None:
-    """Returns the effect on the arrival of commands that the scatter of hidden delays shows, if any.
+    """Return the effect on the arrival of commands that the scatter of hidden delays shows, if any.
 
     Args:
         changes: Of the commands in the field.
@@ -306,7 +306,7 @@ def detect_timing_effect(
 def add_mean_delay(
     residuals: Residuals, found: DetectedEffect, steady: Sequence[tuple[EffectType, EffectValues]]
 ) -> Residuals:
-    """Returns the evidence with what the found effect changes on average, and the mean delay that joints share beyond it.
+    """Return the evidence with what the found effect changes on average, and the mean delay that joints share beyond it.
 
     How delays scatter does not tell their mean: frames that may not overtake each other wait twice
     as long as others that scatter alike. Frames are late for all joints alike, so that what one
@@ -349,7 +349,7 @@ def add_mean_delay(
 
 
 def _draw_delays(changes: CommandChanges, kind: EffectType) -> list[np.ndarray]:
-    """Returns hidden delays that an effect of each size makes, without errors of measurement, each `(D,)`."""
+    """Return hidden delays that an effect of each size makes, without errors of measurement, each `(D,)`."""
     residuals, joints = changes.residuals, changes.residuals.increments.shape[2]
     sizes = np.repeat(JITTER_SIZES, DRAWS_PER_WINDOW)[:, None]
     values = {}
@@ -367,17 +367,17 @@ def _draw_delays(changes: CommandChanges, kind: EffectType) -> list[np.ndarray]:
 
 
 def _compute_scatter(values: np.ndarray) -> float:
-    """Returns the root mean square, outliers cut."""
+    """Return the root mean square, outliers cut."""
     return float(np.sqrt(np.mean(np.minimum(np.square(values), 25.0))))
 
 
 def _subsample_delays(drawn: np.ndarray) -> np.ndarray:
-    """Returns delays that are distributed alike, at most `MOST`."""
+    """Return delays that are distributed alike, at most `MOST`."""
     return np.sort(drawn)[np.linspace(0, len(drawn) - 1, min(MAX_DRAWN, len(drawn))).astype(int)]
 
 
 def _compute_explained_share(seen: FrameDelays, scale: float) -> float:
-    """Returns the share of the scatter of the delays that is more than their errors."""
+    """Return the share of the scatter of the delays that is more than their errors."""
     return float(
         np.clip(
             1.0 - np.mean((scale * seen.error) ** 2) / max(np.mean(seen.value**2), 1e-12), 0.0, 1.0

@@ -61,7 +61,7 @@ class DiagnosisSubject:
 
 @spec
 class Diagnose:
-    """Holds a simulator against recordings and says what it lacks.
+    """Hold a simulator against recordings and says what it lacks.
 
     Attributes:
         session: Folder, seed, device.
@@ -83,7 +83,7 @@ class Diagnose:
     diagnosis: DiagnosisSubject
 
     def run(self) -> None:
-        """Writes `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
+        """Write `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
 
         Raises:
             RecordingError: a recording cannot be used, or there is too little data to fit a
