@@ -1,11 +1,13 @@
-"""What actuator models and policies remember: the last `H` commands and positions.
+"""Memory of actuator models and policies: the last `H` commands and positions.
 
 Worked trace (H = 3), one control step at time t:
 
-    observe      q = [q(t-2), q(t-1), q(t)]     u = [u(t-3), u(t-2), u(t-1)]
-    push_u       q = [q(t-2), q(t-1), q(t)]     u = [u(t-2), u(t-1), u(t)]      <- rows pair up as
-    in a recording; actuator input push_q       q = [q(t-1), q(t), q(t+1)]     u = [u(t-2), u(t-1),
-    u(t)]      <- next observation
+    observe   q = [q(t-2), q(t-1), q(t)]     u = [u(t-3), u(t-2), u(t-1)]
+    push_u    q = [q(t-2), q(t-1), q(t)]     u = [u(t-2), u(t-1), u(t)]     actuator input
+    push_q    q = [q(t-1), q(t), q(t+1)]     u = [u(t-2), u(t-1), u(t)]     next observation
+
+After `push_u` the rows pair up as in a recording.
+
 """
 
 from dataclasses import dataclass
@@ -38,7 +40,12 @@ class History:
         self.q[:, -1] = q
 
     def reset(self, mask: Any, q: Any) -> None:
-        """Backfill the environments of `mask`, shape `(N,)` bool: at rest at `q`, shape `(N, J)`, no command."""
+        """Put environments at rest, without commands, over the whole history.
+
+        Args:
+            mask: Environments, shape `(N,)` bool.
+            q: Positions, shape `(N, J)`.
+        """
         rows = mask[:, None, None]
         self.q.copy_(q[:, None, :].where(rows, self.q))
         self.u.masked_fill_(rows, 0.0)

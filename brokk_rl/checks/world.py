@@ -12,7 +12,7 @@ from brokk_rl.machine import Machine
 def check_world(
     simulator: Simulator, machine: Machine, scenes: torch.Tensor, device: torch.device | str = "cpu"
 ) -> None:
-    """Check what `Simulator.build` returns against `World`.
+    """Check a simulator against `World`.
 
     Args:
         simulator: The spec.

@@ -36,11 +36,21 @@ class World(Protocol):
     """True when `step` and `reset` may be captured in a CUDA graph."""
 
     def step(self, increment: torch.Tensor) -> None:
-        """Advance one control period; the drive moves each joint by `increment`, `(N, J)`, unless something blocks it."""
+        """Advance one control period.
+
+        Args:
+            increment: Motion of each joint that the drive makes unless something blocks it, `(N, J)`.
+        """
         ...
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
-        """Put the worlds of `mask`, `(N,)` bool, at rest at `q`, `(N, J)`, in the scenes of `scene`, `(N, S)`; see `sim.scene`."""
+        """Put worlds at rest.
+
+        Args:
+            mask: Worlds that are reset, `(N,)` bool.
+            q: Joint positions, `(N, J)`.
+            scene: Scenes, `(N, S)`; see `sim.scene`.
+        """
         ...
 
     def state_dict(self) -> dict[str, torch.Tensor]:
@@ -48,7 +58,7 @@ class World(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a copy that `state_dict` returned."""
         ...
 
 

@@ -94,8 +94,7 @@ class Evaluate:
             effects=self.effect,
             follower=self.follower,
         )
-        name = type(self.policy).__name__.removesuffix("Policy").lower()
-        policies = {name: self.policy} | self.rivals
+        policies = {name_spec(self.policy): self.policy} | self.rivals
         results, _ = evaluate_policies(config, self.evaluation, self.session, policies)
         return float(results["success_strict"]["mean"])
 

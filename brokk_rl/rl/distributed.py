@@ -1,8 +1,9 @@
-"""Several processes that train one policy, one a GPU (or several on a CPU, to try it).
+"""Training of one policy by several processes, one a GPU (or several on a CPU, to try it).
 
-rsl-rl averages gradients and normalisers over them; here is what goes around it: the process group,
-what the first decides for all, figures over all environments, and the proof that all still hold the
-same policy.
+rsl-rl averages gradients and normalisers over them. This module adds the process group, decisions
+of the first process for all, figures over all environments, and the proof that all processes still
+hold the same policy.
+
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from brokk_rl.errors import DistributedError
 
 
 class TrainingGroup:
-    """The processes that train together, a context manager; in a process that is alone nothing here costs anything.
+    """Process group of a training, a context manager; without effect for a single process.
 
     Args:
         device: Where this process computes: NCCL between GPUs, gloo between CPUs and for what lies
@@ -31,7 +32,7 @@ class TrainingGroup:
 
     @property
     def together(self) -> bool:
-        """Whether there is more than one process."""
+        """True when there is more than one process."""
         return self.rank.count > 1
 
     def __enter__(self) -> TrainingGroup:
@@ -71,7 +72,7 @@ class TrainingGroup:
             dist.barrier()
 
     def broadcast_first(self, value: Any) -> Any:
-        """Return the first process's `value`: where a clock decides, one clock must decide for all."""
+        """Return the first process's `value`: a decision by the clock must be the same for all."""
         if not self.together:
             return value
         box = [value]
@@ -79,7 +80,7 @@ class TrainingGroup:
         return box[0]
 
     def gather(self, value: Any) -> list[Any]:
-        """Return everyone's `value` (plain numbers and text), in the order of ranks."""
+        """Return the `value` (plain numbers and text) of all processes, in the order of ranks."""
         if not self.together:
             return [value]
         found: list[Any] = [None] * self.rank.count
@@ -87,7 +88,10 @@ class TrainingGroup:
         return found
 
     def gather_on_first(self, state: Any) -> list[Any]:
-        """Return everyone's `state` (mappings of tensors, on the host) to the first process, to the others an empty list."""
+        """Return the `state` of all processes to the first one, an empty list to the others.
+
+        A state is a mapping of tensors; they are copied to the host.
+        """
         if not self.together:
             return [state]
         found: list[Any] = [None] * self.rank.count
@@ -148,7 +152,7 @@ def _copy_to_host(state: Any) -> Any:
 
 
 def _is_lost_connection(text: str) -> bool:
-    """Whether a RuntimeError is the end of a connection: gloo has no class of its own for it."""
+    """Return whether a RuntimeError is a lost connection: gloo has no class of its own for it."""
     return any(
         word in text
         for word in ("gloo", "NCCL", "Connection closed by peer", "Connection reset by peer")

@@ -18,10 +18,11 @@ recorded."""
 def capture_graph(
     step: Callable[[], None], device: torch.device, gradients: bool = False
 ) -> torch.cuda.CUDAGraph:
-    """Return a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses.
+    """Return a CUDA graph of `step`.
 
     Args:
-        step: What to capture; called `WARM_UP` times before.
+        step: The step; called `WARM_UP` times before. It must not synchronise with the host, and its
+            tensors must keep their addresses.
         device: A CUDA device.
         gradients: Whether `step` differentiates.
     """
@@ -42,7 +43,7 @@ def capture_graph(
 
 @contextlib.contextmanager
 def report_compile_errors() -> Iterator[None]:
-    """Says what to do where `torch.compile` finds nothing to compile with.
+    """Turn an error of `torch.compile` without a compiler into a message with its remedy.
 
     Raises:
         ConfigError: Something that is first called in here cannot be compiled.

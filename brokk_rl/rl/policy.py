@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from rsl_rl.models import MLPModel
@@ -44,6 +44,8 @@ training hardly explores any more."""
 class ClassicalPolicy:
     """The task's classical controller: inverse kinematics with dead-time compensation."""
 
+    label: ClassVar[str] = "classical"
+
     def build(self, loop: ControlLoop, seed: int) -> Policy:
         """Return the policy; the controller's numbers are the task's (`task.classical`).
 
@@ -69,6 +71,8 @@ class UntrainedPolicy:
 
     training: TrainingConfig
 
+    label: ClassVar[str] = "untrained"
+
     def build(self, loop: ControlLoop, seed: int) -> Policy:
         """Return the policy with weights drawn from `seed`."""
         config = self.training.runner_config()
@@ -87,6 +91,8 @@ class TrainedPolicy:
     """
 
     folder: str
+
+    label: ClassVar[str] = "trained"
 
     def build(self, loop: ControlLoop, seed: int) -> Policy:
         """Return the policy.
@@ -205,7 +211,7 @@ def locate_bundle(folder: str) -> Path:
 
 
 def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Return contract and weights of the bundle in `folder`; see `TrainedPolicy.build` for errors."""
+    """Return contract and weights of the bundle in `folder`; errors as in `TrainedPolicy.build`."""
     if not (folder / CONTRACT).exists():
         raise CheckpointError(
             f"{folder} holds no policy ({CONTRACT} is missing); "

@@ -26,7 +26,9 @@ from brokk_rl.rl.execution import capture_graph, limit_to_one_thread
 
 
 class CapturedRollout:
-    """Does what `act` and `process_env_step` of `rsl_rl.algorithms.PPO` do, into the algorithm's own storage.
+    """Acting and storing as `rsl_rl.algorithms.PPO` does them, into the algorithm's own storage.
+
+    Each is one replay of a CUDA graph.
 
     For feed-forward networks with a Gaussian policy; all tensors keep their addresses. On a CPU the
     same runs without graphs.
@@ -122,7 +124,10 @@ FIGURES = ("value", "surrogate", "entropy")
 
 
 class DevicePPO(PPO):
-    """PPO for feed-forward networks; on a CPU, and with curiosity or symmetry, it is rsl-rl's own, which acts on one thread."""
+    """PPO for feed-forward networks.
+
+    On a CPU, and with curiosity or symmetry, it is rsl-rl's own, which acts on one thread.
+    """
 
     _rollout: CapturedRollout | None = None
     _mini_batch: Sequence[Callable[[], None]] | None = None
@@ -160,11 +165,11 @@ class DevicePPO(PPO):
             self._rollout.store(rewards, dones, extras.get("time_outs", torch.zeros_like(rewards)))
 
     def update(self) -> dict[str, float]:
-        """Learn from the stored steps and returns mean losses; see `rsl_rl.algorithms.PPO.update`."""
+        """Learn from the stored steps and return mean losses; see `rsl_rl.algorithms.PPO.update`."""
         return self.update_on_device() if self._on_device else super().update()
 
     def update_on_device(self) -> dict[str, float]:
-        """Do what `update` does with one read-back at the end; the same numbers up to rounding."""
+        """Learn as `update` does, with one read-back at the end; the same numbers up to rounding."""
         storage = self.storage
         used = self._batch_size() * self.num_mini_batches
         order = torch.randperm(used, device=self.device)
@@ -190,7 +195,7 @@ class DevicePPO(PPO):
         return {name: value / updates for name, value in zip(FIGURES, sums, strict=True)}
 
     def save(self) -> dict[str, Any]:
-        """Return the state without what is special to this device, so that it can be loaded on any."""
+        """Return the state without device-specific entries, so that any device can load it."""
         saved = super().save()
         optimizer = saved["optimizer_state_dict"]
         plain = {"lr": self.learning_rate, "capturable": False, "fused": None}
@@ -200,7 +205,7 @@ class DevicePPO(PPO):
         }
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Load a state; graphs are captured anew at the next update, because the optimiser's tensors are others now."""
+        """Load a state; the next update captures new graphs for the optimiser's new tensors."""
         self._mini_batch = None
         return super().load(loaded_dict, load_cfg, strict)
 
@@ -215,7 +220,7 @@ class DevicePPO(PPO):
         return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
 
     def _prepare(self) -> None:
-        """Make the tensors that graphs read and write, and let the optimiser read its rate from one of them."""
+        """Make the tensors that graphs read and write; the optimiser reads its rate from one of them."""
         self._rows = torch.zeros(self._batch_size(), dtype=torch.int64, device=self.device)
         self._advantages = torch.zeros_like(self.storage.values)
         self._rate = torch.tensor(self.learning_rate, device=self.device)
@@ -235,7 +240,10 @@ class DevicePPO(PPO):
                 state["step"] = state["step"].to(self.device, torch.float32)
 
     def _parts(self) -> Sequence[Callable[[], None]]:
-        """Return what a mini-batch consists of, on a GPU captured; the calls before the capture leave no trace."""
+        """Return the parts of a mini-batch, captured on a GPU.
+
+        The calls before the capture leave no trace.
+        """
         device = torch.device(self.device)
         if device.type != "cuda":
             return (
@@ -272,7 +280,10 @@ class DevicePPO(PPO):
         return captured
 
     def _normalise(self, model: nn.Module) -> None:
-        """Update a model's normalisation in place: rsl-rl binds a new tensor, which the graph would not see."""
+        """Update a model's normalisation in place.
+
+        rsl-rl binds a new tensor, which the graph would not see.
+        """
         held = [
             (module, name, value)
             for module in model.modules()
@@ -288,7 +299,10 @@ class DevicePPO(PPO):
         self._descend()
 
     def _differentiate(self) -> None:
-        """Differentiate the loss of the stored steps `_rows`; Schulman et al. 2017, equations 7 and 9, as rsl-rl weighs them."""
+        """Differentiate the loss of the stored steps `_rows`.
+
+        Schulman et al. 2017, equations 7 and 9, with the weights of rsl-rl.
+        """
         storage, rows = self.storage, self._rows
         observations = {
             name: value.flatten(0, 1)[rows] for name, value in storage.observations.items()
@@ -342,11 +356,11 @@ class DevicePPO(PPO):
         self._sums.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
 
     def _sum_up(self) -> None:
-        """Add up gradients and divergence of all processes, which then all hold the same; the host does not wait for it."""
+        """Add up gradients and divergence of all processes; the host does not wait for it."""
         dist.all_reduce(self._gathered)
 
     def _descend(self) -> None:
-        """One step of the optimiser along the mean gradient of all processes."""
+        """Take one step of the optimiser along the mean gradient of all processes."""
         if self.is_multi_gpu:
             self._gathered.div_(self.gpu_world_size)
         if self._is_adaptive:
@@ -360,7 +374,7 @@ class DevicePPO(PPO):
         return self.desired_kl is not None and self.schedule == "adaptive"
 
     def _adapt_rate(self, divergence: torch.Tensor) -> None:
-        """Raise the learning rate where the policy moves less than `desired_kl`, lowers it where it moves more."""
+        """Adapt the learning rate: up where the policy moves less than `desired_kl`, down where more."""
         lower, higher = (
             (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE),
             (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE),

@@ -46,7 +46,7 @@ class TrainingBudget:
             )
 
     def share_spent(self, env_steps: int, seconds: float) -> float:
-        """Return how much is spent, 1 or more when it is all."""
+        """Return the spent share of the budget, 1 or more when all of it is spent."""
         return max(
             env_steps / (self.max_env_steps or float("inf")),
             seconds / (self.max_seconds or float("inf")),
@@ -55,7 +55,7 @@ class TrainingBudget:
 
 @spec
 class TrainingConfig:
-    """How a policy is trained with rsl-rl's PPO.
+    """Numbers of a training with rsl-rl's PPO.
 
     Attributes:
         num_envs: Environments, of each process where several train together; `null` for what the
@@ -103,7 +103,7 @@ class TrainingConfig:
         return desired * (1.0 - 0.9 * min(1.0, (share_spent - 1.0 + self.settling) / self.settling))
 
     def runner_config(self) -> dict[str, Any]:
-        """Return a copy for rsl-rl, which writes into it; keys without a value are dropped: its constructors know no `null`."""
+        """Return a copy for rsl-rl, which writes into it, without keys whose value is `null`."""
         return _drop_nulls(copy.deepcopy(self.runner)) | {
             "save_interval": 10**9,
             "check_for_nan": False,
@@ -111,20 +111,20 @@ class TrainingConfig:
 
 
 class TrainingRunner(OnPolicyRunner):
-    """Trains; see `Training`.
+    """Runner of a training; see `TrainingConfig`.
 
-    rsl-rl's own checkpoint lacks the environment, the random generators and the step count; ours
-    holds all of them, so that a resumed run on a CPU goes on bit for bit. It is read with
-    `weights_only=True`: a checkpoint from a stranger cannot run code. Of several processes the
-    first writes it, with what belongs to each of the others.
+    rsl-rl's own checkpoint lacks the environment, the random generators and the step count. This one
+    holds all of them: a resumed run on a CPU goes on bit for bit. It is read with `weights_only=True`,
+    so that a checkpoint from a stranger cannot run code. Of several processes the first writes it,
+    including the state of the others.
 
     Args:
         env: The control loop; a checkpoint of another machine than its own is refused.
         training: Configuration.
         folder: Checkpoints go here.
         device: Where the networks live.
-        logbook: Takes the place of rsl-rl's logger.
-        group: Those that train together, entered; `None` for a process that is alone.
+        logger: Takes the place of rsl-rl's logger.
+        group: The processes that train together, entered; `None` for a single process.
     """
 
     env: ControlLoop
@@ -147,7 +147,7 @@ class TrainingRunner(OnPolicyRunner):
         self.logger = logbook  # type: ignore[assignment]
 
     def run(self) -> None:
-        """Train until the budget is spent, saving a checkpoint every `save_interval` iterations and at the end."""
+        """Train until the budget is spent; save a checkpoint every `save_interval` and at the end."""
         book: TrainingLogger = self.logger  # type: ignore[assignment]
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
@@ -170,7 +170,10 @@ class TrainingRunner(OnPolicyRunner):
                 self.checkpoint()
 
     def _rounds(self, book: TrainingLogger, steps: int) -> int:
-        """Return how many iterations to do until the next checkpoint or change of step, 0 when the budget is spent."""
+        """Return the number of iterations until the next checkpoint or change of `desired_kl`.
+
+        0 when the budget is spent.
+        """
         budget, interval = self.training.budget, self.training.save_interval
         rounds = min(
             part - self.current_learning_iteration % part
@@ -200,7 +203,10 @@ class TrainingRunner(OnPolicyRunner):
         }
 
     def _configure_multi_gpu(self) -> None:
-        """Tell rsl-rl of the processes of `group`; its own way knows NCCL only and never ends the process group."""
+        """Tell rsl-rl of the processes of `group`.
+
+        rsl-rl's own way knows NCCL only and never ends the process group.
+        """
         rank = self.group.rank
         self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = (
             rank.count,
@@ -217,7 +223,9 @@ class TrainingRunner(OnPolicyRunner):
             super().learn(num_learning_iterations, init_at_random_ep_len)
 
     def checkpoint(self) -> None:
-        """Write a checkpoint in one step, holding all that is needed to go on exactly; drops the oldest beyond `keep_checkpoints`.
+        """Write a checkpoint in one step; drop the oldest beyond `keep_checkpoints`.
+
+        It holds all that is needed to go on exactly.
 
         Raises:
             StorageError: The disk is full or the folder cannot be written; older checkpoints are
@@ -257,7 +265,7 @@ class TrainingRunner(OnPolicyRunner):
             old.unlink()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Do nothing: rsl-rl would save amid an iteration's bookkeeping; `checkpoint` follows every call of `learn`."""
+        """Do nothing: rsl-rl would save amid an iteration; `checkpoint` follows every `learn`."""
 
     def load(
         self,
@@ -348,7 +356,7 @@ def get_random_state(device: torch.device | str) -> dict[str, torch.Tensor]:
 
 
 def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str) -> None:
-    """Restore what `random_state` returned."""
+    """Restore generators that `get_random_state` read."""
     torch.set_rng_state(state["cpu"].cpu())
     if torch.device(device).type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)

@@ -1,4 +1,4 @@
-"""Where the figures of a training run go: always to `progress.csv` in the run folder, and to a tracker if one is chosen."""
+"""Trackers of a training run's figures, beside `progress.csv` in the run folder."""
 
 from __future__ import annotations
 
@@ -49,7 +49,9 @@ class TensorBoardTracking:
 
 @spec
 class WandbTracking:
-    """Weights & Biases, offline first: one run per job, synchronised later with `wandb sync` or online with wandb.mode=online.
+    """Weights & Biases, offline first: one run per job, sent later by `wandb sync`.
+
+    With `wandb.mode=online` it is sent at once.
 
     Attributes:
         project: Project name.

@@ -1,4 +1,4 @@
-"""The world on CPU threads: `mujoco.batch.Batch`, the default without a GPU."""
+"""Worlds stepped by MuJoCo C on CPU threads (`mujoco.batch.Batch`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
 
 class NativeWorld:
-    """Fulfils `brokk_rl.contracts.world.World` with a thread pool; results are the same at any number of threads.
+    """World on a thread pool; fulfils `brokk_rl.contracts.world.World`.
+
+    Results are the same at any number of threads.
 
     Args:
         machine: The machine.
@@ -69,7 +71,7 @@ class NativeWorld:
         )
 
     def bare_step(self) -> None:
-        """Do nothing but `mujoco.batch`: as many substeps, no drive, nothing read out; what `step` is held against."""
+        """Run the substeps of `mujoco.batch` alone, without drive and read-out; `step` compares with it."""
         self._batch.step(nstep=self._substeps)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
@@ -94,7 +96,7 @@ class NativeWorld:
         return {name: tensor.clone() for name, tensor in self._stored().items()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a copy that `state_dict` returned."""
         for name, tensor in self._stored().items():
             tensor.copy_(state[name])
 

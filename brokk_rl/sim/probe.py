@@ -1,4 +1,4 @@
-"""What of MuJoCo and Warp works on this computer; each probe returns text or raises whatever went wrong."""
+"""Probes of MuJoCo and Warp on this computer; each returns text or raises an exception."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ def find_kernel_cache() -> Path:
 
 
 def capture_graph() -> str:
-    """Capture a small Warp kernel launch on the first GPU in a CUDA graph and replays it; needs no compiled kernel.
+    """Capture a small Warp copy on the first GPU in a CUDA graph and replay it.
+
+    Needs no compiled kernel.
 
     Raises:
         RuntimeError: The graph cannot be captured or does not do its work.
@@ -44,7 +46,7 @@ def capture_graph() -> str:
 
 
 def find_renderer() -> str | None:
-    """Return the first value of MUJOCO_GL with which a picture can be drawn here, `None` when there is none.
+    """Return the first value of MUJOCO_GL that can draw a picture here, `None` when there is none.
 
     MuJoCo settles on one library at import and a broken driver may end the process, so each try has
     a process of its own.
@@ -92,7 +94,7 @@ def render_test_picture() -> None:
 
 
 def _start_warp_quietly() -> Any:
-    """Start Warp without its banner; what it would say about the GPU, the doctor says itself."""
+    """Start Warp without its banner; the doctor reports the GPU itself."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR

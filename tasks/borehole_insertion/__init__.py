@@ -22,7 +22,7 @@ DOWN_RAD = math.pi / 2
 
 @spec
 class BoreholeRanges:
-    """Where the borehole may be; uniform ranges (lowest, highest).
+    """Ranges of the borehole; uniform (lowest, highest).
 
     Attributes:
         distance_m: Horizontal distance of the rim's centre from the slew axis.
@@ -43,7 +43,7 @@ class BoreholeRanges:
 
 @spec
 class InsertionCriteria:
-    """When the chisel counts as inserted.
+    """Criteria of an inserted chisel.
 
     Attributes:
         strict_depth_m: Depth of the tip below the rim, inside the hole.
@@ -186,7 +186,10 @@ def _measure_closeness(
     inside_m: torch.Tensor,
     depth_m: float,
 ) -> torch.Tensor:
-    """Return how near an insertion is to done, 0 to 1: distance at three scales, alignment at three, depth inside the hole."""
+    """Return the closeness of an insertion, 0 to 1.
+
+    Sum of distance at three scales, alignment at three, and depth inside the hole.
+    """
     approach = sum(1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.1)) / 3
     aligned = sum(1 / (1 + lateral_m / scale) for scale in (0.1, 0.03, 0.01)) / 3
     upright = 1 / (1 + turn_rad / 0.2)
