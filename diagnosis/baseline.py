@@ -232,13 +232,9 @@ def fit_baseline(
     field = compare_simulator(actuator, _list_started(case.field), machine, seed)
     if tuned := tune_parameters([one.residuals for one in left_out]):
         actuator = apply_changes(actuator, tuned, machine)
-        left_out = _set_covariances(
-            [
-                one.with_base(apply_changes(one.residuals.simulator.base, tuned, machine))
-                for one in left_out
-            ],
-            machine,
-        )
+        changed = [apply_changes(one.residuals.simulator.base, tuned, machine) for one in left_out]
+        left_out = [one.with_base(base) for one, base in zip(left_out, changed, strict=True)]
+        left_out = _set_covariances(left_out, machine)
         field = field.with_base(actuator)
     field = replace(
         field, residuals=replace(field.residuals, valid_mask=_find_known_windows(case, field))
@@ -416,10 +412,8 @@ def _is_one_sided(kind: EffectType) -> bool:
 
 def _list_trials(kind: EffectType) -> dict[str, list[ParameterRay]]:
     """Return the ways in which an effect can grow, by a name for each of its shapes."""
-    trials: list[dict[str, float]] = [
-        {},
-        *({number: part} for number in kind.shaping for part in SHAPE_FACTORS),
-    ]
+    trials: list[dict[str, float]] = [{}]
+    trials += [{number: part} for number in kind.shaping for part in SHAPE_FACTORS]
     found = {}
     for place, trial in enumerate(trials):
         shape = {name: np.full(kind.num_joints, part) for name, part in trial.items()}
@@ -498,6 +492,5 @@ def _wrap_simulator(
         )
 
     left_out = [around(one) for one in base.left_out]
-    known = fit_covariances(left_out, machine)
-    left_out = [replace(one, residuals=replace(one.residuals, noise=known)) for one in left_out]
+    left_out = _set_covariances(left_out, machine)
     return replace(base, field=around(base.field), left_out=left_out)

@@ -126,16 +126,9 @@ def restore_result(
 def choose_again(
     tables: Sequence[SubsetTable], price: Any, penalties: Penalties, kinds: Sequence[EffectType]
 ) -> EffectSet:
-    """Return the set that is worth most at these prices."""
-    return choose_set(
-        tables,
-        price,
-        penalties.name,
-        penalties.share,
-        list_shared_effects(kinds),
-        penalties.partial,
-        penalties.joint,
-    )
+    """Return the set with the largest net gain at these penalties."""
+    shared, own = list_shared_effects(kinds), penalties
+    return choose_set(tables, price, own.name, own.share, shared, own.partial, own.joint)
 
 
 SAME_SHARE = 0.9
@@ -366,7 +359,9 @@ def compute_effect_probabilities(
 
 
 def is_unknown(result: DetectionResult, penalties: Penalties, weights: ProbabilityModel) -> bool:
-    """Return True where an unknown cause is told: where effects were found from `SAID` on, else where it is more probable than none.
+    """Return True where the answer is an unknown cause.
+
+    Beside detected effects that takes a probability above `MIN_UNKNOWN`, else above that of none.
 
     What sensors, frames or tool points show for sure is there whatever moves a joint besides: that
     is then a remainder.

@@ -57,8 +57,10 @@ joint."""
 
 
 def is_needed(residuals: Residuals, fitted: FittedSet, promised: float) -> bool:
-    """Return True where effects hardly add up: sizes are far beyond the typical, and some hide others, or earn far less than `promised`.
+    """Return True where the responses of the set do not add up.
 
+    Sizes are then far beyond the typical ones, and an effect hides others or gains far less than
+    `promised`.
     What acts on the command hides what else does: nothing shows within a dead band. A speed that is
     far off hides nothing.
     """
