@@ -42,7 +42,9 @@ class SimulatedMachines:
         """The actuator and its effects."""
         inner = getattr(self.actuator, "actuator", self.actuator)
         effects = getattr(self.actuator, "effects", {})
-        return "simulator: " + " + ".join([type(inner).__name__, *effects])
+        # recordings keep the name of a class that was renamed
+        name = getattr(inner, "label", type(inner).__name__)
+        return "simulator: " + " + ".join([name[:1].upper() + name[1:], *effects])
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> SimulatedMachinesLink:
         """Return a link to `num_runs` machines."""
