@@ -13,6 +13,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.registry import resolve_package_path
 from brokk_rl.sim.drive import add_drive
 from brokk_rl.sim.scene import add_block
 
@@ -60,11 +61,11 @@ def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
             f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose "
             "another machine=…"
         )
-    path = ASSETS / machine.mjcf
+    path = ASSETS / resolve_package_path(machine.mjcf)
     if not path.exists():
         raise ConfigError(
-            f"machine {machine.name}: no MJCF at {path}; set `mjcf` to a file under {ASSETS} or "
-            "to an absolute path"
+            f"machine {machine.name}: no MJCF at {path}; set `mjcf` to a file under {ASSETS},"
+            " to package:path, or to an absolute path"
         )
     try:  # included rather than attached, so that names stay as the MJCF gives them
         includes = "".join(f'<include file="{file}"/>' for file in (ASSETS / "worksite.xml", path))
