@@ -16,7 +16,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.sim.scene import make_nominal_scenes
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 
 LOGGED_STATES = ("oil_c",)
 """States of an actuator model, one number a machine, that the machine's sensors show."""
@@ -42,9 +42,7 @@ class SimulatedMachines:
         """The actuator and its effects."""
         inner = getattr(self.actuator, "actuator", self.actuator)
         effects = getattr(self.actuator, "effects", {})
-        # recordings keep the name of a class that was renamed
-        name = getattr(inner, "label", type(inner).__name__)
-        return "simulator: " + " + ".join([name[:1].upper() + name[1:], *effects])
+        return "simulator: " + " + ".join([name_spec(inner).capitalize(), *effects])
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> SimulatedMachinesLink:
         """Return a link to `num_runs` machines."""
