@@ -87,7 +87,7 @@ class FrameLabel:
 
 
 def list_stems(folder: Path) -> list[Path]:
-    """Returns the frames of a folder, sorted: each path without its endings.
+    """Return the frames of a folder, sorted: each path without its endings.
 
     Raises:
         FrameError: there is no such folder, or no frame in it.
@@ -107,7 +107,7 @@ def list_stems(folder: Path) -> list[Path]:
 
 
 def read_truth(stem: Path) -> SceneTruth:
-    """Returns the truth of the rendered frame at `stem`.
+    """Return the truth of the rendered frame at `stem`.
 
     Raises:
         FrameError: it has none, or one that cannot be read.
@@ -128,7 +128,7 @@ def read_truth(stem: Path) -> SceneTruth:
 
 
 def read_label(stem: Path) -> FrameLabel:
-    """Returns the masks of the rendered frame at `stem`.
+    """Return the masks of the rendered frame at `stem`.
 
     Raises:
         FrameError: it has none, or one that cannot be read.
@@ -144,7 +144,7 @@ def read_label(stem: Path) -> FrameLabel:
 
 
 def encode_mask(label: FrameLabel) -> np.ndarray:
-    """Returns masks as they stand in the file, `(h, w)` uint8."""
+    """Return masks as they stand in the file, `(h, w)` uint8."""
     return (BLOCK * label.block + HOLE_MASK * label.hole_mask + ARM * label.arm).astype(np.uint8)
 
 
@@ -155,7 +155,7 @@ def write_camera(
     baseline_m: float | None,
     dist: Sequence[float] = (),
 ) -> None:
-    """Writes `camera.yaml`.
+    """Write `camera.yaml`.
 
     Raises:
         StorageError: it could not be written.
@@ -179,7 +179,7 @@ def write_frame(
     label: FrameLabel | None = None,
     truth: SceneTruth | None = None,
 ) -> None:
-    """Writes a frame, the truth last: where that stands, all of it does.
+    """Write a frame, the truth last: where that stands, all of it does.
 
     Raises:
         StorageError: a file could not be written.
@@ -202,7 +202,7 @@ def write_frame(
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """Writes a picture, grey or BGR, as PNG.
+    """Write a picture, grey or BGR, as PNG.
 
     Raises:
         StorageError: it could not be written.
@@ -223,7 +223,7 @@ def _build_path(stem: Path, ending: str) -> Path:
 
 
 def _write(path: Path, value: bytes | np.ndarray) -> None:
-    """Writes a file in one step: readers see all of it or none."""
+    """Write a file in one step: readers see all of it or none."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

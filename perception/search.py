@@ -64,7 +64,7 @@ class SearchLevel:
     nearest_m: np.ndarray | None = None
 
     def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
-        """Returns the ellipses of this level that have a possible size where they are, in px of the picture `(h, w)`."""
+        """Return the ellipses of this level that have a possible size where they are, in px of the picture `(h, w)`."""
         return [one for one in self._found(detector, gray) if self._fits(one)]
 
     def _fits(self, one: Ellipse) -> bool:
@@ -126,7 +126,7 @@ class SearchLevel:
 def plan_search_levels(
     frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfortable_px: float
 ) -> list[SearchLevel]:
-    """Returns where to look: each part of the block in the coarsest resolution in which a hole there has a good size.
+    """Return where to look: each part of the block in the coarsest resolution in which a hole there has a good size.
 
     A circle's major semi-axis is focal length times radius over depth, however it is tilted. What
     is looked at reaches as far
@@ -200,7 +200,7 @@ def plan_search_levels(
 
 
 def merge_levels_to_box(mask: np.ndarray, whole: Sequence[SearchLevel]) -> list[SearchLevel]:
-    """Returns one level instead, in full resolution: the bounding box of the mask, as large as a hole may be anywhere."""
+    """Return one level instead, in full resolution: the bounding box of the mask, as large as a hole may be anywhere."""
     x, y, wide, high = cv2.boundingRect(mask.view(np.uint8))
     region = np.zeros([-(-size // STEP) for size in mask.shape], np.uint8)
     region[y // STEP : (y + high - 1) // STEP + 1, x // STEP : (x + wide - 1) // STEP + 1] = 1
@@ -214,7 +214,7 @@ def merge_levels_to_box(mask: np.ndarray, whole: Sequence[SearchLevel]) -> list[
 
 
 def _measure_occluders(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Returns how large a hole looks at least on what stands before a face, `(h, w)`, `NOWHERE` where nothing does.
+    """Return how large a hole looks at least on what stands before a face, `(h, w)`, `NOWHERE` where nothing does.
 
     Args:
         seen_px: How large it would look at each place, 0 where nobody knows.

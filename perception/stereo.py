@@ -69,7 +69,7 @@ class Stereo:
     def depth_m(
         self, left: np.ndarray, right: np.ndarray, focal_px: float, baseline_m: float
     ) -> np.ndarray:
-        """Returns depth along z for each pixel of the left picture, `(h, w)` float32, NaN where unknown.
+        """Return depth along z for each pixel of the left picture, `(h, w)` float32, NaN where unknown.
 
         Args:
             left: RGB, `(h, w, 3)` uint8.
@@ -90,7 +90,7 @@ class Stereo:
         ).astype(np.float32)
 
     def _matched(self, left: np.ndarray, right: np.ndarray, largest_px: float) -> np.ndarray:
-        """Returns disparities, NaN where there is none."""
+        """Return disparities, NaN where there is none."""
         count = min(-(-int(np.ceil(largest_px)) // 16), max(1, (left.shape[1] - 1) // 16)) * 16
         step = self.smoothness * self.window_px**2
         matcher = cv2.StereoSGBM.create(
@@ -111,7 +111,7 @@ class Stereo:
         )
 
     def _refined(self, left: np.ndarray, right: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Returns disparities that make the windows of both pictures agree best, whatever their brightness and contrast."""
+        """Return disparities that make the windows of both pictures agree best, whatever their brightness and contrast."""
         one, other = (
             cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _SMOOTH_PX)
             for picture in (left, right)

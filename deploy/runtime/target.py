@@ -33,7 +33,7 @@ class TargetPosition:
     t_s: float | None
 
     def write(self, slot: Slot) -> None:
-        """Makes it the loop's target."""
+        """Make it the loop's target."""
         record = slot.new()
         record["t_s"] = time.monotonic() if self.t_s is None else self.t_s
         record["center_in_base_m"], record["std_m"] = self.center_in_base_m, self.std_m
@@ -44,7 +44,7 @@ class TargetProvider(Protocol):
     """Knows the borehole."""
 
     def news(self, holes: list[Any]) -> TargetPosition | None:
-        """Returns the borehole where there is news of it, else `None`; called several times a second.
+        """Return the borehole where there is news of it, else `None`; called several times a second.
 
         Args:
             holes: What perception knows, records of `deploy.runtime.shm_layout.HOLE`.
@@ -59,7 +59,7 @@ class TargetSpec(Protocol):
     """A spec in `conf/target`."""
 
     def build(self) -> TargetProvider:
-        """Returns it at work."""
+        """Return it at work."""
         ...
 
 
@@ -74,7 +74,7 @@ class GivenTarget:
     center_in_base_m: tuple[float, float, float]
 
     def build(self) -> TargetProvider:
-        """Returns it at work; see `TargetSource`."""
+        """Return it at work; see `TargetSource`."""
         return _FixedTarget(TargetPosition(np.array(self.center_in_base_m), 0.0, None))
 
 
@@ -89,7 +89,7 @@ class FileTarget:
     path: str
 
     def build(self) -> TargetProvider:
-        """Returns it at work; see `TargetSource`."""
+        """Return it at work; see `TargetSource`."""
         return _WatchedFile(Path(self.path))
 
 
@@ -104,7 +104,7 @@ class DetectedTarget:
     score: float
 
     def build(self) -> TargetProvider:
-        """Returns it at work; see `TargetSource`."""
+        """Return it at work; see `TargetSource`."""
         return _SurestHole(self.score)
 
 
@@ -124,7 +124,7 @@ class TargetSelector:
         self._place: TargetPosition | None = None
 
     def refresh(self) -> None:
-        """Takes over news.
+        """Take over news.
 
         Raises:
             ConfigError: the configured source makes no sense now.
@@ -136,12 +136,12 @@ class TargetSelector:
             self._place.write(self._slot)
 
     def choose(self, place: TargetPosition) -> None:
-        """Takes what a person has chosen."""
+        """Take what a person has chosen."""
         self._place = place
         place.write(self._slot)
 
     def _seen(self, known: list[Any]) -> TargetPosition | None:
-        """Returns what the camera says of the borehole since the last time."""
+        """Return what the camera says of the borehole since the last time."""
         place = self._place
         if place is None:
             return None
@@ -152,13 +152,13 @@ class TargetSelector:
 
 
 def read_holes(slot: Slot) -> list[Any]:
-    """Returns the boreholes that perception knows, records of `HOLE`."""
+    """Return the boreholes that perception knows, records of `HOLE`."""
     record = slot.read()
     return [] if record is None else list(record["holes"][: int(record["count"])])
 
 
 def find_nearest(holes: list[Any], center_m: np.ndarray) -> Any | None:
-    """Returns that of `holes` which is the borehole at `center_m`, if any."""
+    """Return that of `holes` which is the borehole at `center_m`, if any."""
     one = min(
         holes,
         key=lambda hole: float(np.linalg.norm(hole["center_in_base_m"] - center_m)),
@@ -172,7 +172,7 @@ def find_nearest(holes: list[Any], center_m: np.ndarray) -> Any | None:
 
 
 def locate_hole(hole: Any) -> TargetPosition:
-    """Returns where a borehole is that perception knows."""
+    """Return where a borehole is that perception knows."""
     return TargetPosition(
         np.array(hole["center_in_base_m"]), float(hole["std_m"]), float(hole["t_s"])
     )

@@ -70,7 +70,7 @@ class StereoPatch:
     pull_px: float
 
     def places(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns columns `(1, w)` and rows `(h, 1)` in the picture of those of `left`, `(w,)` and `(h,)`."""
+        """Return columns `(1, w)` and rows `(h, 1)` in the picture of those of `left`, `(w,)` and `(h,)`."""
         u, v = (
             (some + 0.5) * self.shrink - 0.5 + corner
             for some, corner in zip((columns, rows), self.corner, strict=True)
@@ -78,7 +78,7 @@ class StereoPatch:
         return u[None, :], v[:, None]
 
     def on_plane(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
-        """Returns where `right` shows the points of a plane that the left one has at such places, columns `(h, w)`."""
+        """Return where `right` shows the points of a plane that the left one has at such places, columns `(h, w)`."""
         return (
             u
             - self.pull_px * compute_inverse_depth(m, self.camera_matrix, u, v)
@@ -89,15 +89,15 @@ class StereoPatch:
     def seen(
         self, u: np.ndarray, v: np.ndarray, row: np.ndarray, m: np.ndarray, picture: np.ndarray
     ) -> np.ndarray:
-        """Returns what a picture like `right`, of one channel or more, shows of the points of a plane; `row` as `remap` has it."""
+        """Return what a picture like `right`, of one channel or more, shows of the points of a plane; `row` as `remap` has it."""
         return cv2.remap(picture, self.on_plane(u, v, m).astype(np.float32), row, cv2.INTER_CUBIC)
 
     def column(self, u: float) -> float:
-        """Returns the column of `left` of a column of the picture."""
+        """Return the column of `left` of a column of the picture."""
         return (u - self.corner[0] + 0.5) / self.shrink - 0.5
 
     def row(self, v: float) -> float:
-        """Returns the row of `left` of a row of the picture."""
+        """Return the row of `left` of a row of the picture."""
         return (v - self.corner[1] + 0.5) / self.shrink - 0.5
 
     def inside(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
@@ -109,7 +109,7 @@ class StereoPatch:
 def crop_pair(
     frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, outer: float
 ) -> StereoPatch | None:
-    """Returns the surroundings of an ellipse `(5,)`, up to `outer` of its radii, in both pictures; `None` without a right one."""
+    """Return the surroundings of an ellipse `(5,)`, up to `outer` of its radii, in both pictures; `None` without a right one."""
     if frame.right is None or frame.baseline_m is None or frame.right.shape != frame.color.shape:
         return None
     height, width = gray.shape
@@ -154,7 +154,7 @@ def align_plane(
     cell_px: int,
     bias_per_m: float,
 ) -> FacePlane | None:
-    """Returns the plane by which the two pictures agree best on the face; `face` itself where too little of it is in sight.
+    """Return the plane by which the two pictures agree best on the face; `face` itself where too little of it is in sight.
 
     `None` where they do not agree: the right picture is another's, or shifted.
 
@@ -208,7 +208,7 @@ def align_plane(
     weight, counted = weight[..., None], counted[..., None]
 
     def departing(values: np.ndarray) -> np.ndarray:
-        """Returns what two pictures `(h, w, 2)` show on the face, less the mean of a window, `(2, P)`."""
+        """Return what two pictures `(h, w, 2)` show on the face, less the mean of a window, `(2, P)`."""
         departs = values - cv2.boxFilter(values * weight, -1, window) / counted
         return departs.reshape(-1, 2)[at].T.astype(float)
 
@@ -252,7 +252,7 @@ def align_plane(
 
 
 def merge_planes(first: FacePlane, second: FacePlane, bias_per_m: float) -> FacePlane:
-    """Returns the plane between two, each weighted by what it knows best; the whole of the first may be off by a bias."""
+    """Return the plane between two, each weighted by what it knows best; the whole of the first may be off by a bias."""
     doubt = first.cov + np.diag([0.0, 0.0, bias_per_m**2])
     weights = [np.linalg.inv(cov) for cov in (doubt, second.cov)]
     cov = np.linalg.inv(weights[0] + weights[1])
@@ -267,7 +267,7 @@ def measure_parallax(
     inner: float,
     ring: tuple[float, float],
 ) -> tuple[float, float]:
-    """Returns how much the pictures differ inside an ellipse by the plane's warp, over how much they do on the face around it.
+    """Return how much the pictures differ inside an ellipse by the plane's warp, over how much they do on the face around it.
 
     A flat disc looks the same from both cameras, the inside of a hole does not. NaN where too
     little of it can be seen. With it, the part of the inside that something hides from the right

@@ -54,7 +54,7 @@ def measure_interior(
     camera_matrix: np.ndarray,
     plane: FacePlane | None,
 ) -> Interior:
-    """Returns what is seen inside an ellipse `(5,)`; slope and depth need the plane of the face."""
+    """Return what is seen inside an ellipse `(5,)`; slope and depth need the plane of the face."""
     x, y, a = ellipse[:3]
     reach = a * RING[1] + 2
     top, left = max(0, int(y - reach)), max(0, int(x - reach))
@@ -108,7 +108,7 @@ def measure_interior(
 
 
 def _measure_contrast(ring: np.ndarray, dark: float) -> float:
-    """Returns by how much `dark` is darker than a ring, in standard deviations of its grain.
+    """Return by how much `dark` is darker than a ring, in standard deviations of its grain.
 
     The edge of a shadow across the ring is no grain: the darker of its two parts (Otsu 1979)
     counts, by what varies within it.
@@ -133,7 +133,7 @@ def _measure_darkest_around(
     camera_matrix: np.ndarray,
     plane: FacePlane | None,
 ) -> float:
-    """Returns the grey level of the darkest hundredth of what is on or behind the face around an ellipse; 0 where nothing is."""
+    """Return the grey level of the darkest hundredth of what is on or behind the face around an ellipse; 0 where nothing is."""
     x, y, wide = ellipse[0], ellipse[1], WIDE * ellipse[2]
     step = max(2, int(wide / 60))
     rows, columns = (
@@ -151,13 +151,13 @@ def _measure_darkest_around(
 
 
 def _list_pixels(there: np.ndarray, left: int, top: int) -> np.ndarray:
-    """Returns column and row of the pixels of a part of a picture, `(P, 2)`."""
+    """Return column and row of the pixels of a part of a picture, `(P, 2)`."""
     line, column = np.nonzero(there)
     return np.column_stack([column + left, line + top])
 
 
 def _fit_brightness_gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """Returns the mean slope of brightness `(P,)` over places of a ring `(P, 2)`, `(2,)` grey levels a pixel.
+    """Return the mean slope of brightness `(P,)` over places of a ring `(P, 2)`, `(2,)` grey levels a pixel.
 
     What departs much from it does not count.
     """

@@ -31,7 +31,7 @@ class CentreDepth:
     std_m: float
 
     def build(self) -> CentreDepthEstimator:
-        """Returns an estimator."""
+        """Return an estimator."""
         return CentreDepthEstimator(self)
 
 
@@ -44,7 +44,7 @@ class CentreDepthEstimator:
         self.settings = settings
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Returns the point at the ellipse's centre with the mean normal around it; see `PoseEstimator`."""
+        """Return the point at the ellipse's centre with the mean normal around it; see `PoseEstimator`."""
         s = self.settings
         half = s.window_px // 2
         u, v = round(ellipse.x), round(ellipse.y)
@@ -76,7 +76,7 @@ class CentreDepthEstimator:
         )
 
     def _normals(self, frame: Frame, row: np.ndarray) -> np.ndarray:
-        """Returns unit normals of the depth beside the rim, `(K, 3)`, from differences over a few pixels."""
+        """Return unit normals of the depth beside the rim, `(K, 3)`, from differences over a few pixels."""
         wide = row + np.array([0, 0, self.settings.ring_px, self.settings.ring_px, 0])
         places = conic.sample_ellipses(
             wide[None], np.arange(self.NUM_NORMALS) * 2 * np.pi / self.NUM_NORMALS

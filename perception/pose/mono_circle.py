@@ -32,7 +32,7 @@ class MonoCircle:
     darkness: float
 
     def build(self) -> MonoCircleEstimator:
-        """Returns an estimator."""
+        """Return an estimator."""
         return MonoCircleEstimator(self)
 
 
@@ -43,7 +43,7 @@ class MonoCircleEstimator:
         self.settings = settings
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Returns the expected one of two circles; see `PoseEstimator`."""
+        """Return the expected one of two circles; see `PoseEstimator`."""
         s = self.settings
         if frame.base_from_camera is None:
             return Rejection("pose", "known pose of the camera", 0.0, 1.0, ellipse)

@@ -55,17 +55,17 @@ class FacePlane:
         return -self.m / np.linalg.norm(self.m)
 
     def normal_cov_rad2(self) -> np.ndarray:
-        """Returns the covariance of the normal, `(3, 3)`, singular along it."""
+        """Return the covariance of the normal, `(3, 3)`, singular along it."""
         length = np.linalg.norm(self.m)
         project = (np.eye(3) - np.outer(self.normal, self.normal)) / length
         return project @ self.cov @ project
 
     def inverse_depth(self, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns its inverse depth at columns and rows of a picture, of broadcast shapes; see `inverse_depth`."""
+        """Return its inverse depth at columns and rows of a picture, of broadcast shapes; see `inverse_depth`."""
         return compute_inverse_depth(self.m, camera_matrix, u, v)
 
     def point(self, ray: np.ndarray) -> np.ndarray:
-        """Returns where a ray `(3,)` with z = 1 meets it."""
+        """Return where a ray `(3,)` with z = 1 meets it."""
         return ray / float(self.m @ ray)
 
 
@@ -92,7 +92,7 @@ class FaceSupport:
 def compute_inverse_depth(
     m: np.ndarray, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> np.ndarray:
-    """Returns inverse depth on a plane `m · P = 1` at columns and rows of a picture: linear in both, so of whole rows at once."""
+    """Return inverse depth on a plane `m · P = 1` at columns and rows of a picture: linear in both, so of whole rows at once."""
     across, down, middle = np.linalg.solve(camera_matrix.T, m)
     return across * u + (down * v + middle)
 
@@ -109,7 +109,7 @@ def collect_support(
     most: int,
     cell_px: int,
 ) -> FaceSupport:
-    """Returns the pixels with known depth between `inner` and `outer` radii of an ellipse `(5,)`.
+    """Return the pixels with known depth between `inner` and `outer` radii of an ellipse `(5,)`.
 
     A circle of a known radius says itself about how far away it is and how its plane leans: what is
     much nearer is something that stands before it, what is much farther lies behind the block.
@@ -160,7 +160,7 @@ def collect_support(
 def fit_plane(
     points: FaceSupport, rings: tuple[float, ...], floor: float, generator: np.random.Generator
 ) -> FacePlane | None:
-    """Returns the plane that the points around the ellipse lie on, grown from the ring near it outwards.
+    """Return the plane that the points around the ellipse lie on, grown from the ring near it outwards.
 
     `None` where they determine none: there are too few, they lie on a line, or nearly all that
     agree in one cell.
@@ -222,7 +222,7 @@ def fit_plane(
 
 
 def compute_upper_median(values: np.ndarray) -> float:
-    """Returns the median of many values `(P,)`, of an even number the larger one in the middle."""
+    """Return the median of many values `(P,)`, of an even number the larger one in the middle."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
 
@@ -230,7 +230,7 @@ def compute_upper_median(values: np.ndarray) -> float:
 def _guess_plane(
     rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40
 ) -> np.ndarray:
-    """Returns the plane through three points that most points lie nearest to (least median of squares)."""
+    """Return the plane through three points that most points lie nearest to (least median of squares)."""
     judge = generator.integers(len(rays), size=min(len(rays), 400))
     triples = generator.integers(len(rays), size=(trials, 3))
     triples = triples[np.abs(np.linalg.det(rays[triples])) > 1e-9]
@@ -243,7 +243,7 @@ def _guess_plane(
 
 
 def number_cells(cell: np.ndarray) -> np.ndarray:
-    """Returns the numbers of cells `(P,)` from 0 on, of points row by row; where there are too few, of bands of rows instead."""
+    """Return the numbers of cells `(P,)` from 0 on, of points row by row; where there are too few, of bands of rows instead."""
     cell = np.unique(cell, return_inverse=True)[1]
     return (
         cell
@@ -253,7 +253,7 @@ def number_cells(cell: np.ndarray) -> np.ndarray:
 
 
 def compute_psi_slope(off: np.ndarray) -> np.ndarray:
-    """Returns by how much of a residual, `off` in reaches of Tukey's biweight `(P,)`, its pull changes, over its weight.
+    """Return by how much of a residual, `off` in reaches of Tukey's biweight `(P,)`, its pull changes, over its weight.
 
     A residual that grows counts less and less: a fit gives way to noise further than its weights
     alone say, by a fifth with a reach of 4.7 standard deviations, by a half with one of 3.
@@ -265,7 +265,7 @@ def compute_psi_slope(off: np.ndarray) -> np.ndarray:
 def estimate_sandwich_covariance(
     slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: np.ndarray
 ) -> np.ndarray | None:
-    """Returns the covariance of a fit of three numbers, `(3, 3)`, by how it changes without each cell, in which noise may be alike.
+    """Return the covariance of a fit of three numbers, `(3, 3)`, by how it changes without each cell, in which noise may be alike.
 
     `None` where it is none without one of them.
 

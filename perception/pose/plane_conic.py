@@ -137,7 +137,7 @@ class PlaneConic:
             )
 
     def build(self) -> PlaneConicEstimator:
-        """Returns an estimator."""
+        """Return an estimator."""
         return PlaneConicEstimator(self)
 
 
@@ -152,7 +152,7 @@ class PlaneConicEstimator:
         self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Returns the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
+        """Return the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
         s = self.settings
         row = as_row(ellipse)
         gray, allowed = self._pictures(frame, masks)
@@ -239,7 +239,7 @@ class PlaneConicEstimator:
         )
 
     def _pictures(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the grey picture and the pixels of the face, which all ellipses of a frame share."""
+        """Return the grey picture and the pixels of the face, which all ellipses of a frame share."""
         if self._seen is None or self._seen[0] is not frame or self._seen[1] is not masks:
             allowed = masks.block > 0.5
             if masks.hole_mask is not None:
@@ -250,7 +250,7 @@ class PlaneConicEstimator:
     def _shape(
         self, face: FacePlane, row: np.ndarray, frame: Frame, ellipse: Ellipse
     ) -> bool | Rejection:
-        """Returns whether an ellipse has size and shape of a rim with nothing forgiven, or which gate it does not pass."""
+        """Return whether an ellipse has size and shape of a rim with nothing forgiven, or which gate it does not pass."""
         s = self.settings
         ray = np.linalg.solve(frame.camera_matrix, np.array([row[0], row[1], 1.0]))
         cosine = -float(face.normal @ ray) / float(np.linalg.norm(ray))
@@ -325,7 +325,7 @@ class PlaneConicEstimator:
 
 
 def compute_center_covariance(face: FacePlane, circle: RimCircle, bias_per_m: float) -> np.ndarray:
-    """Returns the covariance of a centre, `(3, 3)` m²: along the ray by the plane's, on the plane by the circle's."""
+    """Return the covariance of a centre, `(3, 3)` m²: along the ray by the plane's, on the plane by the circle's."""
     center = circle.center_m
     ray = center / center[2]
     depth_var = center[2] ** 4 * (float(ray @ face.cov @ ray) + bias_per_m**2)
@@ -333,7 +333,7 @@ def compute_center_covariance(face: FacePlane, circle: RimCircle, bias_per_m: fl
 
 
 def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float:
-    """Returns the part of a rim on a face, about where an ellipse `(5,)` is, before which something nearer stands.
+    """Return the part of a rim on a face, about where an ellipse `(5,)` is, before which something nearer stands.
 
     It may be smaller than the rim; and where the nearer thing begins, its depth is often unknown.
     """
@@ -357,17 +357,17 @@ def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float
 
 
 def as_row(ellipse: Ellipse) -> np.ndarray:
-    """Returns centre, semi-axes and direction, `(5,)`."""
+    """Return centre, semi-axes and direction, `(5,)`."""
     return np.array([ellipse.x, ellipse.y, ellipse.a, ellipse.b, ellipse.theta_rad])
 
 
 def convert_to_gray(frame: Frame) -> np.ndarray:
-    """Returns the frame's picture in grey, `(h, w)` uint8."""
+    """Return the frame's picture in grey, `(h, w)` uint8."""
     return cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
 
 
 def average_inside(picture: np.ndarray, row: np.ndarray) -> float:
-    """Returns the mean of a picture within 0.8 of an ellipse."""
+    """Return the mean of a picture within 0.8 of an ellipse."""
     x, y, a = row[:3]
     top, left = max(0, int(y - a)), max(0, int(x - a))
     part = picture[top : int(y + a) + 2, left : int(x + a) + 2]

@@ -71,7 +71,7 @@ class PlaneChart:
     camera_matrix: np.ndarray
 
     def flat(self, pixels: np.ndarray) -> np.ndarray:
-        """Returns the coordinates of what is seen at pixels, `(…, 2)`."""
+        """Return the coordinates of what is seen at pixels, `(…, 2)`."""
         rays = (
             np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1)
             @ np.linalg.inv(self.camera_matrix).T
@@ -80,7 +80,7 @@ class PlaneChart:
         return np.stack([away @ self.first, away @ self.second], -1)
 
     def seen(self, circle: np.ndarray) -> np.ndarray:
-        """Returns the ellipse `(5,)` that a circle `(x, y, radius)` is in the picture."""
+        """Return the ellipse `(5,)` that a circle `(x, y, radius)` is in the picture."""
         x, y, radius = circle
         back = np.linalg.inv(
             self.camera_matrix @ np.column_stack([self.first, self.second, self.origin])
@@ -102,7 +102,7 @@ def fit_rim_circle(
     center_px: float,
     shape_px: float,
 ) -> RimCircle | None:
-    """Returns the circle on the plane `m · P = 1` whose rim has the most edges of dark to bright; `None` where nothing agrees.
+    """Return the circle on the plane `m · P = 1` whose rim has the most edges of dark to bright; `None` where nothing agrees.
 
     Args:
         gray: Picture, `(h, w)` uint8.
@@ -153,7 +153,7 @@ def fit_rim_circle(
 def _find_profile_edges(
     gray: np.ndarray, ellipse: np.ndarray, reach_px: float, chart: PlaneChart
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns the steepest places of profiles across an ellipse on the plane, and how long a pixel is there.
+    """Return the steepest places of profiles across an ellipse on the plane, and how long a pixel is there.
 
     Returns:
         Places `(P, PEAKS, 2)` m, NaN where there are fewer, and the length on the plane of a pixel
@@ -208,7 +208,7 @@ def _find_profile_edges(
 def _vote_for_circle(
     edges: np.ndarray, pixel_m: np.ndarray, radius_m: float, tolerance: float
 ) -> np.ndarray | None:
-    """Returns the circle `(x, y, radius)` through three edges that most profiles speak for."""
+    """Return the circle `(x, y, radius)` through three edges that most profiles speak for."""
     places, owner = edges.reshape(-1, 2), np.repeat(np.arange(len(edges)), edges.shape[1])
     known = np.isfinite(places[:, 0])
     places, owner = places[known], owner[known]
@@ -239,7 +239,7 @@ def _vote_for_circle(
 def _fit_circle(
     start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray, center_px: float, shape_px: float
 ) -> tuple[np.ndarray | None, np.ndarray, float, float]:
-    """Returns the circle that fits the edges nearest to one, the covariance of its centre, its residual in px and its coverage."""
+    """Return the circle that fits the edges nearest to one, the covariance of its centre, its residual in px and its coverage."""
     found = start
     for scale_px in (NARROW_PX, INLIER_PX, 0.6 * INLIER_PX):
         away = edges - found[:2]

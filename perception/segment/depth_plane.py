@@ -32,7 +32,7 @@ class SightGrid:
 
     @staticmethod
     def of(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> SightGrid:
-        """Returns that of the middles of cells of `step` x `step` px."""
+        """Return that of the middles of cells of `step` x `step` px."""
         y, x = (
             (
                 (np.arange(count) * step + step // 2 - camera_matrix[k, 2]) / camera_matrix[k, k]
@@ -42,30 +42,30 @@ class SightGrid:
         return SightGrid(x, y)
 
     def sight(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Returns the lines of sight of some of them, `(…, 3)`."""
+        """Return the lines of sight of some of them, `(…, 3)`."""
         return np.stack([self.x[columns], self.y[rows], np.ones(rows.shape, np.float32)], -1)
 
     @cached_property
     def half(self) -> SightGrid:
-        """Returns every second of them, in double precision."""
+        """Return every second of them, in double precision."""
         return SightGrid(self.x[::2].astype(float), self.y[::2].astype(float))
 
     @cached_property
     def powers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns 1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: what sums over pixels are made of, by rows and columns."""
+        """Return 1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: what sums over pixels are made of, by rows and columns."""
         across, down = (
             np.stack([np.ones_like(some), some, some * some]) for some in (self.x, self.y)
         )
         return across, down
 
     def inverse(self, plane: np.ndarray) -> np.ndarray:
-        """Returns inverse depth on a plane, `(h, w)`."""
+        """Return inverse depth on a plane, `(h, w)`."""
         plane = plane.astype(self.x.dtype)
         return plane[0] * self.x + (plane[1] * self.y + plane[2])[:, None]
 
 
 def arrange_squares(sums: np.ndarray) -> np.ndarray:
-    """Returns the sums of the products of x, y and 1 with each other, `(3, 3)`, among those of `x^i y^j`, `[j, i]`."""
+    """Return the sums of the products of x, y and 1 with each other, `(3, 3)`, among those of `x^i y^j`, `[j, i]`."""
     return np.array(
         [[sums[j, i] for j, i in row] for row in ((XX, XY, X), (XY, YY, Y), (X, Y, ONE))]
     )
@@ -130,7 +130,7 @@ class DepthPlane:
             )
 
     def build(self) -> PlaneSegmenter:
-        """Returns the segmenter."""
+        """Return the segmenter."""
         return PlaneSegmenter(self)
 
 
@@ -142,7 +142,7 @@ class PlaneSegmenter:
         self._tolerance = settings.num_sigma * settings.noise_per_m
 
     def segment(self, frame: Frame) -> Masks:
-        """Returns the block's mask; nobody has looked for mouths.
+        """Return the block's mask; nobody has looked for mouths.
 
         Raises:
             FrameError: too little depth is known.
@@ -181,7 +181,7 @@ class PlaneSegmenter:
         return Masks(mask, None)
 
     def _planes(self, grid: SightGrid, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
-        """Returns planes `n / d`, `(3,)`, the best supported first: each explains pixels that those before it do not."""
+        """Return planes `n / d`, `(3,)`, the best supported first: each explains pixels that those before it do not."""
         settings, generator = self._settings, np.random.default_rng(self._settings.seed)
         found, rest = [], known.copy()
         for _ in range(settings.num_planes):
@@ -214,7 +214,7 @@ class PlaneSegmenter:
         there: np.ndarray,
         generator: np.random.Generator,
     ) -> np.ndarray:
-        """Returns planes through three pixels of `rest` that lie near each other, at many scales, `(trials, 3)`."""
+        """Return planes through three pixels of `rest` that lie near each other, at many scales, `(trials, 3)`."""
         count, (height, width) = self._settings.num_trials, inverse.shape
         row, column = np.divmod(there[generator.integers(len(there), size=count)], width)
         reach = width * self._settings.neighbourhood * generator.uniform(0.2, 1.0, count)
@@ -241,7 +241,7 @@ class PlaneSegmenter:
     def _refined(
         self, plane: np.ndarray, grid: SightGrid, inverse: np.ndarray, known: np.ndarray
     ) -> np.ndarray:
-        """Returns the least-squares plane of the pixels that agree with `plane`."""
+        """Return the least-squares plane of the pixels that agree with `plane`."""
         grid, inverse, known = grid.half, inverse[::2, ::2], known[::2, ::2]
         across, down = grid.powers
         for _ in range(2):
@@ -258,7 +258,7 @@ class PlaneSegmenter:
     def _faces(
         self, plane: np.ndarray, grid: SightGrid, inverse: np.ndarray, known: np.ndarray
     ) -> np.ndarray:
-        """Returns where connected pieces of a plane look like a face of a block, `(h, w)` uint8 of 0 and 1."""
+        """Return where connected pieces of a plane look like a face of a block, `(h, w)` uint8 of 0 and 1."""
         settings = self._settings
         excess = inverse - grid.inverse(plane)  # > 0: nearer than the plane
         support = (known & (np.abs(excess) < self._tolerance)).astype(np.uint8)
@@ -310,7 +310,7 @@ class PlaneSegmenter:
         return bool(tilt_rad <= self._settings.max_tilt_rad)
 
     def _front(self, piece: np.ndarray, excess: np.ndarray, known: np.ndarray) -> float:
-        """Returns which part of what surrounds a piece lies behind its plane, a half where nothing speaks for either side."""
+        """Return which part of what surrounds a piece lies behind its plane, a half where nothing speaks for either side."""
         near, far = (cv2.dilate(piece, np.ones((size, size), np.uint8)) for size in (5, 9))
         ring = (far > near) & known
         behind = np.count_nonzero(excess[ring] < -self._tolerance)
@@ -322,7 +322,7 @@ class PlaneSegmenter:
 def snap_to_edges(
     mask: np.ndarray, gray: np.ndarray, radius_px: int, contrast: float
 ) -> np.ndarray:
-    """Moves the edges of a small mask onto those of a larger picture by a guided filter (He and Sun, Fast Guided Filter, 2015).
+    """Move the edges of a small mask onto those of a larger picture by a guided filter (He and Sun, Fast Guided Filter, 2015).
 
     Args:
         mask: `(h, w)` float32 in [0, 1].
@@ -354,21 +354,21 @@ def snap_to_edges(
 
 
 def _shrink_depth(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns inverse depth in 1/m at the middle of each `step` x `step` cell, `(h, w)` float32, and where it is known."""
+    """Return inverse depth in 1/m at the middle of each `step` x `step` cell, `(h, w)` float32, and where it is known."""
     depth = depth_m[step // 2 :: step, step // 2 :: step]
     known = np.isfinite(depth) & (depth > 0)
     return np.divide(1.0, depth, out=np.zeros(depth.shape, np.float32), where=known), known
 
 
 def _fill_holes(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
-    """Fills a piece's holes (a mouth, lost depth), except where something stands in front of it."""
+    """Fill a piece's holes (a mouth, lost depth), except where something stands in front of it."""
     outlines, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     whole = cv2.drawContours(np.zeros_like(piece), outlines, -1, 1, cv2.FILLED)
     return np.where(nearer > 0, np.uint8(0), np.asarray(whole, np.uint8))
 
 
 def _measure_extents(piece: np.ndarray, plane: np.ndarray, grid: SightGrid) -> np.ndarray:
-    """Returns the two extents in m that a rectangle with the piece's second moments would have."""
+    """Return the two extents in m that a rectangle with the piece's second moments would have."""
     depth = piece[::2, ::2] / np.maximum(grid.half.inverse(plane), 1e-6)
     across, down = grid.half.powers
     first, second = (

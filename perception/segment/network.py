@@ -60,7 +60,7 @@ class Onnx:
             raise ConfigError(f"segmenter.threads: expected 1 or more, got {self.threads}")
 
     def build(self) -> NetworkSegmenter:
-        """Returns the segmenter.
+        """Return the segmenter.
 
         Raises:
             CheckpointError: there is no such network, or it is none of ours.
@@ -118,7 +118,7 @@ class Unet:
         _check_margin(self.margin)
 
     def build(self) -> NetworkSegmenter:
-        """Returns the segmenter.
+        """Return the segmenter.
 
         Raises:
             CheckpointError: there is no such network, or it is none of ours.
@@ -148,7 +148,7 @@ class NetworkSegmenter:
         self._infer, self._size_px, self._margin = infer, size_px, margin
 
     def segment(self, frame: Frame) -> Masks:
-        """Returns both masks."""
+        """Return both masks."""
         window = cover_picture(frame.color.shape, self._size_px)
         block, mouth = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
         self._look(frame, window, block, mouth)
@@ -173,19 +173,19 @@ class NetworkSegmenter:
         return Masks(block, mouth)
 
     def _look(self, frame: Frame, window: Window, block: np.ndarray, mouth: np.ndarray) -> None:
-        """Writes what the network says of a window where it belongs in both masks."""
+        """Write what the network says of a window where it belongs in both masks."""
         seen = self._infer(as_input(window.take(frame.color, self._size_px)))
         window.put(seen[0], block)
         window.put(seen[1], mouth)
 
 
 def as_input(picture: np.ndarray) -> np.ndarray:
-    """Returns what a network takes, `(3, h, w)` float32 in [0, 1], of a picture `(h, w, 3)` uint8."""
+    """Return what a network takes, `(3, h, w)` float32 in [0, 1], of a picture `(h, w, 3)` uint8."""
     return np.ascontiguousarray(picture.transpose(2, 0, 1)).astype(np.float32) / np.float32(255.0)
 
 
 def find_weights(weights: str) -> Path:
-    """Returns the path of a network: as given if it exists, else the one of that name that ships with the package.
+    """Return the path of a network: as given if it exists, else the one of that name that ships with the package.
 
     Raises:
         CheckpointError: there is neither.
@@ -201,7 +201,7 @@ def find_weights(weights: str) -> Path:
 
 
 def check_size(path: Path, header: dict) -> tuple[int, int]:
-    """Returns width and height of a network's picture from the header of its file.
+    """Return width and height of a network's picture from the header of its file.
 
     Raises:
         CheckpointError: the header is not that of a segmenter that we can run.

@@ -18,7 +18,7 @@ class TruthMasks:
     """Reads the masks that lie beside a rendered or labelled frame; what a perfect segmenter would say."""
 
     def build(self) -> TruthSegmenter:
-        """Returns the segmenter."""
+        """Return the segmenter."""
         return TruthSegmenter()
 
 
@@ -26,7 +26,7 @@ class TruthSegmenter:
     """A segmenter that has the answer."""
 
     def segment(self, frame: Frame) -> Masks:
-        """Returns the masks beside the frame.
+        """Return the masks beside the frame.
 
         Raises:
             FrameError: there are none, or they are of another size.

@@ -55,7 +55,7 @@ class UNet(nn.Module):
         return 2 ** (len(self.widths) - 1)
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
-        """Returns logits, `(B, 2, h, w)`, of RGB pictures `(B, 3, h, w)` in [0, 1]."""
+        """Return logits, `(B, 2, h, w)`, of RGB pictures `(B, 3, h, w)` in [0, 1]."""
         # of the root, in which the noise of light is alike at every brightness, and what is in the
         # shade is not all black; each picture by its own brightness and contrast: dusk and dust are
         # the same picture then, but
@@ -82,7 +82,7 @@ class Probabilities(nn.Module):
         self.network = network
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
-        """Returns probabilities, `(B, 2, h, w)`."""
+        """Return probabilities, `(B, 2, h, w)`."""
         return torch.sigmoid(self.network(picture))
 
 
@@ -117,13 +117,13 @@ def build_inference(network: UNet, device: torch.device) -> Callable[[np.ndarray
 
 
 def average_picture(values: torch.Tensor) -> torch.Tensor:
-    """Returns the mean of each picture, `(B, 1, 1, 1)`."""
+    """Return the mean of each picture, `(B, 1, 1, 1)`."""
     # of means of rows: ONNX Runtime would add all 184,320 numbers of a picture one after the other
     return values.mean(3, keepdim=True).mean((1, 2), keepdim=True)
 
 
 def compute_loss(logits: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Returns binary cross-entropy plus Dice (Milletari et al., 2016), both averaged over the channels.
+    """Return binary cross-entropy plus Dice (Milletari et al., 2016), both averaged over the channels.
 
     Args:
         logits: `(B, 2, h, w)`.

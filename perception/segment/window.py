@@ -25,7 +25,7 @@ class Window:
     height: int
 
     def take(self, picture: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-        """Returns what the window shows, `(h, w)` or `(h, w, c)` of the picture's type.
+        """Return what the window shows, `(h, w)` or `(h, w, c)` of the picture's type.
 
         Args:
             picture: `(H, W)` or `(H, W, c)`.
@@ -42,7 +42,7 @@ class Window:
         return out
 
     def put(self, values: np.ndarray, into: np.ndarray) -> None:
-        """Writes what was found in the window, `(h, w)`, where it belongs in `into`, `(H, W)` float32."""
+        """Write what was found in the window, `(h, w)`, where it belongs in `into`, `(H, W)` float32."""
         source, target = self._shared(into.shape, (values.shape[1], values.shape[0]))
         if target is not None:
             place = into[source]
@@ -53,7 +53,7 @@ class Window:
     def _shared(
         self, shape: tuple[int, ...], size_px: tuple[int, int]
     ) -> tuple[tuple[slice, slice], tuple[slice, slice] | None]:
-        """Returns rows and columns of the picture that lie in the window, and where in `size_px` they go; `None`: nowhere."""
+        """Return rows and columns of the picture that lie in the window, and where in `size_px` they go; `None`: nowhere."""
         source, target = [], []
         for begin, length, limit, size in (
             (self.top, self.height, shape[0], size_px[1]),
@@ -70,12 +70,12 @@ class Window:
 
 
 def cover_picture(shape: tuple[int, ...], size_px: tuple[int, int]) -> Window:
-    """Returns the smallest window of the shape of `size_px` (width, height) that holds a picture `(H, W)`, in its middle."""
+    """Return the smallest window of the shape of `size_px` (width, height) that holds a picture `(H, W)`, in its middle."""
     return center_window((0, 0, shape[1], shape[0]), size_px, 0.0)
 
 
 def tile_halves(shape: tuple[int, ...], size_px: tuple[int, int]) -> list[Window]:
-    """Returns six windows of half the size of a picture `(H, W)` that overlap and together hold nearly all of it."""
+    """Return six windows of half the size of a picture `(H, W)` that overlap and together hold nearly all of it."""
     height, width = shape[:2]
     corners = [
         (across * width, down * height) for down in (0.05, 0.45) for across in (0.0, 0.25, 0.5)
@@ -86,7 +86,7 @@ def tile_halves(shape: tuple[int, ...], size_px: tuple[int, int]) -> list[Window
 def center_window(
     box: tuple[float, float, float, float], size_px: tuple[int, int], margin: float
 ) -> Window:
-    """Returns the window of the shape of `size_px` in whose middle a box lies.
+    """Return the window of the shape of `size_px` in whose middle a box lies.
 
     Args:
         box: Left, top, width and height, px.
@@ -107,7 +107,7 @@ def center_window(
 def bound_block(
     block: np.ndarray, threshold: float, smallest: float
 ) -> tuple[int, int, int, int] | None:
-    """Returns the box (left, top, width, height) around the block, px; `None` where there is none.
+    """Return the box (left, top, width, height) around the block, px; `None` where there is none.
 
     Args:
         block: Probability of the block, `(h, w)`.

@@ -53,7 +53,7 @@ class FrameFolder:
             )
 
     def build(self) -> FolderSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         return FolderSource(self)
 
 
@@ -69,7 +69,7 @@ class CameraModel:
 
 
 def read_camera(path: Path) -> CameraModel:
-    """Reads `camera.yaml`.
+    """Read `camera.yaml`.
 
     Raises:
         FrameError: it is missing, is no YAML, or says what cannot be.
@@ -101,7 +101,7 @@ def read_camera(path: Path) -> CameraModel:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """Returns a picture as it stands in the file, blue first.
+    """Return a picture as it stands in the file, blue first.
 
     Raises:
         FrameError: it is missing, truncated, or no picture.
@@ -151,7 +151,7 @@ class FolderSource:
         self._stems = []
 
     def read_latest(self) -> Frame | None:
-        """Returns the next frame, `None` after the last.
+        """Return the next frame, `None` after the last.
 
         Raises:
             FrameError: it cannot be used; the next call goes on with the one after it.
@@ -190,7 +190,7 @@ class FolderSource:
     def _depth(
         self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: CameraModel
     ) -> np.ndarray:
-        """Returns the depth of a frame: what is stored, else what its two pictures tell."""
+        """Return the depth of a frame: what is stored, else what its two pictures tell."""
         stored, millimetres = (
             stem.with_name(stem.name + ending) for ending in (dataset.DEPTH, dataset.DEPTH_MM)
         )
@@ -229,7 +229,7 @@ def _load_array(path: Path) -> np.ndarray:
 
 
 def _guess_camera_matrix(height: int, width: int) -> np.ndarray:
-    """Returns the camera matrix of an ordinary lens, for pictures of which nothing is known."""
+    """Return the camera matrix of an ordinary lens, for pictures of which nothing is known."""
     return np.array(
         [[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]]
     )

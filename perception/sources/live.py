@@ -37,11 +37,11 @@ class CameraDevice(Protocol):
     """A camera's own library, behind three methods."""
 
     def open(self) -> LensCalibration:
-        """Opens the camera; raises a `FrameError` when that fails."""
+        """Open the camera; raises a `FrameError` when that fails."""
         ...
 
     def capture(self, timeout_s: float) -> RawCapture | None:
-        """Waits for a new capture; `None` when there is none within the time."""
+        """Wait for a new capture; `None` when there is none within the time."""
         ...
 
     @property
@@ -50,11 +50,11 @@ class CameraDevice(Protocol):
         ...
 
     def now_s(self) -> float:
-        """Returns the time on the clock by which captures are stamped."""
+        """Return the time on the clock by which captures are stamped."""
         ...
 
     def close(self) -> None:
-        """Closes the camera; may be called twice."""
+        """Close the camera; may be called twice."""
         ...
 
 
@@ -123,7 +123,7 @@ class LiveSource:
         self._device.close()
 
     def read_latest(self) -> Frame | None:
-        """Returns the newest frame, waiting for one that has not been returned yet and is not too old; `None` after a recording.
+        """Return the newest frame, waiting for one that has not been returned yet and is not too old; `None` after a recording.
 
         Raises:
             FrameError: no such frame came in time, or it cannot be used.

@@ -28,7 +28,7 @@ class PictureFolder:
     folder: str
 
     def build(self) -> PictureSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         return PictureSource(Path(self.folder))
 
 
@@ -68,7 +68,7 @@ class PictureSource:
         self._paths = []
 
     def read_latest(self) -> Frame | None:
-        """Returns the next picture, `None` after the last.
+        """Return the next picture, `None` after the last.
 
         Raises:
             FrameError: it cannot be read; the next call goes on with the one after it.

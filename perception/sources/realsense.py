@@ -37,7 +37,7 @@ class RealSense:
     fresh: Freshness
 
     def build(self) -> LiveSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         place = load_extrinsics(self.base_from_camera, "source.base_from_camera")
         return LiveSource(
             RealSenseDevice(self), "RealSense camera", self.fresh, place.base_from_camera, place.cov
@@ -55,7 +55,7 @@ class RealSenseDevice:
         self._started = False
 
     def open(self) -> LensCalibration:
-        """Opens the camera.
+        """Open the camera.
 
         Raises:
             FrameError: there is no library, no camera, or it cannot do what is asked of it.
@@ -92,7 +92,7 @@ class RealSenseDevice:
         )
 
     def capture(self, timeout_s: float) -> RawCapture | None:
-        """Returns the next capture, `None` when there is none in time."""
+        """Return the next capture, `None` when there is none in time."""
         try:
             frames = self._align.process(
                 self._pipeline.wait_for_frames(max(1, int(1000 * timeout_s)))
@@ -111,18 +111,18 @@ class RealSenseDevice:
         return RawCapture(np.array(color.get_data(), np.uint8), values, t_s)
 
     def now_s(self) -> float:
-        """Returns the host's time: captures are stamped by it."""
+        """Return the host's time: captures are stamped by it."""
         return time.time()
 
     def close(self) -> None:
-        """Closes the camera."""
+        """Close the camera."""
         if self._started:
             self._started = False
             self._pipeline.stop()
 
 
 def invert_distortion(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Returns OpenCV's coefficients `k1 k2 p1 p2 k3` of a lens of which the inverse is told, `(5,)`.
+    """Return OpenCV's coefficients `k1 k2 p1 p2 k3` of a lens of which the inverse is told, `(5,)`.
 
     OpenCV's polynomial says where a ray is seen, RealSense's inverse one, the same in form, which
     ray is seen; the nearest of the first kind is found on a grid over the picture.
@@ -145,7 +145,7 @@ def invert_distortion(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, 
 
 
 def _tabulate_distortion(point: np.ndarray) -> np.ndarray:
-    """Returns by how much each coefficient moves points `(2, M)` of the plane z = 1, `(2, M, 5)`."""
+    """Return by how much each coefficient moves points `(2, M)` of the plane z = 1, `(2, M, 5)`."""
     x, y = point
     r2 = x * x + y * y
     along_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], -1)

@@ -68,7 +68,7 @@ class SimulatedCamera:
             )
 
     def build(self) -> SimulatedSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         return SimulatedSource(self)
 
 
@@ -104,7 +104,7 @@ class SimulatedSource:
         self._count = -1
 
     def show(self, task_scene: Sequence[float], chain_in_base_m: np.ndarray) -> None:
-        """Sets what is seen.
+        """Set what is seen.
 
         Args:
             task_scene: See `Simulated.task_scene`.
@@ -117,7 +117,7 @@ class SimulatedSource:
         )
 
     def read_latest(self) -> Frame | None:
-        """Returns a frame of what is shown now, `None` after `num_frames`.
+        """Return a frame of what is shown now, `None` after `num_frames`.
 
         Raises:
             FrameError: the source is not open, or the hole is behind the camera.
@@ -135,7 +135,7 @@ class SimulatedSource:
         )  # fmt: skip
 
     def shot(self, noise: np.random.Generator) -> RenderedFrame:
-        """Returns what is shown now, with its truth."""
+        """Return what is shown now, with its truth."""
         settings, kind = self._settings, self._settings.surroundings
         chance = np.random.default_rng(settings.seed)  # the same stains and light for every frame
         x, y, z, yaw, scale, radius_m = self._scene
@@ -171,7 +171,7 @@ class SimulatedSource:
         return self._studio.shot(scene, noise)
 
     def _arm(self, from_base: np.ndarray) -> list[Solid]:
-        """Returns the links as cylinders from point to point, in camera coordinates."""
+        """Return the links as cylinders from point to point, in camera coordinates."""
         points = self._chain @ from_base[:3, :3].T + from_base[:3, 3]
         parts: list[Solid] = []
         for number, (start, end) in enumerate(pairwise(points)):

@@ -62,7 +62,7 @@ class Zed:
             raise ConfigError(f"source.confidence: expected 1 to 100, got {self.confidence}")
 
     def build(self) -> LiveSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         place = load_extrinsics(self.base_from_camera, "source.base_from_camera")
         return LiveSource(
             ZedDevice(self), "ZED camera", self.fresh, place.base_from_camera, place.cov
@@ -79,7 +79,7 @@ class ZedDevice:
         self.has_ended = False
 
     def open(self) -> LensCalibration:
-        """Opens the camera.
+        """Open the camera.
 
         Raises:
             FrameError: there is no SDK, no camera, or it cannot do what is asked of it.
@@ -129,7 +129,7 @@ class ZedDevice:
         return LensCalibration(matrix, None, abs(float(calibration.get_camera_baseline())))
 
     def capture(self, timeout_s: float) -> RawCapture | None:
-        """Returns the next capture, `None` when there is none in time or the recording has ended."""
+        """Return the next capture, `None` when there is none in time or the recording has ended."""
         sl, until = self._sl, time.monotonic() + timeout_s
         while (status := self._camera.grab(self._runtime)) != sl.ERROR_CODE.SUCCESS:
             self.has_ended = (
@@ -152,7 +152,7 @@ class ZedDevice:
         )  # the SDK reuses its memory
 
     def now_s(self) -> float:
-        """Returns the time on the SDK's clock; that of a recording stands at its pictures."""
+        """Return the time on the SDK's clock; that of a recording stands at its pictures."""
         reference = (
             self._sl.TIME_REFERENCE.IMAGE
             if self._settings.recording
@@ -161,7 +161,7 @@ class ZedDevice:
         return self._camera.get_timestamp(reference).get_nanoseconds() * 1e-9
 
     def close(self) -> None:
-        """Closes the camera."""
+        """Close the camera."""
         camera, self._camera = self._camera, None
         if camera is not None:
             camera.close()
