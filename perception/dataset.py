@@ -1,4 +1,4 @@
-"""Frames on disk, and beside each rendered one its truth.
+"""Frames on disk with their masks, and the truth of rendered ones.
 
 A folder holds `camera.yaml` and for each frame `<stem>.color.png`, `<stem>.depth.npy` (float32, m,
 NaN unknown) or `<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is a pair
@@ -35,7 +35,7 @@ CAMERA, COLOR, RIGHT, DEPTH, DEPTH_MM, TRUTH, MASK = (
 
 @dataclass(frozen=True)
 class TrueCircle:
-    """A rim, or a disc that is none, as it truly is.
+    """True pose of a rim, or of a flat disc.
 
     Attributes:
         center_m: Centre, `(3,)`, left camera's coordinates.
@@ -43,7 +43,7 @@ class TrueCircle:
         center_in_base_m: Centre in the base frame.
         axis_in_base: Axis in the base frame.
         radius_m: Radius.
-        depth_m: Of the hole; 0 for a disc.
+        depth_m: Depth of the hole; 0 for a disc.
         hidden: Part of the rim that cannot be seen from the left camera, in [0, 1].
         in_view: The whole rim lies within the picture.
     """
@@ -60,12 +60,12 @@ class TrueCircle:
 
 @dataclass(frozen=True)
 class SceneTruth:
-    """What a rendered frame shows.
+    """Content of a rendered frame.
 
     Attributes:
         scene: Kind of scene.
-        conditions: What was drawn for it by name, numbers.
-        holes: All of them; the first one is what the camera was pointed at.
+        conditions: Sampled conditions by name.
+        holes: All holes; the camera points at the first one.
         decoys: Flat discs.
         block: `center_m`, `rotation`, `half_m`; empty where there is no block.
     """
@@ -79,7 +79,7 @@ class SceneTruth:
 
 @dataclass(frozen=True)
 class FrameLabel:
-    """Masks of a frame, `(h, w)` bool: the block with its mouths, what is seen through rims, and the arm."""
+    """Masks of a frame, `(h, w)` bool: block with its holes, inside of the holes, arm."""
 
     block: np.ndarray
     hole_mask: np.ndarray
@@ -87,7 +87,7 @@ class FrameLabel:
 
 
 def list_stems(folder: Path) -> list[Path]:
-    """Return the frames of a folder, sorted: each path without its endings.
+    """Return the frames of a folder, sorted, as paths without endings.
 
     Raises:
         FrameError: there is no such folder, or no frame in it.
@@ -137,7 +137,8 @@ def read_label(stem: Path) -> FrameLabel:
     bits = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if bits is None or bits.ndim != 2:
         raise FrameError(
-            f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames have one"
+            f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames "
+            "have one"
         )
     bits = np.asarray(bits, np.uint8)
     return FrameLabel((bits & BLOCK) > 0, (bits & HOLE_MASK) > 0, (bits & ARM) > 0)

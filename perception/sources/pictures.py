@@ -1,4 +1,4 @@
-"""Pictures of a folder, whatever they are called: enough to look for ellipses."""
+"""All pictures of a folder, for the detection of ellipses."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from brokk_rl.spec import spec
 
 ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"}
 BESIDE = (".depth.png", ".right.png", ".mask.png")
-"""What lies beside the colour picture of a frame."""
+"""Endings of files beside the colour picture of a frame."""
 
 
 @spec
 class PictureFolder:
-    """Every picture of a folder, coloured or grey, without depth and without a camera.
+    """Read every picture of a folder, coloured or grey, without depth and camera.
 
     Attributes:
-        folder: Where they lie, or one picture.
+        folder: The folder, or one picture.
     """
 
     folder: str
@@ -42,7 +42,7 @@ class PictureSource:
 
     @property
     def num_frames(self) -> int:
-        """How many pictures there are."""
+        """Number of pictures."""
         return len(self._paths)
 
     def __enter__(self) -> PictureSource:

@@ -1,4 +1,4 @@
-"""What a frame must be like before anything is made of it; every refusal says what was expected and what came."""
+"""Validation of frames and calibrations; a refusal names the expected and the given value."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from brokk_rl.errors import FrameError
 
 _NUM_DISTORTION = (0, 4, 5, 8, 12, 14)
 _FIELD_RATIO = (0.25, 12.0)
-"""Focal length over the picture's width: from a fisheye of 127 degrees to a telescope of 5."""
+"""Range of focal length over width: from a fisheye of 127 degrees to a telescope of 5."""
 _ASPECT = (0.8, 1.25)
 _CENTER = 0.25
-"""The principal point is no farther from the middle than this part of the picture's size."""
+"""Largest distance of the principal point from the middle, as a part of the picture's size."""
 _FARTHEST_M = 200.0
-"""A median depth beyond this is one in millimetres."""
+"""Median depth beyond which the unit must be mm."""
 _RIGID = 1e-3
+"""Largest departure of a rotation from orthonormality: of matrices written with three digits."""
 
 
 def check_matrix(value: Any, where: str) -> np.ndarray:
@@ -120,7 +121,7 @@ def convert_png_depth(picture: np.ndarray, where: str) -> np.ndarray:
 
 
 def check_depth(values: np.ndarray, where: str, least_known: float) -> np.ndarray:
-    """Return depth in m, `(h, w)` float32, NaN where it was 0, negative or infinite: none of these is a depth."""
+    """Return depth in m, `(h, w)` float32, NaN in place of 0, negative and infinite values."""
     if values.ndim != 2:
         raise FrameError(f"{where}: depth of shape {values.shape}, expected (height, width)")
     if not np.issubdtype(values.dtype, np.floating):

@@ -181,7 +181,7 @@ def test_in_dust_a_spot_no_darker_than_the_grain_is_a_hole_if_two_cameras_see_it
         (replace(faint, deeper=0.0, contrast=3.0), 1.0, True),
     ):
         assert (
-            estimator._looks(inside, parallax, masks, pose_row(ellipse), ellipse, True) is None
+            estimator._check_appearance(inside, parallax, masks, pose_row(ellipse), ellipse, True) is None
         ) == passes
 
 
