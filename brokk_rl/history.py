@@ -1,11 +1,13 @@
-"""What actuator models and policies remember: the last `H` commands and positions.
+"""Memory of actuator models and policies: the last `H` commands and positions.
 
 Worked trace (H = 3), one control step at time t:
 
-    observe      q = [q(t-2), q(t-1), q(t)]     u = [u(t-3), u(t-2), u(t-1)]
-    push_u       q = [q(t-2), q(t-1), q(t)]     u = [u(t-2), u(t-1), u(t)]      <- rows pair up as
-    in a recording; actuator input push_q       q = [q(t-1), q(t), q(t+1)]     u = [u(t-2), u(t-1),
-    u(t)]      <- next observation
+    observe   q = [q(t-2), q(t-1), q(t)]     u = [u(t-3), u(t-2), u(t-1)]
+    push_u    q = [q(t-2), q(t-1), q(t)]     u = [u(t-2), u(t-1), u(t)]     actuator input
+    push_q    q = [q(t-1), q(t), q(t+1)]     u = [u(t-2), u(t-1), u(t)]     next observation
+
+After `push_u` the rows pair up as in a recording.
+
 """
 
 from dataclasses import dataclass
@@ -28,17 +30,22 @@ class History:
     u: Any
 
     def push_u(self, u: Any) -> None:
-        """Appends the commands in force from now on, shape `(N, J)`."""
+        """Append the commands in force from now on, shape `(N, J)`."""
         self.u.copy_(self.u.roll(-1, 1))
         self.u[:, -1] = u
 
     def push_q(self, q: Any) -> None:
-        """Appends newly measured positions, shape `(N, J)`."""
+        """Append newly measured positions, shape `(N, J)`."""
         self.q.copy_(self.q.roll(-1, 1))
         self.q[:, -1] = q
 
     def reset(self, mask: Any, q: Any) -> None:
-        """Backfills the environments of `mask`, shape `(N,)` bool: at rest at `q`, shape `(N, J)`, no command."""
+        """Put environments at rest, without commands, over the whole history.
+
+        Args:
+            mask: Environments, shape `(N,)` bool.
+            q: Positions, shape `(N, J)`.
+        """
         rows = mask[:, None, None]
         self.q.copy_(q[:, None, :].where(rows, self.q))
         self.u.masked_fill_(rows, 0.0)

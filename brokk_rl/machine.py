@@ -116,8 +116,8 @@ class Machine:
     Attributes:
         name: Config name, written into recordings and checkpoints.
         title: What it is, for people.
-        mjcf: File name of the model under `brokk_rl/sim/assets`, or an absolute path; `null`: there
-            is none.
+        mjcf: File name under `brokk_rl/sim/assets`, `package:path` in an installed package, or an
+            absolute path; `null` without a model.
         period_s: Control period.
         dead_time_s: Nominal time from command to first motion.
         num_history: Samples of commands and positions that actuator models and policies see.

@@ -1,11 +1,13 @@
-"""The policy's observation vector (paper, Table I), the same code in training and on the machine.
+"""Observation vector of the policy (paper, Table I), the same code in training and on the machine.
 
-Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first (H
-x J); 133 numbers for five joints and 13 samples. A task in which the wanted pitch of the tool
-differs from episode to episode appends it as one more number,
-and a policy that proposes to a person what it proposed before, oldest first (H x J): histories hold
-what the person did. Each part is normalised with an approximate mean and standard deviation that
-follow from the configuration, so that a policy carries no hidden statistics.
+Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first
+(H x J): 133 numbers for five joints and 13 samples. A task whose wanted pitch differs from episode
+to episode appends it as one more number. A policy that proposes to a person appends its own
+proposals, oldest first (H x J): the history holds the commands that the person gave.
+
+Each part is normalised with an approximate mean and standard deviation that follow from the
+configuration: a policy carries no hidden statistics.
+
 """
 
 from collections.abc import Callable
@@ -34,7 +36,7 @@ class TargetScaling:
 
 
 def compute_size(machine: Machine, with_pitch: bool = False, with_proposals: bool = False) -> int:
-    """Returns the length of the observation vector, that of the paper or with wanted pitch and proposals behind it."""
+    """Return the length of the observation vector: the paper's, with pitch and proposals behind it."""
     return 3 + (2 + with_proposals) * machine.num_history * machine.num_joints + with_pitch
 
 
@@ -74,16 +76,15 @@ class ObservationEncoder:
     def encode(
         self, target_in_base_m: Any, q: Any, u: Any, pitch_rad: Any = None, proposed: Any = None
     ) -> Any:
-        """Returns the vector, shape `(N, size)`.
+        """Return the vector, shape `(N, size)`.
 
         Args:
-            target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N,
-                3)`.
+            target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N, 3)`.
             q: Measured joint positions, oldest first, shape `(N, H, J)`, rad or m.
             u: Commands in force, oldest first, shape `(N, H, J)`, in [-1, 1].
             pitch_rad: Wanted pitch of the tool, shape `(N,)`; left out where the task fixes it.
-            proposed: What was proposed before, oldest first, shape `(N, H, J)`; left out where
-                nobody stands between.
+            proposed: Proposals so far, oldest first, shape `(N, H, J)`; left out where no person stands
+                between.
         """
         target = (target_in_base_m - self._target_mean_m) / self._target_std_m
         joints = ((q - self._q_mean) / self._q_std).reshape(len(q), -1)
@@ -95,25 +96,25 @@ class ObservationEncoder:
         return self._concat(parts, 1)
 
     def decode(self, vector: Any) -> tuple[Any, Any, Any]:
-        """Inverts `encode`: returns target `(N, 3)` in m, positions and commands `(N, H, J)`."""
+        """Invert `encode`: returns target `(N, 3)` in m, positions and commands `(N, H, J)`."""
         num = self.shape[0] * self.shape[1]
         target = vector[:, :3] * self._target_std_m + self._target_mean_m
         q = vector[:, 3 : 3 + num].reshape(-1, *self.shape) * self._q_std + self._q_mean
         return target, q, vector[:, 3 + num : 3 + 2 * num].reshape(-1, *self.shape)
 
     def decode_pitch(self, vector: Any) -> Any:
-        """Returns the wanted pitch `(N,)` in rad, where `has_pitch`."""
+        """Return the wanted pitch `(N,)` in rad, where `has_pitch`."""
         return (
             vector[:, 3 + 2 * self.shape[0] * self.shape[1]] * self._pitch_std_rad
             + self._pitch_mean_rad
         )
 
     def decode_proposals(self, vector: Any) -> Any:
-        """Returns what was proposed, `(N, H, J)`, where `has_proposals`."""
+        """Return the proposals, `(N, H, J)`, where `has_proposals`."""
         return vector[:, -self.shape[0] * self.shape[1] :].reshape(-1, *self.shape)
 
     def describe(self) -> dict[str, Any]:
-        """Returns order and scale of the vector as plain JSON data, for the contract of a policy."""
+        """Return order and scale of the vector as plain JSON data, for the contract of a policy."""
         lower, upper = self._machine.lower, self._machine.upper
         order = ["target_in_base_m (3)", "q oldest first (H x J)", "u oldest first (H x J)"]
         pitch = (

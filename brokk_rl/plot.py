@@ -1,4 +1,4 @@
-"""What all pictures of a report share: colours that those who see few can tell apart, one panel a joint, legends, plain frames."""
+"""The one plot style of all reports: colour-blind-safe palette, figure sizes, legends, frames."""
 
 from __future__ import annotations
 
@@ -8,37 +8,61 @@ from matplotlib.figure import Figure
 from brokk_rl.machine import Machine
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#8c8c8c"
-OTHERS = (GREEN, "#cc79a7", RED, "#56b4e9", "#5b4a9e")
-"""Okabe and Ito's colours."""
+PURPLE = "#cc79a7"
+OTHERS = (GREEN, PURPLE, RED, "#56b4e9", "#5b4a9e")
+"""Colour-blind-safe palette. Source: Okabe and Ito, Color Universal Design (2008), with a grey."""
 PANEL_INCHES = (3.9, 2.9)
-"""Width and height of a panel, inches."""
+"""Width and height of a panel, inches; chosen by hand: three panels fill a page."""
+
+
+def make_figure(width_inches: float, height_inches: float) -> Figure:
+    """Return an empty figure whose layout leaves room for labels."""
+    return Figure(figsize=(width_inches, height_inches), layout="constrained")
 
 
 def make_joint_panels(machine: Machine, shared: str) -> tuple[Figure, list[Axes]]:
-    """Returns a figure with one panel a joint, in rows of three at most, with the same scale along the axes in `shared`."""
+    """Return a figure with one panel a joint, at most three a row.
+
+    Args:
+        machine: Gives the joints.
+        shared: Axes with the same scale in all panels: `x`, `y`, `xy` or nothing.
+    """
     columns = 2 if machine.num_joints in (2, 4) else min(3, machine.num_joints)
     rows = -(-machine.num_joints // columns)
-    figure = Figure(
-        figsize=(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows + 0.6), layout="constrained"
-    )
-    first = figure.add_subplot(rows, columns, 1)
-    share = {f"share{side}": first for side in shared}
-    return figure, [
-        first,
-        *(
-            figure.add_subplot(rows, columns, number + 1, **share)
-            for number in range(1, machine.num_joints)
-        ),
-    ]
+    figure = make_figure(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows + 0.6)
+    axes = [figure.add_subplot(rows, columns, 1)]
+    share = {f"share{side}": axes[0] for side in shared}
+    for number in range(2, machine.num_joints + 1):
+        axes.append(figure.add_subplot(rows, columns, number, **share))
+    return figure, axes
 
 
 def add_legend(figure: Figure, axis: Axes) -> None:
-    """Explains above all panels what is drawn in one of them."""
+    """Add above all panels the legend of one of them."""
     handles, labels = axis.get_legend_handles_labels()
     place = "outside upper center" if figure.get_layout_engine() else "upper center"
     figure.legend(handles, labels, loc=place, ncols=len(labels), frameon=False)
 
 
 def remove_frame(axis: Axes) -> None:
-    """Takes the frame away where it says nothing."""
+    """Remove the frame at the top and at the right."""
     axis.spines[["top", "right"]].set_visible(False)
+
+
+def annotate_point(
+    axis: Axes,
+    text: str,
+    at: tuple[float, float],
+    shift: tuple[float, float] = (0, 3),
+    **style: object,
+) -> None:
+    """Write a text beside a point of the data.
+
+    Args:
+        axis: Where to write.
+        text: The text.
+        at: The point, in data coordinates.
+        shift: Distance of the text from it, typographic points.
+        **style: Further text properties of matplotlib.
+    """
+    axis.annotate(text, at, shift, textcoords="offset points", **style)  # type: ignore[arg-type]

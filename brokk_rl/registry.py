@@ -12,7 +12,7 @@ import json
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import metadata, util
+from importlib import metadata, resources, util
 from pathlib import Path
 
 import yaml
@@ -80,6 +80,23 @@ def list_options() -> list[Option]:
                 )
             found[group, name] = Option(group, name, package, path)
     return [found[key] for key in sorted(found)]
+
+
+def resolve_package_path(name: str) -> Path:
+    """Return the path of a file or folder: a path, or `package:path` in an installed package.
+
+    Raises:
+        ConfigError: There is no such package.
+    """
+    package, colon, inside = name.partition(":")
+    if not colon or Path(name).exists():
+        return Path(name)
+    try:
+        return Path(str(resources.files(package))) / inside
+    except (ModuleNotFoundError, ValueError, TypeError) as error:
+        raise ConfigError(
+            f"{name}: there is no package '{package}' ({error}); give a path, or package:path"
+        ) from error
 
 
 @lru_cache

@@ -1,13 +1,14 @@
-"""One self-contained HTML page: text, tables and pictures in a single file that opens without a network, on a phone or printed.
+"""One self-contained HTML report: text, tables and figures in one file that opens without a network.
 
-    page = Page("Identification of brokk170", "The network is better than the linear model on every
-    joint.") page.add_heading("Errors")
-    page.add_table(["joint", "mlp", "arx"], [["q1", Cell(0.012, best=True), 0.034]], "RMSE at 5 s, rad")
-    page.add_picture(figure, "Measured and predicted position")
-    page.write(folder / "identification.html")
+    report = Report("Identification of brokk170", "The network beats the linear model.", "good")
+    report.add_heading("Errors")
+    report.add_table(["joint", "mlp", "arx"], [["q1", Cell(0.012, best=True), 0.034]], "RMSE, rad")
+    report.add_picture(figure, "Measured and predicted position")
+    report.write(folder / "identification.html")
 
-Everything that is given is escaped; nothing is taken as markup. The page forbids itself scripts and
-any request.
+All reports share the template `report.html.jinja`. Everything that is given is escaped, nothing is
+taken as markup. The page forbids itself scripts and any request. Figures are drawn with
+`brokk_rl.plot`.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
-from html import escape
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+from jinja2 import Environment, FileSystemLoader, Template
 
 from brokk_rl.errors import StorageError
 from brokk_rl.session import write_text
@@ -30,106 +33,88 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Tone = Literal["good", "bad", "warn", "plain"]
+TEMPLATE_FILE = "report.html.jinja"
 MISSING = "–"
-"""Stands for a figure that there is none of."""
+"""Text of a missing value."""
 PICTURE_TYPES = {
     ".png": "image/png",
     ".svg": "image/svg+xml",
     ".jpg": "image/jpeg",
     ".jpeg": "image/jpeg",
 }
-FIGURE = re.compile(r"\s*[<>±≈]?\s*[-+−]?\d")
-"""How text begins that is read as a figure."""
-MARK = "▸ "
-"""Before the best of a kind; before, so that figures stay aligned at the right."""
+NUMBER = re.compile(r"\s*[<>±≈]?\s*[-+−]?\d")
+"""Start of a text that counts as a number."""
+BEST_MARK = "▸ "
+"""Mark before the best of a kind; before, so that numbers stay aligned at the right."""
 DPI = 150
-STYLE = """
-:root { color-scheme: light dark; --ink: #1a1d21; --dim: #5c6570; --paper: #ffffff; --panel: #f4f6f8; --line: #d7dce1;
-  --accent: #0b62a8; --good: #1a7f37; --bad: #b3261e; --warn: #8a5a00; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6e9ec; --dim: #9aa4ae; --paper: #14171a; --panel: #1d2226; --line: #363d44;
-  --accent: #6db8f2; --good: #5fd07f; --bad: #ff8a80; --warn: #e8b455; } }
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 62rem; padding: 1.5rem 1rem 4rem; background: var(--paper); color: var(--ink);
-  font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1 { font-size: 1.7rem; line-height: 1.2; margin: 0 0 .4rem; }
-h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; padding-bottom: .2rem; border-bottom: 1px solid var(--line); }
-h3 { font-size: 1.05rem; margin: 1.6rem 0 .4rem; }
-p { margin: .5rem 0; max-width: 46rem; overflow-wrap: anywhere; }
-.summary { font-size: 1.1rem; }
-.good, .bad, .warn { border-left: .3rem solid; padding: .35rem .8rem; background: var(--panel); }
-.good { border-color: var(--good); } .bad { border-color: var(--bad); } .warn { border-color: var(--warn); }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums lining-nums; font-size: .92rem; }
-figcaption, footer { color: var(--dim); font-size: .88rem; }
-th, td { padding: .22rem .7rem; text-align: left; vertical-align: baseline; border-bottom: 1px solid var(--line); }
-th { font-weight: 600; white-space: nowrap; } thead th { border-bottom: 2px solid var(--line); vertical-align: bottom; }
-.number { text-align: right; white-space: nowrap; }
-.best { font-weight: 700; color: var(--good); }
-.note { display: block; color: var(--dim); font-size: .8rem; font-weight: 400; }
-figure { margin: 1.2rem 0; } figcaption { margin-top: .3rem; max-width: 46rem; }
-img { display: block; max-width: 100%; height: auto; background: #fff; border: 1px solid var(--line); border-radius: .3rem; }
-pre { overflow-x: auto; background: var(--panel); padding: .7rem .9rem; border-radius: .3rem; font-size: .86rem; }
-details { margin: .8rem 0; } summary { cursor: pointer; color: var(--accent); }
-footer { margin-top: 3rem; border-top: 1px solid var(--line); padding-top: .5rem; }
-@media print { :root { color-scheme: light; --ink: #000; --dim: #444; --paper: #fff; --panel: #f4f4f4; --line: #bbb; }
-  body { max-width: none; font-size: 10pt; padding: 0; } figure, tr { break-inside: avoid; } h2, h3 { break-after: avoid; }
-  .scroll, pre { overflow: visible; } pre { white-space: pre-wrap; }
-  details::details-content { content-visibility: visible; height: auto; } }
-"""
+"""Resolution of figures, dots an inch: sharp in print at page width; chosen by hand."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table that is more than its value.
+    """A cell of a table with more than its value.
 
     Attributes:
-        value: Text, number, or `None` for a figure that there is none of.
-        note: Said small below it: an interval, a reason.
-        best: Marked as the best of its kind, by weight, colour and a sign (also for those who see
-            no colour).
+        value: Text, number, or `None` for a missing number.
+        note: Small text below the value: an interval, a reason.
+        best: Marks the best of its kind by weight, colour and a sign (colour alone does not reach
+            every reader).
     """
 
     value: str | float | None
     note: str = ""
     best: bool = False
 
+    def format(self, digits: int) -> str:
+        """Return the text of the cell; numbers get `digits` significant digits."""
+        if self.value is None:
+            text = MISSING
+        elif isinstance(self.value, (str, int)):
+            text = str(self.value)
+        else:
+            text = f"{self.value:.{digits}g}"
+        return BEST_MARK + text if self.best else text
+
+
+Block = dict[str, Any]
+"""An element of a report as the template takes it: its `kind` and the values to show."""
+
 
 class Report:
-    """A page that grows from top to bottom.
+    """A report that grows from top to bottom.
 
     Args:
-        title: What the page is about.
-        summary: The answer in a sentence or two, for those who read no further.
-        tone: Whether the summary is good news.
+        title: Subject of the report.
+        summary: The answer in a sentence or two.
+        tone: Sets the summary apart as good news, bad news or a warning.
     """
 
     def __init__(self, title: str, summary: str = "", tone: Tone = "plain") -> None:
         self._title = title
-        self._parts: list[str] = []
+        self._blocks: list[Block] = []
         if summary:
             self.add_text(summary, tone, "summary")
 
     def add_heading(self, text: str, level: int = 2) -> None:
-        """Begins a section (level 2) or a part of one (level 3)."""
-        self._parts.append(f"<h{level}>{escape(text)}</h{level}>")
+        """Begin a section (level 2) or a part of one (level 3)."""
+        self._blocks.append({"kind": "heading", "text": text, "level": level})
 
     def add_text(self, text: str, tone: Tone = "plain", style: str = "") -> None:
-        """Adds paragraphs; an empty line separates them. `tone` sets one apart as good news, bad news or a warning."""
-        classes = " ".join(filter(None, (style, tone if tone != "plain" else "")))
-        for paragraph in filter(None, (part.strip() for part in text.split("\n\n"))):
-            self._parts.append(
-                f'<p class="{classes}">{escape(paragraph)}</p>'
-                if classes
-                else f"<p>{escape(paragraph)}</p>"
-            )
+        """Add paragraphs, separated by empty lines; `tone` sets them apart."""
+        classes = " ".join(name for name in (style, tone) if name not in ("", "plain"))
+        for paragraph in text.split("\n\n"):
+            if paragraph.strip():
+                self._blocks.append(
+                    {"kind": "paragraph", "text": paragraph.strip(), "classes": classes}
+                )
 
     def add_list(self, texts: Sequence[str]) -> None:
-        """Adds a list of short texts."""
-        self._parts.append("<ul>" + "".join(f"<li>{escape(text)}</li>" for text in texts) + "</ul>")
+        """Add a list of short texts."""
+        self._blocks.append({"kind": "list", "texts": list(texts)})
 
     def add_code(self, text: str) -> None:
-        """Adds commands or a file, as they are."""
-        self._parts.append(f"<pre>{escape(text)}</pre>")
+        """Add commands or a file unchanged."""
+        self._blocks.append({"kind": "code", "text": text})
 
     def add_table(
         self,
@@ -138,100 +123,89 @@ class Report:
         caption: str = "",
         digits: int = 3,
     ) -> None:
-        """Adds a table.
+        """Add a table.
 
         Args:
             columns: Headings.
             rows: One cell a column; the first cell of a row names it. Columns of numbers are
                 aligned at the right.
-            caption: What it shows, with the unit.
-            digits: Significant digits of numbers; text is left as it is, so give text where a
-                column wants fixed decimals.
+            caption: Content of the table, with the unit.
+            digits: Significant digits of numbers. Text stays as it is, so give text where a column
+                needs fixed decimals.
         """
         cells = [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in rows]
         for row in cells:
             if len(row) != len(columns):
                 raise ValueError(f"expected {len(columns)} cells a row, got {len(row)}: {row}")
         numeric = [_is_numeric([row[i].value for row in cells]) for i in range(len(columns))]
-        kinds = [' class="number"' if number else "" for number in numeric]
-        head = "".join(
-            f'<th scope="col"{kind}>{escape(name)}</th>'
-            for name, kind in zip(columns, kinds, strict=True)
-        )
-        body = "".join(
-            "<tr>"
-            + "".join(_format_cell(row[i], numeric[i], i == 0, digits) for i in range(len(row)))
-            + "</tr>"
-            for row in cells
-        )
-        top = f"<thead><tr>{head}</tr></thead>" if any(columns) else ""
-        title = (
-            f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-        )  # outside of what scrolls sideways on a phone
-        self._parts.append(
-            f'<figure>{title}<div class="scroll"><table>{top}<tbody>{body}</tbody></table></div></figure>'
+        shown = []
+        for row in cells:
+            shown.append(
+                [
+                    _prepare_cell(cell, is_number, digits)
+                    for cell, is_number in zip(row, numeric, strict=True)
+                ]
+            )
+        heads = [
+            {"name": name, "is_number": is_number}
+            for name, is_number in zip(columns, numeric, strict=True)
+        ]
+        self._blocks.append(
+            {
+                "kind": "table",
+                "columns": heads,
+                "has_head": any(columns),
+                "rows": shown,
+                "caption": caption,
+            }
         )
 
     def add_facts(self, facts: dict[str, str | float | None]) -> None:
-        """Adds names and what is known of them, one a line."""
+        """Add names and their values, one a line."""
         self.add_table(["", ""], [[name, Cell(value)] for name, value in facts.items()])
 
     def add_picture(self, source: Figure | Path, caption: str = "", description: str = "") -> None:
-        """Adds a picture; its data become part of the page.
+        """Add a picture; its data become part of the page.
 
         Args:
             source: A matplotlib figure, drawn as PNG, or a PNG, SVG or JPEG file.
-            caption: Said below it.
-            description: What it shows, for those who cannot see it; the caption where there is
-                none.
+            caption: Text below the picture.
+            description: Content for those who cannot see it; the caption where it is empty.
 
         Raises:
             StorageError: the file cannot be read.
         """
-        if isinstance(source, Path):
-            kind = PICTURE_TYPES.get(source.suffix.lower())
-            if kind is None:
-                raise StorageError(f"picture {source}: expected one of {', '.join(PICTURE_TYPES)}")
-            try:
-                data = source.read_bytes()
-            except OSError as error:
-                raise StorageError(
-                    f"cannot read picture {source}: {error.strerror or error}"
-                ) from error
-        else:
-            kind, buffer = PICTURE_TYPES[".png"], io.BytesIO()
-            source.savefig(buffer, format="png", dpi=DPI)
-            data = buffer.getvalue()
-        text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+        kind, data = _read_picture(source) if isinstance(source, Path) else _draw_png(source)
         address = f"data:{kind};base64,{base64.b64encode(data).decode()}"
-        self._parts.append(
-            f'<figure><img src="{address}" alt="{escape(description or caption)}">{text}</figure>'
+        self._blocks.append(
+            {
+                "kind": "picture",
+                "address": address,
+                "description": description or caption,
+                "caption": caption,
+            }
         )
 
     @contextmanager
     def add_details(self, summary: str, is_open: bool = False) -> Iterator[None]:
-        """Puts what is added within the block behind a line to click on; printed in full."""
-        self._parts.append(
-            f"<details{' open' if is_open else ''}><summary>{escape(summary)}</summary>"
-        )
+        """Fold everything that is added within the block behind a line; printed in full."""
+        outer, inner = self._blocks, []
+        self._blocks = inner
         try:
             yield
         finally:
-            self._parts.append("</details>")
+            outer.append(
+                {"kind": "details", "summary": summary, "is_open": is_open, "blocks": inner}
+            )
+            self._blocks = outer
 
     def render(self) -> str:
-        """Returns the whole page."""
-        head = (
-            '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-            "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">"
-            f"<title>{escape(self._title)}</title><style>{STYLE}</style>"
-        )
-        made = f"<footer>made by brokk-rl, {datetime.now().astimezone():%Y-%m-%d %H:%M %Z}</footer>"
-        body = "\n".join([f"<h1>{escape(self._title)}</h1>", *self._parts, made])
-        return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
+        """Return the whole page."""
+        made = f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"
+        return _load_template().render(title=self._title, blocks=self._blocks, made=made)
 
     def write(self, path: Path) -> None:
-        """Writes the page in one step: readers see the old file or the whole new one.
+        """Write the page in one step: readers see the old file or the whole new one.
 
         Raises:
             StorageError: it could not be written.
@@ -244,26 +218,41 @@ class Report:
             ) from error
 
 
-def _is_numeric(values: Sequence[str | float | None]) -> bool:
-    """Says whether a column holds figures: numbers, or texts that begin like one."""
-    given = [value for value in values if value is not None and value != MISSING]
-    return bool(given) and all(not isinstance(value, str) or FIGURE.match(value) for value in given)
-
-
-def _format_cell(cell: Cell, is_numeric: bool, is_name: bool, digits: int) -> str:
-    value = cell.value
-    if value is None:
-        text = MISSING
-    elif isinstance(value, str):
-        text = value
-    elif isinstance(value, int):
-        text = str(value)
-    else:
-        text = f"{value:.{digits}g}"
-    classes = " ".join(
-        name for name, given in (("number", is_numeric), ("best", cell.best)) if given
+@cache
+def _load_template() -> Template:
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=False
     )
-    attribute = f' class="{classes}"' if classes else ""
-    note = f'<span class="note">{escape(cell.note)}</span>' if cell.note else ""
-    tag = 'th scope="row"' if is_name else "td"
-    return f"<{tag}{attribute}>{MARK if cell.best else ''}{escape(text)}{note}</{tag[:2]}>"
+    return environment.get_template(TEMPLATE_FILE)
+
+
+def _read_picture(path: Path) -> tuple[str, bytes]:
+    """Return media type and data of a picture file."""
+    kind = PICTURE_TYPES.get(path.suffix.lower())
+    if kind is None:
+        raise StorageError(f"picture {path}: expected one of {', '.join(PICTURE_TYPES)}")
+    try:
+        return kind, path.read_bytes()
+    except OSError as error:
+        raise StorageError(f"cannot read picture {path}: {error.strerror or error}") from error
+
+
+def _draw_png(figure: Figure) -> tuple[str, bytes]:
+    """Return media type and data of a matplotlib figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return PICTURE_TYPES[".png"], buffer.getvalue()
+
+
+def _is_numeric(values: Sequence[str | float | None]) -> bool:
+    """Return whether a column holds numbers, or texts that begin like one."""
+    given = [value for value in values if value is not None and value != MISSING]
+    return bool(given) and all(not isinstance(value, str) or NUMBER.match(value) for value in given)
+
+
+def _prepare_cell(cell: Cell, is_number: bool, digits: int) -> Block:
+    """Return a cell as the template takes it."""
+    classes = " ".join(
+        name for name, given in (("number", is_number), ("best", cell.best)) if given
+    )
+    return {"text": cell.format(digits), "note": cell.note, "classes": classes}

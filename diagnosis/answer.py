@@ -35,7 +35,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class JointClosed:
-    """Error of one joint over 5 s free runs before, after and at the floor, rad or m, and what of it is closed.
+    """Error of one joint over free runs of 5 s, in rad or m, and the closed share of its gap.
 
     Attributes:
         before: Of the simulator as it was.
@@ -54,12 +54,12 @@ class JointClosed:
 
 @dataclass(frozen=True)
 class Gap:
-    """Free-running error over 5 s on parts of the field recordings that were not fitted to, all joints together.
+    """Error of all joints over free runs of 5 s on parts of the field that no effect was fitted to.
 
     Attributes:
         before: Of the simulator as it was.
         after: With the selected effects.
-        floor: What it would be without any effect: the simulator's on left-out reference
+        floor: The error without any effect: that of the simulator on left-out reference
             recordings; without a reference that of a flexible model on field recordings that it was
             not fitted to; `None` where neither is known.
         closed: `(before - after) / (before - floor)`; `None` where there is no gap to close.
@@ -103,7 +103,7 @@ class Selected:
         gap_closed: Share of the gap that it closes: its Shapley value in the set of all that are
             selected.
         same_as: Effects that these recordings cannot tell from it.
-        decided_by: What would tell it from those of `same_as`.
+        decided_by: The measurement that would tell it from those of `same_as`.
     """
 
     effect: str
@@ -126,7 +126,7 @@ class Ranked:
 
 @dataclass(frozen=True)
 class JointGap:
-    """Where the gap lies: error over 5 s free runs (rad or m), the floor, and the share of the whole gap, by joint."""
+    """Error of one joint over free runs of 5 s (rad or m), its floor, and its share of the gap."""
 
     rmse: float
     floor: float
@@ -161,7 +161,7 @@ class Where:
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """The excitation that would tell most about what is left open, and between which effects."""
+    """The most informative next excitation, and the effects that it separates."""
 
     excitation: str
     separates: tuple[str, ...]
@@ -170,7 +170,7 @@ class NextExperiment:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """The whole answer.
+    """The answer of a diagnosis, the content of `diagnosis.json`.
 
     Attributes:
         verdict: `effects`; `none` when no effect earns its place; `unknown` when the gap is real
@@ -178,9 +178,9 @@ class Answer:
         selected: Most probable first; empty unless the verdict is `effects`.
         ranking: All rivals worth naming, `none` and `unknown` among them, most probable first.
         where: Where the gap lies.
-        gap: How large it is, and what is left.
+        gap: Its size, and the remainder.
         next_experiment: `None` where nothing is left to tell apart.
-        reason: One sentence for people.
+        reason: One sentence in words.
         more: Further plain JSON: `sanity`, `horizons`, `evidence`, `remainder`, …
     """
 
@@ -194,7 +194,7 @@ class Answer:
     more: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the content of `diagnosis.json`."""
+        """Return the content of `diagnosis.json`."""
         where = {
             "joints": {
                 name: {
@@ -231,7 +231,7 @@ class Answer:
         }
 
     def write(self, path: Path) -> None:
-        """Writes `diagnosis.json` in one step.
+        """Write `diagnosis.json` in one step.
 
         Raises:
             StorageError: it could not be written.
@@ -243,7 +243,7 @@ class Answer:
 
 
 def read_answer(path: Path) -> Answer:
-    """Reads a `diagnosis.json`.
+    """Read a `diagnosis.json`.
 
     Raises:
         RecordingError: it is missing, no JSON, or of another schema.
@@ -366,10 +366,10 @@ ARRAYS_FILE = "diagnosis.npz"
 
 @dataclass(frozen=True)
 class Outcome:
-    """A finished diagnosis.
+    """A finished diagnosis with the free runs that its report draws.
 
     Attributes:
-        answer: What it says.
+        answer: The answer.
         before: Free runs of the simulator as it was through field recordings that no effect was
             fitted to.
         after: The same with the selected effects; `None` where none was selected.
@@ -383,7 +383,7 @@ class Outcome:
     floor: FreeRuns | None
 
     def save(self, folder: Path) -> None:
-        """Writes `diagnosis.json` and `diagnosis.npz`, each in one step.
+        """Write `diagnosis.json` and `diagnosis.npz`, each in one step.
 
         Raises:
             StorageError: something could not be written.
@@ -408,7 +408,7 @@ class Outcome:
 
 
 def load_outcome(folder: Path, machine: Machine) -> Outcome:
-    """Reads what `Outcome.save` wrote.
+    """Read the files of `Outcome.save`.
 
     Raises:
         RecordingError: a file is missing or damaged.
@@ -467,5 +467,5 @@ def _unpack_runs(name: str, arrays: Any, machine: Machine) -> FreeRuns | None:
 
 
 def format_error(value: float, unit: str) -> str:
-    """Returns an error as a person reads it: in mrad, mm, or in percent of the joints' travel where units differ."""
+    """Return an error as text: in mrad or mm, or in percent of travel where units differ."""
     return f"{100 * value:.1f} % of travel" if unit == "travel" else f"{1e3 * value:.1f} m{unit}"

@@ -26,9 +26,10 @@ READINGS = {
     "quadratic": "grows faster than the way: load, drift, or one error on top of another",
 }
 FLAT, STEP, LINEAR, QUADRATIC = 0.2, 0.35, 0.65, 1.3
-"""Bounds of the slope of log(error) over log(time)."""
+"""Bounds of the slope of log(error) over log(time), chosen by hand about 0 (offset), 0.5 (random
+walk), 1 (ramp) and 2 (acceleration); they name the growth in words and change no figure."""
 MIN_EXCESS_RATIO = 1.2
-"""Error over floor from which there is a growth to read."""
+"""Error over floor from which a growth is classified; chosen by hand: below it the excess is noise."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class ErrorGrowth:
         horizon_s: Times of the free run, s.
         rmse: Error at each, rad or m.
         floor: The same on the reference; `None` without one.
-        early: Slope of log(what exceeds the floor) over log(time), from the first horizon to the
+        early: Slope of log(error beyond the floor) over log(time), from the first horizon to the
             second.
         late: The same from the second to the last.
         reading: One of `READINGS`.
@@ -56,7 +57,7 @@ class ErrorGrowth:
     whole_run: float | None
 
     def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data."""
+        """Return it as plain JSON data."""
         plain = {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in self.__dict__.items()
@@ -67,7 +68,7 @@ class ErrorGrowth:
 def measure_growth(
     runs: FreeRuns, reference: FreeRuns | None, machine: Machine, whole: FreeRuns | None
 ) -> dict[str, ErrorGrowth]:
-    """Returns the growth of each joint's error."""
+    """Return the growth of each joint's error."""
     steps = runs.simulated.shape[1]
     at = [
         min(max(round(h / machine.period_s), 1), steps) - 1
@@ -101,14 +102,14 @@ def measure_growth(
 
 
 def compute_rmse_curve(runs: FreeRuns) -> np.ndarray:
-    """Returns the root mean square error after each step, `(K, J)`, over the windows that go so far; NaN where none does."""
+    """Return the root mean square error after each step, `(K, J)`; NaN without any window."""
     given = np.isfinite(runs.error)
     with np.errstate(invalid="ignore"):
         return np.sqrt((np.where(given, runs.error, 0.0) ** 2).sum(0) / given.sum(0))
 
 
 def fit_log_slopes(horizon_s: np.ndarray, beyond: np.ndarray) -> tuple[float | None, float | None]:
-    """Returns the slope of log(error) over log(time) from the first horizon to the second, and from the second to the last."""
+    """Return the slopes of log(error) over log(time) before and after the second horizon."""
     if len(horizon_s) < 3 or not np.isfinite(beyond[1:]).all() or beyond[1] <= 0 or beyond[-1] <= 0:
         return None, None
     log_s, log_error = np.log(horizon_s), np.log(np.maximum(beyond, 1e-3 * beyond[-1]))
@@ -119,7 +120,7 @@ def fit_log_slopes(horizon_s: np.ndarray, beyond: np.ndarray) -> tuple[float | N
 
 
 def classify_growth(early: float | None, late: float | None) -> str:
-    """Returns what a pair of slopes says, one of `READINGS`."""
+    """Return the kind of growth of a pair of slopes, one of `READINGS`."""
     if early is None or late is None:
         return "none"
     if late < STEP:

@@ -25,12 +25,12 @@ from diagnosis.effect_library import Found, Kind, Still
 
 TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 MIN_SAMPLES = 100
-"""Samples with a measured tool point below which nothing is said."""
+"""Least number of samples with a measured tool point; chosen by hand."""
 
 
 @dataclass(frozen=True)
 class ToolPointErrors:
-    """How measured tool points differ from those of the machine's file.
+    """Distance of measured tool points from those of the machine's file.
 
     Attributes:
         rms_m: Root mean square distance, m.
@@ -49,14 +49,14 @@ class ToolPointErrors:
     count: int
 
     def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data."""
+        """Return it as plain JSON data."""
         return asdict(self)
 
 
 def compare_tool_points(
     recordings: Sequence[Recording], machine: Machine
 ) -> ToolPointErrors | None:
-    """Returns how far off measured tool points are, `None` where there are too few, or the machine's geometry is not known."""
+    """Return the errors of measured tool points, `None` with too few or without known geometry."""
     if not machine.has_bodies:
         return None
     having = [r for r in recordings if all(column in r.extra for column in TOOL_COLUMNS)]
@@ -83,7 +83,7 @@ def compare_tool_points(
 def _list_single_errors(
     machine: Machine, q: np.ndarray, pose: Any, tip: np.ndarray
 ) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Yields the way in which each error of unit size moves the measured tip, `(S, 3)`, relative to the computed one."""
+    """Yield the displacement of the tip by each error of unit size, `(S, 3)`."""
     origins, end = (
         pose.joints_in_base_m.numpy().astype(float),
         pose.tip_in_base_m.numpy().astype(float),
@@ -107,7 +107,7 @@ def _list_single_errors(
 
 
 def _fit_size(column: np.ndarray, off: np.ndarray, whole: float) -> tuple[float, float]:
-    """Returns the explained part of the squared distance and the size."""
+    """Return the explained part of the squared distance and the size."""
     norm = max(float((column**2).sum()), np.finfo(float).tiny)
     size = float((column * off).sum()) / norm
     return size**2 * norm / max(whole, np.finfo(float).tiny), size
@@ -115,27 +115,28 @@ def _fit_size(column: np.ndarray, off: np.ndarray, whole: float) -> tuple[float,
 
 COLUMNS_TOOL = ("ee_x_m", "ee_y_m", "ee_z_m")
 MIN_SECONDS = 40
-"""Seconds with measured tool points that tell something."""
+"""Least time with measured tool points, s; chosen by hand: about twice the unknowns of a set."""
 NUM_ROUNDS = 3
-"""Times that sets of errors are compared: about nothing, then about what was found."""
+"""Rounds of linearisation: about no error, then about the errors of the round before. Chosen by
+hand; the set does not change after the second."""
 MAX_ERRORS = 3
-"""Errors in a set."""
+"""Most errors in a set: all sets are compared, and their number grows with this power."""
 DIFFERENCE_STEP = 0.2
-"""Finite difference, of the typical size."""
+"""Step of the finite difference, of the typical size; the rounds correct the curvature."""
 MIN_NOISE_M = 3e-4
-"""No instrument is better."""
+"""Smallest noise of a tool point, m: the accuracy of a good laser tracker at some metres."""
 MIN_SIZE = 0.3
-"""Smallest size, over the typical one, that is worth naming: trackers see millimetres that no
-drawing and no zero hold."""
+"""Smallest size, over the typical one, that is named; chosen by hand: trackers see millimetres
+below the accuracy of any drawing or zero."""
 
 
 SetFit = tuple[float, np.ndarray, np.ndarray]
-"""What a set of errors earns, their numbers, and the covariance of these."""
+"""Gain of a set of errors in log likelihood, their sizes, and the covariance of the sizes."""
 
 
 @dataclass(frozen=True)
 class _GeometryError:
-    """One error: an effect on one joint, or of the whole machine; `columns` `(D, P)` per unit of `names`."""
+    """One error: an effect on one joint or of the whole machine; `columns` `(D, P)` per unit."""
 
     kind: Kind
     joint: int | None
@@ -144,7 +145,7 @@ class _GeometryError:
 
 
 def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
-    """Says whether the recordings hold enough measured tool points of a machine whose geometry is known."""
+    """Return whether there are enough measured tool points, of a machine with known geometry."""
     if not machine.has_bodies:
         return False
     given = [
@@ -157,11 +158,11 @@ def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
 
 @dataclass(frozen=True)
 class GeometryFindings:
-    """What measured tool points show.
+    """Errors of geometry and encoders in measured tool points.
 
     Attributes:
         found: Errors of geometry and encoders.
-        left: Root mean square of what they leave over that of the reference; 1 where nothing is
+        left: Root mean square of the residual over that of the reference; 1 where nothing is
             measured.
     """
 
@@ -172,7 +173,7 @@ class GeometryFindings:
 def find_geometry_errors(
     case: Case, kinds: Sequence[Kind], price: float, name_price: float
 ) -> GeometryFindings:
-    """Returns the errors of geometry and encoders that the measured tool points of the field show; none where there are none."""
+    """Return the errors of geometry and encoders that the measured tool points show."""
     field, reference, machine = case.field, case.reference, case.machine
     if not is_tracked(field, machine):
         return GeometryFindings([], 1.0)
@@ -207,9 +208,7 @@ def find_geometry_errors(
         )
         size_m = max(size_m, usual_m)
     straight, chosen = off, ()
-    for _ in range(
-        NUM_ROUNDS
-    ):  # what errors do is straight about what was found, not about nothing
+    for _ in range(NUM_ROUNDS):  # errors act linearly about the sizes of the round before
         fits, worth = _score_sets(causes, straight, size_m, price, name_price)
         before, chosen = chosen, max(worth, key=worth.__getitem__)
         if chosen in ((), before):
@@ -241,7 +240,7 @@ def _score_sets(
     price: float,
     name_price: float,
 ) -> tuple[dict[tuple[int, ...], SetFit], dict[tuple[int, ...], float]]:
-    """Returns all sets of causes, by their numbers, and what they are worth."""
+    """Return the fits of all sets of errors, and their gains less the penalties."""
     fits: dict[tuple[int, ...], SetFit] = {(): (0.0, np.zeros(0), np.zeros((0, 0)))}
     worth: dict[tuple[int, ...], float] = {(): 0.0}
     for count in range(1, MAX_ERRORS + 1):
@@ -298,7 +297,7 @@ def _describe_effect(
 def _list_errors(
     kinds: Sequence[Kind], q: np.ndarray, ways: np.ndarray, machine: Machine
 ) -> list[_GeometryError]:
-    """Returns the errors that move the tool point at all, other than along the ways that it goes."""
+    """Return the errors that move the tool point at all, other than along the ways that it goes."""
     plain, found = _compute_tool_points(None, {}, q, machine), []
     for kind in kinds:
         joined = all(not kind.numbers[name].per_joint for name in kind.fitted)
@@ -308,7 +307,10 @@ def _list_errors(
                 step = DIFFERENCE_STEP * kind.size(name)
                 moved = (
                     _compute_tool_points(
-                        kind, {name: _offset_neutral(kind, name, joint, step, machine)}, q, machine
+                        kind,
+                        {name: _shift_from_neutral(kind, name, joint, step, machine)},
+                        q,
+                        machine,
                     )
                     - plain
                 )
@@ -319,10 +321,10 @@ def _list_errors(
     return found
 
 
-def _offset_neutral(
+def _shift_from_neutral(
     kind: Kind, name: str, joint: int | None, by: float, machine: Machine
 ) -> np.ndarray:
-    """Returns a number of an effect that is `by` more than neutral on a joint, or on all, `(J,)` or `(1,)`."""
+    """Return a parameter `by` above neutral on one joint or on all, `(J,)` or `(1,)`."""
     value = np.full(
         machine.num_joints if kind.numbers[name].per_joint else 1,
         kind.numbers[name].none,
@@ -335,15 +337,18 @@ def _offset_neutral(
 def _compute_nonlinearity(
     cause: _GeometryError, values: np.ndarray, q: np.ndarray, machine: Machine
 ) -> np.ndarray:
-    """Returns by how much an error of some size moves the tool point other than in proportion, `(D,)`."""
+    """Return the displacement by an error beyond the linear one, `(D,)`."""
     given = {
-        n: _offset_neutral(cause.kind, n, cause.joint, value, machine)
+        n: _shift_from_neutral(cause.kind, n, cause.joint, value, machine)
         for n, value in zip(cause.names, values, strict=True)
     }
     steps = {n: DIFFERENCE_STEP * cause.kind.size(n) for n in cause.names}
     small = [
         _compute_tool_points(
-            cause.kind, {n: _offset_neutral(cause.kind, n, cause.joint, by, machine)}, q, machine
+            cause.kind,
+            {n: _shift_from_neutral(cause.kind, n, cause.joint, by, machine)},
+            q,
+            machine,
         )
         for n, by in steps.items()
     ]
@@ -359,7 +364,7 @@ def _compute_nonlinearity(
 
 
 def _remove_timing(off: np.ndarray, ways: np.ndarray) -> np.ndarray:
-    """Returns errors `(D,)` without their part along the ways `(D, 2)` that the tool point goes.
+    """Return errors `(D,)` without their part along the ways `(D, 2)` that the tool point goes.
 
     Instruments beside the machine have a clock of their own: a period between them and the encoders
     moves the tool by centimetres.
@@ -368,7 +373,7 @@ def _remove_timing(off: np.ndarray, ways: np.ndarray) -> np.ndarray:
 
 
 def _fit(causes: Sequence[_GeometryError], off: np.ndarray, size_m: float) -> SetFit:
-    """Returns what a set of errors earns, their numbers (as differences from neutral), and their covariance."""
+    """Fit a set of errors by least squares with a normal prior."""
     x = np.concatenate([cause.columns for cause in causes], 1)
     unit = np.concatenate(
         [[abs(cause.kind.size(name)) for name in cause.names] for cause in causes]
@@ -396,7 +401,7 @@ def _measure_size(cause: _GeometryError, values: np.ndarray) -> float:
 def _collect_samples(
     recordings: Sequence[Recording], machine: Machine
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns positions, measured tool points and the ways of a period to and from them, `(D, 2)`, about once a second."""
+    """Return positions, tool points and their travel a period before and after, once a second."""
     having = [r for r in recordings if _is_measured(r)]
     every = max(1, round(having[0].rate_hz))
     seen = np.concatenate(
@@ -424,7 +429,7 @@ def _is_measured(recording: Recording) -> bool:
 def _compute_tool_points(
     kind: Kind | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine
 ) -> np.ndarray:
-    """Returns where the tool point is at measured positions, with an effect or none, `(S, 3)`."""
+    """Return where the tool point is at measured positions, with an effect or none, `(S, 3)`."""
     at, device = torch.as_tensor(q, dtype=torch.float32), torch.device("cpu")
     kinematics = Kinematics(machine, device)
     if kind is None:

@@ -17,21 +17,24 @@ from scipy.stats import false_discovery_control
 from diagnosis.free_runs import FreeRuns
 
 MIN_PERMUTATIONS = 1000
-"""Below so many ways to distribute recordings over two sides, no cell of some forty could be told
-from chance."""
+"""Least number of ways to distribute recordings over two sides: with fewer, no cell of some forty
+could be significant at the false discovery rate."""
 PART_S = 30.0
+"""Length of the parts of recordings, s; chosen by hand: six windows of 5 s."""
 NUM_PERMUTATIONS = 2000
+"""Random permutations; the smallest p is 1 / 2001."""
 FALSE_DISCOVERY_RATE = 0.05
+"""The usual level."""
 
 
 @dataclass(frozen=True)
 class ExchangeBlocks:
-    """Which windows change sides together.
+    """Blocks of windows that change sides together.
 
     Attributes:
         field: Block of each window of the field's free runs, `(W,)`.
         reference: The same of the reference's, with numbers of their own.
-        unit: What a block is, for people.
+        unit: Name of a block in reports.
     """
 
     field: np.ndarray
@@ -40,7 +43,7 @@ class ExchangeBlocks:
 
 
 def assign_blocks(field: FreeRuns, reference: FreeRuns) -> ExchangeBlocks:
-    """Returns recordings as blocks, or parts of them where recordings are too few."""
+    """Return recordings as blocks, or parts of them where recordings are too few."""
     sides = [np.unique(side.source, return_inverse=True)[1] for side in (field, reference)]
     few = comb(len(set(sides[0])) + len(set(sides[1])), len(set(sides[0]))) < MIN_PERMUTATIONS
     if not few:
@@ -52,7 +55,7 @@ def assign_blocks(field: FreeRuns, reference: FreeRuns) -> ExchangeBlocks:
 
 
 def number_parts(runs: FreeRuns) -> np.ndarray:
-    """Returns the number of the part of `PART_S` of a recording that each window lies in, `(W,)`."""
+    """Return the number of the part of `PART_S` of a recording that each window lies in, `(W,)`."""
     begin_s = np.array(
         [
             runs.recordings[s].t_s[r] - runs.recordings[s].t_s[0]
@@ -65,7 +68,7 @@ def number_parts(runs: FreeRuns) -> np.ndarray:
 
 
 def sum_by_block(values: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """Returns sums over the windows of each block, `(B, …)`, of `values`, `(W, …)`."""
+    """Return sums over the windows of each block, `(B, …)`, of `values`, `(W, …)`."""
     found = np.zeros((int(block.max()) + 1, *values.shape[1:]))
     np.add.at(found, block, values)
     return found
@@ -76,7 +79,7 @@ def compute_excess_p(
     reference: tuple[np.ndarray, np.ndarray],
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Returns how probable so large a mean would be if field and reference were alike, `(C,)`.
+    """Return how probable so large a mean would be if field and reference were alike, `(C,)`.
 
     Args:
         field: Sums and counts of each block, both `(B, C)`; a cell's mean is the ratio of their
@@ -96,7 +99,7 @@ def compute_excess_p(
     ] = 1.0
     sides = np.concatenate(
         [np.arange(total)[None] < num_field, sides]
-    )  # the first is what was seen
+    )  # the first row is the observation
     with np.errstate(invalid="ignore", divide="ignore"):
         difference = sides @ sums / (sides @ counts) - (1.0 - sides) @ sums / (
             (1.0 - sides) @ counts
@@ -109,7 +112,7 @@ def compute_excess_p(
 
 
 def estimate_standard_error(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Returns the standard error of the ratio of totals, `(C,)`, from how blocks differ; NaN for fewer than two blocks.
+    """Return the standard error of the ratio of totals, `(C,)`; NaN for fewer than two blocks.
 
     Source: the ratio estimator's, Cochran 1977, section 2.11.
 
@@ -125,7 +128,7 @@ def estimate_standard_error(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def adjust_p_values(p: np.ndarray) -> np.ndarray:
-    """Returns p so that those up to `FALSE_DISCOVERIES` hold but for that part of them; NaN stays NaN.
+    """Return p adjusted for the false discovery rate; NaN stays NaN.
 
     Source: Benjamini and Hochberg 1995.
     """

@@ -25,7 +25,7 @@ from diagnosis.free_runs import FreeRuns
 from diagnosis.gap import Reach, apart
 from diagnosis.refine import Repair
 from diagnosis.residual_model import CLUES
-from diagnosis.stages import survey_gap
+from diagnosis.stages import examine_gap
 
 NEAR = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
@@ -95,7 +95,7 @@ class Diagnosis:
         told = "unknown" if unknown else "effects" if selected else "none"
         after = field.runs(paths) if selected else None
         machine = self.case.machine
-        seen = survey_gap(
+        seen = examine_gap(
             before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
         )
         remainder = self._remainder(findings, reach) if selected else None

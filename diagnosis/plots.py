@@ -33,7 +33,7 @@ NUM_AGES = 16
 
 
 def draw_gap_bars(answer: Answer) -> Figure | None:
-    """Draws the error before and after over the floor; `None` where there is none to draw."""
+    """Draw the error before and after over the floor; `None` where there is none to draw."""
     gap = answer.gap
     if gap is None or not max(gap.before, gap.floor or 0.0):
         return None
@@ -69,7 +69,7 @@ def draw_gap_bars(answer: Answer) -> Figure | None:
 
 
 def draw_gap_map(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
-    """Draws which joint and regime the gap lies in, and how large the error of each joint is over the running time."""
+    """Draw the gap by joint and regime, and the error of each joint over the running time."""
     location = answer.more["location"]
     parts = location["parts"]["regime"]
     joints, regimes = (
@@ -116,7 +116,7 @@ def draw_gap_map(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
 
 
 def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
-    """Draws measured against simulated positions of the joints with the largest gaps: a whole recording, and the worst windows."""
+    """Draw measured and simulated positions of the joints with the largest gaps."""
     before = outcome.before
     error = np.sqrt(np.nanmean(before.error**2, 1))  # (W, J)
     located = outcome.answer.where.joints
@@ -161,7 +161,7 @@ def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
 
 
 def draw_growth(outcome: Outcome, machine: Machine) -> Figure:
-    """Draws the error over the time of a free run, one panel a joint, with what its shape says."""
+    """Draw the error over the time of a free run with its kind of growth, one panel a joint."""
     figure, axes = make_joint_panels(machine, "xy")
     curves = {"before": outcome.before, "after": outcome.after, "floor": outcome.floor}
     t_s = machine.period_s * np.arange(1, outcome.before.simulated.shape[1] + 1)
@@ -193,7 +193,7 @@ def draw_growth(outcome: Outcome, machine: Machine) -> Figure:
 
 
 def draw_rivals(evidence: Mapping[str, Any]) -> Figure | None:
-    """Draws what each rival earned, those that were chosen in blue, and what chance alone earns.
+    """Draw the gain of each rival, chosen ones in blue, and the gain by chance.
 
     Args:
         evidence: `rivals`: a list of `name`, `score`, `selected`; `threshold`: from which a rival
@@ -233,7 +233,7 @@ def draw_rivals(evidence: Mapping[str, Any]) -> Figure | None:
 
 
 def draw_tip_budget(budget: Mapping[str, Any]) -> Figure:
-    """Draws how the joints' errors add up to the mean squared error of the tip, and what is left after the effects."""
+    """Draw how the joints' errors add up at the tip, and the tip error after the effects."""
     before, after, floor = (budget[name] for name in ("before", "after", "floor"))
     parts = sorted(before["joint_part"].items(), key=lambda pair: -pair[1])
     whole = before["tip_rms_mm"]
@@ -293,7 +293,7 @@ def draw_tip_budget(budget: Mapping[str, Any]) -> Figure:
 
 
 def _draw_error_over_time(axis: Axes, before: FreeRuns, machine: Machine) -> None:
-    """Fills the axis with the error of each joint over running time, in parts of its travel."""
+    """Fill the axis with the error of each joint over running time, in parts of its travel."""
     square = np.nanmean(before.error**2, 1) / (machine.upper - machine.lower) ** 2
     order = np.lexsort((before.row, before.source))
     groups = np.array_split(order, min(NUM_AGES * 2, len(order)))

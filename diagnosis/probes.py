@@ -26,16 +26,17 @@ from diagnosis.permutation_test import number_parts
 from diagnosis.regimes import CREEP_COMMAND, REGIMES, TRANSIENT_S, label_regimes, shift_by_dead_time
 
 MIN_SPEED = 0.1
-"""Starts slower than this part of the full speed tell no time."""
+"""Least speed of a start, of full speed; chosen by hand: slower ones amplify the noise of time."""
 MIN_EVENTS = 8
+"""Least number of starts or stops; chosen by hand."""
 MAD = 1.4826
-"""Median absolute deviation to standard deviation."""
+"""Median absolute deviation to standard deviation of a normal distribution."""
 
 
 def measure_onsets(
     runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[tuple[str, str], tuple[float, float]]:
-    """Returns the spread of the lateness of starts (s) as `delay_jitter` and ringing (rad or m) as `compliance`, by joint.
+    """Return the spread of the lateness of starts (s) and the ringing (rad or m), by joint.
 
     Each with its standard error; joints with fewer than `FEWEST` starts or stops are left out.
     """
@@ -65,7 +66,7 @@ def measure_onsets(
 def _measure_lateness(
     runs: FreeRuns, label: np.ndarray, joint: int, machine: Machine
 ) -> Iterator[float]:
-    """Yields for each start within a window how much later the machine moves, s."""
+    """Yield for each start within a window how much later the machine moves, s."""
     ahead = round(TRANSIENT_S / machine.period_s)
     is_start = label == REGIMES.index("start")
     error, path = runs.error[..., joint], runs.simulated[..., joint]
@@ -86,7 +87,7 @@ def _measure_lateness(
 
 
 def _measure_ringing(runs: FreeRuns, label: list[np.ndarray], joint: int) -> Iterator[float]:
-    """Yields for each stop how much the measured position swings about a straight line in the second half of the time after."""
+    """Yield the scatter about a straight line in the second half of the time after each stop."""
     for recording, regime in zip(runs.recordings, label, strict=True):
         is_stop = regime == REGIMES.index("stop")
         edges = np.flatnonzero(np.diff(is_stop.astype(np.int8)))
@@ -98,12 +99,14 @@ def _measure_ringing(runs: FreeRuns, label: list[np.ndarray], joint: int) -> Ite
 
 
 SPAN_S = 0.25
+"""Time over which speeds are taken, s; chosen by hand: shorter ones are noise, longer ones blur."""
 LARGE_COMMAND = 0.7
-"""Commands beyond this are large."""
+"""Smallest of the large commands, of full; chosen by hand."""
 CLEAR_Z = 4.0
-"""A figure that differs from the reference's by so many standard errors is worth a sentence."""
+"""Standard errors from the reference at which a probe is reported; chosen by hand for some sixty
+probes a report."""
 MIN_SAMPLES = 40
-"""Samples with the condition below which a probe says nothing."""
+"""Least number of samples with the condition of a probe; chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -128,11 +131,11 @@ class Probe:
 
     @property
     def is_clear(self) -> bool:
-        """Says whether it stands out."""
+        """Return whether it stands out."""
         return abs(self.z) > CLEAR_Z
 
     def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data."""
+        """Return it as plain JSON data."""
         return asdict(self)
 
 
@@ -191,13 +194,13 @@ TEXTS = {
         MILLI,
     ),
 }
-"""What a coefficient above and below 0 says, and its factor."""
+"""Sentences for a coefficient above and below 0, and the factor to their unit."""
 
 
 def probe_residuals(
     runs: FreeRuns, reference: FreeRuns | None, machine: Machine, dead_time_s: np.ndarray
 ) -> list[Probe]:
-    """Returns all figures, those that stand out most first.
+    """Return all figures, those that stand out most first.
 
     Args:
         runs: Free runs through field recordings.
@@ -233,11 +236,11 @@ def _describe_coefficient(effect: str, value: float, unit: str) -> str:
 def _fit_coefficients(
     runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[tuple[str, str], tuple[float, float]]:
-    """Returns the coefficient of each probe and its standard error, by effect and joint."""
+    """Return the coefficient of each probe and its standard error, by effect and joint."""
     span = max(1, round(SPAN_S / machine.period_s))
-    lacks = _difference_over(runs.error, span) / SPAN_S
-    speed = _difference_over(runs.simulated, span) / SPAN_S
-    acceleration = _difference_over(speed, span) / SPAN_S
+    lacks = _subtract_earlier(runs.error, span) / SPAN_S
+    speed = _subtract_earlier(runs.simulated, span) / SPAN_S
+    acceleration = _subtract_earlier(speed, span) / SPAN_S
     clues = _ProbeColumns(runs, machine, dead_time_s)
     block = np.broadcast_to(number_parts(runs)[:, None], lacks.shape[:2])
     found = {}
@@ -254,14 +257,14 @@ def _fit_coefficients(
             if (np.abs(column) > 0).sum() < MIN_SAMPLES:
                 continue
             place = {"dead_time": 0, "flow_gain": 1}.get(effect, 2)
-            found[effect, name] = _jackknife_coefficient(
+            found[effect, name] = _estimate_coefficient(
                 rows, lacks[..., j][given], block[given], place
             )
     return found
 
 
 class _ProbeColumns:
-    """What each effect would leave behind in the speed that the simulator has too much, `(W, K)` for each joint."""
+    """Regressors of the excess speed, one an effect, `(W, K)` for each joint."""
 
     def __init__(self, runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> None:
         acting = [shift_by_dead_time(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
@@ -284,7 +287,7 @@ class _ProbeColumns:
         self._late = (late_s / max(float(np.ptp(late_s)), 1e-9))[:, None]
 
     def of(self, joint: int, speed: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-        """Yields effect and clue of one joint, whose simulated speed is `speed`, `(W, K)`."""
+        """Yield effect and clue of one joint, whose simulated speed is `speed`, `(W, K)`."""
         u, regime = self._u[..., joint], self._regime[..., joint]
         moving, size = np.abs(u) > COMMANDED, np.abs(u)
         others = (np.abs(self._u) > COMMANDED).sum(2) - moving > 0
@@ -308,17 +311,17 @@ class _ProbeColumns:
             yield "load_dependence", -np.sign(u) * load * np.abs(speed)
 
 
-def _difference_over(values: np.ndarray, span: int) -> np.ndarray:
-    """Returns the change over the last `span` steps, `(W, K, J)`, NaN before there are so many."""
+def _subtract_earlier(values: np.ndarray, span: int) -> np.ndarray:
+    """Return the change over the last `span` steps, `(W, K, J)`, NaN before there are so many."""
     found = np.full(values.shape, np.nan)
     found[:, span:] = values[:, span:] - values[:, :-span]
     return found
 
 
-def _jackknife_coefficient(
+def _estimate_coefficient(
     rows: np.ndarray, target: np.ndarray, block: np.ndarray, place: int
 ) -> tuple[float, float]:
-    """Returns one coefficient of a least-squares fit, and its standard error from leaving out one block at a time."""
+    """Return a least-squares coefficient and its jackknife standard error over blocks."""
     names = np.unique(block)
     grams = np.stack([rows[block == b].T @ rows[block == b] for b in names])
     crosses = np.stack([rows[block == b].T @ target[block == b] for b in names])

@@ -34,20 +34,21 @@ DIRECTIONS = ("not commanded", "extending", "retracting")
 LOADS = ("not commanded", "level", "lifting", "lowering")
 """Against gravity, with it, or with less than `LEVEL` of the joint's largest load."""
 TRANSIENT_S = 0.6
-"""What begins or ends a motion (lag, play, ringing) is over after that."""
+"""Length of a transient, s: lag, play and ringing are over after it; chosen by hand."""
 NEAR_STOP = 0.05
-"""Part of the travel that counts as near an end stop."""
+"""Share of the travel near an end stop; chosen by hand."""
 CREEP_COMMAND = 0.3
-"""Largest command of a creeping joint: about where a dead band still takes half of it."""
+"""Largest command of a creeping joint; chosen by hand: a usual dead band takes half of it."""
 LEVEL_LOAD = 0.1
+"""Share of the largest load below which a joint counts as level; chosen by hand."""
 
 
 @dataclass(frozen=True)
 class SampleGrouping:
-    """A way of sorting samples.
+    """Labels of all samples by one criterion.
 
     Attributes:
-        name: What by.
+        name: The criterion.
         categories: Their names.
         label: Number of the category of each sample, for each recording `(T, J)`.
     """
@@ -60,7 +61,7 @@ class SampleGrouping:
 def group_samples(
     recordings: list[Recording], machine: Machine, dead_time_s: np.ndarray
 ) -> list[SampleGrouping]:
-    """Returns regime, direction and, where the masses are known, load of all samples.
+    """Return regime, direction and, where the masses are known, load of all samples.
 
     Args:
         recordings: The recordings.
@@ -94,7 +95,7 @@ def group_samples(
 
 
 def shift_by_dead_time(u: np.ndarray, dead_time_s: np.ndarray, period_s: float) -> np.ndarray:
-    """Returns the command that moved each joint in the period before each row, `(T, J)`: that of a dead time before."""
+    """Return the command that moved each joint before each row, `(T, J)`."""
     found = np.zeros(u.shape)
     for j, delay_s in enumerate(dead_time_s):
         back = round(float(delay_s) / period_s) + 1  # row k - 1 is in force until row k is measured
@@ -105,7 +106,7 @@ def shift_by_dead_time(u: np.ndarray, dead_time_s: np.ndarray, period_s: float) 
 def label_regimes(
     acting: np.ndarray, q: np.ndarray, machine: Machine, rate_hz: float
 ) -> np.ndarray:
-    """Returns the number of the regime of each sample, `(T, J)`."""
+    """Return the number of the regime of each sample, `(T, J)`."""
     shortly = round(TRANSIENT_S * rate_hz)
     moving = np.abs(acting) > COMMANDED
     sign = np.where(moving, np.sign(acting), 0.0)
@@ -131,30 +132,30 @@ def label_regimes(
 
 
 def label_directions(acting: np.ndarray) -> np.ndarray:
-    """Returns the number of the direction of each sample, `(T, J)`."""
+    """Return the number of the direction of each sample, `(T, J)`."""
     return np.where(np.abs(acting) <= COMMANDED, 0, np.where(acting > 0, 1, 2))
 
 
 def label_loads(acting: np.ndarray, q: np.ndarray, machine: Machine) -> np.ndarray:
-    """Returns the number of the kind of load of each sample, `(T, J)`."""
+    """Return the number of the kind of load of each sample, `(T, J)`."""
     load = (
         Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
     )
     largest = np.maximum(np.abs(load).max(0), 1e-9)
     pushed = load * np.sign(acting)
     kind = np.where(np.abs(load) < LEVEL_LOAD * largest, 1, np.where(pushed < 0, 2, 3))
-    # a joint about the vertical carries nothing: what little comes out is rounding
+    # a joint about the vertical carries nothing: its tiny load is rounding
     kind = np.where(largest < 1e-3 * largest.max(), 1, kind)
     return np.where(np.abs(acting) <= COMMANDED, 0, kind)
 
 
 def _hold_last_sign(sign: np.ndarray) -> np.ndarray:
-    """Returns the newest sign that is not 0 at each row, `(T, J)`; 0 before the first."""
+    """Return the newest sign that is not 0 at each row, `(T, J)`; 0 before the first."""
     place = np.maximum.accumulate(np.where(sign != 0, np.arange(len(sign))[:, None], 0), 0)
     return np.take_along_axis(sign, place, 0)
 
 
 def _count_rows_since(event: np.ndarray) -> np.ndarray:
-    """Returns the rows since the newest event at each row, `(T, J)`; very many before the first."""
+    """Return the rows since the newest event at each row, `(T, J)`; very many before the first."""
     rows = np.arange(len(event))[:, None]
     return rows - np.maximum.accumulate(np.where(event, rows, -(10**9)), 0)

@@ -17,7 +17,7 @@ GOOD_CLOSED = 0.5
 
 
 def write_headline(answer: Answer) -> tuple[str, Tone]:
-    """Returns the answer in two or three sentences, and whether it is good news."""
+    """Return the answer in two or three sentences, and whether it is good news."""
     gap = answer.gap
     told = ""
     if gap is not None:
@@ -56,7 +56,7 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
 
 
 def _describe_tool(answer: Answer) -> str:
-    """Returns how far off the tool is, where that is what a named effect moves: free runs of joints show nothing of it."""
+    """Return the error of the tool, where a named effect moves the tool only."""
     cause = str((answer.more.get("geometry") or {}).get("cause") or "").split(" ")[0]
     if cause not in {one.effect for one in answer.selected}:
         return ""
@@ -78,29 +78,29 @@ def _describe_floor(gap: Gap) -> str:
 
 
 def describe_selected(one: Selected) -> str:
-    """Returns an effect with its joints and probability."""
+    """Return an effect with its joints and probability."""
     return (
         f"{name_effect(one.effect)}{list_on_joints(one.joints)} (probability {one.probability:.2f})"
     )
 
 
 def name_effect(effect: str) -> str:
-    """Returns the name of an effect as words."""
+    """Return the name of an effect as words."""
     return effect.replace("_", " ")
 
 
 def list_on_joints(joints: Sequence[str]) -> str:
-    """Returns ` on q3 and q4`, nothing for an effect of the whole machine."""
+    """Return ` on q3 and q4`, nothing for an effect of the whole machine."""
     return f" on {join_words(joints)}" if joints else ""
 
 
 def join_words(names: Sequence[str]) -> str:
-    """Returns `a, b and c`."""
+    """Return `a, b and c`."""
     return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
 
 
 def describe_class(one: Selected) -> str:
-    """Returns what an effect cannot be told from, and what would decide; nothing where it stands alone."""
+    """Return the indistinguishable effects and the measurement that would decide, or nothing."""
     if not one.same_as:
         return ""
     others = join_words([name_effect(name) for name in one.same_as])
@@ -110,7 +110,7 @@ def describe_class(one: Selected) -> str:
 
 
 def describe_remainder(answer: Answer) -> str:
-    """Returns what is left above the floor after the selected effects."""
+    """Return the error that remains above the floor after the selected effects."""
     gap = answer.gap
     if gap is None or not answer.selected:
         return ""
@@ -136,7 +136,7 @@ def describe_remainder(answer: Answer) -> str:
 def format_estimate(
     value: Estimate | None, factor: float = 1.0, style: str = ".3g"
 ) -> tuple[str, str]:
-    """Returns a number and its interval as texts."""
+    """Return a number and its interval as texts."""
     if value is None:
         return "–", ""
     low, high = (factor * bound for bound in value.ci95)
@@ -157,7 +157,7 @@ def _describe_place(answer: Answer) -> str:
 
 
 def describe_regime(regime: str) -> str:
-    """Returns a regime as a phrase of a sentence."""
+    """Return a regime as a phrase of a sentence."""
     phrases = {
         "hold": "at rest",
         "stop": "just after stops",
@@ -182,7 +182,7 @@ MAX_LISTED = 8
 
 
 def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
-    """Writes `report.html` into `folder`.
+    """Write `report.html` into `folder`.
 
     Parts of the answer that a diagnosis left out are left out here as well.
 
@@ -297,7 +297,7 @@ def _add_effects(page: Report, outcome: Outcome, machine: Machine) -> None:
 
 
 def _add_errors_by_joint(page: Report, outcome: Outcome, machine: Machine) -> None:
-    """Tells errors before and after joint by joint, and on recordings apart."""
+    """Report errors before and after joint by joint, and on recordings apart."""
     gap, unseen = outcome.answer.gap, outcome.answer.more.get("unseen")
     if not outcome.answer.selected or gap is None or not gap.joints:
         return

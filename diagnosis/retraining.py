@@ -29,7 +29,7 @@ SuccessRate = dict[str, Any]
 
 
 def compare_policies(evaluations: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns success by policy and plant, what it lost and regained on the machine, and how well simulators foretold it.
+    """Return success by policy and plant, its loss and recovery, and the agreement of simulators.
 
     Args:
         evaluations: `evaluation.json` of each plant, all of the same policies.
@@ -65,7 +65,7 @@ def compare_policies(evaluations: Mapping[str, Mapping[str, Any]]) -> dict[str, 
 
 
 def _compute_rate(row: Mapping[str, Any]) -> SuccessRate:
-    """Returns a rate with its Wilson interval."""
+    """Return a rate with its Wilson interval."""
     episodes = int(row["episodes"])
     rate = float(row["success_strict"]["mean"])
     low, high = compute_wilson_interval(round(rate * episodes), episodes)
@@ -73,7 +73,7 @@ def _compute_rate(row: Mapping[str, Any]) -> SuccessRate:
 
 
 def subtract_rates(first: SuccessRate, second: SuccessRate) -> SuccessRate:
-    """Returns `first` less `second` with its 95 % interval.
+    """Return `first` less `second` with its 95 % interval.
 
     Source: Newcombe 1998, Statistics in Medicine 17, method 10, from two Wilson intervals. Policies
     meet the same starts, so their outcomes go together and the interval is rather too wide.
@@ -88,11 +88,11 @@ def subtract_rates(first: SuccessRate, second: SuccessRate) -> SuccessRate:
 def measure_rank_agreement(
     success: Mapping[str, Mapping[str, SuccessRate]], plant: str
 ) -> dict[str, float | None]:
-    """Returns how well `plant` says which policies do better on the machine, and how well they do.
+    """Return how well the ranking of policies on `plant` agrees with that on the machine.
 
     Returns:
         `kendall`: Kendall's tau-b of the two orders, 1 when they are the same, `None` when one of
-        them knows no order; `rank_violation`: what a wrong order costs in success on the machine,
+        them knows no order; `rank_violation`: loss of success on the machine by a wrong order,
         mean over policies of the worst pair (mean maximum rank violation; Li et al. 2024, SIMPLER),
         0 at best; `error`: mean absolute difference of success.
     """
@@ -112,14 +112,14 @@ def measure_rank_agreement(
 def compute_rank_violation(
     simulated: Sequence[float] | np.ndarray, real: Sequence[float] | np.ndarray
 ) -> float:
-    """Returns the mean over policies of the largest real difference to a policy that the simulator ranks the other way round."""
+    """Return the mean over policies of the largest real difference that is ranked wrongly."""
     simulated, real = np.asarray(simulated, dtype=float), np.asarray(real, dtype=float)
     swapped = (simulated[:, None] < simulated[None]) != (real[:, None] < real[None])
     return float((swapped * np.abs(real[:, None] - real[None])).max(1).mean())
 
 
 def write_headline(found: Mapping[str, Any]) -> tuple[str, Tone]:
-    """Returns what happened in two or three sentences, and whether it is good news."""
+    """Return the outcome in two or three sentences, and its tone."""
     success = found["success"]
     before, after = success[BEFORE], success[AFTER]
     fall, back, left = found["fall"], found["return"], found["left"]
@@ -143,7 +143,7 @@ def write_headline(found: Mapping[str, Any]) -> tuple[str, Tone]:
 
 
 def format_rate(share: SuccessRate) -> str:
-    """Returns `91 % (88 to 93)`."""
+    """Return `91 % (88 to 93)`."""
     low, high = (100 * bound for bound in share["ci95"])
     return f"{100 * share['mean']:.0f} % ({low:.0f} to {high:.0f})"
 
@@ -160,13 +160,13 @@ COLOURS = {BEFORE: RED, AFTER: BLUE}
 
 
 def write_report(found: Mapping[str, Any], folder: Path) -> None:
-    """Writes `close_gap.html` and `close_gap.png` into `folder`.
+    """Write `close_gap.html` and `close_gap.png` into `folder`.
 
     Raises:
         StorageError: something could not be written.
     """
     text, tone = write_headline(found)
-    page = Report("What the diagnosis is worth to the policy", text, tone)
+    page = Report("Success of the policy before and after retraining", text, tone)
     figure = draw_success(found)
     figure.savefig(folder / PICTURE_FILE, dpi=150)
     page.add_picture(
@@ -205,7 +205,7 @@ def write_report(found: Mapping[str, Any], folder: Path) -> None:
         page.add_heading("How it was made")
         page.add_facts(
             {
-                **{f"{PLANT_NAMES[name]}": what for name, what in found["plants"].items()},
+                **{PLANT_NAMES[name]: text for name, text in found["plants"].items()},
                 **found["retraining"],
             }
         )
@@ -213,7 +213,7 @@ def write_report(found: Mapping[str, Any], folder: Path) -> None:
 
 
 def add_success_table(page: Report, found: Mapping[str, Any]) -> None:
-    """Adds success and time to insert of each policy on each plant."""
+    """Add success and time to insert of each policy on each plant."""
     best = max(found["success"].values(), key=lambda shares: shares["machine"]["mean"])
     rows = []
     for policy, shares in found["success"].items():
@@ -235,7 +235,7 @@ def add_success_table(page: Report, found: Mapping[str, Any]) -> None:
 
 
 def draw_success(found: Mapping[str, Any]) -> Figure:
-    """Draws success of each policy on each plant."""
+    """Draw success of each policy on each plant."""
     figure = Figure(figsize=(9.5, 3.8), layout="constrained")
     axis = figure.add_subplot()
     policies = list(found["success"])

@@ -20,14 +20,14 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
 
 MIN_STRETCHES = 5
-"""Ignored stretches below which a condition that they share may be a coincidence."""
+"""Least number of ignored stretches; chosen by hand: fewer may share a condition by coincidence."""
 MIN_AGREEMENT = 0.9
-"""A condition holds in at least this part of the ignored time, and in at most the rest of it of the
-answered time."""
+"""A condition holds in at least this share of the ignored time, and in at most the rest of the
+obeyed time; chosen by hand."""
 SPEED_ROWS = 3
-"""Rows before and after one by which its speed is told."""
+"""Rows before and after a row that give its speed; chosen by hand: 0.3 s at 20 Hz."""
 NUM_POSITIONS = 15
-"""Places tried for a threshold on a pose."""
+"""Positions of a joint that are tried as a threshold; chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def find_interlock(
     joint: int,
     thresholds: InspectionThresholds,
 ) -> Interlock | None:
-    """Returns the one condition that tells ignored commands of a joint from obeyed ones, `None` where no simple one does.
+    """Return the condition that separates ignored commands of a joint from obeyed ones, or `None`.
 
     Conditions tried: another joint is commanded, none is, the command's own sign, a joint is beyond
     a position.
@@ -119,7 +119,7 @@ def _measure_agreement(
     thresholds: InspectionThresholds,
     machine: Machine,
 ) -> tuple[float, float]:
-    """Returns the parts of the ignored and of the obeyed time in which a condition holds, where it has not just changed."""
+    """Return the shares of ignored and of obeyed time in which a steady condition holds."""
     steady = ~_dilate(
         np.append(False, np.diff(condition)), round(thresholds.settle_s / machine.period_s)
     )
@@ -148,31 +148,32 @@ def _list_conditions(
 
 
 def _dilate(mask: np.ndarray, num_rows: int) -> np.ndarray:
-    """Returns where `mask`, `(T,)`, holds within `num_rows` rows: there a command has not been answered yet."""
+    """Return the rows within `num_rows` of the mask, `(T,)`: there the answer may still come."""
     return np.convolve(mask, np.ones(2 * num_rows + 1), mode="same") > 0.5
 
 
 Severity = Literal["note", "warn", "bad"]
 MAX_IRREGULAR_SHARE = 0.05
-"""Of the periods further than 10 % from the median, as a part of all, above which a clock is
-irregular."""
+"""Share of periods further than 10 % from the median from which a clock is irregular; chosen by
+hand."""
 JUMP_PERIODS = 1.15
-"""A period so many times the median is a jump; the format refuses those beyond 1.2."""
+"""Period over the median that counts as a jump; the format of recordings refuses 1.2."""
 MAX_CLOCK_PPM = 2000.0
-"""Largest deviation of the clock's rate from the stated one; 1e-5 to 4e-3 is what loggers show."""
+"""Largest deviation of the clock's rate from the stated one, ppm; chosen by hand: loggers are off by
+10 to 4000."""
 MIN_SATURATED_ROWS = 10
-"""So many equal samples on end at the very end of what a sensor ever says, away from the joint's
-stops, are no coincidence."""
+"""Least number of consecutive samples at the extreme of a sensor, away from the stops, that count as
+saturation; chosen by hand: half a second at 20 Hz."""
 MIN_COMMANDED_S = 10.0
-"""A joint commanded for less says nothing about itself."""
+"""Least time with a command, s; chosen by hand: two windows of 5 s."""
 
 
 @dataclass(frozen=True)
 class RecordingRemark:
-    """Something about a recording that a person should know before believing what follows from it.
+    """A finding that limits the conclusions from a recording.
 
     Attributes:
-        name: What it is.
+        name: Kind of the finding.
         severity: `bad`: conclusions about this joint are likely wrong; `warn`: they may be; `note`:
             good to know.
         joint: Joint concerned, `None` where it is all of them.
@@ -181,8 +182,8 @@ class RecordingRemark:
         to_s: End of the last one.
         count: Number of stretches.
         amount: How much, with its unit.
-        meaning: What it may come from.
-        advice: What to do.
+        meaning: Possible causes.
+        advice: The remedy.
     """
 
     name: str
@@ -197,7 +198,7 @@ class RecordingRemark:
     advice: str
 
     def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data."""
+        """Return it as plain JSON data."""
         return asdict(self)
 
 
@@ -272,13 +273,13 @@ FINDING_NAMES = {
     "beyond limit": "beyond limit",
     "exclusive": "exclusive joint",
 }
-"""What `brokk_rl.inspection` calls them."""
+"""Name of a remark by kind of finding in `brokk_rl.inspection`."""
 
 
 def examine_recordings(
     recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
 ) -> list[RecordingRemark]:
-    """Returns what is to be said about recordings of `machine`, the gravest first."""
+    """Return all remarks about recordings of `machine`, the most severe first."""
     inspected = [
         (recording, inspect_recording(recording, machine, thresholds).findings)
         for recording in recordings
@@ -312,7 +313,7 @@ def examine_recordings(
 
 
 def name_recording(recording: Recording) -> str:
-    """Returns how a recording is called in a report: by its file, else by its run."""
+    """Return how a recording is called in a report: by its file, else by its run."""
     return recording.path.stem if recording.path else recording.run
 
 
@@ -343,7 +344,7 @@ def _make_remark(
 def _group_findings(
     recording: Recording, findings: Sequence[RecordingFinding]
 ) -> Iterator[RecordingRemark]:
-    """Yields one remark for all stretches of one kind and joint."""
+    """Yield one remark for all stretches of one kind and joint."""
 
     def key(finding: RecordingFinding) -> tuple[str, str]:
         return finding.kind, finding.joint or ""

@@ -19,23 +19,26 @@ from diagnosis.case import Case, parts
 from diagnosis.effect_library import Found, Kind, Still, fit_interval
 
 SIZES = np.geomspace(0.05, 6.0, 25)
+"""Sizes that are tried, of typical; steps of a fifth, as fine as the scatter can tell."""
 REST_SPEED, MOVING_SPEED = 0.01, 0.08
-"""Mean speed over a second, of full speed, below which a joint rests and above which it moves."""
+"""Mean speed over a second, of full speed, below which a joint rests and above which it moves;
+chosen by hand."""
 MIN_STEPS = 20
-"""Fewer steps do not show the smallest."""
+"""Least number of steps for an estimate of the smallest; chosen by hand."""
 STATISTICS_SIGMA = np.array([0.08, 0.08, 0.03, 0.03, 0.08, 0.08])
-"""Differences in the statistics that say nothing: sensors are not quite the same from day to
-day."""
+"""Standard deviation of the statistics from day to day; chosen by hand: larger ones miss faint
+effects, smaller ones add false alarms."""
 MAX_GAIN = 60.0
-"""Evidence is not counted beyond this: the statistics are no exact likelihood."""
+"""Largest gain in log likelihood that counts; chosen by hand: the statistics are no exact
+likelihood."""
 WHITE_NOISE_FACTOR = 6.0
-"""Variance of the second differences of white noise, over its own."""
+"""Variance of the second differences of white noise over its own: 1 + 4 + 1."""
 FLOAT_NOISE = 2e-6
-"""Noise that float32 cannot hold, rad or m."""
+"""Resolution of float32 at some tens of rad or m."""
 
 
 def compute_scatter_statistics(q: np.ndarray, machine: Machine) -> np.ndarray:
-    """Returns, by joint, at rest and in motion: scatter of second differences, share of equal neighbours, smallest steps, `(J, F)`.
+    """Return scatter, share of equal neighbours and smallest steps, by joint, `(J, F)`.
 
     Scatter and steps are logarithms. The smallest steps are those of the sensor, where it has any.
     """
@@ -61,7 +64,7 @@ def compute_scatter_statistics(q: np.ndarray, machine: Machine) -> np.ndarray:
 def measure_excess_scatter(
     field: Sequence[Recording], reference: Sequence[Recording], machine: Machine
 ) -> np.ndarray:
-    """Returns how far positions in the field scatter as they are read, beyond those of the reference, rad or m, `(J,)`.
+    """Return the scatter of positions in the field beyond the reference, rad or m, `(J,)`.
 
     Seen in second differences, at rest or in motion, whichever is more: a joint that rests between
     two steps of a coarse sensor flickers.
@@ -83,7 +86,7 @@ def measure_excess_scatter(
 def find_sensor_effects(
     case: Case, kinds: Sequence[Kind], price: float, name_price: float
 ) -> list[Found]:
-    """Returns the effects on sensors that the scatter of the field's samples shows."""
+    """Return the effects on sensors that the scatter of the field's samples shows."""
     field, reference, machine = case.field, parts(case.reference), case.machine
     if len(reference) < 2:
         return []
@@ -150,7 +153,7 @@ def find_sensor_effects(
 
 
 def _compute_likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    """Returns the log likelihood of the field's statistics `(J, F)` where those of the parts `(P, J, F)` are typical, `(J,)`.
+    """Return the log likelihood of the field's statistics given those of the parts, `(J,)`.
 
     Parts scatter at least as they do without an effect, `plain` `(P, J, F)`: a few of them may
     agree by chance.
@@ -166,7 +169,7 @@ def _compute_likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) 
 def _simulate_statistics(
     kind: Kind, size: float, reference: Sequence[Recording], machine: Machine
 ) -> np.ndarray:
-    """Returns the statistics of the reference with an effect on all joints, `(P, J, F)`."""
+    """Return the statistics of the reference with an effect on all joints, `(P, J, F)`."""
     found = []
     for recording in reference:
         q = torch.as_tensor(recording.q, dtype=torch.float32)

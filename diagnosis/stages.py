@@ -37,7 +37,7 @@ class TipError:
 
     Attributes:
         tip_rms_m: Root mean square distance between simulated and measured tip, m.
-        joint_rms_m: What each joint's error alone would move the tip by, root mean square, m.
+        joint_rms_m: Displacement of the tip by each joint's error alone, root mean square, m.
         joint_part: Part of the mean squared distance that each joint answers for; they add up to 1,
             one below 0 cancels others.
     """
@@ -49,13 +49,13 @@ class TipError:
 
 @dataclass(frozen=True)
 class TipErrorBudget:
-    """The gap at the tool before and after the effects that were found, and the floor; `None` where there is no such simulator.
+    """Tip error before and after the effects, and the floor; `None` without such a simulator.
 
     Attributes:
         before: Of the simulator as it was.
         after: With the selected effects.
         floor: Of the simulator on reference recordings.
-        stages_m: Root mean square of what other stages add, by stage, m.
+        stages_m: Root mean square of the contribution of other stages, by stage, m.
     """
 
     before: TipError
@@ -64,7 +64,7 @@ class TipErrorBudget:
     stages_m: dict[str, float]
 
     def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data, in mm as its name says."""
+        """Return it as plain JSON data, in mm as its name says."""
 
         def account(one: TipError | None) -> dict[str, Any] | None:
             return one and {
@@ -80,7 +80,7 @@ class TipErrorBudget:
 
 
 def measure_tip_error(runs: FreeRuns, machine: Machine) -> TipError:
-    """Returns the error of the tip over free runs.
+    """Return the error of the tip over free runs.
 
     Raises:
         ConfigError: the machine's geometry is not known.
@@ -112,25 +112,24 @@ STAGE_OF: dict[str, Stage] = {
 }  # fmt: skip
 """Stage of each effect; all others are of the actuation."""
 CONTACT_N = 200.0
-"""More than this at the tool is contact, not the noise of a force that is computed from
-pressures."""
+"""Force at the tool that counts as contact, N; chosen by hand: above the noise of a force that is
+computed from pressures."""
 MIN_EXPLAINED, MIN_EXCESS_RATIO = 0.05, 1.5
-"""Poses differ, and with them what a measured tool point has of noise: only what one error of
-geometry explains so much of, or what is so many times the reference's, counts as an error of
-kinematics."""
+"""Share explained by one error of geometry, and ratio to the reference's error, from which the
+kinematics count as wrong; chosen by hand: the noise of tool points differs between poses."""
 MAX_TARGET_DISTANCE_M = 0.5
-"""A hole further than this from the tip is not the one that is touched."""
+"""Largest distance of the touched hole from the tip, m; chosen by hand."""
 TARGET_COLUMNS = ("target_x_m", "target_y_m", "target_z_m")
 
 
 @dataclass(frozen=True)
 class StageFinding:
-    """What a stage has to do with the gap.
+    """Contribution of a stage to the gap.
 
     Attributes:
         stage: Its name.
         part: Part of the joints' gap; `None` for a stage that is no part of it.
-        rms_m: What it adds at the tool, m; `None` where that cannot be told.
+        rms_m: Its contribution at the tool, m; `None` where it is unknown.
         text: Why, in a sentence.
     """
 
@@ -140,13 +139,13 @@ class StageFinding:
     text: str
 
     def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data."""
+        """Return it as plain JSON data."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class StageEvidence:
-    """What is known about the stages before they are weighed; see the modules that the types come from."""
+    """Inputs of the attribution to stages."""
 
     location: GapLocation
     probes: Sequence[Probe]
@@ -158,7 +157,7 @@ class StageEvidence:
 def attribute_to_stages(
     known: StageEvidence, runs: FreeRuns, reference: FreeRuns | None, machine: Machine
 ) -> list[StageFinding]:
-    """Returns what each stage has to do with the gap, those about which something can be said."""
+    """Return the contribution of each stage about which the recordings tell something."""
     whole_m = _compute_tip_excess(known.budget) if known.budget else None
     found = _split_joint_gap(known, runs, reference, machine, whole_m)
     found += list(
@@ -175,7 +174,7 @@ def attribute_to_stages(
 
 
 def select_stage(findings: Sequence[StageFinding], has_gap: bool) -> Stage | None:
-    """Returns the stage that matters most at the tool (without geometry: by its part of the gap); `None` without a gap."""
+    """Return the stage with the largest contribution at the tool; `None` without a gap."""
     those = [
         f
         for f in findings
@@ -188,7 +187,7 @@ def select_stage(findings: Sequence[StageFinding], has_gap: bool) -> Stage | Non
 
 
 def _compute_tip_excess(budget: TipErrorBudget) -> float:
-    """Returns what the tip's error exceeds the floor by, as root mean square, m."""
+    """Return the tip error beyond the floor, root mean square, m."""
     floor_m = budget.floor.tip_rms_m if budget.floor else 0.0
     return float(np.sqrt(max(budget.before.tip_rms_m**2 - floor_m**2, 0.0)))
 
@@ -248,7 +247,7 @@ def _split_joint_gap(
 
 
 def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:
-    """Returns the noise of each sensor, standard deviation, `(J,)`: from third differences, which smooth motion hardly has.
+    """Return the standard deviation of the noise of each sensor, `(J,)`, from third differences.
 
     The median makes edges of motions, which are few, count little. White noise of 1 has third
     differences of sqrt(20).
@@ -280,7 +279,7 @@ def _assess_kinematics(known: StageEvidence) -> StageFinding | None:
 
 
 def assess_perception(recordings: Sequence[Recording], machine: Machine) -> StageFinding | None:
-    """Returns how far estimated boreholes lie from where the tool touched, `None` where recordings do not carry both."""
+    """Return the distance of estimated boreholes from the touched points, `None` without both."""
     if not machine.has_bodies:
         return None
     off = []
@@ -328,12 +327,12 @@ def _assess_contact(runs: FreeRuns) -> StageFinding | None:
 
 
 MAX_LISTED = 12
-"""Regimes and probes that are told, the foremost ones."""
+"""Most regimes and probes in `diagnosis.json`."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What was seen; the parts are explained in the modules that their types come from."""
+    """Location, probes, stages, tip error, geometry and recordings of a gap."""
 
     remarks: Sequence[RecordingRemark]
     location: GapLocation
@@ -344,7 +343,7 @@ class Survey:
     machine: Machine
 
     def where(self) -> Where:
-        """Returns the fields `where` of `diagnosis.json`: shares are those of what exceeds the floor."""
+        """Return the field `where` of `diagnosis.json`; shares are those of the gap."""
         joints = {
             name: JointGap(j.rmse, j.floor, j.gap) for name, j in self.location.joints.items()
         }
@@ -360,7 +359,7 @@ class Survey:
         )
 
     def more(self) -> dict[str, Any]:
-        """Returns further fields of `diagnosis.json`, plain JSON data."""
+        """Return further fields of `diagnosis.json`, plain JSON data."""
         return {
             "sanity": [remark.plain() for remark in self.remarks],
             "location": self.location.plain(),
@@ -371,7 +370,7 @@ class Survey:
         }
 
 
-def survey_gap(
+def examine_gap(
     before: FreeRuns,
     floor: FreeRuns | None,
     after: FreeRuns | None,
@@ -381,7 +380,7 @@ def survey_gap(
     generator: np.random.Generator,
     whole: FreeRuns | None = None,
 ) -> Survey:
-    """Returns what is to be said.
+    """Survey a gap before any effect is fitted.
 
     Args:
         before: Free runs of the simulator as it was through field recordings.

@@ -35,23 +35,23 @@ from diagnosis.regimes import SampleGrouping, group_samples
 from diagnosis.sanity import name_recording
 
 BANDS_HZ = (0.3, 1.0, 3.0)
-"""Bounds of the frequency bands."""
+"""Bounds of the frequency bands, Hz; chosen by hand: drift, motion, valve, vibration."""
 NUM_AGES = 4
-"""Parts into which the running time is cut."""
+"""Number of parts of the running time; chosen by hand."""
 INCREMENT_S = 0.25
-"""Tests look at what is added to the error within this time: it hangs together less than the error
-itself, which stays."""
+"""Time of the increments that the tests compare, s; chosen by hand: increments are less dependent
+than the error, which stays."""
 
 
 @dataclass(frozen=True)
 class GroupSums:
-    """What each window adds to each joint and category, all `(W, J, C)`.
+    """Sums of each window by joint and category, all `(W, J, C)`.
 
     Attributes:
         categories: Their names.
         square: Part of the squared error.
-        tested: By what field and reference are compared: of a band, its part of the squared error;
-            else what was added to the error
+        tested: Quantity that the tests compare: of a band, its part of the squared error; else the
+            increment of the error
             within `SPAN_S`: within a category its size (a few windows would decide its square), of
                 a joint as a whole its square
             (in the mean size a short regime would drown).
@@ -65,7 +65,7 @@ class GroupSums:
 
 
 def trace_to_origin(error: np.ndarray, label: np.ndarray, num_categories: int) -> np.ndarray:
-    """Returns the error by the category in which it arose, `(C, W, K, J)`; it adds up to `error`, with 0 in place of NaN.
+    """Return the error by the category of its origin, `(C, W, K, J)`; the sum is `error`.
 
     Args:
         error: Errors of free runs, `(W, K, J)`, NaN after the end of a recording.
@@ -78,7 +78,7 @@ def trace_to_origin(error: np.ndarray, label: np.ndarray, num_categories: int) -
 
 
 def sum_by_joint(runs: FreeRuns, machine: Machine) -> GroupSums:
-    """Returns the sums of each joint as a single category."""
+    """Return the sums of each joint as a single category."""
     count = np.isfinite(runs.error).sum(1)[..., None].astype(float)
     return GroupSums(
         ("",),
@@ -91,7 +91,7 @@ def sum_by_joint(runs: FreeRuns, machine: Machine) -> GroupSums:
 def sum_by_condition(
     runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[str, GroupSums]:
-    """Returns the sums by regime, direction, load (where masses are known) and frequency."""
+    """Return the sums by regime, direction, load (where masses are known) and frequency."""
     every = group_samples(list(runs.recordings), machine, dead_time_s)
     return {dimension.name: _sum_by_origin(runs, dimension, machine) for dimension in every} | {
         "frequency": _sum_by_band(runs, machine)
@@ -99,7 +99,7 @@ def sum_by_condition(
 
 
 def sum_by_time(runs: FreeRuns, machine: Machine) -> dict[str, GroupSums]:
-    """Returns the sums by recording and by running time, which are those of whole windows."""
+    """Return the sums by recording and by running time, which are those of whole windows."""
     edges = np.linspace(runs.elapsed_s.min(), runs.elapsed_s.max(), NUM_AGES + 1)
     age = np.clip(np.searchsorted(edges, runs.elapsed_s, "right") - 1, 0, NUM_AGES - 1)
     whole = sum_by_joint(runs, machine)
@@ -118,7 +118,7 @@ def sum_by_time(runs: FreeRuns, machine: Machine) -> dict[str, GroupSums]:
 
 
 def _measure_increments(runs: FreeRuns, machine: Machine) -> np.ndarray:
-    """Returns the size of what was added to the error within the last `SPAN_S`, `(W, K, J)`, 0 after the end of a recording."""
+    """Return the absolute increment of the error within `INCREMENT_S`, `(W, K, J)`."""
     span = max(1, round(INCREMENT_S / machine.period_s))
     before = np.pad(runs.error, ((0, 0), (span, 0), (0, 0)))[:, : runs.error.shape[1]]
     return np.nan_to_num(np.abs(runs.error - before))
@@ -138,7 +138,7 @@ def _sum_by_origin(runs: FreeRuns, dimension: SampleGrouping, machine: Machine) 
 
 
 def _sum_by_band(runs: FreeRuns, machine: Machine) -> GroupSums:
-    """Splits by Parseval's theorem; after the end of a recording the error counts as 0, which adds nothing."""
+    """Split by Parseval's theorem; the error after the end of a recording counts as 0."""
     error = np.nan_to_num(runs.error)
     power = np.abs(np.fft.rfft(error, axis=1)) ** 2 / error.shape[1]
     hertz = np.fft.rfftfreq(error.shape[1], machine.period_s)
@@ -161,7 +161,7 @@ TINY = np.finfo(float).tiny
 
 @dataclass(frozen=True)
 class GapPart:
-    """What one category of one joint answers for.
+    """Share of one category of one joint in error and gap.
 
     Attributes:
         joint: The joint.
@@ -169,7 +169,7 @@ class GapPart:
         time: Part of the joint's time that it takes.
         error: Its part of the whole squared error of all joints; those of one dimension add up to
             1.
-        gap: Its part of what exceeds the floor; they add up to 1 as well, none is below 0.
+        gap: Its part of the excess over the floor; these add up to 1 as well, none is negative.
         p: How probable so large an excess would be by chance; `None` without a floor, or where the
             reference never was.
         is_sure: It holds with at most 5 % false discoveries among all that are sure.
@@ -184,7 +184,7 @@ class GapPart:
     is_sure: bool
 
     def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data."""
+        """Return it as plain JSON data."""
         return {
             name: round(value, 6) if isinstance(value, float) else value
             for name, value in self.__dict__.items()
@@ -199,7 +199,7 @@ class JointError:
         rmse: Root mean square error, rad or m.
         floor: The same on the reference; 0 without one.
         error: Its part of the squared error of all joints (of travel, where units differ).
-        gap: Its part of what exceeds the floor; of the squared error where nothing does.
+        gap: Its part of the excess over the floor; of the squared error where nothing exceeds it.
         p: How probable so large an excess would be by chance.
         is_sure: It exceeds the floor, with at most 5 % false discoveries among the joints.
     """
@@ -214,14 +214,14 @@ class JointError:
 
 @dataclass(frozen=True)
 class GapLocation:
-    """Where the gap lies.
+    """Location of the gap.
 
     Attributes:
         joints: By joint.
         parts: By dimension (`regime`, `direction`, `load`, `frequency`, `running time`,
             `recording`).
         growth: By joint.
-        blocks: What changed sides in the tests; empty without a reference.
+        blocks: Unit that changed sides in the tests; empty without a reference.
         has_gap: A joint exceeds its floor for sure; without a reference there is no telling, and
             this is true.
     """
@@ -233,18 +233,18 @@ class GapLocation:
     has_gap: bool
 
     def totals(self, dimension: str) -> dict[str, float]:
-        """Returns the part of the gap of each category, all joints together."""
+        """Return the part of the gap of each category, all joints together."""
         found: dict[str, float] = {}
         for part in self.parts[dimension]:
             found[part.category] = found.get(part.category, 0.0) + part.gap
         return found
 
     def largest(self, dimension: str = "regime") -> list[GapPart]:
-        """Returns the parts of one dimension, the largest of the gap first."""
+        """Return the parts of one dimension, the largest of the gap first."""
         return sorted(self.parts[dimension], key=lambda part: -part.gap)
 
     def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data."""
+        """Return it as plain JSON data."""
         return {
             "joints": {name: joint.__dict__ for name, joint in self.joints.items()},
             "parts": {name: [part.plain() for part in parts] for name, parts in self.parts.items()},
@@ -262,7 +262,7 @@ def locate_gap(
     generator: np.random.Generator,
     whole: FreeRuns | None = None,
 ) -> GapLocation:
-    """Returns where the gap lies.
+    """Return where the gap lies.
 
     Args:
         runs: Free runs through field recordings.
@@ -285,7 +285,7 @@ def locate_gap(
 
 
 class _GapTest:
-    """Holds both sides against each other: what exceeds the floor, and how sure that is."""
+    """Comparison of field and reference: the excess over the floor and its p-values."""
 
     def __init__(
         self,
@@ -305,7 +305,7 @@ class _GapTest:
         self.unit = self._blocks.unit if self._blocks else ""
 
     def joints(self) -> dict[str, JointError]:
-        """Returns the error of each joint."""
+        """Return the error of each joint."""
         mean, base = _average_square(self._mine), self._floor_mean()
         rmse, floor = np.sqrt(mean).tolist(), np.sqrt(base).tolist()
         count = self._mine.count.sum(0)[:, 0]
@@ -328,7 +328,7 @@ class _GapTest:
     def parts(
         self, sums: GroupSums, floor: GroupSums | None, joints: dict[str, JointError]
     ) -> list[GapPart]:
-        """Returns the parts of one way of sorting; where the reference never was, the joint's own floor counts."""
+        """Return the parts of one grouping; without reference samples the joint's floor counts."""
         square, count = sums.square.sum(0), sums.count.sum(0)
         expected = self._floor_mean()[:, None] * count
         if floor is not None:
@@ -364,7 +364,7 @@ class _GapTest:
         return _average_square(self._floor) if self._floor else np.zeros(self._machine.num_joints)
 
     def _chance(self, mine: GroupSums, floor: GroupSums | None) -> np.ndarray:
-        """Returns the standard error of what exceeds the floor, per sample, `(J, C)`; 0 without a floor to exceed."""
+        """Return the standard error of the excess over the floor, per sample, `(J, C)`."""
         shape = mine.square.shape[1:]
         if floor is None or self._blocks is None:
             return np.zeros(shape)
@@ -378,7 +378,7 @@ class _GapTest:
         return np.sqrt(square)
 
     def _p(self, mine: GroupSums, floor: GroupSums | None) -> np.ndarray:
-        """Returns p of each joint and category, `(J, C)`; NaN without a floor."""
+        """Return p of each joint and category, `(J, C)`; NaN without a floor."""
         shape = mine.square.shape[1:]
         if floor is None or self._blocks is None:
             return np.full(shape, np.nan)
@@ -393,7 +393,7 @@ class _GapTest:
 
 
 def _take_first_positive(*choices: np.ndarray) -> np.ndarray:
-    """Returns the positive part of the first choice that has any."""
+    """Return the positive part of the first choice that has any."""
     return next(
         (np.maximum(choice, 0.0) for choice in choices if (choice > 0).any()),
         np.zeros_like(choices[-1]),
@@ -401,7 +401,7 @@ def _take_first_positive(*choices: np.ndarray) -> np.ndarray:
 
 
 def _average_square(sums: GroupSums) -> np.ndarray:
-    """Returns the mean squared error of each joint, `(J,)`."""
+    """Return the mean squared error of each joint, `(J,)`."""
     return sums.square.sum(0)[:, 0] / np.maximum(sums.count.sum(0)[:, 0], 1.0)
 
 

@@ -25,7 +25,7 @@ from exam.oracle import JointErrors
 
 @spec
 class ConstantAnswer:
-    """Gives the same answer to every case: an effect on all joints, or no gap.
+    """Give the same answer to every case: an effect on all joints, or no gap.
 
     Attributes:
         effect: The effect; `null` for none.
@@ -40,7 +40,7 @@ class ConstantAnswer:
             raise ConfigError(f"candidate.probability: expected 0 to 1, got {self.probability}")
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
-        """Writes it."""
+        """Write it."""
         out.mkdir(parents=True, exist_ok=True)
         build_single_answer(self.effect, machine.joint_names, self.probability).write(
             out / ANSWER_FILE
@@ -48,7 +48,7 @@ class ConstantAnswer:
 
 
 def build_single_answer(effect: str | None, joints: tuple[str, ...], probability: float) -> Answer:
-    """Returns an answer that names one effect, or `none`, and nothing else."""
+    """Return an answer that names one effect, or `none`, and nothing else."""
     verdict: Verdict = "effects" if effect else "none"
     selected = (
         Selected(
@@ -74,7 +74,7 @@ MAX_EFFECTS = 4
 
 @spec
 class ForwardSelection:
-    """Adds the best effect to each joint as long as it pays.
+    """Add the best effect to each joint as long as it pays.
 
     Attributes:
         fit: How the simulator is made from the reference.
@@ -86,7 +86,7 @@ class ForwardSelection:
     rule: Literal["held_out", "bic"]
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
-        """Writes the answer.
+        """Write the answer.
 
         Raises:
             RecordingError: the simulator cannot be fitted.
@@ -106,7 +106,7 @@ class ForwardSelection:
 
 
 def select_forward(errors: JointErrors, worth: SetScore) -> dict[str, float]:
-    """Returns the effects that a joint gets, and how much each was worth when it came."""
+    """Return the effects that a joint gets, and how much each was worth when it came."""
     chosen: frozenset[str] = frozenset()
     found: dict[str, float] = {}
     before = 0.0
@@ -122,7 +122,7 @@ def select_forward(errors: JointErrors, worth: SetScore) -> dict[str, float]:
 
 
 def score_held_out(errors: JointErrors, names: frozenset[str]) -> float:
-    """Returns the gain in log likelihood on the half that was not fitted to."""
+    """Return the gain in log likelihood on the half that was not fitted to."""
     return float(
         robust_loss(errors.z)
         - robust_loss(errors.z - responses.crossed(errors.z, errors.rays(names), errors.fold))
@@ -130,7 +130,7 @@ def score_held_out(errors: JointErrors, names: frozenset[str]) -> float:
 
 
 def score_bic(errors: JointErrors, names: frozenset[str]) -> float:
-    """Returns the gain in log likelihood on all entries, less the price of the parameters."""
+    """Return the gain in log likelihood on all entries, less the price of the parameters."""
     rays = errors.rays(names)
     left = errors.z - responses.predicted(rays, responses.fitted(errors.z, rays))
     return float(robust_loss(errors.z) - robust_loss(left)) - 0.5 * len(rays) * float(
@@ -139,7 +139,7 @@ def score_bic(errors: JointErrors, names: frozenset[str]) -> float:
 
 
 def _build_answer(gains: dict[str, dict[str, float]]) -> Answer:
-    """Returns the answer: an effect is as probable as its worth in log likelihood makes it."""
+    """Return the answer: an effect is as probable as its worth in log likelihood makes it."""
     chances = {
         name: 1.0 / (1.0 + float(np.exp(-min(sum(by_joint.values()), 50.0))))
         for name, by_joint in gains.items()

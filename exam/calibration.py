@@ -37,23 +37,23 @@ RANGES = {
     "joint": (2.0, 12.0), "reference": (0.5, 3.0), "name": (2.0, 25.0), "partial": (2.0, 25.0), "share": (0.005, 0.08),
     "tool": (1.5, 3.0),
 }  # fmt: skip
-"""Prices that are tried, log-uniform."""
+"""Ranges of the penalties, log-uniform; chosen by hand: wider than any good answer needs."""
 TRIAL_SIGMA = 0.25
-"""Around the best so far the second half of the trials is drawn: standard deviation of the
-logarithm."""
+"""Standard deviation of the logarithm about the best penalties so far, in the second half of the
+trials; chosen by hand."""
 QUIET_WEIGHT = 2.0
-"""A false alarm costs as much as so many effects that are missed."""
+"""Cost of a false alarm in missed effects; chosen by hand: trust is lost faster than won."""
 PRIOR_PRECISION = 10.0
-"""Precision of a weight about where it begins, which earlier answers told; signs are of about unit
-size."""
+"""Prior precision of a weight about its start; chosen by hand for predictors of about unit size."""
 FORM_ERRORS = np.linspace(0.0, 0.3, 61)
+"""Model-form errors that are tried, relative, in steps of 0.005."""
 TARGET_COVERAGE = 0.9
-"""Share of true sizes that 90 % intervals should hold."""
+"""Share of true sizes that 90 % intervals must cover."""
 
 
 @dataclass(frozen=True)
 class WeighedCase:
-    """One case: its label, what was weighed, and what was said."""
+    """One case: its label, the stored candidate sets, and the answer."""
 
     label: Mapping[str, Any]
     told: Mapping[str, Any]
@@ -61,17 +61,17 @@ class WeighedCase:
 
     @property
     def family(self) -> str:
-        """What the case is about, in one word."""
+        """Kind of cause of the case, in one word."""
         outside, effects = self.label["outside"], self.label["effects"]
         return outside["ailment"] if outside else effects[0]["effect"] if effects else "none"
 
 
 def load_weighed_cases(folders: Sequence[Path]) -> list[WeighedCase]:
-    """Returns the cases whose answers lie in `folders`, each a run folder of `exam.do=run` on a development exam.
+    """Return the cases with answers in `folders`, run folders of `exam.do=run`.
 
     Raises:
         ConfigError: an exam is sealed: nothing is tuned to it.
-        RecordingError: no answer says what was weighed.
+        RecordingError: no answer holds candidate sets.
     """
     found = []
     for folder in folders:
@@ -95,7 +95,7 @@ def load_weighed_cases(folders: Sequence[Path]) -> list[WeighedCase]:
 
 
 def split_by_family(cases: Sequence[WeighedCase]) -> tuple[list[WeighedCase], list[WeighedCase]]:
-    """Returns two halves of the cases; what the cases of one are about is not what those of the other are about."""
+    """Return two halves of the cases that share no kind of cause."""
     families = sorted({item.family for item in cases} - {"none"})
     side = {name: number % 2 for number, name in enumerate(families)}
     quiet = iter(range(len(cases)))
@@ -108,7 +108,7 @@ def split_by_family(cases: Sequence[WeighedCase]) -> tuple[list[WeighedCase], li
 
 @dataclass(frozen=True)
 class ClaimSigns:
-    """Signs of what an answer states, as `certainty` has them, and of what the label knows whether it is true."""
+    """Predictors of the statements of an answer, as `diagnosis.calibration` has them."""
 
     outside: dict[str, float]
     right: list[tuple[str, dict[str, float]]]
@@ -118,7 +118,7 @@ class ClaimSigns:
 def answer_case(
     item: WeighedCase, prices: Prices, weights: Certainty, kinds: Sequence[Kind], machine: Machine
 ) -> tuple[Answer, ClaimSigns]:
-    """Returns what the diagnosis would say at these prices, without numbers, and why it is so sure."""
+    """Return the answer at these penalties, without parameters, and the predictors behind it."""
     found = decision.likely(decision.restore_result(item.told, prices, kinds), prices, weights)
     unknown = decision.is_unknown(found, prices, weights)
     selected = (
@@ -155,8 +155,8 @@ def answer_case(
     )
 
 
-def value_answer(mark: CaseScore) -> tuple[float, float]:
-    """Returns what an answer is worth, of what could be."""
+def rate_answer(mark: CaseScore) -> tuple[float, float]:
+    """Return the points of an answer and the most that it could have."""
     if mark.kind in QUIET_KINDS:
         return QUIET_WEIGHT * (mark.verdict == "none"), QUIET_WEIGHT
     if mark.kind == "outside":
@@ -172,7 +172,7 @@ def value_answer(mark: CaseScore) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class PenaltyFit:
-    """Fits prices to cases.
+    """Fit prices to cases.
 
     Attributes:
         machine: The machine of all cases.
@@ -195,7 +195,7 @@ class PenaltyFit:
     def marks(
         self, cases: Sequence[WeighedCase], prices: Prices, weights: Certainty
     ) -> list[CaseScore]:
-        """Returns the marks of all cases at these prices, with these weights."""
+        """Return the marks of all cases at these prices, with these weights."""
         return [mark for mark, _ in self._marked(cases, prices, weights)]
 
     def _marked(
@@ -208,8 +208,8 @@ class PenaltyFit:
         ]
 
     def value(self, cases: Sequence[WeighedCase], prices: Prices, weights: Certainty) -> float:
-        """Returns the mean worth of the answers."""
-        pairs = np.array([value_answer(mark) for mark in self.marks(cases, prices, weights)])
+        """Return the mean worth of the answers."""
+        pairs = np.array([rate_answer(mark) for mark in self.marks(cases, prices, weights)])
         return float(pairs[:, 0].sum() / pairs[:, 1].sum())
 
     def fitted(
@@ -219,7 +219,7 @@ class PenaltyFit:
         weights: Certainty,
         advance: Callable[[], None],
     ) -> tuple[Prices, Certainty]:
-        """Returns the prices of the best answers: half the trials anywhere, half around the best; then the weights of signs."""
+        """Return the best penalties of a random search, and the weights of the predictors."""
         weights = self.weighed(cases, start, weights)
         generator, best = (
             np.random.default_rng(self.seed),
@@ -237,7 +237,7 @@ class PenaltyFit:
         return best[1], self.weighed(cases, best[1], weights)
 
     def weighed(self, cases: Sequence[WeighedCase], prices: Prices, start: Certainty) -> Certainty:
-        """Returns the weights under which what is true of these cases is most probable, and what forms add to errors."""
+        """Return the weights with the largest likelihood, and the model-form errors."""
         is_outside = [item.label["kind"] == "outside" for item in cases]
         outside = fit_logistic(
             [claims.outside for _, claims in self._marked(cases, prices, start)],
@@ -263,7 +263,7 @@ class PenaltyFit:
     def _named(
         self, cases: Sequence[WeighedCase], prices: Prices, weights: Certainty
     ) -> tuple[list[dict[str, float]], list[bool]]:
-        """Returns the signs of all effects that are named, and whether they are there."""
+        """Return the signs of all effects that are named, and whether they are there."""
         signs, true = [], []
         for mark, claims in self._marked(cases, prices, weights):
             if mark.verdict == "effects":
@@ -273,10 +273,9 @@ class PenaltyFit:
         return signs, true
 
     def forms(self, cases: Sequence[WeighedCase], now: Mapping[str, float]) -> dict[str, float]:
-        """Returns the smallest errors of form, by stage, with which 90 % intervals hold nine in ten true sizes.
+        """Return the smallest model-form errors with which 90 % intervals cover 90 %.
 
-        What moves the machine (timing, actuation) has one, what measures it (sensing, kinematics)
-        another.
+        Timing and actuation share one; sensing, kinematics and perception share another.
         """
         stages, found = {kind.name: kind.stage for kind in self.kinds}, dict(now)
         for group in (("timing", "actuation"), ("sensing", "kinematics", "perception")):
@@ -310,7 +309,7 @@ class PenaltyFit:
 
 
 _work: list[Any] = []
-"""What a process values: a calibration, its cases and weights, sent once."""
+"""State of a worker process: the fit, its cases and weights, sent once."""
 
 
 def _start_worker(
@@ -327,7 +326,7 @@ def _evaluate_trial(prices: Prices) -> float:
 def fit_logistic(
     signs: Sequence[Mapping[str, float]], true: Sequence[bool], start: Mapping[str, float]
 ) -> dict[str, float]:
-    """Returns the weights of a logistic regression, pulled towards those at which it begins but for the constant."""
+    """Fit a logistic regression with a normal prior about the start; the constant is free."""
     names, y = list(signs[0]), np.array(true, dtype=float)
     x, begin = (
         np.array([[one[name] for name in names] for one in signs]),
@@ -345,6 +344,6 @@ def fit_logistic(
 
 
 def _is_covered(number: ParameterScore, was: float, form: float) -> bool:
-    """Says whether the 90 % interval would hold the truth if forms added `form` to the error, and not `was`."""
+    """Return whether the 90 % interval covers the truth at a model-form error of `form`."""
     own = np.sqrt(max(number.deviation**2 - (was * number.said) ** 2, 0.0))
     return bool(number.error <= 1.645 * np.hypot(own, form * number.said))

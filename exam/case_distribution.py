@@ -41,7 +41,7 @@ class PlantRun:
         chance: Seed of the run's own chance.
         elapsed_s: Time the machine has run before.
         faults: Effects it has, by name: parameters in the library's words, `(J,)` each.
-        ailment: What it has besides that no library knows.
+        outside_fault: Its fault outside the library.
         tracked: Whether its tool point is measured.
     """
 
@@ -50,12 +50,12 @@ class PlantRun:
     chance: int
     elapsed_s: float
     faults: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
-    ailment: UnknownFault | None = None
+    outside_fault: UnknownFault | None = None
     tracked: bool = False
 
 
 class PlantFamily(Protocol):
-    """A spec in `conf/exam_plants`: machines of many makes, none of which shares equations with what is examined."""
+    """A spec in `conf/exam_plants`: machines of many makes, written apart from the library."""
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -63,27 +63,26 @@ class PlantFamily(Protocol):
         ...
 
     @property
-    def ailments(self) -> tuple[str, ...]:
-        """Names of what its plants can have that no library knows."""
+    def outside_faults(self) -> tuple[str, ...]:
+        """Names of the faults outside the library that its plants can have."""
         ...
 
     def makes(self, machine: Machine, specimens: Sequence[PlantRun]) -> list[str]:
-        """Returns the make of each specimen; those of one make can run side by side."""
+        """Return the make of each specimen; those of one make can run side by side."""
         ...
 
     def build(self, machine: Machine, specimens: Sequence[PlantRun], run_s: float) -> Link:
-        """Returns a link to specimens of one make, side by side, that runs for `run_s`, with what else is measured as `extra()`."""
+        """Return a link to runs of one make, side by side, for `run_s`."""
         ...
 
 
 KINDS = ("none", "faint", "one", "several", "outside")
-"""No gap; an effect too small to be seen; one effect; two or three; something that no library
-has."""
+"""No gap; an effect too small to be seen; one effect; two or three; a fault outside the library."""
 
 
 @spec
 class EffectDistribution:
-    """How an effect is drawn.
+    """Distribution of the parameters and joints of an effect.
 
     Attributes:
         numbers: Parameter to its value that changes nothing and its typical value.
@@ -133,17 +132,17 @@ class CaseDesign:
         machine_seed: Draws the machine.
         chance: Draws everything else about its recordings.
         faults: Effects that the field has and the reference has not.
-        ailment: The same for what no library knows.
-        size: Of the ailment.
+        outside_fault: The same for a fault outside the library.
+        size: Of the outside_fault.
         tracked: Whether the tool point is recorded.
-        joints: Joints with the ailment.
+        joints: Joints with the outside_fault.
     """
 
     kind: str
     machine_seed: int
     chance: int
     faults: tuple[CaseFault, ...] = ()
-    ailment: UnknownFault | None = None
+    outside_fault: UnknownFault | None = None
     size: float | None = None
     tracked: bool = False
     joints: tuple[str, ...] = ()
@@ -185,17 +184,17 @@ class CaseDistribution:
             raise ConfigError("exam.mix: expected num_cases of 1 or more, and some troubles")
 
     def questions(
-        self, machine: Machine, ailments: Sequence[str], generator: np.random.Generator
+        self, machine: Machine, outside_faults: Sequence[str], generator: np.random.Generator
     ) -> list[CaseDesign]:
-        """Returns the cases in random order; each effect, and each ailment, occurs about as often as any other."""
+        """Return the cases in random order; effects and outside faults are equally frequent."""
         kinds = [kind for kind, count in self._counts().items() for _ in range(count)]
         effects, strange = (
             _cycle_shuffled(list(self.troubles), generator),
-            _cycle_shuffled(list(ailments), generator),
+            _cycle_shuffled(list(outside_faults), generator),
         )
         found = []
         for kind in kinds:
-            tracked, faults, ailment, size = (
+            tracked, faults, outside_fault, size = (
                 bool(generator.random() < self.tracked_share),
                 [],
                 None,
@@ -219,7 +218,7 @@ class CaseDistribution:
                 chosen = self._some(
                     np.flatnonzero(~machine.is_exclusive), generator
                 )  # much of it shows in company only
-                ailment = UnknownFault(
+                outside_fault = UnknownFault(
                     next(strange), size * np.isin(np.arange(machine.num_joints), chosen)
                 )
                 joints = tuple(machine.joint_names[j] for j in chosen)
@@ -227,13 +226,13 @@ class CaseDistribution:
             machine_seed, chance = generator.integers(2**62, size=2).tolist()
             found.append(
                 CaseDesign(
-                    kind, machine_seed, chance, tuple(faults), ailment, size, tracked, joints
+                    kind, machine_seed, chance, tuple(faults), outside_fault, size, tracked, joints
                 )
             )
         return [found[i] for i in generator.permutation(len(found))]
 
     def _counts(self) -> dict[str, int]:
-        """Returns the number of cases of each kind: whole parts of the shares, the largest remainders get what is left."""
+        """Return the number of cases of each kind by largest remainders."""
         exact = {kind: self.shares[kind] * self.num_cases for kind in KINDS}
         counts = {kind: int(value + 1e-9) for kind, value in exact.items()}
         for kind in sorted(KINDS, key=lambda kind: counts[kind] - exact[kind])[
@@ -289,7 +288,7 @@ class CaseDistribution:
 
 
 def _cycle_shuffled(names: list[str], generator: np.random.Generator) -> Iterator[str]:
-    """Yields all names in random order, again and again."""
+    """Yield all names in random order, again and again."""
     while True:
         for i in generator.permutation(len(names)):
             yield names[i]

@@ -25,7 +25,7 @@ LABELS_FILE, HASH_FILE = "labels.sealed.json", "labels.sha256"
 
 
 def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
-    """Writes labels and hash into `folder`; returns the hash. The salt keeps anyone from guessing labels and comparing hashes.
+    """Write labels and hash into `folder` and return the hash.
 
     Raises:
         StorageError: there are labels already, or the file cannot be written.
@@ -47,7 +47,7 @@ def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
 
 
 def open_labels(folder: Path) -> dict[str, Any]:
-    """Returns the labels in `folder`, after comparing them with the published hash.
+    """Return the labels in `folder`, after comparing them with the published hash.
 
     Raises:
         RecordingError: labels or hash are missing, or do not belong together.
@@ -63,7 +63,7 @@ def open_labels(folder: Path) -> dict[str, Any]:
         ) from error
     if hashlib.sha256(text.encode()).hexdigest() != published:
         raise RecordingError(
-            f"{folder / LABELS_FILE} is not what was sealed: its SHA-256 is not that of {HASH_FILE}; make the exam again"
+            f"{folder / LABELS_FILE} was changed after it was sealed: its SHA-256 is not that of {HASH_FILE}; make the exam again"
         )
     return json.loads(text)
 
@@ -82,7 +82,7 @@ def write_cases(
     workers: int,
     advance: Callable[[int], None],
 ) -> list[dict[str, Any]]:
-    """Records all cases into `folder/cases/<id>`, in so many `workers`; returns their labels, plain JSON, in the same order."""
+    """Record all cases into `folder/cases/<id>` and return their labels as plain JSON."""
     names = [f"{number:04d}" for number in range(len(questions))]
     folders = [folder / CASES_FOLDER / name for name in names]
     halves = [
@@ -99,10 +99,10 @@ def write_cases(
 def make_label(
     name: str, question: CaseDesign, field: RecordedHalf, machine: Machine
 ) -> dict[str, Any]:
-    """Returns what is true about a case.
+    """Return the label of a case.
 
-    `moved_rad`: root mean square of what its cause changes of the measured motion in 5 s from equal
-    beginnings, by joint.
+    `moved_rad`: root mean square change of the measured motion by its cause, over 5 s from equal
+    starts, by joint.
     """
     return {
         "case": name,
@@ -125,9 +125,9 @@ def make_label(
             for fault in question.faults
         ],
         "outside": None
-        if question.ailment is None
+        if question.outside_fault is None
         else {
-            "ailment": question.ailment.kind,
+            "ailment": question.outside_fault.kind,
             "joints": list(question.joints),
             "size": question.size,
         },
@@ -140,7 +140,7 @@ def make_label(
 
 
 def measure_motion_change(field: RecordedHalf, machine: Machine) -> np.ndarray:
-    """Returns what the cause changes of the motion in windows of 5 s that begin alike, root mean square, `(J,)`."""
+    """Return the change of motion by the cause in windows of 5 s, root mean square, `(J,)`."""
     steps, total, count = round(HORIZON_S / machine.period_s), 0.0, 0
     for q, without in zip(field.q, field.without_q, strict=True):
         apart = (q - without).astype(float)

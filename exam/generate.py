@@ -37,7 +37,7 @@ EPOCH_S = FIRST_DAY.timestamp()
 
 @spec
 class HalfPlan:
-    """How one half of a case, `reference` or `field`, is recorded.
+    """Plan of the recordings of one half of a case, `reference` or `field`.
 
     Attributes:
         programs: Names of the excitations of each file.
@@ -58,7 +58,7 @@ class HalfPlan:
 
 @dataclass(frozen=True)
 class RecordedHalf:
-    """What was recorded of one half of all cases.
+    """Recordings of one half of all cases.
 
     Attributes:
         u: Commands, `(T, J)` a file.
@@ -73,8 +73,8 @@ class RecordedHalf:
 
 
 @contextmanager
-def _silence_runner() -> Iterator[None]:
-    """Leaves out what the runner says of ways to start poses that took too long: an ailing machine may well be slow."""
+def _mute_runner() -> Iterator[None]:
+    """Mute the runner's warnings about slow ways to start poses: a faulty machine may be slow."""
     logger = logging.getLogger(PlanPlayer.__module__)
     before = logger.level
     logger.setLevel(logging.ERROR)
@@ -95,7 +95,7 @@ class RecordingJob:
         is_field: Whether it is the field.
         elapsed_s: How long the machine has run before.
         created: When, as recordings say it.
-        plan: What is played.
+        plan: The excitation.
     """
 
     plan: ExcitationPlan
@@ -120,14 +120,14 @@ class RecordingJob:
         )
 
     def stream(self, name: str) -> np.random.Generator:
-        """Returns a stream of chance that is this file's alone."""
+        """Return a stream of chance that is this file's alone."""
         return np.random.default_rng(
             [self.question.chance, self.number, int(self.is_field), *name.encode()]
         )
 
 
 class CaseRecorder:
-    """Records cases.
+    """Record cases.
 
     Args:
         machine: The machine.
@@ -152,7 +152,7 @@ class CaseRecorder:
     def planned(
         self, questions: Sequence[CaseDesign], half: HalfPlan, is_field: bool
     ) -> list[RecordingJob]:
-        """Returns the files of one half of all cases with their plans, before anything is recorded.
+        """Return the files of one half of all cases with their plans, before anything is recorded.
 
         Raises:
             ConfigError: an excitation is unknown, or finds no room in a file.
@@ -173,7 +173,7 @@ class CaseRecorder:
         workers: int,
         advance: Callable[[int], None],
     ) -> list[RecordedHalf]:
-        """Writes the files of one half of each case into its folder; returns what is in them, by case.
+        """Write the files of one half of each case into its folder; return their content by case.
 
         Args:
             jobs: The files.
@@ -215,7 +215,7 @@ class CaseRecorder:
             chance=int(job.stream("chance").integers(2**62)),
             elapsed_s=job.elapsed_s,
             faults=faults,
-            ailment=question.ailment if job.is_field else None,
+            outside_fault=question.outside_fault if job.is_field else None,
             tracked=question.tracked,
         )
 
@@ -240,7 +240,7 @@ class CaseRecorder:
     def _batch(
         self, jobs: Sequence[RecordingJob], specimens: Sequence[PlantRun], folders: Sequence[Path]
     ) -> list[RecordedHalf]:
-        """Records files of one half, of machines of one make; returns what is in each."""
+        """Record files of one half, of machines of one make; return the content of each."""
         half, is_field = jobs[0].half, jobs[0].is_field
         machine = self._machine
         plan = ExcitationPlan(
@@ -250,7 +250,7 @@ class CaseRecorder:
         )
         link = self._plants.build(machine, specimens, half.file_s)
         runner = PlanPlayer(plan, machine, self._approach, self._guards)
-        with link as opened, _silence_runner():
+        with link as opened, _mute_runner():
             samples = list(drive(opened, runner, machine, len(jobs), half.file_s))
         track = PlanTrack(samples)
         extra = {
@@ -287,9 +287,10 @@ class CaseRecorder:
         return [RecordedHalf([u[:, n]], [q[:, n]], [without[:, n]]) for n in range(len(jobs))]
 
     def _without(self, specimens: Sequence[PlantRun], u: np.ndarray, half: HalfPlan) -> np.ndarray:
-        """Returns the positions of the same machines without faults, under the same commands and chance, `(T, N, J)`."""
+        """Return the positions of the same machines without faults, `(T, N, J)`."""
         healthy = [
-            replace(specimen, faults={}, ailment=None, tracked=False) for specimen in specimens
+            replace(specimen, faults={}, outside_fault=None, tracked=False)
+            for specimen in specimens
         ]
         link, path = self._plants.build(self._machine, healthy, half.file_s), []
         with link as opened:

@@ -1,32 +1,52 @@
-"""Metrics of an exam: rates with Wilson intervals, all others with bootstrap intervals over cases."""
+"""Metrics of an exam: rates with Wilson intervals, all others with bootstrap intervals over cases.
+
+F1 and AUROC are those of scikit-learn (the optional extra `exam`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from importlib import import_module
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.stats import rankdata
 
+from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import CONFIDENCE, compute_wilson_interval
 from exam.score import QUIET_KINDS, CaseScore, Claim
 
 NUM_DRAWS = 1000
+"""Bootstrap draws; the ends of an interval move by about 1 % of its width between seeds."""
 NUM_BINS = 10
+"""Bins of the reliability diagram and of the expected calibration error; the usual number."""
 SIZES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.01)
-"""Bins of the curve of detection against size."""
+"""Edges of the detection curve over the size of an effect, of typical; chosen by hand: about 30
+cases a bin in an exam of 220."""
 MOVED_RAD = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 1.0)
-"""Bins of the same against what a cause does to the motion."""
-
+"""Edges of the same curve over the change of the motion, rad: each bin doubles."""
 MIN_ORACLE_CLOSED = 0.1
-"""Share of the gap that the true effects must close before anybody is compared with them."""
+"""Share of the gap that the true effects must close before a candidate is compared with them;
+chosen by hand: below it the ratio of two shares is noise."""
 
-Figure = dict[str, Any]
+Metric = dict[str, Any]
 
 
-def compute_rate(right: Sequence[bool]) -> Figure:
-    """Returns share, number and Wilson interval."""
+def import_sklearn(module: str, purpose: str) -> Any:
+    """Return a module of scikit-learn.
+
+    Raises:
+        ConfigError: scikit-learn is not installed.
+    """
+    try:
+        return import_module(f"sklearn.{module}")
+    except ImportError as error:
+        raise ConfigError(f"{purpose} needs scikit-learn: pip install 'brokk-rl[exam]'") from error
+
+
+def compute_rate(right: Sequence[bool]) -> Metric:
+    """Return share, number and Wilson interval."""
     low, high = compute_wilson_interval(sum(right), len(right))
     return {
         "value": float(np.mean(right)) if right else None,
@@ -36,234 +56,257 @@ def compute_rate(right: Sequence[bool]) -> Figure:
 
 
 def bootstrap_over_cases(
-    marks: Sequence[CaseScore], figure: Callable[[Sequence[CaseScore]], float | None], seed: int = 0
-) -> Figure:
-    """Returns any figure of marks with its percentile bootstrap interval over cases."""
-    value = figure(marks)
+    scores: Sequence[CaseScore],
+    metric: Callable[[Sequence[CaseScore]], float | None],
+    seed: int = 0,
+) -> Metric:
+    """Return a metric with its percentile bootstrap interval over cases."""
+    value = metric(scores)
     if value is None:
-        return {"value": None, "of": len(marks), "ci95": None}
+        return {"value": None, "of": len(scores), "ci95": None}
     generator, drawn = np.random.default_rng(seed), []
+    known: dict[bytes, float | None] = {}  # draws of a few cases repeat
     for _ in range(NUM_DRAWS):
-        again = figure([marks[i] for i in generator.integers(len(marks), size=len(marks))])
-        if again is not None:
-            drawn.append(again)
+        rows = generator.integers(len(scores), size=len(scores))
+        key = rows.tobytes()
+        if key not in known:
+            known[key] = metric([scores[row] for row in rows])
+        if known[key] is not None:
+            drawn.append(known[key])
     tail = 50.0 * (1.0 - CONFIDENCE)
     low, high = np.percentile(drawn, [tail, 100.0 - tail]) if drawn else (value, value)
-    return {"value": float(value), "of": len(marks), "ci95": [float(low), float(high)]}
+    return {"value": float(value), "of": len(scores), "ci95": [float(low), float(high)]}
 
 
-def compute_metrics(marks: Sequence[CaseScore], not_begun: int = 0) -> dict[str, Any]:
-    """Returns all figures of an exam, plain JSON; cases that nobody has begun, `not_begun`, are told and count for nothing."""
-    one = [mark for mark in marks if mark.kind == "one"]
-    several = [mark for mark in marks if mark.kind == "several"]
-    quiet = [mark for mark in marks if mark.kind in QUIET_KINDS]
-    outside = [mark for mark in marks if mark.kind == "outside"]
-    joints = [right for mark in one + several for right in mark.joints_right]
-    seconds = [mark.seconds for mark in marks if mark.seconds is not None]
+def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str, Any]:
+    """Return all metrics of an exam as plain JSON data.
+
+    Args:
+        scores: Of the cases that somebody began.
+        not_begun: Number of further cases; they are reported and count for nothing.
+    """
+    one = [score for score in scores if score.kind == "one"]
+    several = [score for score in scores if score.kind == "several"]
+    quiet = [score for score in scores if score.kind in QUIET_KINDS]
+    outside = [score for score in scores if score.kind == "outside"]
+    known = one + several
+    joints = [right for score in known for right in score.joints_right]
+    seconds = [score.seconds for score in scores if score.seconds is not None]
+    numbers = [number for score in scores for number in score.numbers]
+    kinds = ("none", "faint", "one", "several", "outside")
     return {
-        "cases": {
-            kind: sum(mark.kind == kind for mark in marks)
-            for kind in ("none", "faint", "one", "several", "outside")
-        },
-        "sat": {"value": len(marks), "of": len(marks) + not_begun},
-        "failed": sum(mark.verdict == "failed" for mark in marks),
-        "top1": compute_rate([mark.first for mark in one]),
-        "top1_strictly": compute_rate([mark.first_strictly for mark in one]),
-        "exactly_one": compute_rate([_is_exact(mark) for mark in one]),
-        "macro_f1": bootstrap_over_cases(one, compute_macro_f1),
+        "cases": {kind: sum(score.kind == kind for score in scores) for kind in kinds},
+        "sat": {"value": len(scores), "of": len(scores) + not_begun},
+        "failed": sum(score.verdict == "failed" for score in scores),
+        "top1": compute_rate([score.first for score in one]),
+        "top1_strictly": compute_rate([score.first_strictly for score in one]),
+        "exactly_one": compute_rate([_is_exact(score) for score in one]),
+        "macro_f1": bootstrap_over_cases(one, partial(compute_f1, average="macro")),
         "joints": compute_rate(joints),
-        "exact_set": compute_rate([_is_exact(mark) for mark in several]),
-        "set_f1": bootstrap_over_cases(several, compute_micro_f1),
-        "false_alarms": compute_rate([mark.verdict not in ("none", "failed") for mark in quiet]),
-        "false_alarms_none": compute_rate(
-            [mark.verdict not in ("none", "failed") for mark in quiet if mark.kind == "none"]
-        ),
-        "false_alarms_faint": compute_rate(
-            [mark.verdict not in ("none", "failed") for mark in quiet if mark.kind == "faint"]
-        ),
-        "unknown_recall": compute_rate([mark.verdict == "unknown" for mark in outside]),
-        "unknown_wrongly": compute_rate([mark.verdict == "unknown" for mark in one + several]),
-        "unknown_auroc": bootstrap_over_cases(marks, compute_auroc),
-        "ece": bootstrap_over_cases(marks, lambda drawn: compute_ece(collect_claims(drawn))),
-        "reliability": compute_reliability(collect_claims(marks)),
-        "parameter_error": bootstrap_over_cases(
-            marks, lambda drawn: _take_median([n.error for mark in drawn for n in mark.numbers])
-        ),
-        "cover_90": compute_rate([number.in_90 for mark in marks for number in mark.numbers]),
-        "cover_95": compute_rate([number.in_95 for mark in marks for number in mark.numbers]),
-        "closed_of_oracle": bootstrap_over_cases(one + several, compute_closed_of_oracle),
-        "predicted_off": bootstrap_over_cases(one + several, compute_prediction_error),
+        "exact_set": compute_rate([_is_exact(score) for score in several]),
+        "set_f1": bootstrap_over_cases(several, partial(compute_f1, average="micro")),
+        "false_alarms": _compute_false_alarms(quiet),
+        "false_alarms_none": _compute_false_alarms([s for s in quiet if s.kind == "none"]),
+        "false_alarms_faint": _compute_false_alarms([s for s in quiet if s.kind == "faint"]),
+        "unknown_recall": compute_rate([score.verdict == "unknown" for score in outside]),
+        "unknown_wrongly": compute_rate([score.verdict == "unknown" for score in known]),
+        "unknown_auroc": bootstrap_over_cases(scores, compute_auroc),
+        "ece": bootstrap_over_cases(scores, lambda drawn: compute_ece(collect_claims(drawn))),
+        "reliability": compute_reliability(collect_claims(scores)),
+        "parameter_error": bootstrap_over_cases(scores, compute_parameter_error),
+        "cover_90": compute_rate([number.in_90 for number in numbers]),
+        "cover_95": compute_rate([number.in_95 for number in numbers]),
+        "closed_of_oracle": bootstrap_over_cases(known, compute_closed_of_oracle),
+        "predicted_off": bootstrap_over_cases(known, compute_prediction_error),
         "seconds": {"median": _take_median(seconds), "most": max(seconds, default=None)},
-        "by_effect": summarize_effects(marks),
+        "by_effect": summarize_effects(scores),
         "confusion": count_confusions(one),
         "outside": count_outside_answers(outside),
-        "by_size": compute_detection_curve(one, [mark.size for mark in one], SIZES),
-        "by_motion": compute_detection_curve(one, [mark.moved_rad for mark in one], MOVED_RAD),
+        "by_size": compute_detection_curve(one, [score.size for score in one], SIZES),
+        "by_motion": compute_detection_curve(one, [score.moved_rad for score in one], MOVED_RAD),
     }
 
 
-def _is_exact(mark: CaseScore) -> bool:
-    return len(mark.hits) == len(mark.truth) == len(mark.named)
+def _is_exact(score: CaseScore) -> bool:
+    return len(score.hits) == len(score.truth) == len(score.named)
 
 
-def count_by_effect(marks: Sequence[CaseScore]) -> dict[str, list[int]]:
-    """Returns true positives, false positives and false negatives by effect; a name of its class is right."""
-    found: dict[str, list[int]] = {}
-    for mark in marks:
-        hit, said = [true for true, _ in mark.hits], [name for _, name in mark.hits]
-        for effect in mark.truth:
-            found.setdefault(effect, [0, 0, 0])[0 if effect in hit else 2] += 1
-        for effect in mark.named:
-            if effect in said:
-                said.remove(effect)
-            else:
-                found.setdefault(effect, [0, 0, 0])[1] += 1
-    return found
+def _compute_false_alarms(quiet: Sequence[CaseScore]) -> Metric:
+    """Return the share of cases without a visible effect whose answer names one."""
+    return compute_rate([score.verdict not in ("none", "failed") for score in quiet])
 
 
-def compute_f1(right: int, wrong: int, missed: int) -> float:
-    """Returns the harmonic mean of precision and recall."""
-    return 2.0 * right / max(2 * right + wrong + missed, 1)
+def list_labels(score: CaseScore) -> tuple[set[str], set[str]]:
+    """Return the true and the named effects of a case; a name that stands for a true one is it."""
+    stands_for = {said: true for true, said in score.hits}
+    return set(score.truth), {stands_for.get(name, name) for name in score.named}
 
 
-def compute_macro_f1(marks: Sequence[CaseScore]) -> float | None:
-    """Returns the mean F1 over the effects that are there; what is named and is nowhere lowers that of no effect but its recall."""
-    found, there = count_by_effect(marks), {effect for mark in marks for effect in mark.truth}
-    return (
-        float(np.mean([compute_f1(*found[effect]) for effect in sorted(there)])) if there else None
-    )
+def build_indicators(scores: Sequence[CaseScore]) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Return the effects that occur, and which are true and which are named in each case, `(N, E)`."""
+    labels = [list_labels(score) for score in scores]
+    effects = sorted(set().union(*(true | named for true, named in labels)))
+    column = {effect: number for number, effect in enumerate(effects)}
+    # one empty column more: scikit-learn takes a single column for a binary target
+    true, named = np.zeros((2, len(labels), len(effects) + 1), dtype=int)
+    for row, (is_true, is_named) in enumerate(labels):
+        true[row, [column[effect] for effect in is_true]] = 1
+        named[row, [column[effect] for effect in is_named]] = 1
+    return effects, true, named
 
 
-def compute_micro_f1(marks: Sequence[CaseScore]) -> float | None:
-    """Returns F1 over all effects together."""
-    total = np.sum([*count_by_effect(marks).values(), [0, 0, 0]], 0)
-    return compute_f1(*total.tolist()) if total.any() else None
+def compute_f1(scores: Sequence[CaseScore], average: str) -> float | None:
+    """Return F1 of the named effects; `None` where there is nothing to count.
+
+    Args:
+        scores: Of the cases.
+        average: `micro`: over all effects together; `macro`: the mean over the effects that are
+            true somewhere, so that a name that is true nowhere lowers only the recall of others.
+    """
+    if not scores:
+        return None
+    effects, true, named = build_indicators(scores)
+    columns = np.flatnonzero(true.any(0)) if average == "macro" else np.arange(len(effects))
+    if not len(columns):
+        return None
+    metrics = import_sklearn("metrics", "exam.do=score")
+    found = metrics.f1_score(true, named, labels=columns, average=average, zero_division=0.0)
+    return float(found)
 
 
-def summarize_effects(marks: Sequence[CaseScore]) -> dict[str, Figure]:
-    """Returns precision, recall and F1 of each effect over all cases."""
+def summarize_effects(scores: Sequence[CaseScore]) -> dict[str, Metric]:
+    """Return precision, recall and F1 of each effect over all cases."""
+    effects, true, named = build_indicators(scores) if scores else ([], *np.zeros((2, 0, 0), int))
     found = {}
-    for effect, (right, wrong, missed) in sorted(count_by_effect(marks).items()):
+    for number, effect in enumerate(effects):
+        right = int((true[:, number] & named[:, number]).sum())
+        wrong, missed = int(named[:, number].sum()) - right, int(true[:, number].sum()) - right
+        f1 = 2.0 * right / (2 * right + wrong + missed) if right + missed else None
+        errors = [n.error for score in scores for n in score.numbers if n.effect == effect]
         found[effect] = {
             "right": right,
             "wrong": wrong,
             "missed": missed,
             "precision": right / (right + wrong) if right + wrong else None,
             "recall": right / (right + missed) if right + missed else None,
-            "f1": compute_f1(right, wrong, missed) if right + missed else None,
-            "parameter_error": _take_median(
-                [n.error for mark in marks for n in mark.numbers if n.effect == effect]
-            ),
+            "f1": f1,
+            "parameter_error": _take_median(errors),
         }
     return found
 
 
 def count_confusions(one: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
-    """Returns, by true effect, how often each name came first, or `none`, `unknown`, `failed`."""
+    """Return, by true effect, the counts of the first names, or of the verdict without a name."""
     found: dict[str, dict[str, int]] = {}
-    for mark in one:
-        # a name that stands for the true one, over classes, is counted as it
-        said = mark.truth[0] if mark.first else mark.named[0] if mark.named else mark.verdict
-        row = found.setdefault(mark.truth[0], {})
-        row[said] = row.get(said, 0) + 1
+    for score in one:
+        # over classes: a name that stands for the true one is counted as it
+        named = score.named[0] if score.named else score.verdict
+        _count(found.setdefault(score.truth[0], {}), score.truth[0] if score.first else named)
     return found
 
 
 def count_outside_answers(outside: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
-    """Returns, by what lies outside the library, how often what was said."""
+    """Return, by fault outside the library, the counts of the answers."""
     found: dict[str, dict[str, int]] = {}
-    for mark in outside:
-        said = "+".join(mark.named) or mark.verdict
-        row = found.setdefault(str(mark.outside), {})
-        row[said] = row.get(said, 0) + 1
+    for score in outside:
+        _count(found.setdefault(str(score.outside), {}), "+".join(score.named) or score.verdict)
     return found
+
+
+def _count(row: dict[str, int], name: str) -> None:
+    row[name] = row.get(name, 0) + 1
 
 
 def compute_detection_curve(
-    marks: Sequence[CaseScore], at: Sequence[float], edges: Sequence[float]
-) -> list[Figure]:
-    """Returns, by size, how often an effect was rightly named and how often nothing was seen."""
+    scores: Sequence[CaseScore], at: Sequence[float], edges: Sequence[float]
+) -> list[Metric]:
+    """Return, by bins of a size, the rate of right names and of the verdict `none`.
+
+    Args:
+        scores: Of cases with one effect.
+        at: Size of each.
+        edges: Edges of the bins; empty bins are left out.
+    """
     found = []
     for low, high in pairwise(edges):
-        inside = [mark for mark, value in zip(marks, at, strict=True) if low <= value < high]
+        inside = [score for score, value in zip(scores, at, strict=True) if low <= value < high]
         if inside:
-            quiet = [mark.verdict == "none" for mark in inside]
-            found.append(
-                {
-                    "from": low,
-                    "to": high,
-                    "right": compute_rate([mark.first for mark in inside]),
-                    "none": compute_rate(quiet),
-                }
-            )
+            right = compute_rate([score.first for score in inside])
+            none = compute_rate([score.verdict == "none" for score in inside])
+            found.append({"from": low, "to": high, "right": right, "none": none})
     return found
 
 
-def compute_auroc(marks: Sequence[CaseScore]) -> float | None:
-    """Returns how often a case outside the library has a higher probability of `unknown` than another; ties count half."""
-    is_outside = np.array([mark.kind == "outside" for mark in marks])
-    positive, negative = int(is_outside.sum()), int((~is_outside).sum())
-    if not positive or not negative:
+def compute_auroc(scores: Sequence[CaseScore]) -> float | None:
+    """Return the AUROC of the probability of `unknown` for cases outside the library."""
+    is_outside = [score.kind == "outside" for score in scores]
+    if len(set(is_outside)) < 2:
         return None
-    ranks = rankdata([mark.unknown for mark in marks])
-    return float((ranks[is_outside].sum() - positive * (positive + 1) / 2) / (positive * negative))
+    metrics = import_sklearn("metrics", "exam.do=score")
+    return float(metrics.roc_auc_score(is_outside, [score.unknown for score in scores]))
 
 
-def collect_claims(marks: Sequence[CaseScore]) -> list[Claim]:
-    """Returns all statements with a probability."""
-    return [claim for mark in marks for claim in mark.claims]
+def collect_claims(scores: Sequence[CaseScore]) -> list[Claim]:
+    """Return all statements with a probability."""
+    return [claim for score in scores for claim in score.claims]
 
 
-def compute_reliability(made: Sequence[Claim]) -> list[Figure]:
-    """Returns, by bins of the stated probability, its mean and how often such a statement is true."""
+def compute_reliability(made: Sequence[Claim]) -> list[Metric]:
+    """Return, by bins of the stated probability, its mean and the rate of true statements.
+
+    Not `sklearn.calibration.calibration_curve`: it gives no counts, which the intervals need, and
+    puts a probability on an edge into the bin below it.
+    """
     found = []
     for k in range(NUM_BINS):
         inside = [
             claim for claim in made if min(int(claim.probability * NUM_BINS), NUM_BINS - 1) == k
         ]
         if inside:
-            found.append(
-                {
-                    "stated": float(np.mean([claim.probability for claim in inside])),
-                    **compute_rate([c.is_true for c in inside]),
-                }
-            )
+            stated = float(np.mean([claim.probability for claim in inside]))
+            found.append({"stated": stated, **compute_rate([claim.is_true for claim in inside])})
     return found
 
 
 def compute_ece(made: Sequence[Claim]) -> float | None:
-    """Returns the expected calibration error: the mean distance of stated and true frequency, over bins, by their statements."""
+    """Return the expected calibration error.
+
+    It is the mean distance of stated probability and rate of true statements over the bins,
+    weighted by their statements.
+    """
     if not made:
         return None
     bins = compute_reliability(made)
     return sum(one["of"] * abs(one["stated"] - one["value"]) for one in bins) / len(made)
 
 
-def compute_closed_of_oracle(marks: Sequence[CaseScore]) -> float | None:
-    """Returns the share of the gap closed over what the true effects close, the median of the cases where they close something.
+def compute_parameter_error(scores: Sequence[CaseScore]) -> float | None:
+    """Return the median relative error of the parameters."""
+    return _take_median(number.error for score in scores for number in score.numbers)
 
-    The median, as the gap itself is a difference of two errors: where it is small, shares of it are
-    wild.
+
+def compute_closed_of_oracle(scores: Sequence[CaseScore]) -> float | None:
+    """Return the median ratio of the closed share of the gap to that of the oracle.
+
+    The median, as the gap itself is a difference of two errors: where it is small, its shares vary
+    wildly.
     """
-    return _take_median(
-        [
-            (mark.closed or 0.0) / mark.oracle
-            for mark in marks
-            if mark.oracle is not None and mark.oracle > MIN_ORACLE_CLOSED
-        ]
-    )
+    shares = []
+    for score in scores:
+        if score.oracle is not None and score.oracle > MIN_ORACLE_CLOSED:
+            shares.append((score.closed or 0.0) / score.oracle)
+    return _take_median(shares)
 
 
-def compute_prediction_error(marks: Sequence[CaseScore]) -> float | None:
-    """Returns the median distance of predicted and achieved closing."""
-    return _take_median(
-        [
-            abs(m.predicted - m.closed)
-            for m in marks
-            if m.predicted is not None and m.closed is not None
-        ]
-    )
+def compute_prediction_error(scores: Sequence[CaseScore]) -> float | None:
+    """Return the median distance of the predicted and the achieved share of the gap."""
+    distances = []
+    for score in scores:
+        if score.predicted is not None and score.closed is not None:
+            distances.append(abs(score.predicted - score.closed))
+    return _take_median(distances)
 
 
-def _take_median(values: Sequence[float]) -> float | None:
-    return float(np.median(values)) if len(values) else None
+def _take_median(values: Iterable[float]) -> float | None:
+    given = list(values)
+    return float(np.median(given)) if given else None

@@ -24,16 +24,16 @@ from diagnosis.residuals import Ray, rays
 from diagnosis.responses import Shape, fitted
 
 MIN_RESPONSE = 1e-3
-"""Change of an error, over its noise, below which an effect does nothing to a joint."""
+"""Response over noise below which an effect does not reach a joint; chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointErrors:
-    """What the simulator errs by on one joint.
+    """Errors of the simulator on one joint, and the response to each effect.
 
     Attributes:
         z: Errors over their noise, `(E,)`.
-        shapes: What each effect would change about them, one shape a ray; effects that do nothing
+        shapes: Response to each effect, one shape a ray; effects without a response
             to the joint are absent.
         fold: Half of the recordings of each entry.
     """
@@ -43,13 +43,13 @@ class JointErrors:
     fold: np.ndarray
 
     def rays(self, names: frozenset[str]) -> list[Shape]:
-        """Returns the shapes of several effects, in the order of their names."""
+        """Return the shapes of several effects, in the order of their names."""
         return [shape for name in sorted(names) for shape in self.shapes[name]]
 
 
 @dataclass(frozen=True)
 class CaseEvidence:
-    """All that is known before anything is chosen.
+    """Inputs of the choice of effects.
 
     Attributes:
         base: The simulator, against field and reference.
@@ -65,7 +65,7 @@ class CaseEvidence:
 def load_case_evidence(
     folder: Path, fit: ActuatorFit, machine: Machine, names: Sequence[str] | None = None
 ) -> CaseEvidence:
-    """Returns the ground of a case, for the effects `names`, or for all that a free run can show.
+    """Return the evidence of a case, for the effects `names`, or for all that a free run can show.
 
     Raises:
         RecordingError: the simulator cannot be fitted.
@@ -98,13 +98,13 @@ def load_case_evidence(
 
 
 MIN_GAP_RATIO = 1.1
-"""Error over floor below which nobody can say what share of the gap is closed."""
+"""Error over floor below which a share of the gap is noise; chosen by hand."""
 
 
 def close_gap(
     folder: Path, effects: Mapping[str, Sequence[str]], fit: ActuatorFit, machine: Machine
 ) -> float | None:
-    """Returns the share of the gap of a case that its true effects close, on windows that their sizes were not fitted to.
+    """Return the share of the gap of a case that its true effects close, on held-out windows.
 
     Args:
         folder: The case.
@@ -147,7 +147,7 @@ def close_gap(
 def close_labelled_gap(
     cases: Path, fit: ActuatorFit, machine: Machine, label: Mapping[str, Any]
 ) -> float | None:
-    """Returns the same for the case of a label, in the folder `cases`."""
+    """Return the same for the case of a label, in the folder `cases`."""
     return close_gap(
         cases / label["case"],
         {one["effect"]: one["joints"] for one in label["effects"]},
@@ -157,7 +157,7 @@ def close_labelled_gap(
 
 
 def _fit_start(errors: JointErrors, names: frozenset[str]) -> dict[str, np.ndarray]:
-    """Returns the sizes along the rays of each effect that explain the errors best, as far as effects add up."""
+    """Return the additive least-squares sizes along the rays of each effect."""
     if not names:
         return {}
     ends = np.cumsum([len(errors.shapes[name]) for name in sorted(names)])[:-1]

@@ -23,7 +23,7 @@ HEADLINES = (
 def append_to_ledger(
     path: Path, when: str, exam: dict[str, Any], name: str, table: dict[str, Any]
 ) -> None:
-    """Appends one candidate's headlines.
+    """Append one candidate's headlines.
 
     Args:
         path: The ledger.
@@ -86,7 +86,7 @@ ROWS = {
 
 
 def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
-    """Returns the lines of the table of all candidates."""
+    """Return the lines of the table of all candidates."""
     found: list[list[str | Cell]] = []
     for key, (words, more_is_better) in ROWS.items():
         values = {name: table[key]["value"] for name, table in tables.items()}
@@ -127,7 +127,7 @@ def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]
 
 
 def format_markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """Returns the table of all candidates as Markdown, to be pasted where figures stand."""
+    """Return the table of all candidates as Markdown, to be pasted where figures stand."""
     lines = [["", *tables], ["---"] * (1 + len(tables))]
     for words, *cells in build_rows(tables):
         told = (cell if isinstance(cell, Cell) else Cell(cell) for cell in cells)
@@ -143,7 +143,7 @@ def format_markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
 def write_report(
     folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]
 ) -> None:
-    """Writes `exam.html`, its table `exam.md`, pictures of each candidate: `confusion_<name>.png`, `reliability_…`, `size_…`."""
+    """Write `exam.html`, its table `exam.md`, and the pictures of each candidate."""
     first = next(iter(tables.values()))
     kinds = ", ".join(f"{count} {kind}" for kind, count in first["cases"].items() if count)
     page = Report(
@@ -185,7 +185,7 @@ def write_report(
                 for effect, figures in table["by_effect"].items()
             ]
             page.add_table(["effect", *(column.replace("_", " ") for column in columns)], lines)
-        with page.add_details("What lies outside the library, and what was said"):
+        with page.add_details("Faults outside the library, and the answers"):
             said = [
                 [kind, ", ".join(f"{count} {answer}" for answer, count in row.items())]
                 for kind, row in table["outside"].items()
@@ -197,14 +197,17 @@ def write_report(
 
 
 CAPTIONS = {
-    "confusion": "One effect: what was there (rows) and what came first in the answer (columns); a name of its class counts as it.",
-    "reliability": "How often statements of a probability are true; larger points stand for more, bars are 95 % intervals.",
-    "size": "One effect: rightly named, and answered by none, against size (of typical) and against what it does to the motion.",
+    "confusion": "One effect: the truth (rows) and the first name of the answer (columns). "
+    "A name of its class counts as the true one.",
+    "reliability": "Share of true statements over their probability. Larger points are more "
+    "statements, bars are 95 % intervals.",
+    "size": "One effect: share of right names and of the verdict none, over its size (of typical) "
+    "and over its change of the motion.",
 }
 
 
 def draw_confusion(table: Mapping[str, Any]) -> Figure | None:
-    """Draws who is taken for whom."""
+    """Draw who is taken for whom."""
     found = table["confusion"]
     if not found:
         return None
@@ -241,7 +244,7 @@ def draw_confusion(table: Mapping[str, Any]) -> Figure | None:
 
 
 def draw_reliability(table: Mapping[str, Any]) -> Figure | None:
-    """Draws true against stated frequency."""
+    """Draw true against stated frequency."""
     bins = table["reliability"]
     if not bins:
         return None
@@ -267,7 +270,7 @@ def draw_reliability(table: Mapping[str, Any]) -> Figure | None:
 
 
 def draw_detection(table: Mapping[str, Any]) -> Figure | None:
-    """Draws how detection grows with size."""
+    """Draw how detection grows with size."""
     if not table["by_size"]:
         return None
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")

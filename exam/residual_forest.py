@@ -40,7 +40,7 @@ TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 
 
 def extract_features(case: Path, machine: Machine) -> np.ndarray:
-    """Returns the features of each joint of a case, `(J, F)`."""
+    """Return the features of each joint of a case, `(J, F)`."""
     reference, field = (
         record.read_recordings(str(case / half / "*.parquet"), machine)
         for half in ("reference", "field")
@@ -67,7 +67,7 @@ def extract_features(case: Path, machine: Machine) -> np.ndarray:
 
 
 def _build_inputs(recording: Recording, joint: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the inputs `(T, P)` and the way of the next `STEP` samples, `(T,)`."""
+    """Return the inputs `(T, P)` and the way of the next `STEP` samples, `(T,)`."""
     u, q = recording.u[:, joint].astype(float), recording.q[:, joint].astype(float)
     curve = np.stack(
         [np.maximum(side * u - knee, 0.0) for knee in KNEES for side in (1.0, -1.0)], 1
@@ -84,7 +84,7 @@ def _build_inputs(recording: Recording, joint: int) -> tuple[np.ndarray, np.ndar
 def _measure_slopes(
     recording: Recording, joint: int, weights: np.ndarray, machine: Machine
 ) -> np.ndarray:
-    """Returns slopes of the residual on all probes and its own statistics in each block of a recording, `(B, F)`."""
+    """Return slopes of the residual on the probes, and its statistics, in each block, `(B, F)`."""
     inputs, ways = _build_inputs(recording, joint)
     left, first = ways - inputs @ weights, max(LAG_ROWS)
     q, u = recording.q[first:].astype(float), recording.u.astype(float)
@@ -129,7 +129,7 @@ def _compute_log_kurtosis(values: np.ndarray) -> float:
 
 
 def _summarize_tool_error(recordings: Sequence[Recording], machine: Machine) -> np.ndarray:
-    """Returns mean and spread of measured less computed tool point, and its slope on the angles, as one row; 0 without one."""
+    """Return mean, spread and slopes of the tool error as one row; 0 without tool points."""
     offs, angles = [], []
     for one in recordings:
         if not all(name in one.extra for name in TOOL_COLUMNS):
@@ -147,7 +147,7 @@ NONE, UNKNOWN = "none", "unknown"
 
 @spec
 class ResidualForest:
-    """Classifies each joint of a case by its residual features; what is most probable on any joint is the answer.
+    """Classify each joint by its residual features; the most probable class is the answer.
 
     Attributes:
         exam: Folder of the development exam it learns from, another than the one it sits; it cannot
@@ -163,7 +163,7 @@ class ResidualForest:
     seed: int
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
-        """Writes the answer.
+        """Write the answer.
 
         Raises:
             ConfigError: scikit-learn is missing, or the exam to learn from is not given or sealed.
@@ -197,7 +197,7 @@ class _MachineKey:
 
 @cache
 def _learn_forest(folder: Path, trees: int, seed: int, key: _MachineKey) -> Any:
-    """Returns the forest, learned once a process."""
+    """Return the forest, learned once a process."""
     try:
         from sklearn.ensemble import ExtraTreesClassifier  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -219,7 +219,7 @@ def _learn_forest(folder: Path, trees: int, seed: int, key: _MachineKey) -> Any:
 
 
 def _classify_joint(label: dict[str, Any], joint: str) -> str:
-    """Returns what a joint has: the largest effect on it, `unknown` for what lies outside the library, or `none`."""
+    """Return the class of a joint: its largest effect, `unknown`, or `none`."""
     if label["outside"] and joint in label["outside"]["joints"]:
         return UNKNOWN
     here = [
@@ -231,7 +231,7 @@ def _classify_joint(label: dict[str, Any], joint: str) -> str:
 
 
 def _build_answer(chances: dict[str, np.ndarray], joints: tuple[str, ...], least: float) -> Answer:
-    """Returns the answer to the chances of each class by joint."""
+    """Return the answer to the chances of each class by joint."""
     best = {name: float(by_joint.max()) for name, by_joint in chances.items() if name != NONE}
     best[NONE] = float(chances[NONE].min()) if NONE in chances else 0.0
     named = sorted(

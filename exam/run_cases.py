@@ -31,7 +31,7 @@ class Candidate(Protocol):
     """A spec in `conf/exam_candidate`: whatever answers a case."""
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
-        """Writes `diagnosis.json` for the folder `case` into the folder `out`, which is its own and empty.
+        """Write `diagnosis.json` for the folder `case` into the empty folder `out`.
 
         Raises:
             RecordingError: it could not.
@@ -62,7 +62,7 @@ class CommandCandidate:
             )
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
-        """Starts the program in an empty folder and waits for it."""
+        """Start the program in an empty folder and waits for it."""
         words = [word.format(case=case, out=out) for word in self.command]
         if words[0] == "brokk":
             words[:1] = [sys.executable, "-P", "-m", "brokk_rl"]
@@ -104,7 +104,7 @@ def answer_cases(
     workers: int,
     advance: Callable[[], None],
 ) -> int:
-    """Has every case answered that is not yet; returns how many have no answer in the end.
+    """Have every case answered that is not yet; returns how many have no answer in the end.
 
     `folder/<case>/diagnosis.json` is the answer, `sitting.json` beside it says how long it took, or
     why there is none. A case without an answer is tried again by the next run, an answer that
@@ -140,7 +140,7 @@ def answer_cases(
 
 
 def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
-    """Answers one case from a copy under a neutral name: no path leads from there to the labels."""
+    """Answer one case from a copy under a neutral name: no path leads from there to the labels."""
     begun, error = time.monotonic(), None
     with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
         copy, place = Path(scratch) / "case", Path(scratch) / "answer"
@@ -161,12 +161,12 @@ def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) 
 
 
 def is_begun(answer: Path) -> bool:
-    """Says whether anybody answered the case, or tried to, whose answer belongs into a folder."""
+    """Return whether anybody answered the case, or tried to, whose answer belongs into a folder."""
     return (answer / NOTE_FILE).is_file() or (answer / ANSWER_FILE).is_file()
 
 
 def read_seconds(answer: Path) -> float | None:
-    """Returns how long the answer in a folder took, `None` where there is none."""
+    """Return how long the answer in a folder took, `None` where there is none."""
     try:
         note = json.loads((answer / NOTE_FILE).read_text())
     except (OSError, ValueError):

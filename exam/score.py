@@ -53,7 +53,7 @@ class Claim:
 
 @dataclass(frozen=True, kw_only=True)
 class CaseScore:
-    """What is right and wrong about one answer.
+    """Score of one answer.
 
     Attributes:
         case: Which case.
@@ -68,16 +68,15 @@ class CaseScore:
             can have.
         unknown: Probability that the cause lies outside the library.
         claims: Statements whose truth the label knows.
-        numbers: Parameters of what was strictly right.
-        size: Largest size of an effect, of typical; of what lies outside too.
-        moved_rad: What the cause changes of the motion over 5 s, on the joint where it changes
-            most.
+        numbers: Parameters of strictly right names.
+        size: Largest size of an effect or outside fault, of typical.
+        moved_rad: Change of the motion by the cause over 5 s, on the joint with the largest.
         closed: Share of the gap closed, by the answer's own account.
         predicted: Share of the gap that the answer said would be closed, before it looked.
         oracle: Share of the gap that the true effects close when fitted, where somebody computed
             it.
         seconds: Time the answer took.
-        outside: Name of what lies outside the library.
+        outside: Name of the fault outside the library.
     """
 
     case: str
@@ -109,11 +108,11 @@ def score_answer(
     seconds: float | None = None,
     oracle: float | None = None,
 ) -> CaseScore:
-    """Returns the mark of `answer`, `None` where there is none.
+    """Return the score of `answer`; `None` is a missing answer.
 
     Args:
-        label: What is true, as `paper.label` has it.
-        answer: What was said.
+        label: The truth, as `dataset.make_label` has it.
+        answer: The answer.
         classes: Effects that recordings of commands and positions cannot tell apart.
         of_machine: Effects that all joints have together; nobody is asked for their joints.
         seconds: Time it took.
@@ -178,7 +177,7 @@ def score_answer(
 def _match_effects(
     true: Sequence[str], chosen: Sequence[Selected], classes: Sequence[Sequence[str]]
 ) -> list[tuple[str, Selected]]:
-    """Returns each true effect with the name that stands for it; the true name itself before others of its class."""
+    """Return each true effect with the name that stands for it; equal names go first."""
     found, left = [], list(chosen)
     for stands in (_is_same, lambda effect, one: _is_equivalent(effect, one, classes)):
         for effect in true:
@@ -200,7 +199,7 @@ def _is_equivalent(effect: str, one: Selected, classes: Sequence[Sequence[str]])
 
 
 def _get_probability(answer: Answer | None, name: str) -> float:
-    """Returns the probability of `none` or `unknown`; where it is not ranked, 1 or 0 by the verdict."""
+    """Return the probability of `none` or `unknown`; where it is not ranked, 1 or 0 by the verdict."""
     if answer is None:
         return 0.0
     ranked = [one.probability for one in answer.ranking if one.effect == name]
@@ -208,7 +207,7 @@ def _get_probability(answer: Answer | None, name: str) -> float:
 
 
 def _score_parameters(true: Mapping[str, Any], one: Selected) -> list[ParameterScore]:
-    """Returns the marks of all parameters of an effect on the joints that have it and are named."""
+    """Return the marks of all parameters of an effect on the joints that have it and are named."""
     found = []
     for name, by_joint in true["parameters"].items():
         said = one.parameters.get(name, {})

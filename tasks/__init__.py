@@ -1,1 +1,1 @@
-"""Tasks: what the machine is asked to do, what counts as done, and what is rewarded on the way."""
+"""Tasks: goals of the machine, criteria of success, rewards."""

@@ -1,8 +1,9 @@
-"""Proposing to a person: what their hands have yet to do of what was proposed, and proposals that hands can follow.
+"""Proposals for a person who moves the levers.
 
-A person follows late and sluggishly, so the machine's history lacks what the policy has lately
-asked for: without its own proposals it would ask for the same motion again and again until the
-first of it arrives. With them the dead times of machine and person are one.
+A person follows late and sluggishly, so the machine's history lacks the newest proposals. A policy
+without them would propose the same motion again until the first of it arrives. With them the dead
+times of machine and person are one.
+
 """
 
 import torch
@@ -18,7 +19,7 @@ Expected = float | tuple[float, float]
 
 @spec
 class AdviceConfig:
-    """How to propose to a person whose habits are known roughly; the middle of a range counts.
+    """Habits of the person for whom proposals are made; the middle of a range counts.
 
     Attributes:
         delay_s: Reaction delay, from the display to the hand.
@@ -48,12 +49,12 @@ class AdviceConfig:
                 )
 
     def build(self, machine: Machine, device: torch.device) -> "LeverAdviser":
-        """Returns the adviser for `machine` on `device`."""
+        """Return the adviser for `machine` on `device`."""
         return LeverAdviser(self, machine, device)
 
 
 class LeverAdviser:
-    """See `Advice`; stateless, so that it can stand inside a policy."""
+    """Proposals under `AdviceConfig`; stateless, so that it can stand inside a policy."""
 
     def __init__(self, advice: AdviceConfig, machine: Machine, device: torch.device) -> None:
         self._dead_zone = _take_middle(advice.dead_zone)
@@ -66,11 +67,11 @@ class LeverAdviser:
         self._future = _predict_levers(advice, machine).to(device)
 
     def coming(self, proposed: torch.Tensor, given: torch.Tensor) -> torch.Tensor:
-        """Returns the commands that hands will yet give, `(N, F, J)`, if nothing more is proposed.
+        """Return the commands that hands will still give, `(N, F, J)`, without further proposals.
 
         Args:
-            proposed: What was proposed, oldest first, `(N, H, J)`.
-            given: What was given in the last period, `(N, J)`.
+            proposed: Proposals so far, oldest first, `(N, H, J)`.
+            given: Commands given in the last period, `(N, J)`.
         """
         hand = self._shown(given)
         levers = torch.einsum("fh,nhj->nfj", self._future, torch.cat((proposed, hand[:, None]), 1))
@@ -81,11 +82,11 @@ class LeverAdviser:
         )
 
     def proposal(self, wanted: torch.Tensor, proposed: torch.Tensor) -> torch.Tensor:
-        """Returns what to propose, `(N, J)`, where the commands `wanted`, `(N, J)`, are to be given.
+        """Return the proposal, `(N, J)`, by which the commands `wanted`, `(N, J)`, are given.
 
         Args:
             wanted: Commands under the masks.
-            proposed: What was proposed before, oldest first, `(N, H, J)`.
+            proposed: Proposals so far, oldest first, `(N, H, J)`.
         """
         shown = self._shown(wanted)
         if self._most >= wanted.shape[1]:
@@ -97,7 +98,7 @@ class LeverAdviser:
         return torch.where(select_levers(shown.abs() + 2.0 * kept, self._most), shown, 0.0)
 
     def _shown(self, command: torch.Tensor) -> torch.Tensor:
-        """Returns the deflection that commands `command`."""
+        """Return the deflection that commands `command`."""
         return torch.where(
             command == 0,
             0.0,
@@ -106,7 +107,10 @@ class LeverAdviser:
 
 
 def _predict_levers(advice: AdviceConfig, machine: Machine) -> torch.Tensor:
-    """Returns what makes levers of the coming periods, `(F, H + 1)`, of `H` proposals, oldest first, and the hand as it is."""
+    """Return the weights of coming levers, `(F, H + 1)`.
+
+    Columns: `H` proposals, oldest first, and the present position of the hand.
+    """
     num, period_s = machine.num_history, machine.period_s
     delay, lag = (
         _take_middle(advice.delay_s) / period_s,

@@ -1,15 +1,15 @@
-"""The classical controller: resolved-rate control of the tool with dead-time compensation, under the masks of the machine.
+"""Classical controller: resolved-rate control of the tool with dead-time compensation.
 
-It is what a user would pick instead of a learned policy, and it is the base on which the default
-policy learns a residual. It
-sees only what the policy sees: the measured history and the estimated target. Torch, batched,
-without a host synchronisation, and made of operations that ONNX knows, so that an exported policy
+It is the baseline of a learned policy, and the base on which the default policy learns a residual.
+It sees only the policy's observation: the measured history and the estimated target. It is written
+in torch, batched, without host synchronisation, in operations that ONNX knows: an exported policy
 carries it inside.
 
-Dead-time compensation is the idea of the Smith predictor (O. J. M. Smith, 1957): commands that were
-sent but have not acted yet are added to the measured position through a static map of the valve,
-and the controller acts on where the machine is going to be. Resolved-rate control with damped least
-squares follows Nakamura and Hanafusa (1986).
+Dead-time compensation is the idea of the Smith predictor (O. J. M. Smith, 1957). Commands that were
+sent but have not acted yet are added to the measured position through a static map of the valve.
+The controller acts on the predicted position. Resolved-rate control with damped least squares
+follows Nakamura and Hanafusa (1986).
+
 """
 
 from dataclasses import dataclass
@@ -61,13 +61,13 @@ class ClassicalConfig:
     brake_s: float
 
     def build(self, machine: Machine, device: torch.device) -> "ClassicalController":
-        """Returns the controller for `machine` on `device`."""
+        """Return the controller for `machine` on `device`."""
         return ClassicalController(self, machine, device)
 
 
 @dataclass
 class ControllerGuidance:
-    """What the controller makes of a history and a target; `N` environments.
+    """Commands and errors for a history and a target; `N` environments.
 
     Attributes:
         command: Valve commands before the masks, `(N, J)` in [-1, 1]: exclusive joints as for
@@ -97,7 +97,7 @@ class ControllerGuidance:
 
 
 class ClassicalController:
-    """See `Classical`; stateless, so that it can stand inside a policy."""
+    """Controller under `ClassicalConfig`; stateless, so that it can stand inside a policy."""
 
     def __init__(self, config: ClassicalConfig, machine: Machine, device: torch.device) -> None:
         def constant(values: object) -> torch.Tensor:
@@ -121,12 +121,14 @@ class ClassicalController:
         self._damping = config.damping**2 * torch.eye(4, device=device)
 
     def rate(self, u: torch.Tensor) -> torch.Tensor:
-        """Returns the joint speed that the static valve map gives to commands `u`, `(…, J)`, rad/s or m/s."""
+        """Return the joint speed of the static valve map for commands `u`, `(…, J)`, rad/s or m/s."""
         band = self.config.dead_band
         return self.speed * u.sign() * (u.abs() - band).clamp(min=0.0) / (1.0 - band)
 
     def valve(self, rate: torch.Tensor) -> torch.Tensor:
-        """Inverts `rate`: returns the commands for joint speeds given as a share of the full speed, clipped to [-1, 1].
+        """Return the commands, in [-1, 1], for joint speeds given as a share of full speed.
+
+        The inverse of `rate`.
 
         Speeds too small for the valve are given as pulses of `creep`: the prediction counts a pulse
         as soon as it is sent, so that no more of them are sent than are needed.
@@ -140,7 +142,7 @@ class ClassicalController:
         )
 
     def _opening(self, share: torch.Tensor) -> torch.Tensor:
-        """Returns the largest command that is no faster than this share of full speed, `(N, J)` in [0, 1]; 0 for none."""
+        """Return the largest command not faster than a share of full speed, `(N, J)` in [0, 1]."""
         band = self.config.dead_band
         return (band + (1.0 - band) * share) * (share > 0)
 
@@ -153,7 +155,7 @@ class ClassicalController:
         reach_m: tuple[float, float],
         coming: torch.Tensor | None = None,
     ) -> ControllerGuidance:
-        """Returns commands and errors.
+        """Return commands and errors.
 
         Args:
             q: Measured positions, oldest first, `(N, H, J)`.
@@ -208,7 +210,7 @@ class ClassicalController:
         )
 
     def reach(self, q: torch.Tensor, target_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the reach at `q`, `(N, J)`, and its slope over joint positions: `(N,)` and `(N, J)`."""
+        """Return the reach at `q`, `(N, J)`, and its slope over joints: `(N,)` and `(N, J)`."""
         reach, slope, _ = self._reach(self.kinematics.pose(q[None]), target_m)
         return reach[0], slope
 
@@ -220,7 +222,10 @@ class ClassicalController:
         up: torch.Tensor,
         turn: torch.Tensor,
     ) -> torch.Tensor:
-        """Returns joint speeds as a share of full speed that bring the tool closer, `(N, J)` in [-1, 1]; exclusive joints rest."""
+        """Return joint speeds that bring the tool closer, as shares of full speed, `(N, J)`.
+
+        Exclusive joints rest.
+        """
         config = self.config
         wanted = torch.cat((error[:, :2], up[:, None]), 1) * config.gain_1_s
         wanted = wanted * (
@@ -242,7 +247,7 @@ class ClassicalController:
         )
 
     def _reach(self, pose: ToolPose, target_m: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns reach `(M, N)`, the slope of its first row over joint positions `(N, J)`, and the distance in space `(M, N)`."""
+        """Return reach `(M, N)`, its slope `(N, J)` in the first row, and the distance in space `(M, N)`."""
         origins = pose.joints_in_base_m
         joint = origins[:, :, self._reach_joint]
         radius = joint[..., :2].norm(dim=-1).clamp(min=1e-3)
@@ -256,7 +261,12 @@ class ClassicalController:
 
 
 def _solve_4(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Solves symmetric positive definite 4 x 4 systems, `(N, 4, 4)` and `(N, 4, 1)`, by 2 x 2 blocks (Schur complement).
+    """Solve symmetric positive definite 4 x 4 systems by 2 x 2 blocks (Schur complement).
+
+    Args:
+        a: Matrices, `(N, 4, 4)`.
+        b: Right sides, `(N, 4, 1)`.
+
 
     Own code because LAPACK calls neither export to ONNX nor fit into a captured CUDA graph.
     """

@@ -1,63 +1,41 @@
-"""Bringing the tool to a pose: what the tasks of this package share.
+"""Control of a tool-pose task: the path from an observation to a masked command.
 
-A task of this family has a target point and a wanted pitch. The policy sees an estimate of the
-target that is wrong in the way a
-camera is wrong, positions and commands through a scale that is slightly off, and acts under the
-masks of the machine: the exclusive joints alone while positioning, all others afterwards.
+The same code runs in training, in `N` environments, and inside the exported policy: masks, the
+classical controller's guidance, the residual, and proposals for a person.
 """
 
+from __future__ import annotations
+
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 
-from brokk_rl.machine import mask_exclusive_joints
+from brokk_rl.machine import Machine, mask_exclusive_joints
+from brokk_rl.observation import ObservationEncoder, TargetScaling
 from brokk_rl.spec import spec
-from tasks.classical import ControllerGuidance
+from tasks.advice import AdviceConfig
+from tasks.classical import ClassicalConfig, ControllerGuidance
 
-
-@spec
-class ObservationNoise:
-    """What the policy is told is wrong by; drawn anew each episode unless said otherwise.
-
-    Attributes:
-        target_sample_m: Uniform error of the target in each sample and axis (±).
-        target_bias_m: Length of the constant error of the target, uniform from 0, in a random
-            direction.
-        target_relative: Uniform error of each sample as a share of each coordinate (±); the paper's
-            5 %.
-        filter: `mean` gives the policy the mean of all estimates of the episode, as a tracker of a
-            fixed hole does; `none` each sample.
-        q_scale: Scale error of all measured positions (±).
-        u_scale: Scale error of all recorded commands (±).
-    """
-
-    target_sample_m: float
-    target_bias_m: float
-    target_relative: float
-    filter: Literal["none", "mean"]
-    q_scale: float
-    u_scale: float
-
-    def bias_m(self, target_m: torch.Tensor) -> torch.Tensor | float:
-        """Returns the longest constant error of targets, `(N, 3)` in the base frame: the same for all."""
-        return self.target_bias_m
-
-    def sample_m(self, target_m: torch.Tensor) -> torch.Tensor | float:
-        """Returns the half width of the error of each sample and axis: the same for all."""
-        return self.target_sample_m
+ERROR_SCALES_M = (0.1, 0.02)
+"""Distances at which the saturated copies of position errors resolve: approach and insertion.
+Chosen by hand."""
+PITCH_SCALE_RAD = 0.1
+"""The same for the pitch error. Chosen by hand."""
+REACH_CENTER_M = 2.0
+"""Subtracted from the reach; about the middle of the paper's range, 1.7 to 2.4 m."""
 
 
 @spec
 class PhaseSwitch:
-    """When only the exclusive joints move (paper, section III-B).
+    """Rule for the positioning phase, in which only the exclusive joints move (paper, III-B).
 
     Attributes:
         rule: `planar`: while the reach, with the target turned into the arm's plane, is out of
-            range and the tool is not low; it
-            does not depend on where q1 points and always lets the episode proceed. `text`: the same
-                with the distance in space, as
-            the paper's text says. `equation`: while that distance is out of range or the tool is
-            above the height, as the paper's equation 1 says.
+            range and the tool is not low. It does not depend on the direction of q1, and always
+            lets the episode proceed. `text`: the same with the distance in space, as the paper's
+            text says. `equation`: while that distance is out of range or the tool is above the
+            height, as the paper's equation 1 says.
         reach_m: The good working range (nearest, farthest).
         height_m: Height of the tool below which the exclusive joints rest, to keep it off the
             ground.
@@ -67,19 +45,22 @@ class PhaseSwitch:
     reach_m: tuple[float, float]
     height_m: float
 
+    def reach(self, guidance: ControllerGuidance) -> torch.Tensor:
+        """Return the distance by which the rule decides, `(N,)`."""
+        return guidance.reach_m if self.rule == "planar" else guidance.reach_3d_m
+
     def positioning(self, guidance: ControllerGuidance) -> torch.Tensor:
-        """Returns which environments are positioning, `(N,)` bool."""
+        """Return which environments are positioning, `(N,)` bool."""
         near, far = self.reach_m
-        distance = guidance.reach_m if self.rule == "planar" else guidance.reach_3d_m
-        out = (distance < near) | (distance > far)
-        if self.rule == "equation":
-            return out | (guidance.tip_z_m >= self.height_m)
-        return out & (guidance.tip_z_m >= self.height_m)
+        reach = self.reach(guidance)
+        out_of_range = (reach < near) | (reach > far)
+        is_high = guidance.tip_z_m >= self.height_m
+        return out_of_range | is_high if self.rule == "equation" else out_of_range & is_high
 
 
 @spec
 class ActionMapping:
-    """How the policy's output becomes valve commands.
+    """Map from the policy's output to valve commands.
 
     Attributes:
         kind: `direct`: the output is the command. `residual`: it is added to the classical
@@ -105,13 +86,13 @@ class ActionMapping:
         positioning: torch.Tensor,
         exclusive: torch.Tensor,
     ) -> torch.Tensor:
-        """Returns valve commands in [-1, 1], `(N, J)`.
+        """Return valve commands in [-1, 1], `(N, J)`.
 
         Args:
-            output: What the network says, `(N, J)`.
+            output: Output of the network, `(N, J)`.
             base: Command of the classical controller, `(N, J)`.
             lowest: Least commands that do not drive joints into their ends, `(N, J)`
-                (`Guidance.lowest`).
+                (`ControllerGuidance.lowest`).
             highest: Largest such commands, `(N, J)`.
             positioning: Whether only the exclusive joints move, `(N,)` bool.
             exclusive: Which joints are exclusive, `(J,)` bool.
@@ -122,3 +103,202 @@ class ActionMapping:
         if self.mask:
             u = torch.where(mask_exclusive_joints(exclusive, positioning), u, 0.0)
         return u.clamp(-1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class ControlInput:
+    """Everything that follows from one observation.
+
+    Attributes:
+        vector: The policy's observation vector, `(N, O)`.
+        features: The `guide` group, `(N, G)`; see `compute_features`.
+        guidance: Commands and errors of the classical controller.
+        positioning: Whether only the exclusive joints move, `(N,)` bool.
+    """
+
+    vector: torch.Tensor
+    features: torch.Tensor
+    guidance: ControllerGuidance
+    positioning: torch.Tensor
+
+
+class ToolPoseControl:
+    """Path from an observation to a command; stateless.
+
+    Args:
+        machine: The machine.
+        device: Where to compute.
+        scaling: Normalisation of the target.
+        classical: The classical controller.
+        switch: Rule for the positioning phase.
+        action: Map from the policy's output to commands.
+        advice: Proposals for a person; `None` where the policy's commands are given as they are.
+        memory: Newest samples of history that the policy sees.
+        depth_m: How far the controller's target lies below that of the observation.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        device: torch.device,
+        *,
+        scaling: TargetScaling,
+        classical: ClassicalConfig,
+        switch: PhaseSwitch,
+        action: ActionMapping,
+        advice: AdviceConfig | None,
+        memory: int,
+        depth_m: float,
+    ) -> None:
+        def to_constant(values: object) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=device)
+
+        self.switch, self.action, self.memory = switch, action, memory
+        self.controller = classical.build(machine, device)
+        self.adviser = advice.build(machine, device) if advice else None
+        self.encoder = ObservationEncoder(
+            machine, scaling, to_constant, torch.cat, with_proposals=self.adviser is not None
+        )
+        self.down = to_constant([0.0, 0.0, depth_m])
+        self.exclusive = to_constant(machine.is_exclusive).bool()
+        # see `compute_features`: two commands, three scales of four errors, pitch, reach, phase
+        self.num_features = 2 * machine.num_joints + 3 * 4 + 2 + 2
+
+    def process(
+        self,
+        target_m: torch.Tensor,
+        q: torch.Tensor,
+        u: torch.Tensor,
+        pitch_rad: torch.Tensor,
+        proposed: torch.Tensor | None,
+    ) -> ControlInput:
+        """Return the observation vector and all that the controller makes of it.
+
+        Args:
+            target_m: Estimated target, `(N, 3)`.
+            q: Measured positions, oldest first, `(N, H, J)`.
+            u: Commands in force, oldest first, `(N, H, J)`.
+            pitch_rad: Wanted pitch, `(N,)`.
+            proposed: Proposals so far, oldest first, `(N, H, J)`; `None` without an adviser.
+        """
+        q, u = self._forget_positions(q), self._forget_commands(u)
+        coming = None
+        if self.adviser is not None and proposed is not None:
+            proposed = self._forget_commands(proposed)
+            coming = self.adviser.coming(proposed, u[:, -1])
+        guidance = self.controller.guide(
+            q, u, target_m - self.down, pitch_rad, self.switch.reach_m, coming
+        )
+        positioning = self.switch.positioning(guidance)
+        return ControlInput(
+            vector=self.encoder.encode(target_m, q, u, pitch_rad, proposed),
+            features=compute_features(guidance, positioning, u[:, -1]),
+            guidance=guidance,
+            positioning=positioning,
+        )
+
+    def command(
+        self,
+        output: torch.Tensor,
+        base: torch.Tensor,
+        lowest: torch.Tensor,
+        highest: torch.Tensor,
+        positioning: torch.Tensor,
+        proposed: torch.Tensor | None,
+    ) -> torch.Tensor:
+        """Return masked commands, or proposals where there is an adviser, `(N, J)`.
+
+        Args:
+            output: Output of the network, `(N, J)`.
+            base: See `ActionMapping.command`, like the next three.
+            lowest: See there.
+            highest: See there.
+            positioning: See there.
+            proposed: As in `process`.
+        """
+        u = self.action.command(output, base, lowest, highest, positioning, self.exclusive)
+        if self.adviser is None or proposed is None:
+            return u
+        return self.adviser.proposal(u, self._forget_commands(proposed))
+
+    def _forget_positions(self, q: torch.Tensor) -> torch.Tensor:
+        """Return positions `(N, H, J)` that rest before the last `memory` samples."""
+        forgotten = q.shape[1] - self.memory
+        if forgotten <= 0:
+            return q
+        still = q[:, forgotten : forgotten + 1].expand(-1, forgotten, -1)
+        return torch.cat((still, q[:, forgotten:]), 1)
+
+    def _forget_commands(self, u: torch.Tensor) -> torch.Tensor:
+        """Return commands `(N, H, J)` that are zero before the last `memory` samples."""
+        forgotten = u.shape[1] - self.memory
+        if forgotten <= 0:
+            return u
+        return torch.cat((torch.zeros_like(u[:, :forgotten]), u[:, forgotten:]), 1)
+
+
+def compute_features(
+    guidance: ControllerGuidance, positioning: torch.Tensor, u_last: torch.Tensor
+) -> torch.Tensor:
+    """Return the `guide` group, `(N, G)`, which the default policy sees beside the paper's vector.
+
+    All of it follows from that vector: commands of the classical controller, the last command,
+    position errors at three scales, pitch error at two, reach, phase.
+    """
+    errors = torch.cat((guidance.error_m, guidance.goal_error_m[:, None]), 1)
+    coarse, fine = ERROR_SCALES_M
+    turn = guidance.pitch_error_rad[:, None]
+    parts = (
+        guidance.command,
+        u_last,
+        errors,
+        (errors / coarse).tanh(),
+        (errors / fine).tanh(),
+        turn,
+        (turn / PITCH_SCALE_RAD).tanh(),
+        (guidance.reach_m - REACH_CENTER_M)[:, None],
+        positioning[:, None].float(),
+    )
+    return torch.cat(parts, 1)
+
+
+class DeployedPolicy(torch.nn.Module):
+    """The whole policy as it runs on the machine: `(B, O)` observations to `(B, J)` commands.
+
+    Everything that training computes beside the paper's observation (guidance, phase, residual,
+    masks) is inside. Nothing of it has to be written again where the policy is deployed.
+
+    Args:
+        control: Path from observation to command.
+        network: Takes a dictionary of observation groups, returns the action.
+        pitch_rad: Wanted pitch of a task that fixes it.
+    """
+
+    def __init__(
+        self, control: ToolPoseControl, network: torch.nn.Module, pitch_rad: float
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self._control, self._pitch_rad = control, pitch_rad
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return valve commands, `(B, J)` in [-1, 1]."""
+        control, encoder = self._control, self._control.encoder
+        target_m, q, u = encoder.decode(observation)
+        if encoder.has_pitch:
+            pitch_rad = encoder.decode_pitch(observation)
+        else:
+            pitch_rad = torch.full_like(target_m[:, 0], self._pitch_rad)
+        proposed = encoder.decode_proposals(observation) if encoder.has_proposals else None
+        seen = control.process(target_m, q, u, pitch_rad, proposed)
+        # encoding again is not exact to the last bit: only where history was forgotten
+        vector = seen.vector if control.memory < q.shape[1] else observation
+        guidance = seen.guidance
+        return control.command(
+            self.network({"policy": vector, "guide": seen.features}),
+            guidance.command,
+            guidance.lowest,
+            guidance.highest,
+            seen.positioning,
+            proposed,
+        )

@@ -1,10 +1,11 @@
-"""A tool-pose task at work: episodes, observations, masks and judgement for `N` environments at once.
+"""Episodes of a tool-pose task: observations, masks and judgement in `N` environments at once.
 
-What differs between tasks (which target, what success means) is in the `Goal` that a task hands in;
-everything here is the same for all of them. No method synchronises with the host, and every tensor
-of `state` and `episode` keeps its address, so that the whole control step can be captured in one
-CUDA graph.
+Tasks differ in their `ToolPoseGoal` (targets, meaning of success); the rest is the same for all of
+them. No method synchronises with the host, and every tensor of `state` and `episode` keeps its
+address: the whole control step can be captured in one CUDA graph.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Callable
@@ -17,38 +18,57 @@ import torch
 from brokk_rl.contracts.task import Transition
 from brokk_rl.contracts.world import World
 from brokk_rl.history import History
-from brokk_rl.kinematics import Kinematics
+from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, TargetScaling
+from brokk_rl.observation import TargetScaling
 from tasks.advice import AdviceConfig
-from tasks.classical import ClassicalConfig, ClassicalController
-from tasks.control import ActionMapping, ObservationNoise, PhaseSwitch
-from tasks.deployable import DeployedPolicy, compute_features
-from tasks.noise import MeasuredNoise
+from tasks.classical import ClassicalConfig
+from tasks.control import ActionMapping, DeployedPolicy, PhaseSwitch, ToolPoseControl
+from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.reward import RewardTerm, ToolState
 
 REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
+"""Endings of an episode; where several hold in one step, the first of them counts."""
+FIGURES = (
+    "success_strict",
+    "success_paper",
+    "time_to_insert_s",
+    "lateral_error_m",
+    "peak_force_n",
+    "valve_travel",
+    "return",
+    "length",
+)
+"""Figures of an episode, in the order of `evaluation.json`."""
+NUM_PRIVILEGED = 10
+"""Length of the critic's own group; see `_compute_privileged`."""
+FORCE_SCALE_N, MAX_SCALED_FORCE = 2000.0, 5.0
+"""Scale and bound of forces in the critic's group: 10 kN, where reward terms saturate too."""
 
 
 class ToolPoseGoal(Protocol):
-    """What a tool-pose task must say about itself."""
+    """Targets and criteria by which tool-pose tasks differ."""
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """Draws valid starts; `q`, `scene`, `target_m` `(count, 3)` and `target_pitch_rad` `(count,)` at least."""
+        """Draw valid starts.
+
+        Returns:
+            `q`, `scene`, `target_m` `(count, 3)` and `target_pitch_rad` `(count,)` at least.
+        """
         ...
 
     def judge(
         self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
     ) -> dict[str, torch.Tensor]:
-        """Returns `success`, `paper_success` (bool) and `closeness`, each `(N,)`."""
+        """Return `success`, `paper_success` (bool) and `closeness`, each `(N,)`."""
         ...
 
 
 @dataclass
 class ToolPoseOptions:
-    """The parts of a task's configuration that the process itself uses; see `tasks.control` and the task's spec.
+    """Parts of a task's configuration that the process itself uses.
 
-    The target point of the process lies `depth_m` below that of the goal.
+    See the task's spec. The controller's target lies `depth_m` below that of the goal.
     """
 
     episode_s: float
@@ -66,17 +86,26 @@ class ToolPoseOptions:
 
     @classmethod
     def of(cls, task: object, **fixed: Any) -> Self:
-        """Returns the options of a task's spec, whose fields have the same names; the task does not leave `fixed` open."""
-        return cls(
-            **{
-                field.name: fixed[field.name] if field.name in fixed else getattr(task, field.name)
-                for field in fields(cls)
-            }
-        )
+        """Return the options of a task's spec, whose fields have the same names.
+
+        Args:
+            task: The spec.
+            **fixed: Options that the spec does not leave open.
+        """
+        names = [field.name for field in fields(cls) if field.name not in fixed]
+        return cls(**fixed, **{name: getattr(task, name) for name in names})
 
 
 class ToolPoseProcess:
-    """See the module; fulfils `brokk_rl.contracts.task.TaskProcess`."""
+    """Episodes in `N` environments; fulfils `TaskProcess`, `ClassicalTask` and `DeployableTask`.
+
+    Args:
+        goal: Targets and criteria.
+        options: The task's configuration.
+        machine: The machine.
+        num_envs: `N`.
+        device: Where to compute.
+    """
 
     reasons: tuple[str, ...] = REASONS
 
@@ -88,90 +117,73 @@ class ToolPoseProcess:
         num_envs: int,
         device: torch.device,
     ) -> None:
-        def constant(values: object) -> torch.Tensor:
+        def to_constant(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
         self.goal, self.options = goal, options
         self.num_actions = machine.num_joints
         self.max_episode_steps = round(options.episode_s / machine.period_s)
+        self.control = ToolPoseControl(
+            machine,
+            device,
+            scaling=options.scaling,
+            classical=options.classical,
+            switch=options.switch,
+            action=options.action,
+            advice=options.advice,
+            memory=options.memory,
+            depth_m=options.depth_m,
+        )
         self._machine = machine
         self._kinematics = Kinematics(machine, device)
-        self._controller: ClassicalController = options.classical.build(machine, device)
-        self.adviser = options.advice.build(machine, device) if options.advice else None
-        self._encoder = ObservationEncoder(
-            machine, options.scaling, constant, torch.cat, with_proposals=self.adviser is not None
-        )
-        self._exclusive = constant(machine.is_exclusive).bool()
-        self._lower = constant(machine.lower) + options.limit_margin
-        self._upper = constant(machine.upper) - options.limit_margin
-        self._down = constant([0.0, 0.0, options.depth_m])
+        self._lower = to_constant(machine.lower) + options.limit_margin
+        self._upper = to_constant(machine.upper) - options.limit_margin
         self._terms: list[tuple[Callable[[ToolState], torch.Tensor], float]] = [
             (resolve_name(term.function), term.weight) for term in options.reward.values()
         ]
-        num_joints = machine.num_joints
-        start = self.starts(1, 0)
-        shapes = {f"start.{key}": tuple(value.shape[1:]) for key, value in start.items()}
-        shapes |= {
-            "bias_m": (3,),
-            "estimate_sum_m": (3,),
-            "estimate_m": (3,),
-            "q_scale": (),
-            "u_scale": (),
-            "steps": (),
-            "age": (),
-        }
-        shapes |= {
-            "u": (num_joints,),
-            "u_before": (num_joints,),
-            "closeness": (),
-            "contact_force_n": (),
-        }
-        shapes |= {
-            "command": (num_joints,),
-            "features": (self.num_features,),
-            "policy": (self._encoder.size,),
-            "privileged": (10,),
-        }
-        shapes |= {
-            "positioning": (),
-            "rule_reach_m": (),
-            "lowest": (num_joints,),
-            "highest": (num_joints,),
-        }
-        if self.adviser:
-            shapes["proposed"] = (machine.num_history, num_joints)
         self.state = {
-            name: torch.zeros((num_envs, *shape), device=device) for name, shape in shapes.items()
+            name: torch.zeros((num_envs, *shape), device=device)
+            for name, shape in self._list_state_shapes().items()
         }
-        figures = (
-            "success_strict",
-            "success_paper",
-            "time_to_insert_s",
-            "lateral_error_m",
-            "peak_force_n",
-            "valve_travel",
-        )
-        self.episode = {
-            name: torch.zeros(num_envs, device=device) for name in (*figures, "return", "length")
-        }
+        self.episode = {name: torch.zeros(num_envs, device=device) for name in FIGURES}
 
-    @property
-    def num_features(self) -> int:
-        """Size of the `guide` group: commands of the classical controller, errors at three scales, pitch errors, reach, phase."""
-        return 2 * self.num_actions + 4 * 3 + 2 + 2
+    def _list_state_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each entry of `state`, without `N`."""
+        joints = (self._machine.num_joints,)
+        start = self.starts(1, 0)
+        shapes: dict[str, tuple[int, ...]] = {
+            f"start.{key}": tuple(value.shape[1:]) for key, value in start.items()
+        }
+        # errors of this episode's observation, and the running estimate of the target
+        shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "estimate_m": (3,)}
+        shapes |= {"q_scale": (), "u_scale": ()}
+        shapes |= {"steps": (), "age": ()}
+        # the step before
+        shapes |= {"u": joints, "u_before": joints, "closeness": (), "contact_force_n": ()}
+        # the observation, and what the next command needs of it
+        shapes |= {
+            "command": joints,
+            "features": (self.control.num_features,),
+            "policy": (self.control.encoder.size,),
+            "privileged": (NUM_PRIVILEGED,),
+        }
+        shapes |= {"positioning": (), "rule_reach_m": (), "lowest": joints, "highest": joints}
+        if self.control.adviser:
+            shapes["proposed"] = (self._machine.num_history, *joints)
+        return shapes
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """See `TaskProcess.starts`."""
+        """Draw valid starts; see `TaskProcess.starts`."""
         start = self.goal.starts(count, seed)
         pose = Kinematics(self._machine, "cpu").pose(start["q"])
-        return start | {
-            "closeness": self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)["closeness"]
-        }
+        verdict = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)
+        return start | {"closeness": verdict["closeness"]}
 
     def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor]) -> None:
-        """See `TaskProcess.reset`."""
+        """Begin new episodes; see `TaskProcess.reset`."""
         noise, state = self.options.noise, self.state
         uniform = torch.rand(len(mask), 5, device=mask.device)
+        # a direction spread evenly over the sphere
         turn, lift = uniform[:, 0] * (2 * math.pi), uniform[:, 1] * 2 - 1
         flat = torch.sqrt(1 - lift.square())
         bias = torch.stack((flat * turn.cos(), flat * turn.sin(), lift), 1) * uniform[:, 2:3]
@@ -181,8 +193,8 @@ class ToolPoseProcess:
             "bias_m": bias,
             "q_scale": 1 + noise.q_scale * (2 * uniform[:, 3] - 1),
             "u_scale": 1 + noise.u_scale * (2 * uniform[:, 4] - 1),
+            "closeness": start["closeness"],
         }
-        fresh["closeness"] = start["closeness"]
         zero = torch.zeros((), device=mask.device)
         for name, value in state.items():
             rows = mask.reshape(-1, *[1] * (value.dim() - 1))
@@ -191,26 +203,29 @@ class ToolPoseProcess:
             value.masked_fill_(mask, 0.0)
 
     def command(self, action: torch.Tensor) -> torch.Tensor:
-        """See `TaskProcess.command`."""
-        base, lowest, highest = (self.state[name] for name in ("command", "lowest", "highest"))
-        u = self.options.action.command(
-            action, base, lowest, highest, self.state["positioning"].bool(), self._exclusive
+        """Return masked commands or proposals; see `TaskProcess.command`."""
+        state = self.state
+        proposed = state.get("proposed")
+        u = self.control.command(
+            action,
+            state["command"],
+            state["lowest"],
+            state["highest"],
+            state["positioning"].bool(),
+            proposed,
         )
-        if self.adviser:
-            proposed = self.state["proposed"]
-            u = self.adviser.proposal(u, self.recalled(proposed))
+        if proposed is not None:
             proposed.copy_(torch.cat((proposed[:, 1:], u[:, None]), 1))
-        self.state["u_before"].copy_(self.state["u"])
-        self.state["u"].copy_(u)
+        state["u_before"].copy_(state["u"])
+        state["u"].copy_(u)
         return u
 
     def step(self, history: History, world: World) -> Transition:
-        """See `TaskProcess.step`."""
+        """Judge a control step; see `TaskProcess.step`."""
         state, options = self.state, self.options
         q = history.q[:, -1]
         pose = self._kinematics.pose(q)
-        start = self._start()
-        verdict = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)
+        verdict = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, self._get_start())
         # `steps` decides about the time limit and may be set from outside (episodes out of step);
         # `age` counts since the reset
         state["steps"] += 1
@@ -219,47 +234,19 @@ class ToolPoseProcess:
         failed = ((q < self._lower) | (q > self._upper)).any(1)
         touching = first & (world.contact_force_n > 0)
         fault = world.faults
-        # what a diverged world says about forces may be NaN, and one NaN would poison the sums over
-        # all worlds
+        # forces of a diverged world may be NaN, and one NaN would poison the sums over all worlds
         force_n = torch.where(fault, 0.0, world.contact_force_n)
         success = verdict["success"] & ~fault & ~touching
-        seen = ToolState(
-            tip_m=pose.tip_in_base_m,
-            pitch_rad=pose.pitch_rad,
-            target_m=start["target_m"] - self._down,
-            target_pitch_rad=start["target_pitch_rad"],
-            reach_m=state["rule_reach_m"],
-            reach_range_m=options.switch.reach_m,
-            positioning=state["positioning"].bool(),
-            contact_force_n=force_n,
-            peak_force_n=self.episode["peak_force_n"],
-            u=state["u"],
-            u_before=state["u_before"],
-            lateral_m=(start["target_m"] - pose.tip_in_base_m)[:, :2].norm(dim=1),
-            success=success,
-            paper_success=verdict["paper_success"],
-            failed=failed,
-            closeness=verdict["closeness"],
-            closeness_before=state["closeness"],
-        )
-        reward = sum(weight * term(seen) for term, weight in self._terms)
+        tool = self._make_tool_state(pose, verdict, force_n, success, failed)
+        reward = sum(weight * term(tool) for term, weight in self._terms)
         reward = torch.where(fault | touching, 0.0, reward)
         timed_out = state["steps"] >= self.max_episode_steps
         ended = failed | touching | fault
         if options.end_on_success:
             ended = ended | success
-        # the order of REASONS decides when several hold; -1 while the episode goes on
-        reason = torch.full_like(state["steps"], -1.0)
-        endings = (
-            success if options.end_on_success else torch.zeros_like(success),
-            failed,
-            touching,
-            fault,
-            timed_out,
-        )
-        for index in reversed(range(len(REASONS))):
-            reason = torch.where(endings[index], float(index), reason)
-        self._count(seen, history.u, reward, success)
+        ends_by_success = success if options.end_on_success else torch.zeros_like(success)
+        reason = self._find_reason((ends_by_success, failed, touching, fault, timed_out))
+        self._count(tool, history.u, reward, success)
         state["closeness"].copy_(verdict["closeness"])
         state["contact_force_n"].copy_(force_n)
         return Transition(
@@ -269,84 +256,122 @@ class ToolPoseProcess:
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
-        """See `TaskProcess.observe`: `policy`, `guide` (what the classical controller makes of it), `privileged` (critic only)."""
-        self._perceive(history, shift_m)
+        """Return `policy`, `guide` (`compute_features`) and `privileged` (for the critic only).
+
+        See `TaskProcess.observe`.
+        """
+        state = self.state
+        estimate_m = self._estimate_target(shift_m)
+        seen = self.control.process(
+            estimate_m,
+            history.q * state["q_scale"][:, None, None],
+            history.u * state["u_scale"][:, None, None],
+            state["start.target_pitch_rad"],
+            state.get("proposed"),
+        )
+        guidance = seen.guidance
+        state["positioning"].copy_(seen.positioning)
+        state["rule_reach_m"].copy_(self.options.switch.reach(guidance))
+        state["command"].copy_(guidance.command)
+        state["lowest"].copy_(guidance.lowest)
+        state["highest"].copy_(guidance.highest)
+        state["policy"].copy_(seen.vector)
+        state["features"].copy_(seen.features)
+        state["privileged"].copy_(self._compute_privileged(estimate_m))
         return {
-            "policy": self.state["policy"],
-            "guide": self.state["features"],
-            "privileged": self.state["privileged"],
+            "policy": state["policy"],
+            "guide": state["features"],
+            "privileged": state["privileged"],
         }
 
     def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-        """See `TaskProcess.classical_action`."""
+        """Return the classical controller's action; see `ClassicalTask.classical_action`."""
         command, action = groups["guide"][:, : self.num_actions], self.options.action
         return torch.zeros_like(command) if action.kind == "residual" else command / action.scale
 
     def describe(self) -> dict[str, Any]:
-        """See `TaskProcess.describe`."""
+        """Return the contract of the `policy` group; see `DeployableTask.describe`."""
         options = self.options
-        advice = {"advice": asdict(options.advice)} if options.advice else {}
-        return (
-            self._encoder.describe()
-            | {"target_filter": options.noise.filter, "switch": asdict(options.switch)}
-            | advice
-        )
+        description = self.control.encoder.describe()
+        description |= {"target_filter": options.noise.filter, "switch": asdict(options.switch)}
+        if options.advice:
+            description["advice"] = asdict(options.advice)
+        return description
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
-        """See `TaskProcess.deployable`."""
-        return DeployedPolicy(self, network)
+        """Return the policy as one module; see `DeployableTask.deployable`."""
+        pitch_rad = float(self.starts(1, 0)["target_pitch_rad"][0])
+        return DeployedPolicy(self.control, network, pitch_rad)
 
-    def remembered(self, q: torch.Tensor, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the history that the policy sees, `(N, H, J)` each; before its last `memory` samples all looks at rest."""
-        forgotten = q.shape[1] - self.options.memory
-        if forgotten <= 0:
-            return q, u
-        still = q[:, forgotten : forgotten + 1].expand(-1, forgotten, -1)
-        return torch.cat((still, q[:, forgotten:]), 1), self.recalled(u)
+    def _get_start(self) -> dict[str, torch.Tensor]:
+        start = {}
+        for name, value in self.state.items():
+            if name.startswith("start."):
+                start[name.removeprefix("start.")] = value
+        return start
 
-    def recalled(self, u: torch.Tensor) -> torch.Tensor:
-        """Returns commands, `(N, H, J)`, with none before the last `memory` samples."""
-        forgotten = u.shape[1] - self.options.memory
-        return (
-            u
-            if forgotten <= 0
-            else torch.cat((torch.zeros_like(u[:, :forgotten]), u[:, forgotten:]), 1)
+    def _make_tool_state(
+        self,
+        pose: ToolPose,
+        verdict: dict[str, torch.Tensor],
+        force_n: torch.Tensor,
+        success: torch.Tensor,
+        failed: torch.Tensor,
+    ) -> ToolState:
+        state = self.state
+        target_m = state["start.target_m"]
+        return ToolState(
+            tip_m=pose.tip_in_base_m,
+            pitch_rad=pose.pitch_rad,
+            target_m=target_m - self.control.down,
+            target_pitch_rad=state["start.target_pitch_rad"],
+            reach_m=state["rule_reach_m"],
+            reach_range_m=self.options.switch.reach_m,
+            positioning=state["positioning"].bool(),
+            contact_force_n=force_n,
+            peak_force_n=self.episode["peak_force_n"],
+            u=state["u"],
+            u_before=state["u_before"],
+            lateral_m=(target_m - pose.tip_in_base_m)[:, :2].norm(dim=1),
+            success=success,
+            paper_success=verdict["paper_success"],
+            failed=failed,
+            closeness=verdict["closeness"],
+            closeness_before=state["closeness"],
         )
 
-    def _start(self) -> dict[str, torch.Tensor]:
-        return {
-            name.removeprefix("start."): value
-            for name, value in self.state.items()
-            if name.startswith("start.")
-        }
+    def _find_reason(self, endings: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        """Return the index of the first of `endings` (as in `REASONS`) that holds, else -1."""
+        reason = torch.full_like(self.state["steps"], -1.0)
+        for index in reversed(range(len(REASONS))):
+            reason = torch.where(endings[index], float(index), reason)
+        return reason
 
     def _count(
-        self, seen: ToolState, given: torch.Tensor, reward: torch.Tensor, success: torch.Tensor
+        self, tool: ToolState, given: torch.Tensor, reward: torch.Tensor, success: torch.Tensor
     ) -> None:
-        """Updates the figures of the running episode; `given` are the commands in force, `(N, H, J)`."""
+        """Update the figures of the running episode; `given`: commands in force, `(N, H, J)`."""
         episode, period_s = self.episode, self._machine.period_s
-        new = success & (episode["success_strict"] == 0)
         episode["length"] += 1
         episode["return"] += reward
-        episode["time_to_insert_s"].copy_(
-            torch.where(new, episode["length"] * period_s, episode["time_to_insert_s"])
+        # time and lateral error stop at the first success
+        is_open = episode["success_strict"] == 0
+        time_s = torch.where(
+            success & is_open, episode["length"] * period_s, episode["time_to_insert_s"]
         )
-        open_ = episode["success_strict"] == 0
-        episode["lateral_error_m"].copy_(
-            torch.where(open_, seen.lateral_m, episode["lateral_error_m"])
-        )
+        lateral_m = torch.where(is_open, tool.lateral_m, episode["lateral_error_m"])
+        paper = torch.where(tool.paper_success, 1.0, episode["success_paper"])
+        episode["time_to_insert_s"].copy_(time_s)
+        episode["lateral_error_m"].copy_(lateral_m)
         episode["success_strict"].copy_(torch.where(success, 1.0, episode["success_strict"]))
-        episode["success_paper"].copy_(
-            torch.where(seen.paper_success, 1.0, episode["success_paper"])
-        )
-        episode["peak_force_n"].copy_(torch.maximum(episode["peak_force_n"], seen.contact_force_n))
-        travel = (given[:, -1] - given[:, -2]).abs().sum(
-            1
-        ) / period_s  # what was given, not what was proposed
+        episode["success_paper"].copy_(paper)
+        episode["peak_force_n"].copy_(torch.maximum(episode["peak_force_n"], tool.contact_force_n))
+        # of the commands given, not of those proposed
+        travel = (given[:, -1] - given[:, -2]).abs().sum(1) / period_s
         episode["valve_travel"] += (travel - episode["valve_travel"]) / episode["length"]
 
-    def _perceive(self, history: History, shift_m: torch.Tensor | None) -> None:
-        """Writes what the policy is told: estimate, guidance, phase and the observation groups."""
+    def _estimate_target(self, shift_m: torch.Tensor | None) -> torch.Tensor:
+        """Draw a noisy sample of the target; return the estimate, `(N, 3)`."""
         noise, state = self.options.noise, self.state
         true_m = state["start.target_m"]
         error = (2 * torch.rand_like(true_m) - 1) * noise.sample_m(true_m)
@@ -360,39 +385,23 @@ class ToolPoseProcess:
             # the observation after the reset is the first sample
             sample = state["estimate_sum_m"] / (state["age"] + 1)[:, None]
         state["estimate_m"].copy_(sample)
-        q, u = self.remembered(
-            history.q * state["q_scale"][:, None, None], history.u * state["u_scale"][:, None, None]
-        )
-        pitch_rad = state["start.target_pitch_rad"]
-        proposed = coming = None
-        if self.adviser:
-            proposed = self.recalled(state["proposed"])
-            coming = self.adviser.coming(proposed, u[:, -1])
-        guidance = self._controller.guide(
-            q, u, sample - self._down, pitch_rad, self.options.switch.reach_m, coming
-        )
-        positioning = self.options.switch.positioning(guidance)
-        state["positioning"].copy_(positioning)
-        state["rule_reach_m"].copy_(
-            guidance.reach_m if self.options.switch.rule == "planar" else guidance.reach_3d_m
-        )
-        state["command"].copy_(guidance.command)
-        state["lowest"].copy_(guidance.lowest)
-        state["highest"].copy_(guidance.highest)
-        state["policy"].copy_(self._encoder.encode(sample, q, u, pitch_rad, proposed))
-        state["features"].copy_(compute_features(guidance, positioning, u[:, -1]))
-        state["privileged"].copy_(self._privileged(sample))
+        return sample
 
-    def _privileged(self, sample: torch.Tensor) -> torch.Tensor:
-        """Returns what only the critic sees: error of the estimate, scales, contact, time left, closeness."""
+    def _compute_privileged(self, estimate_m: torch.Tensor) -> torch.Tensor:
+        """Return the group that only the critic sees, scaled to about 1.
+
+        Error of the estimate (3), scale errors (2), contact force and its peak, spent share of the
+        time limit, closeness, phase.
+        """
         state = self.state
         rest = (
             (state["q_scale"] - 1) * 100,
             (state["u_scale"] - 1) * 10,
-            (state["contact_force_n"] / 2000).clamp(max=5.0),
-            (self.episode["peak_force_n"] / 2000).clamp(max=5.0),
+            (state["contact_force_n"] / FORCE_SCALE_N).clamp(max=MAX_SCALED_FORCE),
+            (self.episode["peak_force_n"] / FORCE_SCALE_N).clamp(max=MAX_SCALED_FORCE),
             state["steps"] / self.max_episode_steps,
             state["closeness"],
             state["positioning"],
         )
-        return torch.cat(((sample - state["start.target_m"]) * 100, torch.stack(rest, 1)), 1)
+        error = (estimate_m - state["start.target_m"]) * 100
+        return torch.cat((error, torch.stack(rest, 1)), 1)

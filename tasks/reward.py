@@ -92,7 +92,7 @@ class RewardTerm:
             )
 
     def __call__(self, state: ToolState) -> torch.Tensor:
-        """Returns the weighted term, `(N,)`."""
+        """Return the weighted term, `(N,)`."""
         return self.weight * resolve_name(self.function)(state)
 
 
@@ -117,14 +117,14 @@ def pitch(state: ToolState) -> torch.Tensor:
 
 
 def insertion(state: ToolState) -> torch.Tensor:
-    """r^i: r^d + r^o (weighted five times in the paper) while the paper's criterion of success holds."""
+    """r^i: r^d + r^o while the paper's criterion of success holds (weighted five times there)."""
     return (state.paper_success & ~state.positioning) * (
         1.0 / (1.0 + state.distance_m) + 1.0 / (1.0 + state.pitch_error_rad)
     )
 
 
 def far_contact(state: ToolState) -> torch.Tensor:
-    """r^c: contact force in N while the tool is far from the hole (r^d <= 0.7, that is beyond 0.43 m)."""
+    """r^c: contact force in N while the tool is far from the hole (r^d <= 0.7: beyond 0.43 m)."""
     far = 1.0 / (1.0 + state.distance_m) <= 0.7
     return (far & ~state.positioning) * state.contact_force_n
 
@@ -143,7 +143,10 @@ def command_change(state: ToolState) -> torch.Tensor:
 
 
 def progress(state: ToolState) -> torch.Tensor:
-    """Gain of closeness: a potential, so that it changes what is learned first but not what is best (Ng et al. 1999)."""
+    """Gain of closeness.
+
+    A potential: it speeds up learning and leaves the best policy as it is (Ng et al. 1999).
+    """
     return state.closeness - state.closeness_before
 
 
@@ -158,20 +161,20 @@ def failure(state: ToolState) -> torch.Tensor:
 
 
 def contact(state: ToolState) -> torch.Tensor:
-    """Contact force in kN, saturating at 10 kN: a hydraulic arm can break what it leans on."""
+    """Contact force in kN, saturating at 10 kN: a hydraulic arm can break an obstacle."""
     return (state.contact_force_n / 1000.0).clamp(max=10.0)
 
 
 def peak_contact(state: ToolState) -> torch.Tensor:
     """Growth of the episode's peak contact force in kN, up to 10 kN.
 
-    What an episode pays for is its hardest blow, not how long it leans on the rim: a penalty of
-    every step in contact teaches a beginner to stay away from the hole.
+    An episode pays for its hardest blow, not for the time it leans on the rim: a penalty of every step
+    in contact teaches a beginner to stay away from the hole.
     """
     peak_n = torch.maximum(state.peak_force_n, state.contact_force_n)
     return (peak_n.clamp(max=10_000.0) - state.peak_force_n.clamp(max=10_000.0)) / 1000.0
 
 
 def duration(state: ToolState) -> torch.Tensor:
-    """One each step: time is money."""
+    """One in each step."""
     return torch.ones_like(state.reach_m)

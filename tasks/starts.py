@@ -18,7 +18,7 @@ from tasks.classical import ClassicalController
 
 @spec
 class ArmStarts:
-    """Where the arm may begin.
+    """Ranges of the arm at the start of an episode.
 
     Attributes:
         margin_rad: Distance from joint limits.
@@ -36,7 +36,7 @@ class ArmStarts:
 
 @dataclass
 class CandidateTargets:
-    """Candidates for what an arm shall reach; `M` of them.
+    """Candidate targets; `M` of them.
 
     Attributes:
         target_m: Target point in the base frame, `(M, 3)`.
@@ -64,9 +64,9 @@ def draw_starts(
     controller: ClassicalController,
     reach_m: tuple[float, float],
     depth_m: float,
-    what: str,
+    task_name: str,
 ) -> dict[str, torch.Tensor]:
-    """Returns `count` starts from which the target can be reached: `q`, `scene`, `target_m`, `target_pitch_rad`.
+    """Return `count` starts from which the target can be reached.
 
     Args:
         count: Number of starts.
@@ -77,7 +77,10 @@ def draw_starts(
         controller: Gives kinematics and reach.
         reach_m: Good working range.
         depth_m: How far below `target_m` the tool must get.
-        what: Name of the task, for the message when too few are found.
+        task_name: Name of the task, for the message when too few are found.
+
+    Returns:
+        `q`, `scene`, `target_m`, `target_pitch_rad`.
     """
     generator = torch.Generator().manual_seed(seed)
     batch = max(4 * count, 256)
@@ -103,7 +106,7 @@ def draw_starts(
         drawn.append({name: value[done] for name, value in rows.items()})
         if sum(len(found["q"]) for found in drawn) >= count:
             break
-    return join_starts(count, drawn, what)
+    return join_starts(count, drawn, task_name)
 
 
 def draw_arms(
@@ -113,7 +116,11 @@ def draw_arms(
     object_z_m: torch.Tensor,
     generator: torch.Generator,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draws one arm configuration per row of `object_z_m`: returns `q` `(M, J)` and whether it is in the open `(M,)` bool."""
+    """Draw one arm per row of `object_z_m`.
+
+    Returns:
+        `q`, `(M, J)`, and whether it is in the open, `(M,)` bool.
+    """
     lower = torch.as_tensor(machine.lower, dtype=torch.float32) + arms.margin_rad
     upper = torch.as_tensor(machine.upper, dtype=torch.float32) - arms.margin_rad
     q = lower + (upper - lower) * torch.rand(
@@ -136,7 +143,7 @@ def check_reachable(
     reach_m: tuple[float, float],
     margin_rad: float,
 ) -> torch.Tensor:
-    """Returns from which `q`, `(M, J)`, the target pose can be reached under the masks, `(M,)` bool.
+    """Return from which `q`, `(M, J)`, the target pose can be reached under the masks, `(M,)` bool.
 
     First the exclusive joints move until the reach lies well inside the good working range, then
     the others by damped least squares.
@@ -167,9 +174,9 @@ def check_reachable(
 
 
 def join_starts(
-    count: int, drawn: list[dict[str, torch.Tensor]], what: str
+    count: int, drawn: list[dict[str, torch.Tensor]], task_name: str
 ) -> dict[str, torch.Tensor]:
-    """Joins batches of accepted starts and cuts them to `count`.
+    """Join batches of accepted starts and cuts them to `count`.
 
     Raises:
         ConfigError: If too few were accepted.
@@ -178,6 +185,6 @@ def join_starts(
     found = len(joined["q"])
     if found < count:
         raise ConfigError(
-            f"{what}: only {found} of {count} starts were reachable; widen the joint limits or narrow the ranges of the task"
+            f"{task_name}: only {found} of {count} starts were reachable; widen the joint limits or narrow the ranges of the task"
         )
     return {key: value[:count] for key, value in joined.items()}

@@ -12,7 +12,7 @@ from brokk_rl.machine import Machine
 def check_world(
     simulator: Simulator, machine: Machine, scenes: torch.Tensor, device: torch.device | str = "cpu"
 ) -> None:
-    """Checks what `Simulator.build` returns against `World`.
+    """Check a simulator against `World`.
 
     Args:
         simulator: The spec.
@@ -80,7 +80,7 @@ def check_world(
 
 
 def _push_joints(world: World, steps: torch.Tensor) -> torch.Tensor:
-    """Returns the positions over some control periods in which every joint advances, `(T, N, J)`."""
+    """Return the positions over some control periods in which every joint advances, `(T, N, J)`."""
     found = []
     for _ in range(5):
         world.step(steps)

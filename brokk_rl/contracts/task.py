@@ -1,15 +1,29 @@
-"""Tasks and policies.
+"""Contract of a task, and of the policies that act in it.
 
-`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
-extensions.
-Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe
-a target.
+A task is a spec in `conf/task` with one method, `build`. It returns a `TaskProcess`: the episodes of
+`N` environments at once. That contract is all that training and evaluation need. Two more are
+optional, and `supports_classical_control` and `supports_deployment` ask for them:
+
+* `ClassicalTask`: the task knows a classical controller. It is evaluated beside the trained policy,
+  and `policy=classical` works.
+* `DeployableTask`: the task can write its policy as one module from observation to command. Then
+  `mode=export` and the end of `mode=train` write `policy.onnx`.
+
+`brokk_rl.checks.check_task` exercises a task against all of this, for our own options and for those
+of extensions.
+
+One control step calls, in this order: `command` (action to valve commands), the physics, `step`
+(reward and end), `reset` (of the environments that ended), `observe`.
+
+Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `S` columns of a scene.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
+
+from brokk_rl.contracts.world import World
 
 if TYPE_CHECKING:
     import torch
@@ -17,18 +31,23 @@ if TYPE_CHECKING:
     from brokk_rl.history import History
     from brokk_rl.machine import Machine
 
-
-from brokk_rl.contracts.world import World
+STEPS = "steps"
+"""Entry of `TaskProcess.state` with the control steps of the running episode. The trainer sets it
+once to spread the first episodes over time."""
+FAULT = "fault"
+"""Entry of `TaskProcess.reasons` for an episode whose world diverged (`World.faults`)."""
+SUCCESS = "success_strict"
+"""Figure of `TaskProcess.episode` by which policies are compared: 1 after success, else 0."""
 
 
 @dataclass
 class Transition:
-    """What a task says about one control step; all of shape `(N,)`.
+    """Judgement of one control step; all tensors of shape `(N,)`.
 
     Attributes:
         reward: Reward of the step.
-        terminated: The episode ended by what happened (success, joint limit, …).
-        timed_out: The episode ended by its time limit only.
+        terminated: The episode ended by an event (success, joint limit, …), bool.
+        timed_out: The episode ended by its time limit only, bool.
         reason: Index into `TaskProcess.reasons` where the episode ended, else -1.
     """
 
@@ -39,72 +58,115 @@ class Transition:
 
 
 class TaskProcess(Protocol):
-    """A task at work in `N` environments. No method synchronises with the host; all shapes are fixed."""
+    """Episodes of a task in `N` environments.
+
+    No method synchronises with the host, and all shapes are fixed: a GPU captures the control step
+    in a CUDA graph.
+    """
 
     num_actions: int
+    """Length of the policy's action."""
     max_episode_steps: int
+    """Time limit of an episode, control steps."""
     reasons: tuple[str, ...]
-    """Names of the ways in which an episode can end."""
+    """Names of the ways in which an episode can end; `FAULT` is one of them."""
     state: dict[str, torch.Tensor]
-    """Everything needed to go on exactly, by name, each `(N, …)`; written in place."""
+    """All that is needed to go on exactly, by name, each `(N, …)`; written in place. `STEPS` is one
+    of them, `(N,)`."""
     episode: dict[str, torch.Tensor]
-    """Figures of the running episode, each `(N,)`; those that stand in `evaluation.json` have the
-    names given there."""
+    """Figures of the running episode, by name, each `(N,)`; written in place. `SUCCESS` is one of
+    them; evaluation reports the others too."""
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """Draws `count` valid starts: `q` `(count, J)`, `scene` `(count, S)` and whatever else `reset` needs."""
+        """Draw `count` valid starts; the same seed gives the same starts.
+
+        Returns:
+            `q` `(count, J)`, `scene` `(count, S)` (`brokk_rl.sim.scene`), and whatever else `reset`
+            needs.
+        """
         ...
 
     def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor]) -> None:
-        """Begins a new episode in the environments of `mask` with the given starts, each entry `(N, …)`."""
+        """Begin new episodes in the environments of `mask`, `(N,)` bool, from `start`, `(N, …)`."""
         ...
 
     def command(self, action: torch.Tensor) -> torch.Tensor:
-        """Turns the policy's action, `(N, num_actions)`, into valve commands `(N, J)`: bounds and the masks of exclusive joints."""
+        """Return valve commands `(N, J)` in [-1, 1] for the policy's action, `(N, num_actions)`.
+
+        The action is not clipped. Joints that the machine forbids to move together are masked here.
+        """
         ...
 
     def step(self, history: History, world: World) -> Transition:
-        """Judges the control step that has just been simulated."""
+        """Judge the control step that has just been simulated."""
         ...
 
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
-        """Returns the observation groups, called once a control step after `step` and `reset`.
+        """Return the observation groups, each `(N, …)` float32; one of them is `policy`.
 
-        `history` is what sensors say; `shift_m`, `(N, 3)`, is how far off the target is believed
-        (`SensingModel.misplacement`). `policy` is the vector of `brokk_rl.observation`; the tensors
-        are the task's own and are overwritten by the next call.
+        Called once a control step, after `step` and `reset`. The tensors are the task's own, and the
+        next call overwrites them.
+
+        Args:
+            history: Positions as sensors measure them, and the commands in force.
+            shift_m: Error of the target's believed place, `(N, 3)`
+                (`SensingModel.misplacement`); `None` for no such error.
         """
         ...
 
+
+@runtime_checkable
+class ClassicalTask(Protocol):
+    """A task process with a classical controller; optional."""
+
     def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Returns the action, `(N, num_actions)`, with which the classical controller alone would act on these groups."""
+        """Return the classical controller's action, `(N, num_actions)`, for observation groups."""
         ...
 
+
+@runtime_checkable
+class DeployableTask(Protocol):
+    """A task process whose policy can leave the trainer; optional."""
+
     def describe(self) -> dict[str, Any]:
-        """Returns `size`, order, scale and filters of the `policy` vector for the policy's contract, as plain JSON data."""
+        """Return `size`, order, scale and filters of the `policy` group, as plain JSON data.
+
+        It becomes `observation` in `policy.json`; the machine's computer builds the same vector
+        with `brokk_rl.observation`.
+        """
         ...
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
-        """Returns the policy as it runs on the machine: a module from the `policy` vector, `(B, …)`, to masked commands, `(B, J)`.
+        """Return the whole policy: from the `policy` group, `(B, O)`, to masked commands `(B, J)`.
 
         `network` takes a dictionary of observation groups and returns the action.
         """
         ...
 
 
+def supports_classical_control(process: object) -> TypeGuard[ClassicalTask]:
+    """Return whether a task process has a classical controller."""
+    return isinstance(process, ClassicalTask)
+
+
+def supports_deployment(process: object) -> TypeGuard[DeployableTask]:
+    """Return whether the policy of a task process can be exported to ONNX."""
+    return isinstance(process, DeployableTask)
+
+
 class Task(Protocol):
     """A spec in `conf/task`: builds a task process."""
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
-        """Returns the task for `num_envs` environments on `device`."""
+        """Return the task for `num_envs` environments on `device`."""
         ...
 
 
 class Policy(Protocol):
-    """Anything that acts: a trained network, the classical controller, an untrained network."""
+    """Source of actions: a trained network, the classical controller, an untrained network."""
 
     def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Returns the action for the observation groups, shape `(N, num_actions)`."""
+        """Return the action for the observation groups, shape `(N, num_actions)`."""
         ...

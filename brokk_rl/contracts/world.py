@@ -36,19 +36,29 @@ class World(Protocol):
     """True when `step` and `reset` may be captured in a CUDA graph."""
 
     def step(self, increment: torch.Tensor) -> None:
-        """Advances one control period; the drive moves each joint by `increment`, `(N, J)`, unless something blocks it."""
+        """Advance one control period.
+
+        Args:
+            increment: Motion of each joint that the drive makes unless something blocks it, `(N, J)`.
+        """
         ...
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
-        """Puts the worlds of `mask`, `(N,)` bool, at rest at `q`, `(N, J)`, in the scenes of `scene`, `(N, S)`; see `sim.scene`."""
+        """Put worlds at rest.
+
+        Args:
+            mask: Worlds that are reset, `(N,)` bool.
+            q: Joint positions, `(N, J)`.
+            scene: Scenes, `(N, S)`; see `sim.scene`.
+        """
         ...
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Returns copies of everything that must be stored to go on exactly."""
+        """Return copies of everything that must be stored to go on exactly."""
         ...
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Restores what `state_dict` returned."""
+        """Restore a copy that `state_dict` returned."""
         ...
 
 
@@ -56,5 +66,5 @@ class Simulator(Protocol):
     """A spec in `conf/sim`: builds a world."""
 
     def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> World:
-        """Returns a world on `device`; `num_worlds` overrides the configured number."""
+        """Return a world on `device`; `num_worlds` overrides the configured number."""
         ...

@@ -1,4 +1,4 @@
-"""`brokk mode=bench`: how fast physics, control step and training are on this computer."""
+"""`brokk mode=bench`: rates of physics, control step and training on this computer."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ control step, training."""
 
 @spec
 class BenchmarkSizes:
-    """What to measure.
+    """Measurements: numbers of environments, durations, and a run to compare with.
 
     Attributes:
         num_envs: Numbers of environments, one row each; of each process where `torchrun` starts
@@ -69,7 +69,7 @@ class BenchmarkSizes:
 
 @spec
 class Benchmark:
-    """Measures rates: physics alone, the whole control step, and training, for several numbers of environments.
+    """Measures rates of physics, control step and training, for several numbers of environments.
 
     Attributes:
         session: Folder and device.
@@ -137,7 +137,7 @@ class Benchmark:
         for num_envs in self.bench.num_envs:
             self.session.seed_all()
             loop = plant.build(device, num_envs, self.rl.num_starts, self.session.stream("starts"))
-            rows.append(_sum_over_ranks(group.all(self._measure(loop, device, group))))
+            rows.append(_sum_over_ranks(group.gather(self._measure(loop, device, group))))
             log.info(
                 "%d environments: %s",
                 num_envs,
@@ -192,11 +192,10 @@ class Benchmark:
     def _in_turn(
         self, steps: dict[str, Callable[[], object]], loop: ControlLoop, device: torch.device
     ) -> dict[str, float]:
-        """Returns the seconds that one call of each takes, the median over at least `bench.seconds`.
+        """Return the seconds of one call of each, the median over at least `bench.seconds`.
 
-        A few calls of each at a time, so that what else the computer does meets all alike. What is
-        no control step moves arms at rest at their starts, and the control loop finds its worlds as
-        it left them.
+        A few calls of each at a time, so that other load of the computer meets all alike. Calls that are no
+        control step move arms at rest at their starts; the control loop finds its worlds as it left them.
         """
         rest = loop.world.state_dict()
         spent: dict[str, list[float]] = {name: [] for name in steps}
@@ -218,7 +217,7 @@ class Benchmark:
 
 
 def _sum_over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Returns the row of all processes: rates add up; what each of them reached stands in `per_rank`."""
+    """Return the row of all processes: rates add up; `per_rank` holds the rates of each."""
     if len(rows) == 1:
         return rows[0]
     rates = [name for name in rows[0] if name.endswith("_per_s")]
@@ -231,7 +230,7 @@ def _sum_over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _read_single_process(sizes: BenchmarkSizes) -> dict[int, dict[str, Any]]:
-    """Returns the rows of the one process that is compared with, by number of environments."""
+    """Return the rows of the one process that is compared with, by number of environments."""
     if sizes.against is None:
         return {}
     try:
@@ -251,7 +250,7 @@ def _read_single_process(sizes: BenchmarkSizes) -> dict[int, dict[str, Any]]:
 
 
 def _add_comparisons(row: dict[str, Any], alone: dict[str, Any] | None) -> dict[str, Any]:
-    """Returns the row with what its rates are of those of MuJoCo's own batch, and of as many times one process alone."""
+    """Return the row with its rates relative to MuJoCo's own batch and to a single process."""
     if batch := row.get("batch_env_steps_per_s"):
         row = row | {"of_batch": {name: row[name] / batch for name in RATES[1:]}}
     if alone is None:

@@ -1,4 +1,4 @@
-"""`brokk mode=evaluate`: how good is a policy, beside what else could be used, from the same starts."""
+"""`brokk mode=evaluate`: evaluates a policy beside its rivals, all from the same starts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.rl.evaluation import RecordedEpisode, evaluate_policy
+from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.video import render_video
@@ -24,16 +24,16 @@ log = logging.getLogger(__name__)
 
 
 class PolicySpec(Protocol):
-    """A spec in `conf/policy`."""
+    """A spec in `conf/policy`: builds a policy."""
 
     def build(self, loop: ControlLoop, seed: int) -> Policy:
-        """Returns the policy for the control loop."""
+        """Return the policy for the control loop."""
         ...
 
 
 @spec
 class Evaluation:
-    """How to evaluate.
+    """Number of episodes, their seed, and how many to record and show.
 
     Attributes:
         episodes: Number of episodes, one from each start.
@@ -51,7 +51,8 @@ class Evaluation:
     def check(self) -> None:
         if not 1 <= self.num_recorded <= self.episodes:
             raise ConfigError(
-                f"evaluation: expected 1 <= num_recorded <= episodes, got {self.num_recorded} and {self.episodes}"
+                "evaluation: expected 1 <= num_recorded <= episodes, "
+                f"got {self.num_recorded} and {self.episodes}"
             )
 
 
@@ -63,7 +64,7 @@ class Evaluate:
         session: Folder, seed, device.
         machine: The machine.
         sim: Physics.
-        task: What to do.
+        task: The task.
         actuator: How commands become motion.
         effect: Effects around the actuator model, by name.
         follower: Who stands between policy and machine.
@@ -84,8 +85,8 @@ class Evaluate:
     evaluation: Evaluation
 
     def run(self) -> float:
-        """Evaluates; returns the strict success of the policy."""
-        plant = ControlLoopConfig(
+        """Evaluate; return the strict success of the policy."""
+        config = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
             task=self.task,
@@ -93,89 +94,82 @@ class Evaluate:
             effects=self.effect,
             follower=self.follower,
         )
-        policies = {
-            type(self.policy).__name__.removesuffix("Policy").lower(): self.policy
-        } | self.rivals
-        results, _ = evaluate_policies(plant, self.evaluation, self.session, policies)
+        policies = {name_spec(self.policy): self.policy} | self.rivals
+        results, _ = evaluate_policies(config, self.evaluation, self.session, policies)
         return float(results["success_strict"]["mean"])
 
 
 def evaluate_policies(
-    plant: ControlLoopConfig,
+    config: ControlLoopConfig,
     evaluation: Evaluation,
     session: Session,
     policies: dict[str, PolicySpec],
 ) -> tuple[dict[str, Any], torch.Tensor]:
-    """Evaluates policies from the same starts with the same noise, and writes `evaluation.json` and `insertion.mp4`.
+    """Evaluate policies from the same starts with the same noise.
+
+    Writes `evaluation.json` and `insertion.mp4`.
 
     Args:
-        plant: What to evaluate on.
-        evaluation: How.
+        config: The control loop.
+        evaluation: How to evaluate.
         session: Where to write, and on which device.
         policies: By name; the first is the one in question and stands at the top of
             `evaluation.json`.
 
     Returns:
-        The content of `evaluation.json`, and observation vectors `(B, O)` that the first policy
-        met.
+        The content of `evaluation.json`, and observation vectors `(B, O)` of the first policy.
     """
     device = session.torch_device()
-    torch.manual_seed(evaluation.seed)  # from which effects and followers draw, too
-    loop = plant.build(device, evaluation.episodes, evaluation.episodes, evaluation.seed)
+    torch.manual_seed(evaluation.seed)  # effects and followers draw from it, too
+    loop = config.build(device, evaluation.episodes, evaluation.episodes, evaluation.seed)
     loop.capture()
     starts = {key: value.clone() for key, value in loop.starts.items()}
     fresh = loop.state_dict()
-    table: dict[str, Any] = {}
-    recorded: dict[str, list[RecordedEpisode]] = {}
-    seen: dict[str, torch.Tensor] = {}
+    evaluated: dict[str, PolicyEvaluation] = {}
     for name, policy in policies.items():
         log.info("evaluating %s over %d episodes", name, evaluation.episodes)
         loop.load_state_dict(fresh)  # every policy meets the same machines and persons
-        acting = policy.build(loop, session.seed)
-        table[name], recorded[name], seen[name] = evaluate_policy(
-            loop, acting, starts, evaluation.seed, evaluation.num_recorded
+        evaluated[name] = evaluate_policy(
+            loop, policy.build(loop, session.seed), starts, evaluation.seed, evaluation.num_recorded
         )
+    table = {name: result.summary for name, result in evaluated.items()}
     first = next(iter(policies))
     results = {
         **table[first],
         "seed": evaluation.seed,
-        "actuator": name_spec(plant.actuator),
-        "follower": name_spec(plant.follower),
+        "actuator": name_spec(config.actuator),
+        "follower": name_spec(config.follower),
         "policy": first,
         "policies": table,
     }
     write_json(session.folder / "evaluation.json", results)
-    _print(table)
+    _print_table(table)
     if evaluation.video:
-        shown = next(
-            (episode for episode in recorded[first] if episode.success), recorded[first][0]
-        )
-        path = render_video(plant.machine, shown, session.folder / "insertion.mp4")
+        recorded = evaluated[first].episodes
+        shown = next((episode for episode in recorded if episode.success), recorded[0])
+        path = render_video(config.machine, shown, session.folder / "insertion.mp4")
         log.info("video of one episode: %s", path)
-    return results, seen[first]
+    return results, evaluated[first].observations
 
 
-def _print(table: dict[str, Any]) -> None:
-    view = Table(
-        "policy",
-        "strict success",
-        "95 %",
-        "paper's success",
-        "time to insert",
-        "lateral error",
-        "peak force",
-        "valve travel",
+def _print_table(table: dict[str, dict[str, Any]]) -> None:
+    """Print one row per policy; a figure that the task does not record is a dash."""
+    columns = (
+        ("strict success", lambda row: f"{row['success_strict']['mean']:.3f}"),
+        ("95 %", lambda row: "{:.3f} to {:.3f}".format(*row["success_strict"]["ci95"])),
+        ("paper's success", lambda row: f"{row['success_paper']['mean']:.3f}"),
+        ("time to insert", lambda row: f"{row['time_to_insert_s']['median']:.1f} s"),
+        ("lateral error", lambda row: f"{1000 * row['lateral_error_m']:.1f} mm"),
+        ("peak force", lambda row: f"{row['peak_force_n']:.0f} N"),
+        ("valve travel", lambda row: f"{row['valve_travel']:.2f} /s"),
     )
+    view = Table("policy", *(title for title, _ in columns))
     for name, row in table.items():
-        strict, time = row["success_strict"], row["time_to_insert_s"]["median"]
-        view.add_row(
-            name,
-            f"{strict['mean']:.3f}",
-            f"{strict['ci95'][0]:.3f} to {strict['ci95'][1]:.3f}",
-            f"{row['success_paper']['mean']:.3f}",
-            "-" if time is None else f"{time:.1f} s",
-            f"{1000 * row['lateral_error_m']:.1f} mm",
-            f"{row['peak_force_n']:.0f} N",
-            f"{row['valve_travel']:.2f} /s",
-        )
+        cells = []
+        for _, write in columns:
+            try:
+                cells.append(write(row))
+            except (KeyError, TypeError):  # not recorded, or no episode with success
+                cells.append("-")
+        view.add_row(name, *cells)
     Console().print(view)

@@ -1,4 +1,4 @@
-"""`brokk mode=train`: trains a policy, evaluates it beside its rivals, and leaves everything needed to use it."""
+"""`brokk mode=train`: trains a policy, evaluates it beside its rivals and writes its bundle."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import yaml
 
 from brokk_rl import distributed
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
-from brokk_rl.contracts.task import Task
+from brokk_rl.contracts.task import Task, supports_classical_control, supports_deployment
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import Evaluation, evaluate_policies
+from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
 from brokk_rl.rl.distributed import TrainingGroup
-from brokk_rl.rl.export import export_onnx
+from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves
 from brokk_rl.rl.policy import (
     ClassicalPolicy,
@@ -28,7 +28,7 @@ from brokk_rl.rl.policy import (
 )
 from brokk_rl.rl.runner import TrainingConfig, TrainingRunner, list_checkpoints
 from brokk_rl.rl.tracking import NoTracking, Tracking
-from brokk_rl.rl.vec_env import ControlLoopConfig
+from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session
 from brokk_rl.spec import spec
 
@@ -43,7 +43,7 @@ class Train:
         session: Folder, seed, device.
         machine: The machine.
         sim: Physics.
-        task: What to do.
+        task: The task.
         actuator: How commands become motion.
         effect: Effects around the actuator model, by name.
         follower: Who stands between policy and machine.
@@ -72,11 +72,15 @@ class Train:
     """Several processes that `torchrun` starts train one policy."""
 
     def run(self) -> float | None:
-        """Trains; returns the strict success of the trained policy, `None` in all processes but the first."""
-        checkpoint = self._checkpoint()
-        device, folder = self.session.torch_device(), self.session.folder
+        """Train.
+
+        Returns:
+            The strict success of the trained policy; `None` in all processes but the first.
+        """
+        checkpoint = self._find_start()
+        device = self.session.torch_device()
         self.session.seed_all()
-        plant = ControlLoopConfig(
+        config = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
             task=self.task,
@@ -84,77 +88,84 @@ class Train:
             effects=self.effect,
             follower=self.follower,
         )
-        loop = plant.build(
+        loop = config.build(
             device, self.rl.num_envs, self.rl.num_starts, self.session.stream("starts")
         )
         loop.capture(self.rl.fuse)
-        state = "active" if loop.graph_active else "not used (they need sim=warp on a GPU)"
         group = TrainingGroup(device)
-        where = (
-            f"{device}, in each of {group.rank.count} processes" if group.together else str(device)
-        )
-        log.info(
-            "%d environments on %s, %s; CUDA graphs: %s",
-            loop.num_envs,
-            where,
-            type(loop.world).__name__,
-            state,
-        )
+        _log_setup(loop, group)
         self.session.seed_all()  # capturing has drawn random numbers
 
-        steps = loop.num_envs * int(self.rl.runner["num_steps_per_env"]) * group.rank.count
-        tracking = self.tracking if group.rank.first else NoTracking()
-        tracker = tracking.open(
-            folder, {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed}
-        )
-        book = TrainingLogger(
-            folder, tracker, lambda: group.pooled(loop.statistics()), steps, self.rl.max_fault_rate, self.rl.budget.share_spent,
-            quiet=not group.rank.first,
-        )  # fmt: skip
-        with group, book:
-            runner = TrainingRunner(loop, self.rl, folder, device, book, group)
+        logger = self._open_logger(loop, group)
+        with group, logger:
+            runner = TrainingRunner(loop, self.rl, self.session.folder, device, logger, group)
             if checkpoint:
                 runner.load(str(checkpoint))
                 log.info(
                     "going on from %s: %d control steps, %.0f s",
                     checkpoint,
-                    book.env_steps,
-                    book.seconds,
+                    logger.env_steps,
+                    logger.seconds,
                 )
             elif self.start_from:
                 load_initial_weights(runner.alg.actor, self.start_from, self.machine)
             runner.run()
         if not group.rank.first:
             return None
-
         facts = {
-            "env_steps": book.env_steps,
-            "seconds": book.seconds,
+            "env_steps": logger.env_steps,
+            "seconds": logger.seconds,
             "seed": self.session.seed,
             "device": str(device),
+            "follower": read_follower(self.session.folder),
         }
-        facts["follower"] = read_follower(folder)
-        actor = runner.alg.get_policy()
+        return self._finish(config, loop, runner.alg.get_policy(), facts)
+
+    def _open_logger(self, loop: ControlLoop, group: TrainingGroup) -> TrainingLogger:
+        """Return the logger of this process; only the first of several writes."""
+        folder = self.session.folder
+        tracking = self.tracking if group.rank.first else NoTracking()
+        run_config = {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed}
+        return TrainingLogger(
+            folder,
+            tracking.open(folder, run_config),
+            lambda: group.pool_statistics(loop.statistics()),
+            loop.num_envs * int(self.rl.runner["num_steps_per_env"]) * group.rank.count,
+            self.rl.max_fault_rate,
+            self.rl.budget.share_spent,
+            quiet=not group.rank.first,
+        )
+
+    def _finish(
+        self, config: ControlLoopConfig, loop: ControlLoop, actor: Any, facts: dict[str, Any]
+    ) -> float:
+        """Write bundle and curves, evaluate, export; return the strict success."""
+        folder = self.session.folder
         contract = write_bundle(folder, actor, self.rl, loop, facts)
         draw_curves(folder / PROGRESS, folder / "learning_curves.png")
-        policies = {
-            "trained": TrainedPolicy(folder=str(folder)),
-            "classical": ClassicalPolicy(),
-            "untrained": UntrainedPolicy(training=self.rl),
-        }
-        results, observations = evaluate_policies(plant, self.evaluation, self.session, policies)
-        export_onnx(
-            folder,
-            actor,
-            self.task.build(self.machine, 1, torch.device("cpu")),
-            contract,
-            observations,
-        )
+        policies: dict[str, PolicySpec] = {"trained": TrainedPolicy(folder=str(folder))}
+        if supports_classical_control(loop.task):
+            policies["classical"] = ClassicalPolicy()
+        else:
+            log.info(
+                "the task (%s) has no classical controller to compare with",
+                type(self.task).__name__,
+            )
+        policies["untrained"] = UntrainedPolicy(training=self.rl)
+        results, observations = evaluate_policies(config, self.evaluation, self.session, policies)
+        task = self.task.build(self.machine, 1, torch.device("cpu"))
+        if supports_deployment(task):
+            export_onnx(folder, actor, task, contract, observations)
+        else:
+            log.warning(NOT_DEPLOYABLE.format(task=type(self.task).__name__))
         log.info("run folder: %s", folder)
         return float(results["success_strict"]["mean"])
 
-    def _checkpoint(self) -> Path | None:
-        """Returns where to go on from; a run that was stopped before its first checkpoint begins anew in its folder."""
+    def _find_start(self) -> Path | None:
+        """Return the checkpoint to go on from.
+
+        A run that was stopped before its first checkpoint begins anew in its folder.
+        """
         if self.resume is None:
             return None
         folder = self.session.folder
@@ -165,14 +176,26 @@ class Train:
         return find_checkpoint(Path(self.resume))
 
 
+def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:
+    """Log number of environments, device, world and whether CUDA graphs run."""
+    device = str(loop.device)
+    log.info(
+        "%d environments on %s, %s; CUDA graphs: %s",
+        loop.num_envs,
+        f"{device}, in each of {group.rank.count} processes" if group.together else device,
+        type(loop.world).__name__,
+        "active" if loop.graph_active else "not used (they need sim=warp on a GPU)",
+    )
+
+
 def read_follower(folder: Path) -> dict[str, Any] | None:
-    """Returns the `follower` of the run in `folder` as it was configured; `None` where no configuration lies there."""
+    """Return the configured `follower` of the run in `folder`; `None` without a configuration."""
     resolved = folder / RESOLVED
     return yaml.safe_load(resolved.read_text()).get("follower") if resolved.exists() else None
 
 
 def find_checkpoint(path: Path) -> Path:
-    """Returns `path` if it is a checkpoint, else the newest checkpoint of the run folder `path`.
+    """Return `path` if it is a checkpoint, else the newest checkpoint of the run folder `path`.
 
     Raises:
         CheckpointError: There is none.

@@ -1,8 +1,9 @@
-"""Several processes that train one policy, one a GPU (or several on a CPU, to try it).
+"""Training of one policy by several processes, one a GPU (or several on a CPU, to try it).
 
-rsl-rl averages gradients and normalisers over them; here is what goes around it: the process group,
-what the first decides for all, figures over all environments, and the proof that all still hold the
-same policy.
+rsl-rl averages gradients and normalisers over them. This module adds the process group, decisions
+of the first process for all, figures over all environments, and the proof that all processes still
+hold the same policy.
+
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from brokk_rl.errors import DistributedError
 
 
 class TrainingGroup:
-    """The processes that train together, a context manager; in a process that is alone nothing here costs anything.
+    """Process group of a training, a context manager; without effect for a single process.
 
     Args:
         device: Where this process computes: NCCL between GPUs, gloo between CPUs and for what lies
@@ -31,7 +32,7 @@ class TrainingGroup:
 
     @property
     def together(self) -> bool:
-        """Whether there is more than one process."""
+        """True when there is more than one process."""
         return self.rank.count > 1
 
     def __enter__(self) -> TrainingGroup:
@@ -66,41 +67,44 @@ class TrainingGroup:
             ) from error
 
     def wait(self) -> None:
-        """Waits until all have come here."""
+        """Wait until all have come here."""
         if self.together:
             dist.barrier()
 
-    def from_first(self, value: Any) -> Any:
-        """Returns the first process's `value`: where a clock decides, one clock must decide for all."""
+    def broadcast_first(self, value: Any) -> Any:
+        """Return the first process's `value`: a decision by the clock must be the same for all."""
         if not self.together:
             return value
         box = [value]
         dist.broadcast_object_list(box, src=0)
         return box[0]
 
-    def all(self, value: Any) -> list[Any]:
-        """Returns everyone's `value` (plain numbers and text), in the order of ranks."""
+    def gather(self, value: Any) -> list[Any]:
+        """Return the `value` (plain numbers and text) of all processes, in the order of ranks."""
         if not self.together:
             return [value]
         found: list[Any] = [None] * self.rank.count
         dist.all_gather_object(found, value)
         return found
 
-    def gathered(self, state: Any) -> list[Any]:
-        """Returns everyone's `state` (mappings of tensors, on the host) to the first process, to the others an empty list."""
+    def gather_on_first(self, state: Any) -> list[Any]:
+        """Return the `state` of all processes to the first one, an empty list to the others.
+
+        A state is a mapping of tensors; they are copied to the host.
+        """
         if not self.together:
             return [state]
         found: list[Any] = [None] * self.rank.count
         dist.gather_object(_copy_to_host(state), found if self.rank.first else None, dst=0)
         return found if self.rank.first else []
 
-    def pooled(self, figures: Mapping[str, float]) -> dict[str, float]:
-        """Returns the figures of all environments of all processes; see `ControlLoop.statistics`.
+    def pool_statistics(self, figures: Mapping[str, float]) -> dict[str, float]:
+        """Return the figures of all environments of all processes; see `ControlLoop.statistics`.
 
         Means over episodes weigh by the number of episodes; the fault rate by control steps, which
         are as many everywhere.
         """
-        parts = self.all(dict(figures))
+        parts = self.gather(dict(figures))
         episodes = sum(part["episodes"] for part in parts)
         pooled = {
             name: sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes)
@@ -112,14 +116,14 @@ class TrainingGroup:
         }
 
     def check_same(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Proves that all processes hold the same numbers, bit for bit.
+        """Prove that all processes hold the same numbers, bit for bit.
 
         Raises:
             DistributedError: They do not; the message says which ranks differ from the first.
         """
         if not self.together:
             return
-        found = self.all(hash_tensors(state))
+        found = self.gather(hash_tensors(state))
         other = [index for index, value in enumerate(found) if value != found[0]]
         if other:
             raise DistributedError(
@@ -129,7 +133,7 @@ class TrainingGroup:
 
 
 def hash_tensors(state: Mapping[str, torch.Tensor]) -> str:
-    """Returns the SHA-256 of names and bytes of tensors."""
+    """Return the SHA-256 of names and bytes of tensors."""
     digest = hashlib.sha256()
     for name, value in state.items():
         digest.update(name.encode())
@@ -148,7 +152,7 @@ def _copy_to_host(state: Any) -> Any:
 
 
 def _is_lost_connection(text: str) -> bool:
-    """Whether a RuntimeError is the end of a connection: gloo has no class of its own for it."""
+    """Return whether a RuntimeError is a lost connection: gloo has no class of its own for it."""
     return any(
         word in text
         for word in ("gloo", "NCCL", "Connection closed by peer", "Connection reset by peer")

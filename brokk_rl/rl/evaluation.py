@@ -1,4 +1,4 @@
-"""Evaluating a policy: one episode from each of a fixed list of starts, figures with intervals, and a few episodes to look at."""
+"""Evaluation of a policy: one episode from each of a fixed list of starts."""
 
 from __future__ import annotations
 
@@ -8,9 +8,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from brokk_rl.contracts.task import Policy
+from brokk_rl.contracts.task import SUCCESS, Policy
 from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.rl.vec_env import ControlLoop, Starts
+
+SHARES = (SUCCESS, "success_paper")
+"""Figures of an episode that are 0 or 1: reported as a share with its interval."""
+TIME_TO_SUCCESS = "time_to_insert_s"
+"""Figure that counts only in episodes with success: reported as median and 95 % quantile."""
+TRAINING_ONLY = ("return", "length")
+"""Figures of an episode that training logs and evaluation leaves out."""
+OBSERVED_EVERY, NUM_OBSERVED = 8, 16
+"""Observations kept for the comparison of exported and trained policy: of the first 16
+environments, every 8 control steps. Chosen by hand: some hundreds of vectors."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +33,7 @@ class RecordedEpisode:
         u: Commands, `(T, J)`.
         force_n: Peak contact force of each step, `(T,)`.
         scene: Scene vector, `(S,)`.
-        success: Whether it ended inserted.
+        success: Whether it ended with strict success.
     """
 
     t_s: np.ndarray
@@ -34,11 +44,43 @@ class RecordedEpisode:
     success: bool
 
 
+@dataclass(frozen=True)
+class PolicyEvaluation:
+    """Result of `evaluate_policy`.
+
+    Attributes:
+        summary: Fields of `evaluation.json`, without `seed`, `actuator` and `policy`.
+        episodes: The recorded episodes.
+        observations: Some hundreds of observation vectors, `(B, O)`.
+    """
+
+    summary: dict[str, Any]
+    episodes: list[RecordedEpisode]
+    observations: torch.Tensor
+
+
+@dataclass(frozen=True)
+class _Tape:
+    """Control steps of the recorded environments, `(T, R, …)` each once stacked."""
+
+    q: list[torch.Tensor]
+    u: list[torch.Tensor]
+    force_n: list[torch.Tensor]
+    running: list[torch.Tensor]
+
+    def append(self, loop: ControlLoop, running: torch.Tensor, num_recorded: int) -> None:
+        """Add the step that the control loop has just done."""
+        self.q.append(loop.end_q[:num_recorded].clone())
+        self.u.append(loop.end_u[:num_recorded].clone())
+        self.force_n.append(loop.end_force_n[:num_recorded].clone())
+        self.running.append(running[:num_recorded].clone())
+
+
 @torch.no_grad()
 def evaluate_policy(
     loop: ControlLoop, policy: Policy, starts: Starts, seed: int, num_recorded: int
-) -> tuple[dict[str, Any], list[RecordedEpisode], torch.Tensor]:
-    """Runs one episode from each start.
+) -> PolicyEvaluation:
+    """Run one episode from each start.
 
     Args:
         loop: As many environments as starts.
@@ -47,67 +89,65 @@ def evaluate_policy(
             errors and noise.
         seed: Seed of the noise.
         num_recorded: Episodes recorded.
-
-    Returns:
-        The fields of `evaluation.json` (without `seed`, `actuator`, `policy`), the recorded
-        episodes, and some hundreds of observation vectors `(B, O)`.
     """
     torch.manual_seed(seed)
     loop.begin(starts)
-    loop.statistics()
+    loop.statistics()  # forget episodes of before
     num = loop.num_envs
     running = torch.ones(num, dtype=torch.bool, device=loop.device)
     figures = {name: torch.zeros_like(value) for name, value in loop.finished.items()}
     reason = torch.full((num,), -1.0, device=loop.device)
-    tape: list[tuple[torch.Tensor, ...]] = []
-    seen: list[torch.Tensor] = []
+    tape = _Tape([], [], [], [])
+    observed: list[torch.Tensor] = []
     groups = loop.get_observations()
     for step in range(loop.task.max_episode_steps):
-        if step % 8 == 0:
-            seen.append(groups["policy"][:16].clone())
+        if step % OBSERVED_EVERY == 0:
+            observed.append(groups["policy"][:NUM_OBSERVED].clone())
             if not running.any():
                 break
         groups, _, done, _ = loop.step(policy.act(dict(groups.items())))  # type: ignore[arg-type]
-        now = done & running
+        # an environment that has finished goes on with further episodes, which do not count
+        ended = done & running
         for name, value in loop.finished.items():
-            figures[name] = torch.where(now, value, figures[name])
-        reason = torch.where(now, loop.reason, reason)
-        tape.append(
-            tuple(
-                part[:num_recorded].clone()
-                for part in (loop.end_q, loop.end_u, loop.end_force_n, running)
-            )
-        )
+            figures[name] = torch.where(ended, value, figures[name])
+        reason = torch.where(ended, loop.reason, reason)
+        tape.append(loop, running, num_recorded)
         running &= ~done
-    return (
-        _summarize(figures, reason, loop),
-        _collect_episodes(tape, starts, figures, loop),
-        torch.cat(seen),
+    return PolicyEvaluation(
+        summary=_summarize(figures, reason, loop.task.reasons),
+        episodes=_collect_episodes(tape, starts, figures[SUCCESS], loop.machine.period_s),
+        observations=torch.cat(observed),
     )
 
 
 def _summarize(
-    figures: dict[str, torch.Tensor], reason: torch.Tensor, loop: ControlLoop
+    figures: dict[str, torch.Tensor], reason: torch.Tensor, reasons: tuple[str, ...]
 ) -> dict[str, Any]:
-    table = {name: value.cpu().numpy() for name, value in figures.items()}
-    strict, paper = table["success_strict"] > 0, table["success_paper"] > 0
-    times = table["time_to_insert_s"][strict]
+    """Return the fields of `evaluation.json`; figures that the task does not have are left out."""
+    success = figures[SUCCESS].cpu().numpy() > 0
+    summary: dict[str, Any] = {"episodes": len(success)}
+    for name in (*SHARES, *figures):
+        if name in summary or name in TRAINING_ONLY or name not in figures:
+            continue
+        values = figures[name].cpu().numpy()
+        if name in SHARES:
+            summary[name] = _estimate_share(values > 0)
+        elif name == TIME_TO_SUCCESS:
+            summary[name] = _summarize_times(values[success])
+        else:
+            summary[name] = float(values.mean())
     endings = reason.cpu().numpy()
-    return {
-        "episodes": len(strict),
-        "success_strict": _estimate_share(strict),
-        "success_paper": _estimate_share(paper),
-        "time_to_insert_s": {
-            "median": float(np.median(times)) if len(times) else None,
-            "p95": float(np.quantile(times, 0.95)) if len(times) else None,
-        },
-        "lateral_error_m": float(table["lateral_error_m"].mean()),
-        "peak_force_n": float(table["peak_force_n"].mean()),
-        "valve_travel": float(table["valve_travel"].mean()),
-        "terminations": {
-            name: int((endings == index).sum()) for index, name in enumerate(loop.task.reasons)
-        },
+    summary["terminations"] = {
+        name: int((endings == index).sum()) for index, name in enumerate(reasons)
     }
+    return summary
+
+
+def _summarize_times(times_s: np.ndarray) -> dict[str, float | None]:
+    """Return median and 95 % quantile, `None` where there is no time."""
+    if not len(times_s):
+        return {"median": None, "p95": None}
+    return {"median": float(np.median(times_s)), "p95": float(np.quantile(times_s, 0.95))}
 
 
 def _estimate_share(happened: np.ndarray) -> dict[str, Any]:
@@ -116,24 +156,24 @@ def _estimate_share(happened: np.ndarray) -> dict[str, Any]:
 
 
 def _collect_episodes(
-    tape: list[tuple[torch.Tensor, ...]],
-    starts: Starts,
-    figures: dict[str, torch.Tensor],
-    loop: ControlLoop,
+    tape: _Tape, starts: Starts, success: torch.Tensor, period_s: float
 ) -> list[RecordedEpisode]:
-    q, u, force, running = (torch.stack(parts).cpu().numpy() for parts in zip(*tape, strict=True))
+    """Cut the tape into one episode per recorded environment."""
+    q, u, force_n, running = (
+        torch.stack(steps).cpu().numpy() for steps in (tape.q, tape.u, tape.force_n, tape.running)
+    )
     episodes = []
     for row in range(q.shape[1]):
         length = max(2, int(running[:, row].sum()))
         first = starts["q"][row].cpu().numpy()[None]
         episodes.append(
             RecordedEpisode(
-                t_s=np.arange(length + 1) * loop.machine.period_s,
+                t_s=np.arange(length + 1) * period_s,
                 q=np.concatenate((first, q[:length, row])),
                 u=np.concatenate((np.zeros_like(first), u[:length, row])),
-                force_n=np.concatenate(([0.0], force[:length, row])),
+                force_n=np.concatenate(([0.0], force_n[:length, row])),
                 scene=starts["scene"][row].cpu().numpy(),
-                success=bool(figures["success_strict"][row] > 0),
+                success=bool(success[row] > 0),
             )
         )
     return episodes

@@ -18,10 +18,11 @@ recorded."""
 def capture_graph(
     step: Callable[[], None], device: torch.device, gradients: bool = False
 ) -> torch.cuda.CUDAGraph:
-    """Returns a graph of `step`, which must not synchronise with the host, and whose tensors must keep their addresses.
+    """Return a CUDA graph of `step`.
 
     Args:
-        step: What to capture; called `WARM_UP` times before.
+        step: The step; called `WARM_UP` times before. It must not synchronise with the host, and its
+            tensors must keep their addresses.
         device: A CUDA device.
         gradients: Whether `step` differentiates.
     """
@@ -42,7 +43,7 @@ def capture_graph(
 
 @contextlib.contextmanager
 def report_compile_errors() -> Iterator[None]:
-    """Says what to do where `torch.compile` finds nothing to compile with.
+    """Turn an error of `torch.compile` without a compiler into a message with its remedy.
 
     Raises:
         ConfigError: Something that is first called in here cannot be compiled.
@@ -58,7 +59,7 @@ def report_compile_errors() -> Iterator[None]:
 
 @contextlib.contextmanager
 def limit_to_one_thread(device: torch.device | str) -> Iterator[None]:
-    """Keeps torch to one thread meanwhile; nothing changes where `device` is a GPU.
+    """Keep torch to one thread meanwhile; nothing changes where `device` is a GPU.
 
     The tensors of a control step are too small to share. Torch's other threads would only wait for
     the next one, and they wait spinning, on the cores on which the physics runs; where the computer

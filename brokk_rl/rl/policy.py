@@ -1,8 +1,8 @@
 """Policies that can be evaluated, and the bundle in which a trained one leaves the trainer.
 
 A bundle is a folder (or a run folder) with `policy.safetensors` (weights of the actor),
-`policy.json` (the contract: machine, rate, order and scale of observations and commands) and
-`policy.onnx` (everything from the observation vector to the masked command, for the machine).
+`policy.json` (the contract: machine, rate, order and scale of observations and commands) and, where
+the task can be deployed, `policy.onnx` (from the observation vector to the masked command).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from rsl_rl.models import MLPModel
@@ -19,7 +19,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
-from brokk_rl.contracts.task import Policy
+from brokk_rl.contracts.task import (
+    ClassicalTask,
+    Policy,
+    supports_classical_control,
+    supports_deployment,
+)
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.runner import TrainingConfig
@@ -29,15 +34,31 @@ from brokk_rl.spec import spec
 
 WEIGHTS, CONTRACT, ONNX = "policy.safetensors", "policy.json", "policy.onnx"
 SCHEMA = 1
+"""Version of `policy.json`."""
+EXPLORATION_PREFIX = "distribution."
+"""Weights of the exploration noise. They belong to the training, not to the policy: a finished
+training hardly explores any more."""
 
 
 @spec
 class ClassicalPolicy:
-    """Inverse kinematics with dead-time compensation under the same masks: what a user would pick instead of a learned policy."""
+    """The task's classical controller: inverse kinematics with dead-time compensation."""
+
+    label: ClassVar[str] = "classical"
 
     def build(self, loop: ControlLoop, seed: int) -> Policy:
-        """Returns the policy; the controller's numbers are the task's (`task.classical`)."""
-        return _ClassicalActor(loop)
+        """Return the policy; the controller's numbers are the task's (`task.classical`).
+
+        Raises:
+            ConfigError: The task has no classical controller.
+        """
+        if not supports_classical_control(loop.task):
+            raise ConfigError(
+                f"policy=classical: the task ({type(loop.task).__name__}) has no classical "
+                "controller; choose another policy=…, or give the task the method "
+                "`classical_action` (brokk_rl.contracts.task.ClassicalTask)"
+            )
+        return _ClassicalActor(loop.task)
 
 
 @spec
@@ -50,8 +71,10 @@ class UntrainedPolicy:
 
     training: TrainingConfig
 
+    label: ClassVar[str] = "untrained"
+
     def build(self, loop: ControlLoop, seed: int) -> Policy:
-        """Returns the policy with weights drawn from `seed`."""
+        """Return the policy with weights drawn from `seed`."""
         config = self.training.runner_config()
         with torch.random.fork_rng():
             torch.manual_seed(seed)
@@ -69,8 +92,10 @@ class TrainedPolicy:
 
     folder: str
 
+    label: ClassVar[str] = "trained"
+
     def build(self, loop: ControlLoop, seed: int) -> Policy:
-        """Returns the policy.
+        """Return the policy.
 
         Raises:
             CheckpointError: The bundle is missing, corrupt, holds NaN, or was made for another
@@ -82,32 +107,16 @@ class TrainedPolicy:
             actor.load_state_dict(weights)
         except RuntimeError as error:
             raise CheckpointError(
-                f"{self.folder}: the weights do not fit task and machine ({str(error).splitlines()[-1].strip()}); "
-                "evaluate with the task that the policy was trained for (task=…)"
+                f"{self.folder}: the weights do not fit task and machine "
+                f"({str(error).splitlines()[-1].strip()}); evaluate with the task that the policy "
+                "was trained for (task=…)"
             ) from error
         return NetworkPolicy(actor.to(loop.device), loop)
 
 
-def locate_bundle(folder: str) -> Path:
-    """Returns the folder of a policy: a path, or `package:path` within an installed package.
-
-    Raises:
-        CheckpointError: There is no such package.
-    """
-    package, colon, inside = folder.partition(":")
-    if not colon or Path(folder).exists():
-        return Path(folder)
-    try:
-        return Path(str(resources.files(package))) / inside
-    except (ModuleNotFoundError, ValueError, TypeError) as error:
-        raise CheckpointError(
-            f"policy.folder={folder}: there is no package '{package}' ({error}); give a run folder, or package:path"
-        ) from error
-
-
 class _ClassicalActor:
-    def __init__(self, loop: ControlLoop) -> None:
-        self._task = loop.task
+    def __init__(self, task: ClassicalTask) -> None:
+        self._task = task
 
     def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
         return self._task.classical_action(groups)
@@ -120,25 +129,28 @@ class NetworkPolicy:
         self.actor = actor.to(loop.device).eval()
 
     def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Returns the mean action; see `brokk_rl.contracts.task.Policy`."""
+        """Return the mean action; see `brokk_rl.contracts.task.Policy`."""
         return self.actor(TensorDict(groups, batch_size=[len(next(iter(groups.values())))]))
 
 
 def make_actor(
     config: dict[str, Any], obs_groups: dict[str, list[str]], loop: ControlLoop
 ) -> MLPModel:
-    """Returns an actor network of rsl-rl for the observation groups of `loop`."""
+    """Return an actor network of rsl-rl for the observation groups of `loop`.
+
+    Raises:
+        ConfigError: The configuration names a group that the task does not observe.
+    """
+    # a copy by way of JSON: rsl-rl writes into its configuration
     actor_class, arguments = resolve_class(json.loads(json.dumps(config)))
-    missing = [
-        name for name in obs_groups["actor"] if name not in set(loop.get_observations().keys())
-    ]
+    observations = loop.get_observations()
+    missing = set(obs_groups["actor"]) - set(observations.keys())
     if missing:
         raise ConfigError(
-            f"rl.runner.obs_groups.actor: the task gives no group {', '.join(missing)}"
+            f"rl.runner.obs_groups.actor: the task gives no group {', '.join(sorted(missing))}"
         )
-    return actor_class(
-        loop.get_observations(), obs_groups, "actor", loop.num_actions, **arguments
-    ).to(loop.device)
+    actor = actor_class(observations, obs_groups, "actor", loop.num_actions, **arguments)
+    return actor.to(loop.device)
 
 
 def write_bundle(
@@ -148,7 +160,10 @@ def write_bundle(
     loop: ControlLoop,
     facts: dict[str, Any],
 ) -> dict[str, Any]:
-    """Writes weights and contract of a policy into `folder`; returns the contract."""
+    """Write weights and contract of a policy into `folder`; return the contract.
+
+    A task that cannot be deployed has `null` for `observation` in the contract.
+    """
     config = training.runner_config()
     weights = {
         name: value.detach().cpu().contiguous() for name, value in actor.state_dict().items()
@@ -163,7 +178,7 @@ def write_bundle(
         "joints": list(machine.joint_names),
         "exclusive": list(machine.exclusive),
         "command": {"range": [-1.0, 1.0], "order": list(machine.joint_names), "masked": True},
-        "observation": loop.task.describe(),
+        "observation": loop.task.describe() if supports_deployment(loop.task) else None,
         "network": {
             "actor": config["actor"],
             "obs_groups": {"actor": config["obs_groups"]["actor"]},
@@ -177,18 +192,38 @@ def write_bundle(
     return contract
 
 
+def locate_bundle(folder: str) -> Path:
+    """Return the folder of a policy: a path, or `package:path` within an installed package.
+
+    Raises:
+        CheckpointError: There is no such package.
+    """
+    package, colon, inside = folder.partition(":")
+    if not colon or Path(folder).exists():
+        return Path(folder)
+    try:
+        return Path(str(resources.files(package))) / inside
+    except (ModuleNotFoundError, ValueError, TypeError) as error:
+        raise CheckpointError(
+            f"policy.folder={folder}: there is no package '{package}' ({error}); give a run folder, "
+            "or package:path"
+        ) from error
+
+
 def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Returns contract and weights of the bundle in `folder`; see `Trained.build` for errors."""
+    """Return contract and weights of the bundle in `folder`; errors as in `TrainedPolicy.build`."""
     if not (folder / CONTRACT).exists():
         raise CheckpointError(
-            f"{folder} holds no policy ({CONTRACT} is missing); give the folder of a finished training run"
+            f"{folder} holds no policy ({CONTRACT} is missing); "
+            "give the folder of a finished training run"
         )
     try:
         contract = json.loads((folder / CONTRACT).read_text())
         weights = load_file(folder / WEIGHTS)
     except (OSError, ValueError, SafetensorError) as error:
         raise CheckpointError(
-            f"the policy in {folder} is corrupt: {error}; export it again from a checkpoint (mode=export)"
+            f"the policy in {folder} is corrupt: {error}; "
+            "export it again from a checkpoint (mode=export)"
         ) from error
     machine.check_fingerprint(contract.get("fingerprint", {}), f"the policy in {folder}")
     bad = [name for name, value in weights.items() if not torch.isfinite(value).all()]
@@ -199,15 +234,10 @@ def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[st
     return contract, weights
 
 
-EXPLORATION_PREFIX = "distribution."
-"""Exploration belongs to the training that begins, not to the policy: one that has settled explores
-no more."""
-
-
 def load_initial_weights(actor: torch.nn.Module, folder: str, machine: Machine) -> None:
-    """Copies the network of the policy in `folder` into `actor`, whose exploration stays as it is.
+    """Copy the network of the policy in `folder` into `actor`; its exploration stays as it is.
 
-    A bundle holds no critic: the one of the training that begins starts afresh.
+    A bundle holds no critic: the critic starts with fresh weights.
 
     Args:
         actor: The network to be trained.
@@ -218,15 +248,14 @@ def load_initial_weights(actor: torch.nn.Module, folder: str, machine: Machine) 
         CheckpointError: The bundle cannot be used, or its network has another shape.
     """
     _, weights = read_bundle(locate_bundle(folder), machine)
-    kept = {
-        name: value
-        for name, value in actor.state_dict().items()
-        if name.startswith(EXPLORATION_PREFIX)
-    }
+    for name, value in actor.state_dict().items():
+        if name.startswith(EXPLORATION_PREFIX):
+            weights[name] = value
     try:
-        actor.load_state_dict(weights | kept)
+        actor.load_state_dict(weights)
     except RuntimeError as error:
         raise CheckpointError(
             f"start_from={folder}: the policy does not fit task, machine and rl.runner.actor "
-            f"({str(error).splitlines()[-1].strip()}); train with those it was made with, or start_from=null"
+            f"({str(error).splitlines()[-1].strip()}); train with those it was made with, "
+            "or start_from=null"
         ) from error

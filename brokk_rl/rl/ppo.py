@@ -26,7 +26,9 @@ from brokk_rl.rl.execution import capture_graph, limit_to_one_thread
 
 
 class CapturedRollout:
-    """Does what `act` and `process_env_step` of `rsl_rl.algorithms.PPO` do, into the algorithm's own storage.
+    """Acting and storing as `rsl_rl.algorithms.PPO` does them, into the algorithm's own storage.
+
+    Each is one replay of a CUDA graph.
 
     For feed-forward networks with a Gaussian policy; all tensors keep their addresses. On a CPU the
     same runs without graphs.
@@ -56,14 +58,14 @@ class CapturedRollout:
         self._act, self._store = self._run(self._decide), self._run(self._keep)
 
     def act(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Returns drawn actions, `(N, A)`; the tensor is overwritten by the next call."""
+        """Return drawn actions, `(N, A)`; the tensor is overwritten by the next call."""
         for name, value in self._observations.items():
             value.copy_(observations[name])
         self._act()
         return self._actions
 
     def store(self, reward: torch.Tensor, done: torch.Tensor, timed_out: torch.Tensor) -> None:
-        """Stores the step that followed the last `act`; each `(N,)`.
+        """Store the step that followed the last `act`; each `(N,)`.
 
         Raises:
             OverflowError: The storage is full.
@@ -122,7 +124,10 @@ FIGURES = ("value", "surrogate", "entropy")
 
 
 class DevicePPO(PPO):
-    """PPO for feed-forward networks; on a CPU, and with curiosity or symmetry, it is rsl-rl's own, which acts on one thread."""
+    """PPO for feed-forward networks.
+
+    On a CPU, and with curiosity or symmetry, it is rsl-rl's own, which acts on one thread.
+    """
 
     _rollout: CapturedRollout | None = None
     _mini_batch: Sequence[Callable[[], None]] | None = None
@@ -138,7 +143,7 @@ class DevicePPO(PPO):
     _sums: torch.Tensor
 
     def act(self, obs: TensorDict) -> torch.Tensor:
-        """Draws actions; see `rsl_rl.algorithms.PPO.act`."""
+        """Draw actions; see `rsl_rl.algorithms.PPO.act`."""
         if not (self._on_device and isinstance(self.actor.distribution, GaussianDistribution)):
             with limit_to_one_thread(self.device):
                 return super().act(obs)
@@ -152,7 +157,7 @@ class DevicePPO(PPO):
         dones: torch.Tensor,
         extras: dict[str, torch.Tensor],
     ) -> None:
-        """Stores a step; see `rsl_rl.algorithms.PPO.process_env_step`."""
+        """Store a step; see `rsl_rl.algorithms.PPO.process_env_step`."""
         if self._rollout is None:
             with limit_to_one_thread(self.device):
                 super().process_env_step(obs, rewards, dones, extras)
@@ -160,11 +165,11 @@ class DevicePPO(PPO):
             self._rollout.store(rewards, dones, extras.get("time_outs", torch.zeros_like(rewards)))
 
     def update(self) -> dict[str, float]:
-        """Learns from the stored steps and returns mean losses; see `rsl_rl.algorithms.PPO.update`."""
+        """Learn from the stored steps and return mean losses; see `rsl_rl.algorithms.PPO.update`."""
         return self.update_on_device() if self._on_device else super().update()
 
     def update_on_device(self) -> dict[str, float]:
-        """Does what `update` does with one read-back at the end; the same numbers up to rounding."""
+        """Learn as `update` does, with one read-back at the end; the same numbers up to rounding."""
         storage = self.storage
         used = self._batch_size() * self.num_mini_batches
         order = torch.randperm(used, device=self.device)
@@ -190,7 +195,7 @@ class DevicePPO(PPO):
         return {name: value / updates for name, value in zip(FIGURES, sums, strict=True)}
 
     def save(self) -> dict[str, Any]:
-        """Returns the state without what is special to this device, so that it can be loaded on any."""
+        """Return the state without device-specific entries, so that any device can load it."""
         saved = super().save()
         optimizer = saved["optimizer_state_dict"]
         plain = {"lr": self.learning_rate, "capturable": False, "fused": None}
@@ -200,7 +205,7 @@ class DevicePPO(PPO):
         }
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Loads a state; graphs are captured anew at the next update, because the optimiser's tensors are others now."""
+        """Load a state; the next update captures new graphs for the optimiser's new tensors."""
         self._mini_batch = None
         return super().load(loaded_dict, load_cfg, strict)
 
@@ -215,7 +220,7 @@ class DevicePPO(PPO):
         return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
 
     def _prepare(self) -> None:
-        """Makes the tensors that graphs read and write, and lets the optimiser read its rate from one of them."""
+        """Make the tensors that graphs read and write; the optimiser reads its rate from one of them."""
         self._rows = torch.zeros(self._batch_size(), dtype=torch.int64, device=self.device)
         self._advantages = torch.zeros_like(self.storage.values)
         self._rate = torch.tensor(self.learning_rate, device=self.device)
@@ -235,7 +240,10 @@ class DevicePPO(PPO):
                 state["step"] = state["step"].to(self.device, torch.float32)
 
     def _parts(self) -> Sequence[Callable[[], None]]:
-        """Returns what a mini-batch consists of, on a GPU captured; the calls before the capture leave no trace."""
+        """Return the parts of a mini-batch, captured on a GPU.
+
+        The calls before the capture leave no trace.
+        """
         device = torch.device(self.device)
         if device.type != "cuda":
             return (
@@ -272,7 +280,10 @@ class DevicePPO(PPO):
         return captured
 
     def _normalise(self, model: nn.Module) -> None:
-        """Updates a model's normalisation in place: rsl-rl binds a new tensor, which the graph would not see."""
+        """Update a model's normalisation in place.
+
+        rsl-rl binds a new tensor, which the graph would not see.
+        """
         held = [
             (module, name, value)
             for module in model.modules()
@@ -288,7 +299,10 @@ class DevicePPO(PPO):
         self._descend()
 
     def _differentiate(self) -> None:
-        """Differentiates the loss of the stored steps `_rows`; Schulman et al. 2017, equations 7 and 9, as rsl-rl weighs them."""
+        """Differentiate the loss of the stored steps `_rows`.
+
+        Schulman et al. 2017, equations 7 and 9, with the weights of rsl-rl.
+        """
         storage, rows = self.storage, self._rows
         observations = {
             name: value.flatten(0, 1)[rows] for name, value in storage.observations.items()
@@ -342,11 +356,11 @@ class DevicePPO(PPO):
         self._sums.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
 
     def _sum_up(self) -> None:
-        """Adds up gradients and divergence of all processes, which then all hold the same; the host does not wait for it."""
+        """Add up gradients and divergence of all processes; the host does not wait for it."""
         dist.all_reduce(self._gathered)
 
     def _descend(self) -> None:
-        """One step of the optimiser along the mean gradient of all processes."""
+        """Take one step of the optimiser along the mean gradient of all processes."""
         if self.is_multi_gpu:
             self._gathered.div_(self.gpu_world_size)
         if self._is_adaptive:
@@ -360,7 +374,7 @@ class DevicePPO(PPO):
         return self.desired_kl is not None and self.schedule == "adaptive"
 
     def _adapt_rate(self, divergence: torch.Tensor) -> None:
-        """Raises the learning rate where the policy moves less than `desired_kl`, lowers it where it moves more."""
+        """Adapt the learning rate: up where the policy moves less than `desired_kl`, down where more."""
         lower, higher = (
             (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE),
             (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE),

@@ -46,7 +46,7 @@ class TrainingBudget:
             )
 
     def share_spent(self, env_steps: int, seconds: float) -> float:
-        """Returns how much is spent, 1 or more when it is all."""
+        """Return the spent share of the budget, 1 or more when all of it is spent."""
         return max(
             env_steps / (self.max_env_steps or float("inf")),
             seconds / (self.max_seconds or float("inf")),
@@ -55,7 +55,7 @@ class TrainingBudget:
 
 @spec
 class TrainingConfig:
-    """How a policy is trained with rsl-rl's PPO.
+    """Numbers of a training with rsl-rl's PPO.
 
     Attributes:
         num_envs: Environments, of each process where several train together; `null` for what the
@@ -96,14 +96,14 @@ class TrainingConfig:
             )
 
     def divergence(self, share_spent: float) -> float | None:
-        """Returns the `desired_kl` of updates when this share of the budget is spent."""
+        """Return the `desired_kl` of updates when this share of the budget is spent."""
         desired = self.runner["algorithm"].get("desired_kl")
         if desired is None or share_spent <= 1.0 - self.settling:
             return desired
         return desired * (1.0 - 0.9 * min(1.0, (share_spent - 1.0 + self.settling) / self.settling))
 
     def runner_config(self) -> dict[str, Any]:
-        """Returns a copy for rsl-rl, which writes into it; keys without a value are dropped: its constructors know no `null`."""
+        """Return a copy for rsl-rl, which writes into it, without keys whose value is `null`."""
         return _drop_nulls(copy.deepcopy(self.runner)) | {
             "save_interval": 10**9,
             "check_for_nan": False,
@@ -111,20 +111,20 @@ class TrainingConfig:
 
 
 class TrainingRunner(OnPolicyRunner):
-    """Trains; see `Training`.
+    """Runner of a training; see `TrainingConfig`.
 
-    rsl-rl's own checkpoint lacks the environment, the random generators and the step count; ours
-    holds all of them, so that a resumed run on a CPU goes on bit for bit. It is read with
-    `weights_only=True`: a checkpoint from a stranger cannot run code. Of several processes the
-    first writes it, with what belongs to each of the others.
+    rsl-rl's own checkpoint lacks the environment, the random generators and the step count. This one
+    holds all of them: a resumed run on a CPU goes on bit for bit. It is read with `weights_only=True`,
+    so that a checkpoint from a stranger cannot run code. Of several processes the first writes it,
+    including the state of the others.
 
     Args:
         env: The control loop; a checkpoint of another machine than its own is refused.
         training: Configuration.
         folder: Checkpoints go here.
         device: Where the networks live.
-        logbook: Takes the place of rsl-rl's logger.
-        group: Those that train together, entered; `None` for a process that is alone.
+        logger: Takes the place of rsl-rl's logger.
+        group: The processes that train together, entered; `None` for a single process.
     """
 
     env: ControlLoop
@@ -147,13 +147,13 @@ class TrainingRunner(OnPolicyRunner):
         self.logger = logbook  # type: ignore[assignment]
 
     def run(self) -> None:
-        """Trains until the budget is spent, saving a checkpoint every `save_interval` iterations and at the end."""
+        """Train until the budget is spent; save a checkpoint every `save_interval` and at the end."""
         book: TrainingLogger = self.logger  # type: ignore[assignment]
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
-        while rounds := self.group.from_first(self._rounds(book, steps)):
+        while rounds := self.group.broadcast_first(self._rounds(book, steps)):
             if self.current_learning_iteration % ITERATIONS_PER_ROUND == 0:
-                share = self.group.from_first(
+                share = self.group.broadcast_first(
                     self.training.budget.share_spent(book.env_steps, book.seconds)
                 )
                 self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
@@ -164,13 +164,16 @@ class TrainingRunner(OnPolicyRunner):
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
-            over = self.group.from_first(self._rounds(book, steps)) == 0
+            over = self.group.broadcast_first(self._rounds(book, steps)) == 0
             if over or self.current_learning_iteration % self.training.save_interval == 0:
                 self.group.check_same(self._policy_state())
                 self.checkpoint()
 
     def _rounds(self, book: TrainingLogger, steps: int) -> int:
-        """Returns how many iterations to do until the next checkpoint or change of step, 0 when the budget is spent."""
+        """Return the number of iterations until the next checkpoint or change of `desired_kl`.
+
+        0 when the budget is spent.
+        """
         budget, interval = self.training.budget, self.training.save_interval
         rounds = min(
             part - self.current_learning_iteration % part
@@ -191,7 +194,7 @@ class TrainingRunner(OnPolicyRunner):
         return rounds
 
     def _policy_state(self) -> dict[str, torch.Tensor]:
-        """Returns parameters and normalisers of actor and critic by name."""
+        """Return parameters and normalisers of actor and critic by name."""
         models = {"actor": self.alg.actor, "critic": self.alg.critic}
         return {
             f"{part}.{name}": value
@@ -200,7 +203,10 @@ class TrainingRunner(OnPolicyRunner):
         }
 
     def _configure_multi_gpu(self) -> None:
-        """Tells rsl-rl of the processes of `group`; its own way knows NCCL only and never ends the process group."""
+        """Tell rsl-rl of the processes of `group`.
+
+        rsl-rl's own way knows NCCL only and never ends the process group.
+        """
         rank = self.group.rank
         self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = (
             rank.count,
@@ -212,19 +218,21 @@ class TrainingRunner(OnPolicyRunner):
         self.cfg["multi_gpu"] = numbers if self.is_distributed else None
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
-        """Trains for some iterations; see `rsl_rl.runners.OnPolicyRunner`."""
+        """Train for some iterations; see `rsl_rl.runners.OnPolicyRunner`."""
         with _allow_tensor_cores(self.env.graph_active):
             super().learn(num_learning_iterations, init_at_random_ep_len)
 
     def checkpoint(self) -> None:
-        """Writes a checkpoint in one step, holding all that is needed to go on exactly; drops the oldest beyond `keep_checkpoints`.
+        """Write a checkpoint in one step; drop the oldest beyond `keep_checkpoints`.
+
+        It holds all that is needed to go on exactly.
 
         Raises:
             StorageError: The disk is full or the folder cannot be written; older checkpoints are
                 untouched.
         """
         own = {"env": self.env.state_dict(), "random": get_random_state(self.device)}
-        parts = self.group.gathered(own)
+        parts = self.group.gather_on_first(own)
         if not self.group.rank.first:
             return
         book: TrainingLogger = self.logger  # type: ignore[assignment]
@@ -257,7 +265,7 @@ class TrainingRunner(OnPolicyRunner):
             old.unlink()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Does nothing: rsl-rl would save amid an iteration's bookkeeping; `checkpoint` follows every call of `learn`."""
+        """Do nothing: rsl-rl would save amid an iteration; `checkpoint` follows every `learn`."""
 
     def load(
         self,
@@ -266,7 +274,7 @@ class TrainingRunner(OnPolicyRunner):
         strict: bool = True,
         map_location: str | None = None,
     ) -> dict:
-        """Restores a checkpoint so that training goes on exactly.
+        """Restore a checkpoint so that training goes on exactly.
 
         Raises:
             CheckpointError: The file is missing, corrupt, holds NaN or belongs to another machine
@@ -296,7 +304,7 @@ class TrainingRunner(OnPolicyRunner):
 
 @contextlib.contextmanager
 def _allow_tensor_cores(allowed: bool) -> Iterator[None]:
-    """Lets matrix products use TF32 meanwhile.
+    """Let matrix products use TF32 meanwhile.
 
     Only where the control step is a captured graph, whose kernels were chosen before: ten bits of
     mantissa are enough for a network, but would put the tool of a 5 m arm millimetres off.
@@ -310,12 +318,12 @@ def _allow_tensor_cores(allowed: bool) -> Iterator[None]:
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
-    """Returns the checkpoints of a run folder, oldest first."""
+    """Return the checkpoints of a run folder, oldest first."""
     return sorted(folder.glob("model_*.pt"), key=lambda path: int(path.stem.removeprefix("model_")))
 
 
 def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
-    """Reads a checkpoint without running code from it.
+    """Read a checkpoint without running code from it.
 
     Raises:
         CheckpointError: The file is missing or corrupt, or a weight is NaN.
@@ -340,7 +348,7 @@ def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
 
 
 def get_random_state(device: torch.device | str) -> dict[str, torch.Tensor]:
-    """Returns the state of torch's generators on the CPU and on `device`."""
+    """Return the state of torch's generators on the CPU and on `device`."""
     state = {"cpu": torch.get_rng_state()}
     if torch.device(device).type == "cuda":
         state["cuda"] = torch.cuda.get_rng_state(device)
@@ -348,7 +356,7 @@ def get_random_state(device: torch.device | str) -> dict[str, torch.Tensor]:
 
 
 def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str) -> None:
-    """Restores what `random_state` returned."""
+    """Restore generators that `get_random_state` read."""
     torch.set_rng_state(state["cpu"].cpu())
     if torch.device(device).type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)

@@ -1,4 +1,4 @@
-"""Where the figures of a training run go: always to `progress.csv` in the run folder, and to a tracker if one is chosen."""
+"""Trackers of a training run's figures, beside `progress.csv` in the run folder."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ class Tracker(Protocol):
     """An open tracking run."""
 
     def log(self, figures: dict[str, float], step: int) -> None:
-        """Stores the figures of one iteration."""
+        """Store the figures of one iteration."""
         ...
 
     def close(self) -> None:
-        """Ends the tracking run; called on success, failure and interruption alike."""
+        """End the tracking run; called on success, failure and interruption alike."""
         ...
 
 
@@ -25,7 +25,7 @@ class Tracking(Protocol):
     """A spec in `conf/tracking`: opens a tracking run."""
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Returns an open tracking run for the run in `folder`."""
+        """Return an open tracking run for the run in `folder`."""
         ...
 
 
@@ -34,7 +34,7 @@ class NoTracking:
     """No tracker: `progress.csv` and the pictures of the run folder only."""
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Returns a tracker that does nothing."""
+        """Return a tracker that does nothing."""
         return _NoTracker()
 
 
@@ -43,13 +43,15 @@ class TensorBoardTracking:
     """TensorBoard event files in the run folder."""
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Returns a tracker that writes `folder/tensorboard`."""
+        """Return a tracker that writes `folder/tensorboard`."""
         return _TensorBoardTracker(folder)
 
 
 @spec
 class WandbTracking:
-    """Weights & Biases, offline first: one run per job, synchronised later with `wandb sync` or online with wandb.mode=online.
+    """Weights & Biases, offline first: one run per job, sent later by `wandb sync`.
+
+    With `wandb.mode=online` it is sent at once.
 
     Attributes:
         project: Project name.
@@ -64,7 +66,7 @@ class WandbTracking:
     mode: str
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Returns a tracker with a run of its own, named after the run folder."""
+        """Return a tracker with a run of its own, named after the run folder."""
         return _WandbTracker(self, folder, config)
 
 

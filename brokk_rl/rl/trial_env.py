@@ -1,4 +1,4 @@
-"""Where simulated operators do trials: the simulated machine beside its block, all trials at once, faster than in reality."""
+"""Trials of simulated operators: the simulated machine beside its block, all trials at once."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class SimulatedTrials:
     def run(
         self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
     ) -> list[Recording]:
-        """See `brokk_rl.contracts.operator.TrialGround`."""
+        """Run all trials; see `brokk_rl.contracts.operator.TrialGround`."""
         device = torch.device(
             "cpu"
         )  # a few hundred trials are as fast on a CPU, and operators are numpy
@@ -112,7 +112,7 @@ class SimulatedTrials:
 
 
 class OperatorLevers(FollowerModel):
-    """Operators in the place of a follower: they see arm, hole and proposal, and what they give is given.
+    """Operators in the place of a follower: they see arm, hole and proposal, and give the commands.
 
     Args:
         operators: The operators.
@@ -127,14 +127,14 @@ class OperatorLevers(FollowerModel):
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
-        """Nothing that could be restored: trials are done once."""
+        """Empty: nothing can be restored, trials are done once."""
         return {}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """A trial that is over stays over; see `brokk_rl.contracts.actuator.FollowerModel`."""
+        """Do nothing: a trial that is over stays over."""
 
     def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        """Returns what the operators give, `(N, J)`, where `proposed`, `(N, J)`, is advised."""
+        """Return the commands of the operators, `(N, J)`, who are shown `proposed`, `(N, J)`."""
         assert self.loop is not None
         q = self.loop.history.q[:, -1].numpy().astype(float)
         rim_m = self.loop.task.state["start.target_m"].numpy().astype(float)
@@ -146,7 +146,7 @@ class OperatorLevers(FollowerModel):
 
 
 def _make_starts(machine: Machine, trials: TrialBatch) -> dict[str, torch.Tensor]:
-    """Returns starts of the control loop for the study's places; the block stands with its side to the machine."""
+    """Return starts of the control loop at the study's places; the block faces the machine."""
     num, rim = len(trials.q), trials.rim_in_base_m
     scene = np.column_stack((rim, np.arctan2(rim[:, 1], rim[:, 0]), np.ones(num), trials.radius_m))
     made: dict[str, Any] = {

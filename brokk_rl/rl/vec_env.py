@@ -35,7 +35,7 @@ Starts = dict[str, torch.Tensor]
 
 @dataclass(frozen=True)
 class ControlLoopConfig:
-    """What a control loop is made of: specs, not yet built.
+    """Parts of a control loop: specs, not yet built.
 
     Attributes:
         machine: The machine.
@@ -56,11 +56,11 @@ class ControlLoopConfig:
     def build(
         self, device: torch.device, num_envs: int | None, pool: int, seed: int
     ) -> ControlLoop:
-        """Returns the control loop on `device`.
+        """Return the control loop on `device`.
 
         Args:
             device: Where to simulate.
-            num_envs: Number of environments; `None` for what the simulator's configuration says.
+            num_envs: Number of environments; `None` for the number of the simulator's configuration.
             pool: Number of valid starts from which resets draw.
             seed: Seed of the starts.
         """
@@ -79,13 +79,13 @@ class ControlLoopConfig:
 
 
 class ControlLoop(VecEnv):
-    """`N` simulated machines under control; see the module.
+    """`N` simulated machines under control, as rsl-rl wants to see them.
 
     Args:
         machine: The machine.
         world: Physics.
         actuator: Actuator model, effects included.
-        follower: What makes the command given of the one proposed.
+        follower: Turns the proposed command into the command given.
         task: Task process.
         starts: Valid starts from which resets draw, each entry `(pool, …)`.
     """
@@ -154,12 +154,15 @@ class ControlLoop(VecEnv):
 
     @property
     def graph_active(self) -> bool:
-        """Whether a control step is one replay of a CUDA graph."""
+        """True when a control step is one replay of a CUDA graph."""
         return self._graph is not None
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Control steps since the start of each episode, `(N,)`; rsl-rl may set it to put episodes out of step."""
+        """Control steps since the start of each episode, `(N,)`.
+
+        rsl-rl may set it to put episodes out of step.
+        """
         return self.task.state["steps"].long()
 
     @episode_length_buf.setter
@@ -167,7 +170,11 @@ class ControlLoop(VecEnv):
         self.task.state["steps"].copy_(value)
 
     def begin(self, starts: Starts | None = None) -> None:
-        """Starts a new episode everywhere: from `starts`, each entry `(N, …)`, else from random rows of the pool."""
+        """Start a new episode everywhere.
+
+        Args:
+            starts: Each entry `(N, …)`; `None` for random rows of the pool.
+        """
         with self._always_alike():
             start = starts or self._draw()
             self.done.fill_(True)
@@ -176,7 +183,9 @@ class ControlLoop(VecEnv):
             self.done.fill_(False)
 
     def capture(self, fuse: bool = False) -> None:
-        """Captures the control step in a CUDA graph where device and world allow it; a few steps are simulated on the way.
+        """Capture the control step in a CUDA graph where device and world allow it.
+
+        A few steps are simulated on the way.
 
         Args:
             fuse: First have `torch.compile` fuse the small operations around the physics, on a GPU
@@ -202,14 +211,14 @@ class ControlLoop(VecEnv):
         self.begin()
 
     def get_observations(self) -> TensorDict:
-        """Returns the current observation groups; asking twice gives the same."""
+        """Return the current observation groups; asking twice gives the same."""
         return TensorDict(
             {name: value.clone() for name, value in self._groups.items()},
             batch_size=[self.num_envs],
         )
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
-        """Advances one control period; see `rsl_rl.env.VecEnv.step`."""
+        """Advance one control period; see `rsl_rl.env.VecEnv.step`."""
         with self._always_alike():
             self._action.copy_(actions)
             self._steps += 1
@@ -220,7 +229,7 @@ class ControlLoop(VecEnv):
             return self.get_observations(), self.reward, self.done, {"time_outs": self.timed_out}
 
     def statistics(self) -> dict[str, float]:
-        """Returns means over the episodes finished since the last call, shares of their endings, and their number.
+        """Return figures of the episodes that finished since the last call: means, endings, number.
 
         Reads back from the device once.
         """
@@ -236,7 +245,7 @@ class ControlLoop(VecEnv):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns copies of everything that must be stored to go on exactly; random generators are the session's."""
+        """Return copies of all that is needed to go on exactly, but for random generators."""
         state: dict[str, torch.Tensor] = {
             "history.q": self.history.q,
             "history.u": self.history.u,
@@ -253,7 +262,7 @@ class ControlLoop(VecEnv):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what `state_dict` returned."""
+        """Restore a copy that `state_dict` returned."""
         tensors = state["tensors"]
         self.history.q.copy_(tensors["history.q"])
         self.history.u.copy_(tensors["history.u"])
@@ -272,19 +281,23 @@ class ControlLoop(VecEnv):
 
     @contextlib.contextmanager
     def _always_alike(self) -> Iterator[None]:
-        """In and outside of rsl-rl's inference mode, at any number of threads: for each, torch would compile anew what is fused."""
+        """Make torch's modes the same for every caller.
+
+        rsl-rl calls in and outside of its inference mode, and at any number of threads. For each of them
+        torch would compile the fused parts anew.
+        """
         with limit_to_one_thread(self.device), torch.inference_mode(False), torch.no_grad():
             yield
 
     def _advance(self) -> None:
-        """One control step on the device."""
+        """Run one control step on the device."""
         self.world.step(self._command())
         start = self._judge()
         self.world.reset(self.done, start["q"], start["scene"])
         self._perceive(start)
 
     def _command(self) -> torch.Tensor:
-        """Puts what is given of the action into force; returns how far the drive shall move each joint, `(N, J)`."""
+        """Apply the action; return the motion that the drive is to make of each joint, `(N, J)`."""
         # histories hold what was given, as the machine's log does: it is all that policy and
         # actuator model can know
         self.end_u.copy_(self.follower.step(self.task.command(self._action)))
@@ -294,7 +307,7 @@ class ControlLoop(VecEnv):
         return self.actuator.step(self.truth) - self.truth.q[:, -1]
 
     def _judge(self) -> Starts:
-        """Judges what the world has done; returns where the finished environments start anew."""
+        """Judge the simulated step; return starts for the environments that finished."""
         # a world that became NaN is a fault and starts anew; its numbers must not poison the sums
         # over all worlds
         self.truth.push_q(self.world.q.nan_to_num())
@@ -315,7 +328,7 @@ class ControlLoop(VecEnv):
         return self._draw()
 
     def _perceive(self, start: Starts) -> None:
-        """Resets finished environments and observes all of them."""
+        """Reset finished environments and observes all of them."""
         self.truth.reset(self.done, start["q"])
         self.actuator.reset(self.done)
         self.follower.reset(self.done)

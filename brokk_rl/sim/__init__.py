@@ -1,1 +1,1 @@
-"""The simulated world: machine, drive, block with borehole; stepped by MuJoCo on threads (`native`) or on a GPU (`warp`)."""
+"""Simulated world: machine, drive and block with a borehole, on CPU threads or on a GPU."""

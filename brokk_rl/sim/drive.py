@@ -1,14 +1,15 @@
-"""The drive: makes the joints follow what the actuator model predicts, holds the arm, and yields where something blocks it.
+"""Drive: servos that follow the actuator model, hold the arm, and yield to an obstacle.
 
 Each joint has a servo of its own inside MuJoCo, force = stiffness (act - q) - damping q', cut off
-at the yield force (the relief valve). Its reference is accumulated from the predicted increments.
-"Present position + increment" would be wrong: any sag under load becomes the next starting point,
-and the arm sinks. Within a control period the reference moves on at constant speed v (MuJoCo
-integrates ctrl = v into act), led by v damping / stiffness, so that damping does not cost a lag.
+at the yield force (the relief valve). Its reference accumulates the predicted increments. "Present
+position + increment" would be wrong: any sag under load becomes the next starting point, and the
+arm sinks. Within a control period the reference moves on at constant speed v (MuJoCo integrates
+ctrl = v into act). It leads by v damping / stiffness, so that damping does not cost a lag.
 
-The simulation has no gravity: the actuator model was learned on a machine that has its weight, so
-what gravity does to the motion is already in its increments and must not be counted twice. Nothing
-but the machine moves, so that this is the same as compensating it link by link, and cheaper.
+The simulation has no gravity. The actuator model was learned on a machine that has its weight, so
+its increments already contain the effect of gravity, which must not be counted twice. Nothing but
+the machine moves: this is the same as compensating gravity link by link, and cheaper.
+
 """
 
 import mujoco
@@ -27,7 +28,7 @@ machine can do."""
 
 
 def add_drive(spec: mujoco.MjSpec, machine: Machine, inertia: np.ndarray) -> None:
-    """Adds one servo per joint, in machine order.
+    """Add one servo per joint, in machine order.
 
     Args:
         spec: Model with the joints.
@@ -81,9 +82,9 @@ class DriveReferences:
     def step(
         self, q: torch.Tensor, increment: torch.Tensor, act: torch.Tensor, ctrl: torch.Tensor
     ) -> None:
-        """Moves the references on by one control period.
+        """Move the references on by one control period.
 
-        The reference never leads the joint by more than what opens the relief valve, so a blocked
+        The reference never leads the joint by more than the lead that opens the relief valve. So a blocked
         joint does not wind up.
 
         Args:
@@ -99,7 +100,11 @@ class DriveReferences:
         reference.add_(increment)
 
     def diverged(self, qvel: torch.Tensor) -> torch.Tensor:
-        """Returns the worlds, `(N,)` bool, that are beyond use: absurd or NaN joint speeds, `(N, J)`, or references not finite.
+        """Return the diverged worlds, `(N,)` bool: joint speeds absurd or NaN, or references infinite.
+
+        Args:
+            qvel: Joint speeds, `(N, J)`.
+
 
         The references count because the cut-off at the yield force turns NaN into a force that
         looks sound.
@@ -107,5 +112,5 @@ class DriveReferences:
         return (self.reference.mul(0.0).add_(qvel).abs_().amax(1) <= MAX_SPEED).logical_not_()
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor) -> None:
-        """Puts the references of the worlds of `mask`, `(N,)` bool, to `q`, `(N, J)`."""
+        """Put the references of the worlds of `mask`, `(N,)` bool, to `q`, `(N, J)`."""
         torch.where(mask[:, None], q.to(self.reference.dtype), self.reference, out=self.reference)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
 
-from brokk_rl.contracts.actuator import Actuator
+from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -19,12 +19,12 @@ from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.spec import spec
 
 LOGGED_STATES = ("oil_c",)
-"""States of an actuator model, one number a machine, that its sensors show."""
+"""States of an actuator model, one number a machine, that the machine's sensors show."""
 
 
 @spec
 class SimulatedMachines:
-    """Simulated machines side by side: an actuator model, with effects, from home; as fast as it computes.
+    """Simulated machines side by side from home, as fast as they compute: an actuator model.
 
     Attributes:
         actuator: The machine that is driven; with effects around it, as recordings show it.
@@ -35,27 +35,24 @@ class SimulatedMachines:
     noise: float
 
     def check(self) -> None:
-        if self.noise < 0:
-            raise ConfigError(f"link.noise: expected 0 or more, got {self.noise}")
+        _check_noise(self.noise)
 
     @property
     def source(self) -> str:
         """The actuator and its effects."""
-        inner, effects = (
-            getattr(self.actuator, "actuator", self.actuator),
-            getattr(self.actuator, "effects", {}),
-        )
+        inner = getattr(self.actuator, "actuator", self.actuator)
+        effects = getattr(self.actuator, "effects", {})
         return "simulator: " + " + ".join([type(inner).__name__, *effects])
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> SimulatedMachinesLink:
-        """Returns a link to `num_runs` machines."""
+        """Return a link to `num_runs` machines."""
         # a few dozen machines are faster on a CPU
         device = torch.device("cpu") if session.device == "auto" else session.torch_device()
         return SimulatedMachinesLink(self, machine, num_runs, session, device)
 
 
 class SimulatedMachinesLink:
-    """The link at work; each `send` is one control period."""
+    """Link to simulated machines; each `send` is one control period."""
 
     def __init__(
         self,
@@ -65,69 +62,56 @@ class SimulatedMachinesLink:
         session: Session,
         device: torch.device,
     ) -> None:
-        self._config, self._machine, self._device = config, machine, device
+        self._noise, self._machine, self._device = config.noise, machine, device
         self._generator = session.generator("link")
-        self._form = (num_runs, machine.num_joints) if num_runs > 1 else (machine.num_joints,)
+        self._shape = (num_runs, machine.num_joints) if num_runs > 1 else (machine.num_joints,)
         everywhere = torch.ones(num_runs, dtype=torch.bool, device=device)
-        shape = (num_runs, machine.num_history, machine.num_joints)
-        self._history = History(
-            q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device)
-        )
-        self._history.reset(
-            everywhere,
-            torch.as_tensor(machine.home, dtype=torch.float32, device=device).repeat(num_runs, 1),
-        )
+        home = torch.as_tensor(machine.home, dtype=torch.float32, device=device)
+        self._history = _make_history(machine, num_runs, device)
+        self._history.reset(everywhere, home.repeat(num_runs, 1))
         devices = [device] if device.type == "cuda" else []
-        with torch.random.fork_rng(devices):  # what differs from machine to machine is drawn here
+        with torch.random.fork_rng(devices):  # differences between machines are drawn here
             torch.manual_seed(session.stream("link"))
             self._model = config.actuator.build(machine, num_runs, device)
             self._model.reset(everywhere)
-        self._logged = {
-            path.rpartition(".")[2]: path
-            for path in self._model.state
-            if path.rpartition(".")[2] in LOGGED_STATES
-        }
+        self._logged = _find_logged_states(self._model)
         self._steps = 0
         self._measure()
 
     def read(self) -> JointState:
-        """Returns the state after the last control period; reading twice gives the same."""
-        return JointState(self._steps * self._machine.period_s, self._measured.reshape(self._form))
+        """Return the state after the last control period; reading twice gives the same."""
+        return JointState(self._steps * self._machine.period_s, self._measured.reshape(self._shape))
 
     def send(self, command: Command) -> Command:
-        """Drives the machines for one control period; what is no number is a standstill."""
-        u = np.nan_to_num(
-            np.asarray(command.u, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0
-        ).clip(-1.0, 1.0)
-        u = u.astype(np.float32)  # recorded as it was computed with
+        """Drive the machines for one control period; NaN and infinity are a standstill."""
+        u = _limit_command(command).astype(np.float32)  # recorded as it was computed with
         with torch.inference_mode():
-            self._history.push_u(
-                torch.as_tensor(u.reshape(self._measured.shape), device=self._device)
-            )
+            rows = u.reshape(self._measured.shape)
+            self._history.push_u(torch.as_tensor(rows, device=self._device))
             self._history.push_q(self._model.step(self._history))
         self._steps += 1
         self._measure()
         return Command(u)
 
     def extra(self) -> dict[str, np.ndarray]:
-        """Returns what the sensors show besides, each `(N,)`: the oil's temperature where the model knows one."""
+        """Return further sensors, each `(N,)`: the oil's temperature where the model has one."""
         state = self._model.state if self._logged else {}
         return {name: state[path].cpu().numpy().copy() for name, path in self._logged.items()}
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exc: Any) -> None:
+    def __exit__(self, *exc: object) -> None:
         pass
 
     def _measure(self) -> None:
         q = self._history.q[:, -1].cpu().numpy().astype(np.float64)
-        self._measured = q + self._config.noise * self._generator.standard_normal(q.shape)
+        self._measured = q + self._noise * self._generator.standard_normal(q.shape)
 
 
 @spec
 class SimulatedWorksite:
-    """One simulated machine in the world: an actuator model with effects, physics, a block with a borehole.
+    """One simulated machine beside a block with a borehole: actuator model and physics.
 
     Attributes:
         sim: Builds the world.
@@ -144,19 +128,18 @@ class SimulatedWorksite:
     start: tuple[float, ...] | None
 
     def check(self) -> None:
-        if self.noise < 0:
-            raise ConfigError(f"link.noise: expected 0 or more, got {self.noise}")
+        _check_noise(self.noise)
 
     @property
     def source(self) -> str:
-        """That it is simulated, with contact."""
+        """Name of the source in recordings."""
         return "simulated site"
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> SimulatedWorksiteLink:
-        """Returns a link to the machine.
+        """Return a link to the machine.
 
         Raises:
-            ConfigError: more than one machine is asked for, or the start does not fit the machine.
+            ConfigError: More than one machine is asked for, or the start does not fit the machine.
         """
         if num_runs != 1:
             raise ConfigError(
@@ -170,38 +153,29 @@ class SimulatedWorksite:
 
 
 class SimulatedWorksiteLink:
-    """The link at work; each `send` is one control period."""
+    """Link to a simulated worksite; each `send` is one control period."""
 
-    def __init__(self, site: SimulatedWorksite, machine: Machine, session: Session) -> None:
-        self._site, self._machine = site, machine
+    def __init__(self, config: SimulatedWorksite, machine: Machine, session: Session) -> None:
+        self._noise, self._machine = config.noise, machine
         self._generator = session.generator("link")
         cpu = torch.device("cpu")
-        self._world = site.sim.build(machine, cpu, 1)
-        shape = (1, machine.num_history, machine.num_joints)
+        self._world = config.sim.build(machine, cpu, 1)
         with torch.random.fork_rng([]):
             torch.manual_seed(session.stream("link"))
-            self._model = site.actuator.build(machine, 1, cpu)
-        self._history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-        self._logged = {
-            path.rpartition(".")[2]: path
-            for path in self._model.state
-            if path.rpartition(".")[2] in LOGGED_STATES
-        }
+            self._model = config.actuator.build(machine, 1, cpu)
+        self._history = _make_history(machine, 1, cpu)
+        self._logged = _find_logged_states(self._model)
         self._steps, self._measured = 0, np.zeros(machine.num_joints)
-        self.place(
-            np.array(site.start if site.start is not None else machine.home),
-            np.array(site.hole_in_base_m),
-        )
+        start = config.start if config.start is not None else machine.home
+        self.place(np.array(start), np.array(config.hole_in_base_m))
 
     def read(self) -> JointState:
-        """Returns the state after the last control period; reading twice gives the same."""
+        """Return the state after the last control period; reading twice gives the same."""
         return JointState(self._steps * self._machine.period_s, self._measured.copy())
 
     def send(self, command: Command) -> Command:
-        """Drives the machine for one control period; what is no number is a standstill."""
-        u = np.nan_to_num(
-            np.asarray(command.u, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0
-        ).clip(-1.0, 1.0)
+        """Drive the machine for one control period; NaN and infinity are a standstill."""
+        u = _limit_command(command)
         with torch.inference_mode():
             self._history.push_u(torch.as_tensor(u[None], dtype=torch.float32))
             self._world.step(self._model.step(self._history) - self._history.q[:, -1])
@@ -211,7 +185,12 @@ class SimulatedWorksiteLink:
         return Command(u)
 
     def place(self, q: np.ndarray, hole_in_base_m: np.ndarray) -> None:
-        """Puts the machine, at rest, at `q`, `(J,)`, and the block with the rim of its hole at `hole_in_base_m`, its side to it."""
+        """Put the machine at rest, and the block so that it faces the machine.
+
+        Args:
+            q: Joint positions, `(J,)`.
+            hole_in_base_m: Centre of the hole's rim, `(3,)`.
+        """
         everywhere = torch.ones(1, dtype=torch.bool)
         start, scene = torch.as_tensor(q[None], dtype=torch.float32), make_nominal_scenes(1)
         x, y, z = hole_in_base_m.tolist()
@@ -224,18 +203,43 @@ class SimulatedWorksiteLink:
         self._measure()
 
     def extra(self) -> dict[str, np.ndarray]:
-        """Returns the contact force, and the oil's temperature where the model knows one, each `(1,)`."""
-        found = {
-            name: self._model.state[path].numpy().copy() for name, path in self._logged.items()
-        }
-        return found | {"force_n": self._world.contact_force_n.numpy().copy()}
+        """Return contact force, and oil temperature where the model has one, each `(1,)`."""
+        state = self._model.state
+        sensors = {name: state[path].numpy().copy() for name, path in self._logged.items()}
+        return sensors | {"force_n": self._world.contact_force_n.numpy().copy()}
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exc: Any) -> None:
+    def __exit__(self, *exc: object) -> None:
         pass
 
     def _measure(self) -> None:
         q = self._history.q[0, -1].numpy().astype(np.float64)
-        self._measured = q + self._site.noise * self._generator.standard_normal(q.shape)
+        self._measured = q + self._noise * self._generator.standard_normal(q.shape)
+
+
+def _check_noise(noise: float) -> None:
+    if noise < 0:
+        raise ConfigError(f"link.noise: expected 0 or more, got {noise}")
+
+
+def _make_history(machine: Machine, num_runs: int, device: torch.device) -> History:
+    shape = (num_runs, machine.num_history, machine.num_joints)
+    return History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
+
+
+def _find_logged_states(model: ActuatorModel) -> dict[str, str]:
+    """Return the path in `model.state` of each logged state; paths of effects have dots."""
+    logged = {}
+    for path in model.state:
+        name = path.rpartition(".")[2]
+        if name in LOGGED_STATES:
+            logged[name] = path
+    return logged
+
+
+def _limit_command(command: Command) -> np.ndarray:
+    """Return the command in [-1, 1], zero where it is not finite."""
+    u = np.nan_to_num(np.asarray(command.u, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    return u.clip(-1.0, 1.0)

@@ -1,8 +1,9 @@
-"""From a machine and its MJCF to a compiled MuJoCo model.
+"""Compilation of a machine and its MJCF to a MuJoCo model.
 
-The MJCF says what the links look like and how their mass is distributed; every number about the
-machine is written into it from the machine's YAML, so that simulation, policy and the machine's own
-computer cannot disagree.
+The MJCF holds the shapes of the links and the distribution of their mass. Every other number is
+written into it from the machine's YAML, so that simulation, policy and the machine's own computer
+cannot disagree.
+
 """
 
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.registry import resolve_package_path
 from brokk_rl.sim.drive import add_drive
 from brokk_rl.sim.scene import add_block
 
@@ -21,12 +23,13 @@ VISUAL_GROUP = 2
 
 
 def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> mujoco.MjModel:
-    """Returns the model of `machine` at a work site with a block.
+    """Return the model of `machine` at a work site with a block.
 
     Args:
         machine: The machine.
         timestep_s: Length of a substep.
-        visual: Keeps what only pictures need; the physics is the same without, and faster.
+        visual: Keep geoms, cameras and lights that only pictures need. The physics is the same without
+            them, and faster.
 
     Raises:
         ConfigError: The MJCF is missing or its joints are not those of the machine.
@@ -43,7 +46,10 @@ def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> 
 
 
 def mask_contact_sensors(model: mujoco.MjModel) -> np.ndarray:
-    """Returns 1 for the touch sensors among `sensordata` and 0 for all others; the touch sensors' sum is the contact force."""
+    """Return 1 for the touch sensors among `sensordata`, else 0.
+
+    The sum of the touch sensors is the contact force.
+    """
     chosen = np.zeros(model.nsensordata)
     chosen[model.sensor_adr[model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH]] = 1.0
     return chosen
@@ -54,10 +60,11 @@ def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
         raise ConfigError(
             f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose another machine=…"
         )
-    path = ASSETS / machine.mjcf
+    path = ASSETS / resolve_package_path(machine.mjcf)
     if not path.exists():
         raise ConfigError(
-            f"machine {machine.name}: no MJCF at {path}; set `mjcf` to a file under {ASSETS} or to an absolute path"
+            f"machine {machine.name}: no MJCF at {path}; set `mjcf` to a file under {ASSETS},"
+            " to package:path, or to an absolute path"
         )
     try:  # included rather than attached, so that names stay as the MJCF gives them
         includes = "".join(f'<include file="{file}"/>' for file in (ASSETS / "worksite.xml", path))
@@ -81,7 +88,7 @@ def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
 
 
 def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
-    """Writes origins, axes, limits, masses and the tool point into `spec`."""
+    """Write origins, axes, limits, masses and the tool point into `spec`."""
     drawn = spec.copy().compile()
     links = [spec.joint(name).parent for name in machine.joint_names]
     ends = [_read_values(body.origin_m) for body in machine.bodies[1:]] + [machine.tip_m]
@@ -113,7 +120,7 @@ def _read_values(dimensions: tuple) -> np.ndarray:
 
 
 def _scale_geoms(link: mujoco.MjsBody, drawn_end: np.ndarray, end: np.ndarray) -> None:
-    """Scales the geoms of a link along it when its length differs from the one drawn in the MJCF."""
+    """Scale the geoms of a link along it when its length differs from the one drawn in the MJCF."""
     drawn_length, length = np.linalg.norm(drawn_end), np.linalg.norm(end)
     if drawn_length < 1e-9 or abs(length - drawn_length) < 1e-9:
         return
@@ -136,7 +143,7 @@ def _scale_geoms(link: mujoco.MjsBody, drawn_end: np.ndarray, end: np.ndarray) -
 def _write_inertia(
     link: mujoco.MjsBody, drawn: mujoco.MjModel, mass_kg: float, com_m: tuple[float, float, float]
 ) -> None:
-    """Gives the link its mass and centre of mass; its inertia is that of the MJCF, scaled with the mass."""
+    """Write mass and centre of mass of a link; its inertia is the MJCF's, scaled with the mass."""
     body = drawn.body(link.name)
     if body.mass[0] <= 0.0:
         raise ConfigError(
@@ -160,7 +167,7 @@ def _write_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
 
 
 def _remove_visuals(spec: mujoco.MjSpec) -> None:
-    """Removes what only pictures need."""
+    """Remove geoms, cameras and lights that only pictures need."""
     for geom in [g for g in spec.geoms if g.group == VISUAL_GROUP]:
         spec.delete(geom)
     for thing in [*spec.cameras, *spec.lights]:
@@ -168,7 +175,7 @@ def _remove_visuals(spec: mujoco.MjSpec) -> None:
 
 
 def _compute_joint_inertia(model: mujoco.MjModel, machine: Machine) -> np.ndarray:
-    """Returns the diagonal of the mass matrix at home, `(J,)`."""
+    """Return the diagonal of the mass matrix at home, `(J,)`."""
     data = mujoco.MjData(model)
     data.qpos[:] = machine.home
     mujoco.mj_forward(model, data)

@@ -1,4 +1,4 @@
-"""The world on CPU threads: `mujoco.batch.Batch`, the default without a GPU."""
+"""Worlds stepped by MuJoCo C on CPU threads (`mujoco.batch.Batch`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
 
 class NativeWorld:
-    """Fulfils `brokk_rl.contracts.world.World` with a thread pool; results are the same at any number of threads.
+    """World on a thread pool; fulfils `brokk_rl.contracts.world.World`.
+
+    Results are the same at any number of threads.
 
     Args:
         machine: The machine.
@@ -56,7 +58,7 @@ class NativeWorld:
         self.reset(~self.faults, home, make_nominal_scenes(num_worlds))
 
     def step(self, increment: torch.Tensor) -> None:
-        """Advances one control period; see `brokk_rl.contracts.world.World`."""
+        """Advance one control period; see `brokk_rl.contracts.world.World`."""
         self._drive.step(self._qpos, increment, self._act, self._ctrl)
         try:
             self._batch.rollout(self._substeps, record=("sensordata",), out=self._recorded)
@@ -69,11 +71,11 @@ class NativeWorld:
         )
 
     def bare_step(self) -> None:
-        """Does nothing but `mujoco.batch`: as many substeps, no drive, nothing read out; what `step` is held against."""
+        """Run the substeps of `mujoco.batch` alone, without drive and read-out; `step` compares with it."""
         self._batch.step(nstep=self._substeps)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
-        """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
+        """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
         rows = mask.nonzero()[:, 0]
         if not len(rows):
             return
@@ -90,11 +92,11 @@ class NativeWorld:
         self.q[rows], self.contact_force_n[rows], self.faults[rows] = start, 0.0, False
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Returns copies of everything that must be stored to go on bit for bit."""
+        """Return copies of everything that must be stored to go on bit for bit."""
         return {name: tensor.clone() for name, tensor in self._stored().items()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Restores what `state_dict` returned."""
+        """Restore a copy that `state_dict` returned."""
         for name, tensor in self._stored().items():
             tensor.copy_(state[name])
 

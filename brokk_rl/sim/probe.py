@@ -1,4 +1,4 @@
-"""What of MuJoCo and Warp works on this computer; each probe returns text or raises whatever went wrong."""
+"""Probes of MuJoCo and Warp on this computer; each returns text or raises an exception."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ RENDERERS = ("egl", "osmesa", "glfw")
 
 
 def get_warp_version() -> str:
-    """Returns the version of Warp."""
+    """Return the version of Warp."""
     import warp as wp
 
     return str(wp.config.version)
 
 
 def find_kernel_cache() -> Path:
-    """Returns the folder in which Warp keeps its compiled kernels."""
+    """Return the folder in which Warp keeps its compiled kernels."""
     wp = _start_warp_quietly()
     return Path(wp.config.kernel_cache_dir)
 
 
 def capture_graph() -> str:
-    """Captures a small Warp kernel launch on the first GPU in a CUDA graph and replays it; needs no compiled kernel.
+    """Capture a small Warp copy on the first GPU in a CUDA graph and replay it.
+
+    Needs no compiled kernel.
 
     Raises:
         RuntimeError: The graph cannot be captured or does not do its work.
@@ -44,7 +46,7 @@ def capture_graph() -> str:
 
 
 def find_renderer() -> str | None:
-    """Returns the first value of MUJOCO_GL with which a picture can be drawn here, `None` when there is none.
+    """Return the first value of MUJOCO_GL that can draw a picture here, `None` when there is none.
 
     MuJoCo settles on one library at import and a broken driver may end the process, so each try has
     a process of its own.
@@ -73,7 +75,7 @@ def find_renderer() -> str | None:
 
 
 def render_test_picture() -> None:
-    """Draws a ball in a picture of 32 x 32 pixels.
+    """Draw a ball in a picture of 32 x 32 pixels.
 
     Raises:
         RuntimeError: The picture is black.
@@ -92,7 +94,7 @@ def render_test_picture() -> None:
 
 
 def _start_warp_quietly() -> Any:
-    """Starts Warp without its banner; what it would say about the GPU, the doctor says itself."""
+    """Start Warp without its banner; the doctor reports the GPU itself."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR

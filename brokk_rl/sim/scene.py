@@ -130,7 +130,7 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
 
     Args:
         spec: Written.
-        visual: Add also what only pictures need.
+        visual: Add also the geoms and the camera that only pictures need.
     """
     body = spec.worldbody.add_body(
         name="block", mocap=True, pos=make_nominal_scenes(1)[0, :3].numpy()

@@ -1,4 +1,4 @@
-"""Simulator specs of `conf/sim`: MuJoCo C on CPU threads, MuJoCo Warp on a GPU, or a choice by device.
+"""Simulator specs of `conf/sim`: MuJoCo C on CPU threads, MuJoCo Warp on a GPU, or by device.
 
 The worlds are imported where they are built: `mujoco_warp` alone takes seconds to import.
 """

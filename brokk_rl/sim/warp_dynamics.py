@@ -29,15 +29,14 @@ better one."""
 
 
 class JointAlgebra(NamedTuple):
-    """Types and functions for one number of degrees of freedom; a kernel takes from it what it needs.
+    """Types and functions of Warp for one number of degrees of freedom.
 
     Attributes:
         Vector: A number a degree of freedom.
         Matrix: A square matrix.
-        inertia_at: `(elements, element, world)` -> the mass matrix of a world, from the lower half
-            that `mujoco_warp` keeps.
-        solved: `(A, b)` -> the solution of A x = b for a positive definite A, which needs no
-            pivots.
+        inertia_at: `(elements, element, world)` -> the mass matrix of a world, from the lower half that
+            `mujoco_warp` keeps.
+        solved: `(A, b)` -> the solution of A x = b for a positive definite A, which needs no pivots.
     """
 
     Vector: Any
@@ -48,7 +47,7 @@ class JointAlgebra(NamedTuple):
 
 @functools.cache
 def compile_algebra(num_dofs: int) -> JointAlgebra:
-    """Returns the types and functions for `num_dofs` degrees of freedom."""
+    """Return the types and functions for `num_dofs` degrees of freedom."""
     n = num_dofs
     Vector = wp.types.vector(n, wp.float32)
     Matrix = wp.types.matrix((n, n), wp.float32)
@@ -92,7 +91,7 @@ _BLOCK = 32  # small blocks, so that some thousand worlds spread over all of a G
 
 @wp.struct
 class _Arm:
-    """What does not change: joints, their servos, and the bodies that each joint is the last to move, one joint after the other."""
+    """Constants of the arm: joints, their servos, and bodies ordered by the last joint that moves them."""
 
     joint_kind: wp.array[int]
     armature: wp.array2d[float]
@@ -107,7 +106,7 @@ class _Arm:
 
 @wp.struct
 class _Pose:
-    """Where joints and bodies are: axes and anchors of the joints, centres of mass and principal axes of the bodies."""
+    """Axes and anchors of the joints, centres of mass and principal axes of the bodies."""
 
     axis: wp.array2d[wp.vec3]
     anchor: wp.array2d[wp.vec3]
@@ -117,7 +116,7 @@ class _Pose:
 
 @functools.cache
 def _compile_kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """Returns the kernels for what comes before and after the contacts, for `num_dofs` degrees of freedom."""
+    """Return the kernels that run before and after the contacts."""
     n = num_dofs
     Vector, Matrix, inertia_at, solved = compile_algebra(n)
     Columns = wp.types.matrix((n, 3), wp.float32)
@@ -252,7 +251,9 @@ def _compile_kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
 
 
 class ArmDynamics:
-    """Stands in for all of `mujoco_warp` but kinematics, collisions, constraints and their solution, for an arm driven by servos.
+    """Forces and time step of an arm of servos, in place of several stages of `mujoco_warp`.
+
+    Kinematics, collisions, constraints and their solution stay outside.
 
     Args:
         mujoco_model: The arm: joints in one chain, each driven by the servo of its number
@@ -309,16 +310,16 @@ class ArmDynamics:
         self._kernels, self._num_worlds = _compile_kernels(model.nv), data.nworld
 
     def before_contacts(self) -> None:
-        """From the kinematics to what collisions and the solver need: `cdof`, `M` and `qfrc_smooth`."""
+        """Compute `cdof`, `M` and `qfrc_smooth`, which collisions and solver need, from the kinematics."""
         wp.launch(self._kernels[0], self._num_worlds, self._before, block_dim=_BLOCK)
 
     def after_contacts(self) -> None:
-        """Advances the state by a substep with the accelerations found."""
+        """Advance the state by a substep with the accelerations found."""
         wp.launch(self._kernels[1], self._num_worlds, self._after, block_dim=_BLOCK)
 
 
 def _find_last_dof(model: mujoco.MjModel, body: int) -> int:
-    """Returns the last degree of freedom that moves `body`, -1 for none."""
+    """Return the last degree of freedom that moves `body`, -1 for none."""
     welded = model.body_weldid[body]
     return (
         int(model.body_dofadr[welded] + model.body_dofnum[welded] - 1)

@@ -1,4 +1,4 @@
-"""The contact solver of the Warp worlds: a world's whole problem in one launch.
+"""Contact solver of the Warp worlds: a world's whole problem in one launch.
 
 MuJoCo finds the acceleration x that minimises a convex cost (MuJoCo documentation, Computation,
 "Constraint solver" and "Primal problem"; Todorov, "Convex and analytically-invertible dynamics with
@@ -44,7 +44,9 @@ _FRICTION = wp.types.vector(
 
 @wp.struct
 class ConstraintRows:
-    """Rows of all worlds as `mujoco_warp.make_constraint` leaves them; the three rows of a contact follow each other.
+    """Constraint rows of all worlds as `mujoco_warp.make_constraint` leaves them.
+
+    The three rows of a contact follow each other.
 
     Attributes:
         num_rows: Rows of each world that are wanted; there may be room for fewer.
@@ -71,7 +73,7 @@ class ConstraintRows:
 
 @wp.func
 def _count_rows(constraints: ConstraintRows, world: int, row: int, num_rows: int) -> int:
-    """Rows of the constraint that begins at `row`: none if none begins there."""
+    """Return the number of rows of the constraint that begins at `row`: 0 if none begins there."""
     if constraints.kind[world, row] != _ELLIPTIC:
         return 1
     if constraints.first_row[constraints.contact[world, row], 0] == row and row + 3 <= num_rows:
@@ -83,7 +85,7 @@ def _count_rows(constraints: ConstraintRows, world: int, row: int, num_rows: int
 def _evaluate_cone(
     residual: wp.vec3, stiffness: wp.vec3, mu: float, friction: wp.vec2
 ) -> tuple[wp.vec3, wp.mat33]:
-    """Returns the force -∂s/∂r of a constraint and the curvature ∂²s/∂r² of its cost.
+    """Return the force -∂s/∂r of a constraint and the curvature ∂²s/∂r² of its cost.
 
     With t the length of the tangential residual, each part times its friction, and n the normal
     one, a contact that separates (n ≥ t) costs nothing; one that sticks (μ² n + t ≤ 0) costs ½ Σ D
@@ -108,7 +110,7 @@ def _evaluate_cone(
 
 @functools.cache
 def _compile_solver(num_dofs: int) -> wp.Kernel:
-    """Returns the solver's kernel for `num_dofs` degrees of freedom."""
+    """Return the solver's kernel for `num_dofs` degrees of freedom."""
     n = num_dofs
     Vector, Matrix, inertia_at, solved = compile_algebra(n)
     Rows = wp.types.matrix((3, n), wp.float32)
@@ -116,7 +118,7 @@ def _compile_solver(num_dofs: int) -> wp.Kernel:
 
     @wp.func
     def system(matrix: Matrix, right: Vector) -> System:
-        """Returns `[matrix | right]`, so that both are summed at once."""
+        """Return `[matrix | right]`, so that both are summed at once."""
         joined = System()
         for i in range(n):
             for j in range(n):
@@ -128,7 +130,7 @@ def _compile_solver(num_dofs: int) -> wp.Kernel:
     def rows_at(
         constraints: ConstraintRows, world: int, row: int, span: int
     ) -> tuple[Rows, wp.vec3, wp.vec3]:
-        """Returns Jacobian, target and stiffness of a constraint, zeros below a single row."""
+        """Return Jacobian, target and stiffness of a constraint, zeros below a single row."""
         jacobian, target, stiffness = Rows(), wp.vec3(), wp.vec3()
         for i in range(3):
             if i < span:
@@ -154,7 +156,7 @@ def _compile_solver(num_dofs: int) -> wp.Kernel:
         cone_width: float,
         x: Vector,
     ) -> System:
-        """Writes the forces at x and returns this thread's part of `[Hessian | gradient]` of the sum of constraints."""
+        """Write the forces at x; return this thread's part of `[Hessian | gradient]`."""
         total = System()
         for row in range(lane, num_rows, wp.block_dim()):
             span = _count_rows(constraints, world, row, num_rows)
@@ -182,7 +184,7 @@ def _compile_solver(num_dofs: int) -> wp.Kernel:
         step: Vector,
         alpha: float,
     ) -> wp.vec2:
-        """Returns this thread's part of the first and second derivative along `step` of the sum of constraints."""
+        """Return this thread's part of the first and second derivative of the cost along `step`."""
         total = wp.vec2()
         for row in range(lane, num_rows, wp.block_dim()):
             span = _count_rows(constraints, world, row, num_rows)
@@ -211,7 +213,9 @@ def _compile_solver(num_dofs: int) -> wp.Kernel:
         descent: float,
         num_searches: int,
     ) -> float:
-        """Returns the length of step with the least cost, which is convex along it: Newton's method on its slope, bracketed.
+        """Return the length of step with the least cost: bracketed Newton's method on the slope.
+
+        The cost is convex along the step.
 
         Without constraints the slope is `start` + length `bend`; with them it begins at -`descent`.
         """
@@ -316,7 +320,7 @@ def _compile_solver(num_dofs: int) -> wp.Kernel:
 
 
 class ContactSolver:
-    """Stands in for `mujoco_warp.solve` where all constraints are joint limits and contacts without torsional friction.
+    """Solver for joint limits and contacts without torsional friction; replaces `mujoco_warp.solve`.
 
     Args:
         model: Gives the degrees of freedom and the options `iterations`, `ls_iterations` and
@@ -347,7 +351,7 @@ class ContactSolver:
         self._outputs = [data.qacc, rows.Ma, data.qfrc_constraint, data.solver_niter, peak]
 
     def __call__(self) -> None:
-        """Finds the accelerations and forces of all worlds."""
+        """Find the accelerations and forces of all worlds."""
         wp.launch_tiled(
             self._kernel,
             dim=self._num_worlds,

@@ -35,7 +35,9 @@ def _keep_peak(
     first_row: wp.array2d[int],
     peak: wp.array[float],
 ):
-    """Raises each world's peak to the sum of the normal forces of its contacts, the first row of each in an elliptic cone.
+    """Raise each world's peak to the sum of the normal forces of its contacts.
+
+    The normal force is the first row of each contact in an elliptic cone.
 
     The same as the sum of the touch sensors (`sim.native` reads those), for one launch instead of
     eight.
@@ -49,7 +51,7 @@ def _keep_peak(
 
 
 def check_supported(compiled: mujoco.MjModel, machine: Machine, is_fused: bool) -> None:
-    """Raises a `ConfigError` for what a substep leaves out."""
+    """Raise a `ConfigError` for parts of a model that the substep does not simulate."""
     left_out = {
         "tendons": compiled.ntendon,
         "equalities": compiled.neq,
@@ -84,7 +86,9 @@ def check_supported(compiled: mujoco.MjModel, machine: Machine, is_fused: bool) 
 
 
 def make_staged_substep(model: mjw.Model, data: mjw.Data, peak: wp.array) -> Callable[[], None]:
-    """Returns `mjw.step` for a chain of bodies, without its stages for cameras, deformable bodies, tendons and sensors.
+    """Return `mjw.step` without the stages that a chain of bodies does not need.
+
+    Left out: cameras, deformable bodies, tendons and sensors.
 
     Some 60 launches, and ten an iteration of the solver. The GPU waits for launches, not for
     arithmetic: every stage that a model does not need costs time.
@@ -117,7 +121,7 @@ def make_staged_substep(model: mjw.Model, data: mjw.Data, peak: wp.array) -> Cal
 def make_fused_substep(
     compiled: mujoco.MjModel, model: mjw.Model, data: mjw.Data, peak: wp.array
 ) -> Callable[[], None]:
-    """Returns the same for an arm of a few joints driven by servos, in 18 launches.
+    """Return a substep for an arm of a few joints driven by servos, in 18 launches.
 
     Args:
         compiled: The model as MuJoCo has it.
@@ -225,7 +229,7 @@ class WarpWorld:
         self.reset(torch.ones_like(self.faults), home, make_nominal_scenes(num_worlds, device))
 
     def step(self, increment: torch.Tensor) -> None:
-        """Advances one control period; see `brokk_rl.contracts.world.World`."""
+        """Advance one control period; see `brokk_rl.contracts.world.World`."""
         view = self._views
         self._drive.step(view["qpos"], increment, view["act"], view["ctrl"])
         self.contact_force_n.zero_()
@@ -238,7 +242,7 @@ class WarpWorld:
         )
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
-        """Begins anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
+        """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
         view = self._views
         position, turn = self._placement.pose(scene)
         size, pos = self._placement.geoms(scene)
@@ -260,11 +264,11 @@ class WarpWorld:
         self.faults.masked_fill_(mask, False)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Returns copies of everything that must be stored to go on."""
+        """Return copies of everything that must be stored to go on."""
         return {name: tensor.clone() for name, tensor in self._stored().items()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Restores what `state_dict` returned."""
+        """Restore a copy that `state_dict` returned."""
         for name, tensor in self._stored().items():
             tensor.copy_(state[name])
 
@@ -283,7 +287,7 @@ class WarpWorld:
 
     @contextlib.contextmanager
     def _on_torch_stream(self) -> Iterator[None]:
-        """Makes Warp use torch's current stream, and know when torch is capturing it."""
+        """Make Warp use torch's current stream, and tell it when torch is capturing it."""
         if not self.supports_graphs:
             with wp.ScopedDevice(self._warp_device):
                 yield

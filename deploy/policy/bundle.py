@@ -45,6 +45,11 @@ class PolicyBundle:
         self.contract = _read(place / CONTRACT, folder)
         _check_contract(self.contract, machine, folder)
         observation = self.contract["observation"]
+        if observation is None:
+            raise CheckpointError(
+                f"{folder}: the policy's task cannot be deployed, so there is no {ONNX}; see "
+                "brokk_rl.contracts.task.DeployableTask"
+            )
         pitch = observation.get("pitch")
         scaling = TargetScaling(
             target_mean_m=observation["target"]["mean_m"],

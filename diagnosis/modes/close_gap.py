@@ -1,4 +1,4 @@
-"""`brokk mode=close_gap`: what found effects are worth to a policy, before and after retraining with them."""
+"""`brokk mode=close_gap`: success of a policy before and after retraining with diagnosed effects."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RETRAINED = "retrained"
 
 @spec
 class StandIn:
-    """What stands in for the machine: an actuator with effects that the simulator does not know.
+    """Stand-in of the machine: an actuator with effects that the simulator does not know.
 
     Attributes:
         actuator: Its actuator.
@@ -47,13 +47,13 @@ class StandIn:
 
 @spec
 class CloseGap:
-    """Evaluates a policy in the simulator, in the repaired one and on the machine's stand-in; retrains it with the found effects.
+    """Evaluate a policy before and after retraining with the diagnosed effects.
 
     Attributes:
         session: Folder, seed, device.
         machine: The machine.
         sim: Physics.
-        task: What to do.
+        task: The task.
         actuator: The simulator's actuator, as it was.
         effect: Its effects, as it was.
         found: Effects that the diagnosis found; the repaired simulator has them too.
@@ -109,7 +109,7 @@ class CloseGap:
             )
 
     def run(self) -> float:
-        """Writes `close_gap.json`, `.html` and `.png`; returns the strict success of the retrained policy on the machine.
+        """Write `close_gap.json`, `.html`, `.png`; return the success of the retrained policy.
 
         Below the run folder lie `retrained/` (as `mode=train` leaves it) and an `evaluation.json`
         for each plant.
@@ -163,7 +163,7 @@ class CloseGap:
         return replace(known, effects=self.effect | self.randomisation | self.found)
 
     def _retrained(self) -> Path:
-        """Returns the folder of the retrained policy; trains it unless an interrupted run has done so."""
+        """Return the folder of the retrained policy; train it unless that is done."""
         place = self.session.folder / RETRAINED
         if (place / EVALUATION).exists():
             return place
@@ -181,7 +181,7 @@ class CloseGap:
     def _evaluated(
         self, name: str, plant: ControlLoopConfig, policies: dict[str, PolicySpec]
     ) -> dict[str, Any]:
-        """Returns `evaluation.json` on a plant; one that an interrupted run has written is kept."""
+        """Return `evaluation.json` on a plant; one that an interrupted run has written is kept."""
         place = self.session.folder / name
         if (place / EVALUATION).exists():
             return json.loads((place / EVALUATION).read_text())

@@ -42,12 +42,12 @@ EVALUATED = {
 
 
 def write_story(folder: Path, stages: Mapping[str, str], withheld: Mapping[str, Any]) -> None:
-    """Writes `story.html`.
+    """Write `story.html`.
 
     Args:
         folder: Run folder of the story, with one folder a stage.
-        stages: What each is for.
-        withheld: The effects that nobody was told of, as configured.
+        stages: Purpose of each.
+        withheld: The withheld effects, as configured.
 
     Raises:
         StorageError: it could not be written.
@@ -70,7 +70,7 @@ def write_story(folder: Path, stages: Mapping[str, str], withheld: Mapping[str, 
     if found:
         _add_diagnosis(page, found, withheld)
     if repair:
-        page.add_heading("What it is worth")
+        page.add_heading("Success after retraining")
         retraining.add_success_table(page, repair)
         page.add_text(
             "The repaired simulator predicted for the retrained policy a success of "
@@ -138,7 +138,7 @@ def _add_stages(page: Report, folder: Path, stages: Mapping[str, str]) -> None:
             ]
         )
     rows.append(["", "all", f"{whole_s / 60:.1f}"])
-    page.add_table(["stage", "what for", "minutes"], rows)
+    page.add_table(["stage", "purpose", "minutes"], rows)
     with page.add_details("The commands"):
         records = (read_record(folder / name) for name in stages)
         page.add_code(
@@ -217,7 +217,7 @@ def _add_diagnosis(page: Report, found: Answer, withheld: Mapping[str, Any]) -> 
 def _get_true_number(
     withheld: Mapping[str, Any], effect: str, number: str, joint: str
 ) -> str | None:
-    """Returns the number that the machine really has."""
+    """Return the number that the machine really has."""
     node = withheld.get(effect)
     if node is None or (_get_joints(node) and joint not in _get_joints(node)):
         return None
@@ -241,7 +241,7 @@ def _read_diagnosis(folder: Path) -> Answer | None:
 log = logging.getLogger(__name__)
 
 HANDED_ON_FOLDER = "given"
-"""Folder with what the stages take from the story."""
+"""Folder with the files that stages take from the story."""
 HANDED_ON_GROUPS = ("sim", "task", "rl", "evaluation")
 """Groups that a stage can take from the story."""
 FOLDER_PLACEHOLDER = "{folder}"
@@ -252,10 +252,10 @@ class StoryStage:
     """One command of a story; its run folder is `<story>/<name of the stage>`.
 
     Attributes:
-        title: What it is for, in words.
+        title: Its purpose in words.
         command: Arguments of `brokk`; `{folder}` stands for the run folder of the story.
         takes: Groups (`sim`, `task`, `rl`, `evaluation`) and `device` that it takes from the story.
-        links: Links made before it, both ends below the run folder: where, and to what.
+        links: Links made before it, both ends below the run folder: path and target.
         needs: A file below the run folder without whose content the story ends before this stage;
             `null`: nothing.
         resumes: Whether an interrupted one goes on with `resume=`; otherwise it begins anew.
@@ -278,7 +278,7 @@ class StoryStage:
 
 @spec
 class Rehearse:
-    """Rehearses a story: runs modes one after the other, each in a folder of its own, and tells at the end what came of it.
+    """Run several modes in a row, each in a folder of its own, and report the outcome.
 
     Attributes:
         session: Folder, seed, device.
@@ -313,7 +313,7 @@ class Rehearse:
             )
 
     def run(self) -> None:
-        """Runs the stages that are not finished; writes `story.html` after each of them.
+        """Run the stages that are not finished; writes `story.html` after each of them.
 
         Raises:
             BrokkError: a stage failed; the story goes on from there with `resume=`.
@@ -335,7 +335,7 @@ class Rehearse:
         Console().print(f"story: {self.session.folder / STORY_FILE}", highlight=False)
 
     def _hand_on(self, folder: Path) -> dict[str, Any]:
-        """Writes what stages take from the story, as it was composed, into files that `group=@<file>` takes; returns it."""
+        """Write the composed groups of the story as files for `group=@<file>`; return them."""
         composed = yaml.safe_load((folder / RESOLVED).read_text())
         given = {name: composed[name] for name in (*HANDED_ON_GROUPS, "withheld")}
         (folder / HANDED_ON_FOLDER).mkdir(exist_ok=True)
@@ -348,7 +348,7 @@ class Rehearse:
         return given
 
     def _play(self, name: str, stage: StoryStage, folder: Path, given: dict[str, Any]) -> None:
-        """Runs one stage in a process of its own, as a person would, and waits for it."""
+        """Run one stage in a process of its own, as a person would, and waits for it."""
         place = folder / name
         for link, target in stage.links.items():
             path = folder / link
@@ -367,7 +367,7 @@ class Rehearse:
             if stage.resumes:
                 words += [f"resume={place}"]
             else:
-                shutil.rmtree(place)  # half of it: what is not finished has no record that says so
+                shutil.rmtree(place)  # an unfinished stage has no record
         with subprocess.Popen([sys.executable, "-P", "-m", "brokk_rl", *words]) as process:
             try:
                 code = process.wait()
@@ -382,5 +382,5 @@ class Rehearse:
 
 
 def _has_content(path: Path) -> bool:
-    """Says whether a YAML file holds anything but comments."""
+    """Return whether a YAML file holds anything but comments."""
     return path.is_file() and bool(yaml.safe_load(path.read_text()))

@@ -42,7 +42,7 @@ ORACLE_FILE = "oracle.json"
 
 @spec
 class ExamSettings:
-    """What to do, and with which cases.
+    """The step to do, and the cases.
 
     Attributes:
         do: `make` cases into the run folder, `run` a candidate on them, ask the `oracle`, `score`
@@ -52,7 +52,7 @@ class ExamSettings:
         candidate: Who answers.
         baselines: Who answers for comparison, by name.
         workers: Cases answered, recorded or weighed at once.
-        answers: What `score` compares: a name for each candidate, and the run folder with its
+        answers: Of `score`: a name for each candidate, and the run folder with its
             answers. `calibrate`: answers of the diagnosis to one or several exams.
         prices: Of `calibrate`: prices that it begins at.
         certainty: The same of the weights that say how sure an answer is.
@@ -61,7 +61,7 @@ class ExamSettings:
         oracles: Of `score`: run folder of `exam.do=oracle`; `null`: nobody asked it.
         ledger: File to which `score` appends its headlines; `null`: none.
         mix: Which cases there are.
-        plants: Machines that share no equations with what is examined.
+        plants: Machines, written apart from the library.
         roughness: How much of a machine no tidy model has: a name of the family's, `mild` or
             `strong`.
         reference: How the machine as it is believed to be is recorded.
@@ -117,13 +117,13 @@ class ExamSettings:
 
 @spec
 class Exam:
-    """Examines the diagnosis on cases whose cause is withheld: makes them, has them answered, scores the answers.
+    """Examine the diagnosis on cases with a withheld cause.
 
     Attributes:
         session: Folder and seed.
         machine: The machine of all cases.
-        excitation: What is played, by name; `exam.reference` and `exam.field` say in which file.
-        exam: What to do.
+        excitation: Excitations by name; `exam.reference` and `exam.field` give the file.
+        exam: The step and the cases.
         resume: Run folder of an interrupted `exam.do=run`, `oracle` or `baselines` to go on with;
             the same as `session.out`.
     """
@@ -148,11 +148,11 @@ class Exam:
             )
 
     def run(self) -> None:
-        """Does what `exam.do` says, in the run folder."""
+        """Do the step of `exam.do` in the run folder."""
         getattr(self, f"_{self.exam.do}")()
 
     def _make(self) -> None:
-        """Writes `cases/`, `labels.sealed.json` (mode 0600), `labels.sha256` and `exam.json`."""
+        """Write `cases/`, `labels.sealed.json` (mode 0600), `labels.sha256` and `exam.json`."""
         settings, folder = self.exam, self.session.folder
         is_exam = self.session.seed >= settings.first_sealed_seed
         if is_exam != settings.sealed:
@@ -195,14 +195,14 @@ class Exam:
         )
 
     def questions(self, salt: str) -> list[CaseDesign]:
-        """Returns the cases; those of an exam hang on the salt too, which nobody knows before the labels are opened."""
+        """Return the cases; those of a sealed exam depend on the secret salt too."""
         entropy = [self.session.seed, *(salt.encode() if self.exam.sealed else b"")]
         return self.exam.mix.questions(
-            self.machine, self.exam.plants.ailments, np.random.default_rng(entropy)
+            self.machine, self.exam.plants.outside_faults, np.random.default_rng(entropy)
         )
 
     def _run(self) -> None:
-        """Writes `<case>/diagnosis.json` and `<case>/sitting.json` for each case."""
+        """Write `<case>/diagnosis.json` and `<case>/sitting.json` for each case."""
         settings = self.exam
         cases = self._cases()
         with Progress(transient=True) as progress:
@@ -239,7 +239,7 @@ class Exam:
         return Path(self.exam.folder or "")
 
     def _oracle(self) -> None:
-        """Opens the labels; writes `oracle.json`, the share of the gap that the true effects of each case close."""
+        """Open the labels; write `oracle.json`: shares of the gap that true effects close."""
         labels = [
             label
             for label in dataset.open_labels(self._folder)["cases"]
@@ -271,7 +271,7 @@ class Exam:
         )
 
     def _baselines(self) -> None:
-        """Has every baseline answer every case, each into `<name>/`, then scores them beside `exam.answers`."""
+        """Have every baseline answer every case, then score them beside `exam.answers`."""
         cases, settings = self._cases(), self.exam
         usable = {
             name: one
@@ -299,7 +299,7 @@ class Exam:
         self._scored(settings.answers | {name: str(self.session.folder / name) for name in usable})
 
     def _calibrate(self) -> None:
-        """Opens the labels of development exams; writes `prices.yaml`, `certainty.yaml`; prints what answers were and would be."""
+        """Open development labels; write `prices.yaml` and `certainty.yaml`; print the change."""
         settings = self.exam
         cases = load_weighed_cases([Path(folder) for folder in settings.answers.values()])
         classes, of_machine = settings.mix.classes, self._of_machine()
@@ -351,7 +351,7 @@ class Exam:
         self._scored(self.exam.answers)
 
     def _scored(self, answers: Mapping[str, str]) -> None:
-        """Opens the labels; writes `marks.json`, `exam.html` and pictures, appends to the ledger, and prints the table."""
+        """Open the labels; write `marks.json`, report and ledger; print the table."""
         labels = dataset.open_labels(self._folder)
         facts = json.loads((self._folder / "exam.json").read_text())
         tables = {
@@ -368,7 +368,7 @@ class Exam:
         log.info("report: %s", self.session.folder / report.REPORT_FILE)
 
     def _table(self, folder: Path, labels: list[dict[str, Any]]) -> dict[str, Any]:
-        """Returns the figures of the answers in `folder`."""
+        """Return the figures of the answers in `folder`."""
         mix, marks = self.exam.mix, []
         best = (
             {}

@@ -57,7 +57,7 @@ def _add_lag(n: PlantParameters, size: FaultSizes) -> None:
 
 
 def _add_stiction(n: PlantParameters, size: FaultSizes) -> None:
-    """`start` counts from where the valve begins to open: the pressure that a small opening holds must break away."""
+    """Add a break-away pressure; `start` counts from where the valve begins to open."""
     overlap = np.minimum(n["overlap_extend"], n["overlap_retract"])
     open_at = np.maximum(size["start"] - overlap, 0.0) / (1.0 - overlap) * (size["start"] > 0)
     n["breakaway"] = open_at / (open_at + LAND_LEAK)
@@ -153,7 +153,7 @@ see it by."""
 
 
 def apply_faults(numbers: PlantParameters, faults: Mapping[str, FaultSizes]) -> PlantParameters:
-    """Returns a machine's numbers with faults.
+    """Return a machine's numbers with faults.
 
     Raises:
         ConfigError: a fault is unknown.

@@ -13,9 +13,10 @@ from exam.plants.plant_parameters import RAD_PER_CYCLE, PlantParameters
 
 GRAVITY_M_S2 = 9.81
 RIGID_S = 0.05
-"""Period of oscillation up to which a boom is as good as rigid at the rate of a recording."""
+"""Period of oscillation up to which a boom counts as rigid, s: a control period of 20 Hz."""
 HARDENS_AT = 0.05
-"""Deflection in rad (m) at which the spring of the boom is twice as stiff as at rest."""
+"""Deflection in rad (m) at which the spring of the boom is twice as stiff as at rest; chosen by
+hand."""
 
 
 class Boom:
@@ -35,7 +36,7 @@ class Boom:
         self._bent, self._rate, self._q = q.copy(), np.zeros_like(q), q.copy()
 
     def step(self, q: np.ndarray, speed: np.ndarray, dt_s: float) -> np.ndarray:
-        """Returns the positions of the links, `(N, J)`, whose actuators are at `q` and move with `speed`."""
+        """Return the positions of the links, `(N, J)`, for actuators at `q` with `speed`."""
         if self._soft.any():
             bend = q - self._bent
             pull = self._omega**2 * bend * (1.0 + (bend / HARDENS_AT) ** 2) + self._fade * (
@@ -79,7 +80,7 @@ class Arm:
         self._down = self._base.transpose(0, 2, 1) @ np.array([0.0, 0.0, -GRAVITY_M_S2])
 
     def load(self, q: np.ndarray) -> np.ndarray:
-        """Returns the weight on each joint in its positive direction, over its yield force, at `q`, `(N, J)`."""
+        """Return the weight on each joint over its yield force, positive along the joint, `(N, J)`."""
         at_m, axes, _ = self._chain(q)
         weight = np.zeros_like(q)
         for k, com_m in enumerate(self._centres):
@@ -90,7 +91,7 @@ class Arm:
         return weight / self._yield
 
     def tool(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the tip as instruments beside the machine see it, `(N, 3)` m, and its angle below the horizontal, `(N,)`."""
+        """Return the measured tip, `(N, 3)` m, and its angle below the horizontal, `(N,)`."""
         at_m, _, tip_m = self._chain(q)
         tip_m, last_m = ((self._base @ point[..., None])[..., 0] for point in (tip_m, at_m[-1]))
         along = tip_m - last_m
@@ -98,7 +99,7 @@ class Arm:
         return tip_m, np.arctan2(-along[:, 2], (along[:, :2] * heading).sum(1))
 
     def _chain(self, q: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
-        """Returns origins and axes of the joints and the tip, in the frame of the base; the centres of mass go to `_centres`."""
+        """Return origins, axes and tip in the base frame; store centres of mass in `_centres`."""
         turned, at_m = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
         origins, axes, self._centres = [], [], []
         for j, axis in enumerate(self._axes):
@@ -117,7 +118,7 @@ class Arm:
 
 
 def _rotate(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Returns the rotations about a unit axis by each angle, `(N, 3, 3)`."""
+    """Return the rotations about a unit axis by each angle, `(N, 3, 3)`."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return (

@@ -30,7 +30,7 @@ KINDS = (
 
 
 class OutOfLibraryFaults:
-    """All of them at work, each in the runs that have it.
+    """The faults of several runs side by side.
 
     Args:
         machine: Limits and period.
@@ -62,7 +62,7 @@ class OutOfLibraryFaults:
         self.bend = 0.12 * self._of.get("bouc_wen", np.zeros_like(severity))
 
     def command(self, u: np.ndarray) -> np.ndarray:
-        """Returns what the valve block makes of commands, `(N, J)`."""
+        """Return the commands that reach the valve block, `(N, J)`."""
         if (size := self._of.get("joystick_curve")) is not None:
             u = np.sign(u) * np.abs(u) ** (1.0 + 0.7 * size)
         if (size := self._of.get("cross_talk")) is not None:
@@ -78,7 +78,7 @@ class OutOfLibraryFaults:
         return u
 
     def later_s(self, u: np.ndarray, t_s: np.ndarray) -> np.ndarray:
-        """Returns how much later a frame with commands `u` comes, `(N, J)`, when the machine has run for `t_s`, `(N,)`."""
+        """Return the extra delay of a frame, `(N, J)`, after a running time of `t_s`, `(N,)`."""
         later_s = np.zeros_like(u)
         if (size := self._of.get("warm_delay")) is not None:
             later_s = later_s + 0.22 * size * (1.0 - np.exp(-t_s / 500.0))[:, None]
@@ -88,7 +88,7 @@ class OutOfLibraryFaults:
         return later_s
 
     def tempo(self, k: int, q: np.ndarray, flow: np.ndarray) -> np.ndarray | float:
-        """Returns a factor on the speeds in control period `k`, at `q` with `flow` of full flow, each `(N, J)`."""
+        """Return a factor on the speeds in period `k`, at `q` with `flow` of full flow."""
         factor, at = 1.0, (q - self._lower) / self._travel
         if (size := self._of.get("pose_friction")) is not None:
             factor = factor * (1.0 - 0.6 * size * np.exp(-(((at - 0.5) / 0.15) ** 2)))
@@ -110,6 +110,6 @@ class OutOfLibraryFaults:
         return factor
 
     def shown(self, q: np.ndarray) -> np.ndarray:
-        """Returns the angles that the encoders' discs show at `q`, `(N, J)`."""
+        """Return the angles that the encoders' discs show at `q`, `(N, J)`."""
         size = self._of.get("dial_error")
         return q if size is None else q + 0.05 * size * np.sin(RAD_PER_CYCLE * q / 0.7)

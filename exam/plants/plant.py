@@ -28,11 +28,11 @@ POWER_STAGES = {
     "throttled": ThrottleValves,
 }
 MOVING = 0.01
-"""Speed, of full speed, from which a joint moves."""
+"""Speed, of full speed, from which a joint moves; chosen by hand."""
 DROOP_S = 1.5
-"""Time in which the supply gives way and recovers."""
+"""Time in which the supply drops and recovers, s; chosen by hand."""
 WARM_S = 900.0
-"""Time constant of the tank's temperature."""
+"""Time constant of the tank's temperature, s; chosen by hand: a quarter of an hour."""
 
 
 class ExamPlant:
@@ -42,8 +42,8 @@ class ExamPlant:
         machine: Geometry, masses, limits.
         make: See `anatomy.MAKES`.
         anatomies: Numbers of each run's machine.
-        strangers: Kind of ailment outside the library of each run, or `None`; its severity is the
-            number `stranger`.
+        outside_faults: Kind of the fault outside the library of each run, or `None`; its severity is the
+            parameter `outside_severity`.
         seeds: Chance of each run.
         elapsed_s: How long each machine has run before.
         tracked: Whether the tool of each run is measured.
@@ -55,7 +55,7 @@ class ExamPlant:
         machine: Machine,
         make: str,
         anatomies: Sequence[PlantParameters],
-        strangers: Sequence[str | None],
+        outside_faults: Sequence[str | None],
         seeds: Sequence[int],
         elapsed_s: np.ndarray,
         tracked: Sequence[bool],
@@ -75,8 +75,8 @@ class ExamPlant:
         self._luck = np.stack([chance.luck for chance in self._chance], 1)
         self._line, self._valve = CommandBus(n, machine.period_s), SpoolValve(n)
         self._power = POWER_STAGES[make](n, machine)
-        self._strangers = OutOfLibraryFaults(
-            machine, list(strangers), n["stranger"], self._luck[:, :, 2]
+        self._outside_faults = OutOfLibraryFaults(
+            machine, list(outside_faults), n["outside_severity"], self._luck[:, :, 2]
         )
         self._arm, self._encoders = Arm(machine, n), Encoders(n, machine.period_s)
         self._q = np.tile(machine.home, (count, 1))
@@ -97,14 +97,14 @@ class ExamPlant:
         return self._true
 
     def read(self) -> JointState:
-        """Returns what the encoders show now."""
-        shown = self._strangers.shown(self._true), self._strangers.shown(self._earlier)
+        """Return the present readings of the encoders."""
+        shown = self._outside_faults.shown(self._true), self._outside_faults.shown(self._earlier)
         return JointState(
             self._k * self._machine.period_s, self._encoders.read(*shown, self._noise[self._k])
         )
 
     def extra(self) -> Mapping[str, np.ndarray]:
-        """Returns the measured tool, NaN where nobody measures it; empty where that is so in all runs."""
+        """Return the measured tool, NaN in runs without a tracker; empty where none has one."""
         if not self._tracked.any():
             return {}
         tip_m, pitch_rad = self._arm.tool(self._true)
@@ -118,19 +118,19 @@ class ExamPlant:
         return dict(zip(("ee_x_m", "ee_y_m", "ee_z_m", "ee_pitch_rad"), seen.T, strict=True))
 
     def send(self, command: Command) -> Command:
-        """Moves on by one control period with these commands, `(N, J)`."""
+        """Move on by one control period with these commands, `(N, J)`."""
         machine, n, k = self._machine, self._n, self._k
         power, dt_s = self._power, self._power.dt_s
         t_s, run_s = k * machine.period_s, self._elapsed_s + k * machine.period_s
-        u = self._strangers.command(np.asarray(command.u, dtype=float))
+        u = self._outside_faults.command(np.asarray(command.u, dtype=float))
         luck = self._luck[k]
-        self._line.send(u, t_s, luck[:, :1], luck[:, 1:2], self._strangers.later_s(u, run_s))
+        self._line.send(u, t_s, luck[:, :1], luck[:, 1:2], self._outside_faults.later_s(u, run_s))
         tempo, load = self._tempo(k, run_s), self._arm.load(self._true)
         self._earlier = self._true
         for i in range(round(machine.period_s / dt_s)):
             moving = np.abs(power.speed) > MOVING
             opening = self._valve.step(
-                self._line.at(t_s + i * dt_s), dt_s, self._strangers.bend, moving, load
+                self._line.at(t_s + i * dt_s), dt_s, self._outside_faults.bend, moving, load
             )
             self._flow = self._shared(opening, load)
             speed = power.step(self._flow * tempo, load) * machine.max_speed
@@ -148,24 +148,24 @@ class ExamPlant:
         return command
 
     def _tempo(self, k: int, run_s: np.ndarray) -> np.ndarray:
-        """Returns a factor on all flows in this control period, `(N, J)`: oil, supply, chance, and what nobody has a name for."""
+        """Return a factor on all flows, `(N, J)`: oil, supply, chance, outside faults."""
         n = self._n
         work = np.minimum((np.abs(self._flow) * n["demand"]).sum(1, keepdims=True), 1.0)
         self._droop += (work - self._droop) * self._machine.period_s / DROOP_S
         warm = 1.0 + n["warm_up"] * (1.0 - np.exp(-run_s / WARM_S))[:, None]
         drifted = 1.0 + n["drift"] * (1.0 - np.exp(-run_s[:, None] / n["drift_s"]))
         tempo = (1.0 + self._wander[k]) * warm * drifted * (1.0 - n["droop"] * self._droop)
-        return np.maximum(tempo * self._strangers.tempo(k, self._true, self._flow), 0.0)
+        return np.maximum(tempo * self._outside_faults.tempo(k, self._true, self._flow), 0.0)
 
     def _shared(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Returns the flows that the pump can give of those asked for, `(N, J)`."""
+        """Return the flows that the pump can give of those asked for, `(N, J)`."""
         asked = np.abs(opening) * self._n["demand"]
         total = asked.sum(1, keepdims=True)
         if not (total > 1.0).any():
             return opening
         if not self._starving:
             return opening / np.maximum(total, 1.0)
-        # oil takes the easiest way: what is missing is missing where the load is heaviest
+        # oil takes the easiest way: the heaviest load gets the least
         heavy = asked * np.exp(-2.0 * np.sign(opening) * load)
         given = np.maximum(
             asked
@@ -182,7 +182,7 @@ class ExamPlant:
 
 
 class _RunNoise:
-    """All random numbers of one run, drawn beforehand, so that a run is the same whatever runs beside it."""
+    """Random numbers of one run, drawn beforehand: a run does not depend on its neighbours."""
 
     def __init__(self, seed: int, anatomy: PlantParameters, steps: int, machine: Machine) -> None:
         generator = np.random.default_rng(seed)
@@ -204,7 +204,7 @@ class _RunNoise:
 
 @spec
 class HydraulicPlants:
-    """Hydraulic arms of three makes (chambers, compensated, throttled), each machine with numbers and nuisances of its own.
+    """Hydraulic arms of three makes (chambers, compensated, throttled), each machine unique.
 
     Attributes:
         roughness: By name, how much hysteresis, waviness, wandering, droop and warm-up a machine
@@ -219,21 +219,21 @@ class HydraulicPlants:
         return tuple(FAULTS)
 
     @property
-    def ailments(self) -> tuple[str, ...]:
-        """Names of what its plants can have that no library knows."""
+    def outside_faults(self) -> tuple[str, ...]:
+        """Names of the faults outside the library that its plants can have."""
         return out_of_library_faults.KINDS
 
     def makes(self, machine: Machine, specimens: Sequence[PlantRun]) -> list[str]:
-        """Returns the make of each specimen."""
+        """Return the make of each specimen."""
         return [
             plant_parameters.draw_plant(machine, specimen.seed, 1.0)[0] for specimen in specimens
         ]
 
     def build(self, machine: Machine, specimens: Sequence[PlantRun], run_s: float) -> ExamPlant:
-        """Returns specimens of one make, side by side.
+        """Return specimens of one make, side by side.
 
         Raises:
-            ConfigError: an effect, an ailment or a roughness is unknown.
+            ConfigError: an effect, an outside_fault or a roughness is unknown.
         """
         found = []
         for specimen in specimens:
@@ -246,15 +246,18 @@ class HydraulicPlants:
                 machine, specimen.seed, self.roughness[specimen.roughness]
             )
             numbers = apply_faults(numbers, specimen.faults)
-            if specimen.ailment is not None:
-                numbers["stranger"] = specimen.ailment.severity
+            if specimen.outside_fault is not None:
+                numbers["outside_severity"] = specimen.outside_fault.severity
             found.append((make, numbers))
         (make,) = {make for make, _ in found}
         return ExamPlant(
             machine,
             make,
             [numbers for _, numbers in found],
-            [specimen.ailment.kind if specimen.ailment else None for specimen in specimens],
+            [
+                specimen.outside_fault.kind if specimen.outside_fault else None
+                for specimen in specimens
+            ],
             [specimen.chance for specimen in specimens],
             np.array([specimen.elapsed_s for specimen in specimens]),
             [specimen.tracked for specimen in specimens],

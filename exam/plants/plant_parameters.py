@@ -32,8 +32,8 @@ RANGES = {
     "lever": (0.0, 0.05),  # change of the cylinder's lever arm over the travel
     "noise_rad": (0.0002, 0.0005),
 }
-"""Per joint, uniform. Sizes are those of the class; see the machine's file for what is known of a
-real one."""
+"""Range of each parameter, uniform and by joint; chosen by hand for machines of the class. The
+machine's file has the sources of a real one."""
 
 NUISANCES = {
     "hysteresis": (0.006, 0.02),  # play between command and spool, of full command
@@ -43,16 +43,17 @@ NUISANCES = {
     "droop": (0.01, 0.03),  # loss of speed at full demand after a few seconds
     "warm_up": (-0.01, 0.03),  # change of speed over the first half hour
 }
-"""The same for what no tidy model has; all but times scale with the roughness."""
+"""The same for nuisances without a tidy model; all but times scale with the roughness. Chosen by
+hand; `benchmarks/exam/floors.py` measures the resulting floors."""
 
 
 def draw_plant(machine: Machine, seed: int, roughness: float) -> tuple[str, PlantParameters]:
-    """Returns make and numbers of the machine with this seed.
+    """Return make and numbers of the machine with this seed.
 
     Args:
         machine: Number of joints.
         seed: Same seed, same machine.
-        roughness: Size of what no tidy model has; 1 is calibrated to a mild floor.
+        roughness: Size of the nuisances.
     """
     generator = np.random.default_rng(seed)
     make = MAKES[int(generator.integers(len(MAKES)))]
@@ -82,7 +83,7 @@ RAD_PER_CYCLE = 2.0 * np.pi
 """Radians a second for one hertz."""
 ZERO_WITHOUT_FAULT = (
     "jitter_s", "loss", "pilot_s", "stroke_s", "leak", "breakaway", "gap_rad", "soft_s", "soft_damping", "drift", "stamp_s",
-    "step_rad", "bias_rad", "extra_m", "roll_rad", "pitch_rad", "extra_noise_rad", "stranger",
+    "step_rad", "bias_rad", "extra_m", "roll_rad", "pitch_rad", "extra_noise_rad", "outside_severity",
 )  # fmt: skip
 """Numbers that are 0 in a machine without faults."""
 NEUTRAL_WITHOUT_FAULT = {"stop": 1.0, "extend": 1.0, "retract": 1.0, "scale": 1.0, "drift_s": 600.0}

@@ -22,7 +22,7 @@ used."""
 
 
 def compute_friction(speed: np.ndarray, dry: np.ndarray, viscous: np.ndarray) -> np.ndarray:
-    """Returns friction force over speed: a dry part that is smooth through zero, and a viscous one."""
+    """Return friction force over speed: a dry part that is smooth through zero, and a viscous one."""
     return dry / np.sqrt(speed * speed + SMOOTHING_SPEED * SMOOTHING_SPEED) + viscous
 
 
@@ -31,8 +31,8 @@ CHAMBER_FORCE_RATIO = 1.4
 ROD_AREA = 0.75
 """Area of the rod side over that of the bore."""
 BACK_PRESSURE = 0.45
-"""Pressure in the emptying chamber at full speed without load: what keeps a falling load from
-running away."""
+"""Pressure in the emptying chamber at full speed without load; it keeps a falling load from running
+away."""
 REST_PRESSURE = 0.40
 """Pressure on the rod side of a machine that has just stopped."""
 DROP_OUT, DROP_IN = 1.0 - ROD_AREA * BACK_PRESSURE, 1.0 - BACK_PRESSURE
@@ -66,7 +66,7 @@ class TwoChamberCylinders:
         )  # first mode at 6 Hz
         self._push = force / (inertia * machine.max_speed)  # 1/s
         self._stiff = (RAD_PER_CYCLE * mode_hz) ** 2 / self._push / (1.0 + ROD_AREA)  # 1/s
-        # what is soft rings with its own damping, and what rubs less lets it
+        # a soft hose rings with its own damping, and lower friction allows it
         ringing = 2.0 * numbers["soft_damping"] * RAD_PER_CYCLE * mode_hz / self._push
         self._friction = numbers["friction"] * (1.0 - 0.7 * hose)
         self._viscous = numbers["viscous"] + hose * (
@@ -75,7 +75,7 @@ class TwoChamberCylinders:
         self._leak = numbers["leak"] / machine.max_speed
 
     def begin(self, load: np.ndarray) -> None:
-        """Lets the cylinders of resting joints bear their load, `(N, J)`."""
+        """Let the cylinders of resting joints bear their load, `(N, J)`."""
         self._rod = np.clip(
             np.full_like(load, REST_PRESSURE) + load / CHAMBER_FORCE_RATIO / ROD_AREA,
             REST_PRESSURE,
@@ -84,7 +84,7 @@ class TwoChamberCylinders:
         self._bore = ROD_AREA * self._rod - load / CHAMBER_FORCE_RATIO
 
     def step(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Returns the speeds after a time step, of `max_speed`.
+        """Return the speeds after a time step, of `max_speed`.
 
         Args:
             opening: Signed flow asked for, of that at full speed, `(N, J)`.
@@ -99,7 +99,7 @@ class TwoChamberCylinders:
         outlet = area * np.sqrt(
             np.maximum(np.where(out, rod, bore / ROD_AREA), 0.0) / BACK_PRESSURE
         )
-        lost = -self._leak * load  # what the weight presses through the closed valve
+        lost = -self._leak * load  # leak through the closed valve by the weight
         into_bore = np.where(out, inlet, -outlet) - lost
         from_rod = np.where(out, outlet, -inlet) + lost  # at the scale of the bore's speed
         speed = self.speed
@@ -114,7 +114,7 @@ class TwoChamberCylinders:
         return speed
 
     def stopped(self, where: np.ndarray) -> None:
-        """Takes the speed from joints at their stops, `(N, J)` bool."""
+        """Take the speed from joints at their stops, `(N, J)` bool."""
         self.speed = np.where(where, 0.0, self.speed)
 
 
@@ -142,11 +142,11 @@ class CompensatedValves:
         self._leak = numbers["leak"] / machine.max_speed
 
     def begin(self, load: np.ndarray) -> None:
-        """Lets the cylinders of resting joints bear their load, `(N, J)`."""
+        """Let the cylinders of resting joints bear their load, `(N, J)`."""
         self._force = -load / COMPENSATED_FORCE_RATIO
 
     def step(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Returns the speeds after a time step, of `max_speed`; see `chambers` for the arguments."""
+        """Return the speeds after a time step, of `max_speed`; see `chambers` for the arguments."""
         n, dt_s = self._n, self.dt_s
         # the compensator's spring gives: flow falls in proportion to the load it works against
         flow = opening * np.clip(1.0 + 0.5 * n["sensitivity"] * np.sign(opening) * load, 0.2, 1.8)
@@ -166,7 +166,7 @@ class CompensatedValves:
         return self.speed
 
     def stopped(self, where: np.ndarray) -> None:
-        """Takes the speed from joints at their stops, `(N, J)` bool."""
+        """Take the speed from joints at their stops, `(N, J)` bool."""
         self.speed = np.where(where, 0.0, self.speed)
 
 
@@ -182,10 +182,10 @@ class ThrottleValves:
         self._keep = np.exp(-self.dt_s / numbers["answer_s"])
 
     def begin(self, load: np.ndarray) -> None:
-        """Does nothing: there is no pressure to build up."""
+        """Do nothing: there is no pressure to build up."""
 
     def step(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Returns the speeds after a time step, of `max_speed`; see `chambers` for the arguments."""
+        """Return the speeds after a time step, of `max_speed`; see `chambers` for the arguments."""
         grip = 0.5 * self._n["sensitivity"] / (0.4 + 0.6 * np.minimum(np.abs(opening), 1.0))
         settled = (
             opening * np.clip(1.0 + grip * np.sign(opening) * load, 0.2, 1.8) + self._sink * load
@@ -194,5 +194,5 @@ class ThrottleValves:
         return self.speed
 
     def stopped(self, where: np.ndarray) -> None:
-        """Takes the speed from joints at their stops, `(N, J)` bool."""
+        """Take the speed from joints at their stops, `(N, J)` bool."""
         self.speed = np.where(where, 0.0, self.speed)

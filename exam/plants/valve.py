@@ -11,10 +11,10 @@ from exam.plants.plant_parameters import PlantParameters
 
 TAU = 2.0 * np.pi
 LAND_LEAK = 0.08
-"""Opening at which the leak over the metering land takes half of the pressure from a joint that
-does not move."""
+"""Opening at which the leak over the metering land takes half of the pressure from a joint at rest;
+chosen by hand."""
 WEIGHT_SHARE = 0.25
-"""How much a load of yield force changes the pressure that a joint needs to break away."""
+"""Change of the break-away pressure by a load of yield force; chosen by hand."""
 
 
 class SpoolValve:
@@ -40,7 +40,7 @@ class SpoolValve:
     def step(
         self, u: np.ndarray, dt_s: float, bend: np.ndarray, moving: np.ndarray, load: np.ndarray
     ) -> np.ndarray:
-        """Returns signed openings after a time step, 1 for a fully open port, waviness included.
+        """Return signed openings after a time step, 1 for a fully open port, waviness included.
 
         Args:
             u: Commands in force.

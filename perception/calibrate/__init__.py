@@ -1,1 +1,1 @@
-"""Where the camera is in the base frame: from a board on the arm or from touched points, stored with its uncertainty."""
+"""Camera extrinsics: from a board on the arm, two pose logs or touched points."""

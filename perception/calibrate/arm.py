@@ -1,4 +1,4 @@
-"""Where joint positions put the last link, and how it moves when they are not what they seem."""
+"""Poses of the arm's last link from joint positions, and their sensitivity to errors."""
 
 from __future__ import annotations
 
@@ -13,6 +13,13 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from perception.calibrate import transforms
+
+SPEED_INTERVAL_S = 0.1
+"""Joint speeds are differences over this time; chosen by hand, several samples of a recording."""
+MIN_TOOL_ACROSS = 0.1
+"""Least part of the unit tool axis across the last joint that still defines the link's x axis."""
+TRAVEL_SLACK = 0.1
+"""Positions may exceed a joint's travel by this, rad or m; more means other units."""
 
 
 @dataclass(frozen=True)
@@ -32,43 +39,41 @@ class LinkPoses:
 
 
 def compute_link_poses(machine: Machine, q: np.ndarray) -> LinkPoses:
-    """Returns the last link at joint positions, `(N, J)`, rad or m.
+    """Return the last link at joint positions, `(N, J)`, rad or m.
 
     Raises:
         ConfigError: the machine's geometry is not known.
     """
-    found = compute_tool_kinematics(machine, q)
-    origins, axes, along, tip = (
-        found.joints_in_base_m,
-        found.axes_in_base,
-        found.axis_in_base,
-        found.tip_in_base_m,
-    )
+    tool = compute_tool_kinematics(machine, q)
+    origins, axes, along = tool.joints_in_base_m, tool.axes_in_base, tool.axis_in_base
     z = axes[:, -1]
     x = along - (along * z).sum(-1, keepdims=True) * z
-    if (
-        np.linalg.norm(x, axis=-1).min() < 0.1
-    ):  # a tool along its own joint: any direction across will do
+    # a tool along its own joint defines no x axis: any fixed direction across the joint will do
+    if np.linalg.norm(x, axis=-1).min() < MIN_TOOL_ACROSS:
         x = axes[:, 0] - (axes[:, 0] * z).sum(-1, keepdims=True) * z
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)
-    turn = np.stack([x, np.cross(z, x), z], -1)
+    rotation = np.stack([x, np.cross(z, x), z], -1)
     hinge = np.array([joint.kind == "hinge" for joint in machine.joints])[:, None]
     motions = np.concatenate(
         [np.where(hinge, np.cross(origins, axes), axes), np.where(hinge, axes, 0.0)], -1
     )
-    return LinkPoses(transforms.make_transform(turn, tip), motions, tip)
+    tip = tool.tip_in_base_m
+    return LinkPoses(transforms.make_transform(rotation, tip), motions, tip)
 
 
 def build_wobble_motions(base_from_link: np.ndarray, shift_m: float, turn_rad: float) -> np.ndarray:
-    """Returns motions of links about themselves in all six directions, `(N, 6, 6)` in the base frame."""
-    found = np.zeros((len(base_from_link), 6, 6))
+    """Return motions of links about their origins in six directions, `(N, 6, 6)`, base frame."""
+    motions = np.zeros((len(base_from_link), 6, 6))
     for k, unit in enumerate(np.eye(3)):
-        found[:, k, :3] = shift_m * unit
-        found[:, 3 + k, :3], found[:, 3 + k, 3:] = (
-            turn_rad * np.cross(base_from_link[:, :3, 3], unit),
-            turn_rad * unit,
-        )
-    return found
+        motions[:, k, :3] = shift_m * unit
+        motions[:, 3 + k, :3] = turn_rad * np.cross(base_from_link[:, :3, 3], unit)
+        motions[:, 3 + k, 3:] = turn_rad * unit
+    return motions
+
+
+def interpolate_columns(t_s: np.ndarray | float, times_s: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the rows of `q`, `(T, J)` at `times_s`, interpolated linearly at `t_s`."""
+    return np.stack([np.interp(t_s, times_s, column) for column in q.T], -1)
 
 
 @dataclass(frozen=True)
@@ -86,27 +91,25 @@ class JointTrajectory:
     names: tuple[str, ...] | None
 
     def at(self, name: str, t_s: float) -> np.ndarray | None:
-        """Returns the joint positions of a frame, `(J,)`; `None` where nobody knows them."""
+        """Return the joint positions of a frame, `(J,)`; `None` where they are not known."""
         if self.names is not None:
             return self.q[self.names.index(name)] if name in self.names else None
         times = np.asarray(self.t_s)
         if not times[0] <= t_s <= times[-1]:
             return None
-        return np.array([np.interp(t_s, times, column) for column in self.q.T])
+        return interpolate_columns(t_s, times, self.q)
 
-    def speed(self, t_s: np.ndarray, over_s: float = 0.1) -> np.ndarray:
-        """Returns joint speeds, `(N, J)`, at times; nothing moves where positions belong to frames."""
+    def speed(self, t_s: np.ndarray) -> np.ndarray:
+        """Return joint speeds, `(N, J)`, at times; 0 where positions belong to frames."""
         if self.t_s is None:
             return np.zeros((len(t_s), self.q.shape[1]))
-        ends = [
-            np.stack([np.interp(t_s + half, self.t_s, column) for column in self.q.T], 1)
-            for half in (-over_s / 2, over_s / 2)
-        ]
-        return (ends[1] - ends[0]) / over_s
+        begin = interpolate_columns(t_s + -SPEED_INTERVAL_S / 2, self.t_s, self.q)
+        end = interpolate_columns(t_s + SPEED_INTERVAL_S / 2, self.t_s, self.q)
+        return (end - begin) / SPEED_INTERVAL_S
 
 
 def read_joint_positions(path: Path, machine: Machine) -> JointTrajectory:
-    """Returns joint positions from a recording (Parquet), or from YAML: `<stem>: [q1, …]`, rad or m.
+    """Read a recording (Parquet), or YAML of `<stem of a frame>: [q1, …]`, rad or m.
 
     Raises:
         ConfigError: the file cannot be read as such.
@@ -114,21 +117,22 @@ def read_joint_positions(path: Path, machine: Machine) -> JointTrajectory:
     """
     if path.suffix == ".parquet":
         recording = record.read_recording(path, machine)
-        return JointTrajectory(
-            np.asarray(recording.t_s, float), np.asarray(recording.q, float), None
-        )
+        t_s, q = np.asarray(recording.t_s, float), np.asarray(recording.q, float)
+        return JointTrajectory(t_s, q, None)
     try:
-        told = yaml.safe_load(path.read_text())
-        names, q = tuple(str(name) for name in told), np.array(list(told.values()), float)
+        data = yaml.safe_load(path.read_text())
+        names, q = tuple(str(name) for name in data), np.array(list(data.values()), float)
     except (OSError, yaml.YAMLError, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(
-            f"{path}: expected a recording (*.parquet), or YAML of '<stem of a frame>: [joint positions]' ({error})"
+            f"{path}: expected a recording (*.parquet), or YAML of "
+            f"'<stem of a frame>: [joint positions]' ({error})"
         ) from error
     if q.ndim != 2 or q.shape[1] != machine.num_joints or not np.isfinite(q).all():
         raise ConfigError(
-            f"{path}: expected {machine.num_joints} joint positions for each frame, in machine order, rad or m"
+            f"{path}: expected {machine.num_joints} joint positions for each frame, in machine "
+            "order, rad or m"
         )
-    outside = (q < machine.lower - 0.1) | (q > machine.upper + 0.1)
+    outside = (q < machine.lower - TRAVEL_SLACK) | (q > machine.upper + TRAVEL_SLACK)
     if outside.any():
         row, column = np.argwhere(outside)[0]
         joint = machine.joints[column]

@@ -1,11 +1,11 @@
-"""How a camera sees a flat board: one pose or two that fit, and how well the corners decide each."""
+"""Calibration from frames of a board on the arm and the joint positions there."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,155 +25,153 @@ from perception.calibrate.hand_eye import (
     predict_board_poses,
     solve_hand_eye,
 )
-from perception.label.camera_pose import BoardTracker
+from perception.label.camera_pose import Charuco, TagGrid
 
-# --- from by_board: Calibration from frames of a board on the arm and the joint positions there.
+log = logging.getLogger(__name__)
 
 MAX_ERROR_RATIO = 3.0
-"""A second pose whose error is less than this many times the first's is kept: the arm decides."""
+"""A second pose is kept if its error is less than this many times the first's; chosen by hand.
+
+The poses of the arm then decide between the two.
+"""
 NUM_CANDIDATES = 2
+MIN_TURN_SHARE = 0.1
+"""Below this part of `least_turn_rad` about the second axis the problem counts as singular."""
 
 
 @dataclass(frozen=True)
 class BoardPose:
-    """A board in one frame.
+    """Pose of a board in one frame.
 
     Attributes:
         camera_from_board: Poses that fit, the better first, `(2, 4, 4)`; twice the same where the
             corners leave no doubt.
         cov: Covariance of each as a small motion in the board's frame, `(2, 6, 6)`.
         error_px: Root mean square reprojection error of the better.
-        middle_px: Where the board is in the picture, `(2,)`.
     """
 
     camera_from_board: np.ndarray
     cov: np.ndarray
     error_px: float
-    middle_px: np.ndarray
 
 
 def estimate_board_pose(
-    frame: Frame, there_m: np.ndarray, seen_px: np.ndarray, corner_px: float, max_error_px: float
+    frame: Frame,
+    corners_m: np.ndarray,
+    corners_px: np.ndarray,
+    corner_px: float,
+    max_error_px: float,
 ) -> BoardPose:
-    """Returns the board's poses.
+    """Return the one or two poses of a flat board that fit its corners.
 
     Args:
         frame: Gives camera matrix and distortion.
-        there_m: Corners on the board, `(n, 3)`.
-        seen_px: The same in the picture, `(n, 2)`.
-        corner_px: Standard deviation of a corner; where the corners show more, that counts.
+        corners_m: Corners on the board, `(n, 3)`.
+        corners_px: The same in the picture, `(n, 2)`.
+        corner_px: Least standard deviation of a corner; a larger reprojection error replaces it.
         max_error_px: Largest root mean square reprojection error.
 
     Raises:
         FrameError: the corners fit no pose.
     """
-    matrix, dist = np.asarray(frame.camera_matrix, float), frame.distortion
-    # at its middle a small motion of the board is least entangled: shift and turn are nearly
-    # independent there
-    found = []
+    matrix, distortion = np.asarray(frame.camera_matrix, float), frame.distortion
+    fits = []
     count, turns, shifts, _ = cv2.solvePnPGeneric(
-        there_m, seen_px, matrix, dist, flags=cv2.SOLVEPNP_IPPE
+        corners_m, corners_px, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
     )
     for turn, shift in zip(turns[:count], shifts[:count], strict=True):
-        turn, shift = cv2.solvePnPRefineLM(there_m, seen_px, matrix, dist, turn, shift)
+        turn, shift = cv2.solvePnPRefineLM(corners_m, corners_px, matrix, distortion, turn, shift)
         pose = transforms.make_transform(np.asarray(cv2.Rodrigues(turn)[0]), np.ravel(shift))
-        if not np.isfinite(pose).all() or (there_m @ pose[:3, :3].T + pose[:3, 3])[:, 2].min() <= 0:
+        depth_m = (corners_m @ pose[:3, :3].T + pose[:3, 3])[:, 2]
+        if not np.isfinite(pose).all() or depth_m.min() <= 0:
             continue  # behind the camera
-        away = cv2.projectPoints(there_m, turn, shift, matrix, dist)[0][:, 0] - seen_px
-        found.append((float(np.sqrt((away**2).sum(1).mean())), pose))
-    found.sort(key=lambda one: one[0])
-    if not found or found[0][0] > max_error_px:
-        what = (
-            "fit no pose"
-            if not found
-            else f"miss by {found[0][0]:.1f} px, {max_error_px:g} are allowed"
+        projected = cv2.projectPoints(corners_m, turn, shift, matrix, distortion)[0][:, 0]
+        fits.append((float(np.sqrt(((projected - corners_px) ** 2).sum(1).mean())), pose))
+    fits.sort(key=lambda fit: fit[0])
+    if not fits:
+        raise FrameError(f"{frame.name}: the board's corners fit no pose")
+    best_px = fits[0][0]
+    if best_px > max_error_px:
+        raise FrameError(
+            f"{frame.name}: the board's corners miss by {best_px:.1f} px, {max_error_px:g} are "
+            "allowed"
         )
-        raise FrameError(f"{frame.name}: the board's corners {what}")
-    best_px = found[0][0]
-    kept = [
-        pose
-        for error_px, pose in found[:NUM_CANDIDATES]
-        if error_px <= MAX_ERROR_RATIO * max(best_px, corner_px)
-    ]
+    largest_px = MAX_ERROR_RATIO * max(best_px, corner_px)
+    kept = [pose for error_px, pose in fits[:NUM_CANDIDATES] if error_px <= largest_px]
     poses = np.stack([*kept, *kept[:1]][:NUM_CANDIDATES])
     # two numbers a corner, six of them spent on the pose
-    std_px = max(corner_px, best_px * np.sqrt(len(there_m) / max(2 * len(there_m) - 6, 1)))
-    cov = np.stack(
-        [
-            std_px**2 * np.linalg.inv(_compute_pose_information(pose, there_m, matrix))
-            for pose in poses
-        ]
+    freedom = max(2 * len(corners_m) - 6, 1)
+    std_px = max(corner_px, best_px * np.sqrt(len(corners_m) / freedom))
+    information = [_compute_pose_information(pose, corners_m, matrix) for pose in poses]
+    return BoardPose(
+        poses, np.stack([std_px**2 * np.linalg.inv(one) for one in information]), best_px
     )
-    return BoardPose(poses, cov, best_px, seen_px.mean(0))
 
 
 def _compute_pose_information(
-    pose: np.ndarray, there_m: np.ndarray, matrix: np.ndarray
+    pose: np.ndarray, corners_m: np.ndarray, matrix: np.ndarray
 ) -> np.ndarray:
-    """Returns how the corners pin a small motion of the board, `(6, 6)` px^2 each; the lens is straight enough for that."""
-    point = there_m @ pose[:3, :3].T + pose[:3, 3]
+    """Return the information of the corners on a small motion of the board, `(6, 6)`, px^2.
+
+    Lens distortion is neglected: its slope is small.
+    """
+    point = corners_m @ pose[:3, :3].T + pose[:3, 3]
     x, y, z = point.T
     slope = np.zeros((len(point), 2, 3))
     slope[:, 0, 0], slope[:, 0, 2] = matrix[0, 0] / z, -matrix[0, 0] * x / z**2
     slope[:, 1, 1], slope[:, 1, 2] = matrix[1, 1] / z, -matrix[1, 1] * y / z**2
-    motion = np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(point), 3, 3)), -transforms.build_cross_matrices(there_m)],
-        2,
-    )
+    shift = np.broadcast_to(np.eye(3), (len(point), 3, 3))
+    motion = np.concatenate([shift, -transforms.build_cross_matrices(corners_m)], 2)
     rows = (slope @ pose[:3, :3] @ motion).reshape(-1, 6)
     return rows.T @ rows + 1e-9 * np.eye(6)
 
 
-log = logging.getLogger(__name__)
-
-
-class BoardSpec(Protocol):
-    """A board of `conf/perception/camera_pose`."""
-
-    def build(self) -> BoardTracker:
-        """Returns a tracker."""
-        ...
-
-
 @dataclass(frozen=True)
 class BoardObservation:
-    """A frame in which the board was found: its name, time, the board, and the joint positions, `(J,)`."""
+    """A frame in which the board was found.
+
+    Attributes:
+        name: Stem of the frame.
+        t_s: Its time.
+        pose: The board.
+    """
 
     name: str
     t_s: float
     pose: BoardPose
-    q: np.ndarray
 
 
 @spec
 class BoardCalibration:
-    """A board on the last link, somewhere, watched by a camera that stands still in the base frame.
+    """A board on the last link, watched by a camera that stands still in the base frame.
+
+    The board's pose on the link is estimated too.
 
     Attributes:
         source: The frames.
-        board: What it looks like.
+        board: Layout of the board.
         joints: A recording (Parquet) that ran along, or YAML: stem of a frame to its joint
             positions.
         corner_px: Standard deviation of a corner in the picture.
-        max_error_px: Largest reprojection error of a board that is believed.
-        joint_std_rad: By how much a joint is off in each pose on its own (rad or m): backlash,
-            sensor.
-        zero_std_rad: By how much the zero of a joint may be off in all poses (rad or m); 0 leaves
-            zeros alone. They are estimated along, as far as the poses tell; a wrong zero of the
-            first joint is part of the camera's place as the arm sees it.
-        wobble_m: By which the link is elsewhere in each pose beyond what joints do, standard
+        max_error_px: Largest reprojection error of a board that is used.
+        joint_std_rad: Independent error of a joint in each pose, standard deviation (rad or m):
+            backlash, sensor.
+        zero_std_rad: Standard deviation of the zero of a joint, the same in all poses (rad or m); 0
+            leaves zeros alone. They are estimated too, but for the first and the last joint: a
+            camera elsewhere, or a board elsewhere, explains those as well.
+        wobble_m: Error of the link's place in each pose beyond that of the joints, standard
             deviation: play, bending.
         wobble_rad: The same, as a turn.
-        clock_s: Largest offset of the clocks that is looked for.
-        least_correlation: Of the speeds, below which their offset is taken for 0.
-        least_turn_rad: The poses turn at least this far about two axes.
+        clock_s: Largest offset of the clocks that is tried.
+        least_correlation: Of the speeds, below which the offset is taken as 0.
+        least_turn_rad: The poses should turn at least this far about two axes.
         max_poses: Of more frames, as many are used, evenly.
-        work_m: How far before the camera it is used: there its uncertainty is told.
-        temperature_c: Of the day, for the record; `null` where nobody measured.
+        work_m: Working distance, at which the uncertainty of a point is stated.
+        temperature_c: Of the day, for the record; `null` where it was not measured.
     """
 
     source: FrameSourceSpec
-    board: BoardSpec
+    board: Charuco | TagGrid
     joints: str
     corner_px: float
     max_error_px: float
@@ -199,41 +197,62 @@ class BoardCalibration:
         )
         if min(positive) <= 0 or min(self.zero_std_rad, self.clock_s) < 0 or self.max_poses < 10:
             raise ConfigError(
-                "calibration: expected corner_px, max_error_px, joint_std_rad, wobble_m, wobble_rad and work_m above 0, "
-                "zero_std_rad and clock_s of 0 or more, max_poses of 10 or more"
+                "calibration: expected corner_px, max_error_px, joint_std_rad, wobble_m, "
+                "wobble_rad and work_m above 0, zero_std_rad and clock_s of 0 or more, max_poses "
+                "of 10 or more"
             )
 
     def calibrate(self, machine: Machine) -> dict[str, Any]:
-        """Returns what `calibration.yaml` says.
+        """Return the content of `calibration.yaml`.
 
         Raises:
-            FrameError: the poses do not tell where the camera is; says which are missing.
+            FrameError: the poses do not determine the camera; names those that are missing.
             ConfigError, RecordingError: the joint positions cannot be read.
         """
-        track = arm.read_joint_positions(Path(self.joints), machine)
-        seen, refused = self._seen(track)
-        offset = self._offset(machine, track, seen)
-        shift_s = offset.offset_s if offset is not None and offset.is_trusted else 0.0
-        seen = self._with_joints(track, seen, shift_s, refused)
-        if len(seen) < MIN_VIEWS:
+        trajectory = arm.read_joint_positions(Path(self.joints), machine)
+        observations, refused = self._find_boards()
+        clock = self._estimate_clock(machine, trajectory, observations)
+        shift_s = 0.0 if clock is None else clock.applied_s
+        known, positions = [], []
+        for one in observations:
+            q = trajectory.at(one.name, one.t_s + shift_s)
+            if q is None:
+                reason = f"{self.joints} has no joint positions for it"
+                refused.append(PoseResidual(one.name, None, None, reason))
+            else:
+                known.append(one)
+                positions.append(q)
+        if len(known) < MIN_VIEWS:
             reasons = sorted({one.left_out or "" for one in refused})[:3]
             raise FrameError(
-                f"calibration: {len(seen)} frames show the board where the joint positions are known, {MIN_VIEWS} are needed, "
-                f"20 are good. Left out: {'; '.join(reasons) or 'none'}"
+                f"calibration: {len(known)} frames show the board where the joint positions are "
+                f"known, {MIN_VIEWS} are needed, 20 are good. Left out: "
+                f"{'; '.join(reasons) or 'none'}"
             )
-        if len(seen) > self.max_poses:
-            seen = [
-                seen[k] for k in np.linspace(0, len(seen) - 1, self.max_poses).round().astype(int)
-            ]
-        views = self._views(machine, track, seen, shift_s, offset is not None)
+        if len(known) > self.max_poses:
+            chosen = np.linspace(0, len(known) - 1, self.max_poses).round().astype(int)
+            known, positions = [known[k] for k in chosen], [positions[k] for k in chosen]
+        q = np.stack(positions)
+        views = self._build_views(machine, trajectory, known, q, clock)
         solution = solve_hand_eye(views)
         assert solution is not None  # there are enough
-        return self._told(machine, views, solution, seen, refused, offset, shift_s)
+        used = np.flatnonzero(solution.used)
+        turns, _ = evaluation.measure_rotation_ranges(views.base_from_link[used])
+        missing = self._check_coverage(machine, views, solution, q, float(turns[1]))
+        more = {
+            "temperature_c": self.temperature_c,
+            "T_link_board": solution.guess.link_from_board.round(9).tolist(),
+            **evaluation.summarise_solution(views, solution, clock),
+            "corners_px": round(float(np.median([one.pose.error_px for one in known])), 3),
+            "turns_rad": turns.round(4).tolist(),
+            "missing": missing,
+        }
+        residuals = [*evaluation.list_residuals(views, solution), *refused]
+        camera, cov = solution.guess.base_from_camera, solution.cov[:6, :6]
+        return build_calibration("board", machine, camera, cov, residuals, self.work_m, more)
 
-    def _seen(
-        self, track: arm.JointTrajectory
-    ) -> tuple[list[BoardObservation], list[PoseResidual]]:
-        """Returns the boards in the frames, joint positions still missing, and frames without one."""
+    def _find_boards(self) -> tuple[list[BoardObservation], list[PoseResidual]]:
+        """Return the boards in the frames, and the frames without one."""
         tracker, found, refused = self.board.build(), [], []
         with self.source.build() as source, Progress(transient=True) as progress:
             task = progress.add_task("boards", total=source.num_frames)
@@ -243,68 +262,45 @@ class BoardCalibration:
                     frame = source.read_latest()
                     if frame is None:
                         return found, refused
-                    there, where = tracker.corners(frame)
-                    one = estimate_board_pose(
-                        frame, there, where, self.corner_px, self.max_error_px
+                    corners_m, corners_px = tracker.find_corners(frame)
+                    pose = estimate_board_pose(
+                        frame, corners_m, corners_px, self.corner_px, self.max_error_px
                     )
-                    found.append(
-                        BoardObservation(
-                            Path(frame.name).name, frame.t_s, one, np.zeros(track.q.shape[1])
-                        )
-                    )
+                    found.append(BoardObservation(Path(frame.name).name, frame.t_s, pose))
                 except FrameError as error:
-                    refused.append(
-                        PoseResidual(
-                            str(error).split(":")[0].split("/")[-1], None, None, str(error)
-                        )
-                    )
+                    name = str(error).split(":")[0].split("/")[-1]
+                    refused.append(PoseResidual(name, None, None, str(error)))
 
-    def _offset(
-        self, machine: Machine, track: arm.JointTrajectory, seen: list[BoardObservation]
-    ) -> clock_offset.ClockEstimate | None:
-        if track.t_s is None or len(seen) < clock_offset.MIN_SPEEDS or not self.clock_s:
-            return None
-        times, turns = (
-            np.array([one.t_s for one in seen]),
-            np.stack([one.pose.camera_from_board[0, :3, :3] for one in seen]),
-        )
-        link_turns = arm.compute_link_poses(machine, track.q).base_from_link[:, :3, :3]
-        return clock_offset.estimate_clock_offset(
-            times, turns, track.t_s, link_turns, self.clock_s, self.least_correlation
-        )
-
-    def _with_joints(
-        self,
-        track: arm.JointTrajectory,
-        seen: list[BoardObservation],
-        shift_s: float,
-        refused: list[PoseResidual],
-    ) -> list[BoardObservation]:
-        known = []
-        for one in seen:
-            q = track.at(one.name, one.t_s + shift_s)
-            if q is None:
-                refused.append(
-                    PoseResidual(
-                        one.name, None, None, f"{self.joints} has no joint positions for it"
-                    )
-                )
-            else:
-                known.append(BoardObservation(one.name, one.t_s, one.pose, q))
-        return known
-
-    def _views(
+    def _estimate_clock(
         self,
         machine: Machine,
-        track: arm.JointTrajectory,
-        seen: list[BoardObservation],
-        shift_s: float,
-        moving: bool,
+        trajectory: arm.JointTrajectory,
+        observations: list[BoardObservation],
+    ) -> clock_offset.ClockEstimate | None:
+        is_enough = len(observations) >= clock_offset.MIN_SPEEDS
+        if trajectory.t_s is None or not is_enough or not self.clock_s:
+            return None
+        links = arm.compute_link_poses(machine, trajectory.q)
+        return clock_offset.estimate_clock_offset(
+            np.array([one.t_s for one in observations]),
+            np.stack([one.pose.camera_from_board[0, :3, :3] for one in observations]),
+            trajectory.t_s,
+            links.base_from_link[:, :3, :3],
+            self.clock_s,
+            self.least_correlation,
+        )
+
+    def _build_views(
+        self,
+        machine: Machine,
+        trajectory: arm.JointTrajectory,
+        observations: list[BoardObservation],
+        q: np.ndarray,
+        clock: clock_offset.ClockEstimate | None,
     ) -> HandEyeViews:
-        q = np.stack([one.q for one in seen])
         links = arm.compute_link_poses(machine, q)
         # a wrong zero of the first joint is a camera elsewhere, one of the last a board elsewhere:
-        # the arm itself believes it too
+        # no camera can tell them apart
         inner = range(1, machine.num_joints - 1) if self.zero_std_rad else range(0)
         shared, std = links.joints[:, inner], [self.zero_std_rad] * len(inner)
         names = [machine.joint_names[k] for k in inner]
@@ -312,51 +308,47 @@ class BoardCalibration:
             self.joint_std_rad * links.joints,
             arm.build_wobble_motions(links.base_from_link, self.wobble_m, self.wobble_rad),
         ]
-        if moving:
-            speed = track.speed(np.array([one.t_s for one in seen]) + shift_s)
-            late = np.einsum("nj,njk->nk", speed, links.joints)[:, None]
-            shared, std, names = (
-                np.concatenate([shared, late], 1),
-                [*std, clock_offset.CLOCK_STD_S],
-                [*names, evaluation.CLOCK_NAME],
-            )
-            slack.append(clock_offset.FRAME_JITTER_S * late)
-        poses, covs = (
-            np.stack([getattr(one.pose, name) for one in seen])
-            for name in ("camera_from_board", "cov")
-        )
+        if clock is not None:
+            frame_s = np.array([one.t_s for one in observations])
+            speed = trajectory.speed(frame_s + clock.applied_s)
+            motion = np.einsum("nj,njk->nk", speed, links.joints)[:, None]
+            shared = np.concatenate([shared, motion], 1)
+            std, names = [*std, clock_offset.CLOCK_STD_S], [*names, evaluation.CLOCK_NAME]
+            slack.append(clock_offset.FRAME_JITTER_S * motion)
         return HandEyeViews(
-            links.base_from_link, poses, covs, np.concatenate(slack, 1), shared, np.array(std), tuple(one.name for one in seen),
-            tuple(names),
-        )  # fmt: skip
-
-    def _told(
-        self, machine: Machine, views: HandEyeViews, solution: HandEyeSolution, seen: list[BoardObservation],
-        refused: list[PoseResidual], offset: clock_offset.ClockEstimate | None, shift_s: float,
-    ) -> dict[str, Any]:  # fmt: skip
-        used = np.flatnonzero(solution.used)
-        q = np.stack([seen[k].q for k in used])
-        distance_m = np.linalg.norm(predict_board_poses(views, solution.guess)[used, :3, 3], axis=1)
-        missing = evaluation.list_missing_poses(
-            machine, q, views.base_from_link[used], distance_m, self.least_turn_rad
+            base_from_link=links.base_from_link,
+            camera_from_board=np.stack([one.pose.camera_from_board for one in observations]),
+            seen_cov=np.stack([one.pose.cov for one in observations]),
+            slack=np.concatenate(slack, 1),
+            shared=shared,
+            shared_std=np.array(std),
+            names=tuple(one.name for one in observations),
+            shared_names=tuple(names),
         )
-        turns, _ = evaluation.measure_rotation_ranges(views.base_from_link[used])
-        if turns[1] < 0.1 * self.least_turn_rad or len(used) < MIN_VIEWS:
+
+    def _check_coverage(
+        self,
+        machine: Machine,
+        views: HandEyeViews,
+        solution: HandEyeSolution,
+        q: np.ndarray,
+        second_turn_rad: float,
+    ) -> list[str]:
+        """Return which poses are missing; refuse poses that do not determine the camera."""
+        used = np.flatnonzero(solution.used)
+        board = predict_board_poses(views, solution.guess)[used]
+        missing = evaluation.list_missing_poses(
+            machine,
+            q[used],
+            views.base_from_link[used],
+            np.linalg.norm(board[:, :3, 3], axis=1),
+            self.least_turn_rad,
+        )
+        if second_turn_rad < MIN_TURN_SHARE * self.least_turn_rad or len(used) < MIN_VIEWS:
             raise FrameError(
-                f"calibration: the poses do not tell where the camera is: {'; '.join(missing) or 'too few agree'}"
+                "calibration: the poses do not determine where the camera is: "
+                f"{'; '.join(missing) or 'too few agree'}"
             )
         for one in missing:
             log.warning("calibration: %s", one)
-        more = {
-            "temperature_c": self.temperature_c,
-            "T_link_board": solution.guess.link_from_board.round(9).tolist(),
-            **evaluation.summarise_solution(views, solution, offset, shift_s),
-            "corners_px": round(float(np.median([one.pose.error_px for one in seen])), 3),
-            "turns_rad": turns.round(4).tolist(),
-            "missing": missing,
-        }
-        judged = [*evaluation.list_residuals(views, solution), *refused]
-        cov = solution.cov[:6, :6]
-        return build_calibration(
-            "board", machine, solution.guess.base_from_camera, cov, judged, self.work_m, more
-        )
+        return missing

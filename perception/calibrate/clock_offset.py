@@ -1,4 +1,4 @@
-"""How much the clock of the camera is off against that of the joints: both saw the same motion."""
+"""Offset between the clocks of camera and arm, by the correlation of their rotation speeds."""
 
 from __future__ import annotations
 
@@ -12,30 +12,41 @@ from perception.calibrate import transforms
 
 log = logging.getLogger(__name__)
 
+# All numbers below were chosen by hand.
 STEP_S = 0.01
-OVER_S, LONGEST_S = 0.25, 0.7
-"""Speeds are taken over the first; over a gap longer than the second one says nothing."""
+"""Grid of offsets that are tried; a parabola through the best three refines it."""
+SPEED_INTERVAL_S = 0.25
+"""Speeds are taken over this time: longer smooths starts and stops, shorter amplifies noise."""
+MAX_GAP_S = 0.7
+"""A longer gap between two frames gives no speed."""
 MIN_SPEEDS = 15
 """Pairs of frames that must have a speed."""
+MAX_SPEED_RATIO = 1.3
+"""A board faster than the arm ever was, by more than this factor, was detected wrongly."""
 CLOCK_STD_S = 0.02
-"""How well the correlation of speeds tells the offset; the poses tell the rest."""
+"""Standard deviation of the offset by correlation; the poses refine it."""
 FRAME_JITTER_S = 0.005
-"""By which the time of a single frame may be off."""
+"""Standard deviation of the time stamp of a single frame."""
 
 
 @dataclass(frozen=True)
 class ClockEstimate:
-    """What is added to the time of a frame to have the time of the recording.
+    """Time to add to that of a frame to have the recording's.
 
     Attributes:
         offset_s: The offset.
         correlation: Of both speeds there, in [-1, 1].
-        is_trusted: They correlate well enough to believe it.
+        is_trusted: The correlation is high enough to use the offset.
     """
 
     offset_s: float
     correlation: float
     is_trusted: bool
+
+    @property
+    def applied_s(self) -> float:
+        """The offset where it is trusted, else 0."""
+        return self.offset_s if self.is_trusted else 0.0
 
 
 def estimate_clock_offset(
@@ -46,61 +57,71 @@ def estimate_clock_offset(
     largest_s: float,
     least_correlation: float,
 ) -> ClockEstimate | None:
-    """Returns the offset at which the speeds of turning agree best, `None` where there is too little motion to compare.
+    """Return the offset at which the rotation speeds of board and link correlate best.
 
     Args:
-        frame_s: Times of the frames in which the board was seen, `(N,)`.
-        turns: How the camera saw the board turned, `(N, 3, 3)`.
+        frame_s: Times of the frames that show the board, `(N,)`.
+        turns: Rotation of the board in the camera, `(N, 3, 3)`.
         recording_s: Times of the recording, `(T,)`.
-        link_turns: How the joints turned the link, `(T, 3, 3)`.
-        largest_s: Offsets of this size and less are tried.
-        least_correlation: From which on an offset is believed; a warning says when it is not.
+        link_turns: Rotation of the link in the base, `(T, 3, 3)`.
+        largest_s: Largest offset that is tried, either way.
+        least_correlation: Below this the offset is not trusted, and a warning is logged.
+
+    Returns:
+        `None` where there is too little motion to compare.
     """
-    later = np.searchsorted(frame_s, frame_s + OVER_S)
-    here = np.flatnonzero(later < len(frame_s))
-    here = here[frame_s[later[here]] - frame_s[here] <= LONGEST_S]
-    begin, end = frame_s[here], frame_s[later[here]]
-    # how far it turned: not about which axis, that is what nobody knows yet
-    seen = _compute_angles(turns[here], turns[later[here]]) / (end - begin)
+    later = np.searchsorted(frame_s, frame_s + SPEED_INTERVAL_S)
+    first = np.flatnonzero(later < len(frame_s))
+    first = first[frame_s[later[first]] - frame_s[first] <= MAX_GAP_S]
+    begin, end = frame_s[first], frame_s[later[first]]
+    # the size of the turn alone: the rotation between the two frames is not known yet
+    seen = _compute_angles(turns[first], turns[later[first]]) / (end - begin)
     link = Slerp(recording_s, Rotation.from_matrix(link_turns))
-    fastest = float((_compute_angles(link_turns[:-1], link_turns[1:]) / np.diff(recording_s)).max())
-    believed = seen <= 1.3 * fastest + 1e-9  # a board that jumps was seen wrongly
+    arm_speeds = _compute_angles(link_turns[:-1], link_turns[1:]) / np.diff(recording_s)
+    believed = seen <= MAX_SPEED_RATIO * float(arm_speeds.max()) + 1e-9
     begin, end, seen = begin[believed], end[believed], seen[believed]
     if len(seen) < MIN_SPEEDS:
         return None
-    tried, scores = np.arange(-largest_s, largest_s + STEP_S / 2, STEP_S), []
-    for shift in tried:
+    offsets = np.arange(-largest_s, largest_s + STEP_S / 2, STEP_S)
+    scores = []
+    for shift in offsets:
         inside = (begin + shift >= recording_s[0]) & (end + shift <= recording_s[-1])
-        if inside.sum() < MIN_SPEEDS:
-            scores.append(-1.0)
-            continue
-        ends = (link(times[inside] + shift).as_matrix() for times in (begin, end))
-        one, other = _compute_angles(*ends) / (end - begin)[inside], seen[inside]
-        both = one.std() * other.std()
-        scores.append(
-            float(np.mean((one - one.mean()) * (other - other.mean())) / both)
-            if both > 1e-9
-            else -1.0
-        )
+        scores.append(_correlate_speeds(link, begin[inside], end[inside], seen[inside], shift))
     best = int(np.argmax(scores))
     if scores[best] <= -1.0:
         return None
-    top = tried[best]
-    if 0 < best < len(tried) - 1 and min(scores[best - 1], scores[best + 1]) > -1.0:
-        before, here, after = scores[best - 1 : best + 2]
-        bend = before - 2 * here + after
+    top = offsets[best]
+    if 0 < best < len(offsets) - 1 and min(scores[best - 1], scores[best + 1]) > -1.0:
+        before, middle, after = scores[best - 1 : best + 2]
+        bend = before - 2 * middle + after
         top += 0.5 * STEP_S * (before - after) / bend if bend < 0 else 0.0
     found = ClockEstimate(float(top), scores[best], scores[best] >= least_correlation)
     if not found.is_trusted:
         log.warning(
-            "clocks: speeds of board and arm correlate by %.2f, %g is needed to tell an offset; it is taken for 0. Move the "
-            "arm while recording, with starts and stops.", found.correlation, least_correlation,
-        )  # fmt: skip
+            "clocks: speeds of board and arm correlate by %.2f, %g is needed to estimate an "
+            "offset; it is taken as 0. Move the arm while recording, with starts and stops.",
+            found.correlation,
+            least_correlation,
+        )
     return found
 
 
-def _compute_angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Returns by which angles rotations differ, rad."""
-    return np.linalg.norm(
-        transforms.compute_rotation_vectors(np.swapaxes(one, 1, 2) @ other), axis=1
-    )
+def _correlate_speeds(
+    link: Slerp, begin_s: np.ndarray, end_s: np.ndarray, seen_rad_s: np.ndarray, shift_s: float
+) -> float:
+    """Return the correlation of the link's speeds with those seen; -1 where it is undefined."""
+    if len(seen_rad_s) < MIN_SPEEDS:
+        return -1.0
+    begin, end = link(begin_s + shift_s).as_matrix(), link(end_s + shift_s).as_matrix()
+    speed = _compute_angles(begin, end) / (end_s - begin_s)
+    scale = speed.std() * seen_rad_s.std()
+    if not scale > 1e-9:
+        return -1.0
+    product = (speed - speed.mean()) * (seen_rad_s - seen_rad_s.mean())
+    return float(np.mean(product / scale))
+
+
+def _compute_angles(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the angles between rotations, `(N,)` rad."""
+    relative = np.swapaxes(start, 1, 2) @ end
+    return np.linalg.norm(transforms.compute_rotation_vectors(relative), axis=1)

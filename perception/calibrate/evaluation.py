@@ -1,4 +1,4 @@
-"""Whether the poses of a calibration say all that is asked of them, and which are missing."""
+"""Evaluation of a hand-eye solution: residuals, cross-validation, and poses that are missing."""
 
 from __future__ import annotations
 
@@ -18,21 +18,93 @@ from perception.calibrate.hand_eye import (
     refine_solution,
 )
 
-# --- from judgement: What a solution is worth: how far off each view is, what the other half of
-# the views says, what the clocks showed.
-
+CLOCK_NAME = "clock"
+"""Name of the clocks' offset among the systematic errors."""
 AXES = ("forward axis", "axis to the left", "vertical")
+"""Axes of the base frame in messages."""
 RANGE_PERCENT = (5, 95)
+"""Percentiles between which a range of turns is measured, so that one outlier does not widen it."""
+MIN_DISTANCE_RATIO = 1.2
+"""Ratio of farthest to nearest board; chosen by hand, a fifth decouples depth from focal length."""
+
+
+def list_residuals(views: HandEyeViews, solution: HandEyeSolution) -> list[PoseResidual]:
+    """Return the residual of each view, and which were left out."""
+    residuals = []
+    for k, name in enumerate(views.names):
+        away = solution.away[k]
+        away_m, away_rad = float(np.linalg.norm(away[:3])), float(np.linalg.norm(away[3:]))
+        left_out = None
+        if not solution.used[k]:
+            ratio = np.sqrt(solution.distance[k] / 6.0)
+            left_out = f"{ratio:.0f} times as far off as it should be"
+        residuals.append(PoseResidual(name, away_m, away_rad, left_out))
+    return residuals
+
+
+def summarise_solution(
+    views: HandEyeViews, solution: HandEyeSolution, clock: ClockEstimate | None
+) -> dict[str, Any]:
+    """Return the file's entries on systematic errors, clocks and cross-validation.
+
+    Args:
+        views: The views; their times include `clock.applied_s`.
+        solution: Of these views.
+        clock: Offset of the clocks by speeds; `None` where it was not estimated.
+    """
+    std = np.sqrt(np.diag(solution.cov)[12:])
+    errors = {}
+    for name, mean, one_std in zip(views.shared_names, solution.guess.shared, std, strict=True):
+        errors[name] = {"mean": round(float(mean), 6), "std": round(float(one_std), 6)}
+    refined = errors.pop(CLOCK_NAME, None)
+    clock_entry = None
+    if clock is not None:
+        more_s = refined["mean"] if refined else 0.0
+        clock_entry = {
+            "offset_s": round(clock.applied_s + more_s, 4),
+            "std_s": refined["std"] if refined else None,
+            "correlation": round(clock.correlation, 3),
+            "trusted": clock.is_trusted,
+        }
+    return {
+        "joint_zeros": errors,
+        "clock": clock_entry,
+        "arm_factor": round(solution.factor, 3),
+        "other_half": cross_validate_halves(views, solution),
+    }
+
+
+def cross_validate_halves(
+    views: HandEyeViews, solution: HandEyeSolution
+) -> dict[str, float] | None:
+    """Return the median residual of each half of the views at the solution of the other half."""
+    used = np.flatnonzero(solution.used)
+    halves = used[::2], used[1::2]
+    if min(len(half) for half in halves) < 2 * MIN_VIEWS:
+        return None
+    away = []
+    for half, other in (halves, halves[::-1]):
+        refined = refine_solution(views.part(half), solution)
+        rest = views.part(other)
+        board = predict_board_poses(rest, refined.guess)
+        motion = transforms.compute_motion(rest.camera_from_board, board[:, None])
+        away.append(motion[np.arange(len(rest)), np.abs(motion).sum(-1).argmin(1)])
+    sizes = np.concatenate(away)
+    return {
+        "median_m": round(float(np.median(np.linalg.norm(sizes[:, :3], axis=1))), 6),
+        "median_rad": round(float(np.median(np.linalg.norm(sizes[:, 3:], axis=1))), 6),
+    }
 
 
 def measure_rotation_ranges(base_from_link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how far the poses turn about three perpendicular axes of their own, most first, and these axes in the base frame.
+    """Return the ranges of turns about the poses' own principal axes, largest first.
 
     Args:
         base_from_link: `(N, 4, 4)`.
 
     Returns:
-        `(3,)` rad from the 5th to the 95th percentile, and the axes as rows, `(3, 3)`.
+        `(3,)` rad from the 5th to the 95th percentile, and the axes in the base frame as rows,
+            `(3, 3)`.
     """
     middle = transforms.find_nearest_rotation(base_from_link[:, :3, :3].sum(0))
     vectors = transforms.compute_rotation_vectors(base_from_link[:, :3, :3] @ middle.T)
@@ -45,27 +117,28 @@ def measure_rotation_ranges(base_from_link: np.ndarray) -> tuple[np.ndarray, np.
 def list_missing_motions(
     base_from_link: np.ndarray, distance_m: np.ndarray, least_rad: float
 ) -> list[str]:
-    """Returns in words what poses, `(N, 4, 4)`, do not show; empty where they say enough.
+    """Return in words which motions the poses lack; empty where they suffice.
 
     Args:
-        base_from_link: The link in the poses that were used.
-        distance_m: How far the camera was from the board, `(N,)`.
-        least_rad: About two axes at least the poses should turn this far.
+        base_from_link: The link in the poses that were used, `(N, 4, 4)`.
+        distance_m: From the camera to the board, `(N,)`.
+        least_rad: Turn that the poses need about two axes.
     """
     turns, axes = measure_rotation_ranges(base_from_link)
-    found = []
-    for number, what in enumerate(("", "second ")):
+    missing = []
+    for number, ordinal in enumerate(("", "second ")):
         if turns[number] < least_rad:
             nearest = AXES[int(np.abs(axes[number]).argmax())]
-            found.append(
-                f"the poses turn by {np.degrees(turns[number]):.0f} degrees about their {what}axis (near the {nearest}), "
-                f"{np.degrees(least_rad):.0f} are needed"
+            missing.append(
+                f"the poses turn by {np.degrees(turns[number]):.0f} degrees about their {ordinal}"
+                f"axis (near the {nearest}), {np.degrees(least_rad):.0f} are needed"
             )
-    if distance_m.max() < 1.2 * distance_m.min():
-        found.append(
-            f"the board is always {distance_m.min():.1f} to {distance_m.max():.1f} m away: add poses nearer and farther, by a fifth"
+    if distance_m.max() < MIN_DISTANCE_RATIO * distance_m.min():
+        missing.append(
+            f"the board is always {distance_m.min():.1f} to {distance_m.max():.1f} m away: add "
+            "poses nearer and farther, by a fifth"
         )
-    return found
+    return missing
 
 
 def list_missing_poses(
@@ -75,97 +148,24 @@ def list_missing_poses(
     distance_m: np.ndarray,
     least_rad: float,
 ) -> list[str]:
-    """Returns in words which poses of a machine should be added; see `unturned`.
+    """Return in words which poses of a machine to add; see `list_missing_motions`.
 
     Args:
         machine: Names and travel of the joints.
         q: Joint positions of the poses that were used, `(N, J)`.
         base_from_link: The link there.
-        distance_m: How far the camera was from the board.
-        least_rad: About two axes at least the poses should turn this far.
+        distance_m: From the camera to the board.
+        least_rad: Turn that the poses need about two axes.
     """
-    found = list_missing_motions(base_from_link, distance_m, least_rad)
-    if measure_rotation_ranges(base_from_link)[0][1] < least_rad:
-        low, high = q.min(0), q.max(0)
-        for column, joint in enumerate(machine.joints):
-            if joint.kind == "hinge" and high[column] - low[column] < 0.5 * least_rad:
-                room = (
-                    "lower"
-                    if low[column] - joint.lower.value > joint.upper.value - high[column]
-                    else "higher"
-                )
-                found.append(
-                    f"{joint.name} stays within {np.degrees(low[column]):.0f} to {np.degrees(high[column]):.0f} degrees: add poses "
-                    f"with it {room}, as far as the board stays in view"
-                )
-    return found
-
-
-CLOCK_NAME = "clock"
-"""Name of the clocks' offset among what is wrong in all views alike."""
-
-
-def list_residuals(views: HandEyeViews, solution: HandEyeSolution) -> list[PoseResidual]:
-    """Returns how far off each view is, and which were left out."""
-    found = zip(views.names, solution.away, solution.distance, solution.used, strict=True)
-    return [
-        PoseResidual(
-            name, float(np.linalg.norm(away[:3])), float(np.linalg.norm(away[3:])),
-            None if good else f"{np.sqrt(far / 6.0):.0f} times as far off as it should be",
+    missing = list_missing_motions(base_from_link, distance_m, least_rad)
+    if measure_rotation_ranges(base_from_link)[0][1] >= least_rad:
+        return missing
+    for joint, low, high in zip(machine.joints, q.min(0), q.max(0), strict=True):
+        if joint.kind != "hinge" or high - low >= 0.5 * least_rad:
+            continue
+        side = "lower" if low - joint.lower.value > joint.upper.value - high else "higher"
+        missing.append(
+            f"{joint.name} stays within {np.degrees(low):.0f} to {np.degrees(high):.0f} degrees: "
+            f"add poses with it {side}, as far as the board stays in view"
         )
-        for name, away, far, good in found
-    ]  # fmt: skip
-
-
-def summarise_solution(
-    views: HandEyeViews, solution: HandEyeSolution, offset: ClockEstimate | None, shift_s: float
-) -> dict[str, Any]:
-    """Returns what a file says about a solution by views, besides the camera's place.
-
-    Args:
-        views: The views.
-        solution: What they said.
-        offset: Of the clocks, by speeds; `None` where it was not looked for.
-        shift_s: The part of it that the views were taken with.
-    """
-    std = np.sqrt(np.diag(solution.cov)[12:])
-    wrong = {
-        name: {"mean": round(float(value), 6), "std": round(float(one), 6)}
-        for name, value, one in zip(views.shared_names, solution.guess.shared, std, strict=True)
-    }
-    late = wrong.pop(CLOCK_NAME, None)
-    clock = None
-    if offset is not None:
-        clock = {
-            "offset_s": round(shift_s + (late["mean"] if late else 0.0), 4), "std_s": late["std"] if late else None,
-            "correlation": round(offset.correlation, 3), "trusted": offset.is_trusted,
-        }  # fmt: skip
-    return {
-        "joint_zeros": wrong,
-        "clock": clock,
-        "arm_factor": round(solution.factor, 3),
-        "other_half": cross_validate_halves(views, solution),
-    }
-
-
-def cross_validate_halves(
-    views: HandEyeViews, solution: HandEyeSolution
-) -> dict[str, float] | None:
-    """Returns how far off the boards of each half of the views are from where the other half's answer expects them."""
-    used = np.flatnonzero(solution.used)
-    halves = used[::2], used[1::2]
-    if min(len(half) for half in halves) < 2 * MIN_VIEWS:
-        return None
-    away = []
-    for half, other in (halves, halves[::-1]):
-        found = refine_solution(views.part(half), solution)
-        rest = views.part(other)
-        seen = transforms.compute_motion(
-            rest.camera_from_board, predict_board_poses(rest, found.guess)[:, None]
-        )
-        away.append(seen[np.arange(len(rest)), np.abs(seen).sum(-1).argmin(1)])
-    sizes = np.concatenate(away)
-    return {
-        "median_m": round(float(np.median(np.linalg.norm(sizes[:, :3], axis=1))), 6),
-        "median_rad": round(float(np.median(np.linalg.norm(sizes[:, 3:], axis=1))), 6),
-    }
+    return missing

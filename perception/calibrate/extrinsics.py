@@ -1,4 +1,4 @@
-"""The stored place of a camera: a YAML file that sources of frames take as `base_from_camera`."""
+"""Camera extrinsics in a YAML file: written by `mode=calibrate`, read by sources of frames."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from perception.sources import validation
 
-# --- from result: What a calibration says, and how it is stored.
-
 SCHEMA = 1
+"""Version of the file's layout."""
+MIN_EIGENVALUE = -1e-9
+"""A covariance may have eigenvalues as low as this, m^2 or rad^2, by rounding."""
 CameraPlacement = str | tuple[tuple[float, ...], ...] | None
-"""How a config says where a camera is: a file of `mode=calibrate`, a 4 x 4 transform, or not at
-all."""
+"""Camera pose in a config: a file of `mode=calibrate`, a 4 x 4 transform, or `None` (unknown)."""
 
 
 @dataclass(frozen=True)
 class CameraExtrinsics:
-    """Where a camera is.
+    """Pose of a camera and its uncertainty.
 
     Attributes:
-        base_from_camera: `(4, 4)`, `None` where nobody knows.
+        base_from_camera: `(4, 4)`, `None` where it is not known.
         cov: Of a small motion of it in its own coordinates, `(6, 6)`, m and then rad; `None` where
-            nobody has told.
+            it is not known.
     """
 
     base_from_camera: np.ndarray | None
@@ -38,54 +38,61 @@ class CameraExtrinsics:
 
 
 def load_extrinsics(given: CameraPlacement, where: str) -> CameraExtrinsics:
-    """Returns where a camera is as a config gives it.
+    """Return the camera's pose as a config gives it.
 
     Raises:
-        FrameError: there is no such file, it is none of ours, the transform is not rigid, or its
-            covariance is none.
+        FrameError: the file cannot be read or is of another kind, the transform is not rigid, or
+            the covariance is not one.
     """
     if given is None:
         return CameraExtrinsics(None, None)
     if not isinstance(given, str):
         return CameraExtrinsics(validation.check_pose(given, where), None)
-    told, where = read_calibration(Path(given), where), f"{where}={given}"
-    cov = np.asarray(told.get("covariance", np.zeros((6, 6))), float)
-    if (
-        cov.shape != (6, 6)
-        or not np.isfinite(cov).all()
-        or np.linalg.eigvalsh((cov + cov.T) / 2).min() < -1e-9
-    ):
+    content, where = read_calibration(Path(given), where), f"{where}={given}"
+    cov = np.asarray(content.get("covariance", np.zeros((6, 6))), float)
+    is_covariance = (
+        cov.shape == (6, 6)
+        and np.isfinite(cov).all()
+        and np.linalg.eigvalsh((cov + cov.T) / 2).min() >= MIN_EIGENVALUE
+    )
+    if not is_covariance:
         raise FrameError(
             f"{where}: covariance: expected a covariance of six numbers, (6, 6); calibrate again"
         )
-    return CameraExtrinsics(validation.check_pose(told["T_base_cam"], where), (cov + cov.T) / 2)
+    return CameraExtrinsics(validation.check_pose(content["T_base_cam"], where), (cov + cov.T) / 2)
 
 
 def read_calibration(path: Path, where: str) -> dict[str, Any]:
-    """Returns what stands in a file of `mode=calibrate`.
+    """Return the content of a file of `mode=calibrate`.
 
     Raises:
-        FrameError: it cannot be read, or is none.
+        FrameError: it cannot be read, or is of another kind.
     """
     try:
-        told = yaml.safe_load(path.read_text())
+        content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise FrameError(
-            f"{where}: {path} cannot be read ({error}); expected calibration.yaml of `brokk mode=calibrate`"
+            f"{where}: {path} cannot be read ({error}); expected calibration.yaml of "
+            "`brokk mode=calibrate`"
         ) from error
-    if not isinstance(told, dict) or told.get("schema") != SCHEMA or "T_base_cam" not in told:
+    if (
+        not isinstance(content, dict)
+        or content.get("schema") != SCHEMA
+        or "T_base_cam" not in content
+    ):
         raise FrameError(
-            f"{where}: {path} is no calibration of schema {SCHEMA}; `brokk mode=calibrate` writes one"
+            f"{where}: {path} is no calibration of schema {SCHEMA}; `brokk mode=calibrate` "
+            "writes one"
         )
-    return told
+    return content
 
 
 def compute_point_std_m(cov: np.ndarray, distance_m: float) -> float:
-    """Returns how uncertain a point `distance_m` before the camera is in the base frame, by the calibration alone, m.
+    """Return the standard deviation of a point in the base frame, by the calibration alone, m.
 
     Args:
         cov: Of a small motion of the camera in its own frame, `(6, 6)`.
-        distance_m: How far before the camera.
+        distance_m: Distance of the point along the camera's axis.
     """
     lever = np.concatenate(
         [np.eye(3), distance_m * np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 0]])], 1
@@ -94,24 +101,36 @@ def compute_point_std_m(cov: np.ndarray, distance_m: float) -> float:
 
 
 def round_to_lists(values: np.ndarray | Sequence[float], digits: int = 9) -> list[Any]:
-    """Returns an array as lists of rounded numbers, for YAML."""
+    """Return an array as lists of rounded numbers, for YAML."""
     return np.round(np.asarray(values, float), digits).tolist()
 
 
 @dataclass(frozen=True)
 class PoseResidual:
-    """One pose or point: its name, how far off it is (m, rad or `None`), and why it was left out, `None` if it was not."""
+    """Residual of one pose or point.
+
+    Attributes:
+        name: Frame, time or point.
+        away_m: Size of the residual's shift, `None` where there is none.
+        away_rad: Size of its turn, `None` where there is none.
+        left_out: Why it was not used; `None` if it was.
+    """
 
     name: str
     away_m: float | None
     away_rad: float | None
     left_out: str | None
 
-    def plain(self) -> dict[str, Any]:
-        """Returns it as plain data."""
-        rounded = {key: None if value is None else round(value, 6) for key, value in
-                   (("away_m", self.away_m), ("away_rad", self.away_rad))}  # fmt: skip
-        return {"name": self.name, **rounded, "left_out": self.left_out}
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data, rounded."""
+        away_m = None if self.away_m is None else round(self.away_m, 6)
+        away_rad = None if self.away_rad is None else round(self.away_rad, 6)
+        return {
+            "name": self.name,
+            "away_m": away_m,
+            "away_rad": away_rad,
+            "left_out": self.left_out,
+        }
 
 
 def build_calibration(
@@ -119,36 +138,30 @@ def build_calibration(
     machine: Machine,
     base_from_camera: np.ndarray,
     cov: np.ndarray,
-    judged: Sequence[PoseResidual],
+    residuals: Sequence[PoseResidual],
     distance_m: float,
     more: dict[str, Any],
 ) -> dict[str, Any]:
-    """Returns what `calibration.yaml` says.
+    """Return the content of `calibration.yaml`.
 
     Args:
-        kind: `board` or `touched`.
+        kind: `board`, `poses` or `touched`.
         machine: Whose base it is.
         base_from_camera: The camera, `(4, 4)`.
         cov: Covariance of a small motion of it in its own frame, `(6, 6)`.
-        judged: Poses or points.
-        distance_m: How far away the camera's work is: there its uncertainty is told.
-        more: What the kind has to say besides.
+        residuals: Of poses or points, those left out too.
+        distance_m: Working distance, at which the uncertainty of a point is stated.
+        more: Entries of this kind alone.
     """
-    used = [one for one in judged if one.left_out is None]
-
-    def rms(values: Sequence[float | None]) -> float | None:
-        there = [value for value in values if value is not None]
-        return round(float(np.sqrt(np.mean(np.square(there)))), 6) if there else None
-
+    used = [one for one in residuals if one.left_out is None]
     return {
         "schema": SCHEMA,
         "kind": kind,
         "created": record.format_now(),
         "machine": machine.name,
         "T_base_cam": round_to_lists(base_from_camera),
-        "covariance": round_to_lists(
-            cov, 15
-        ),  # of a small motion of the camera in its own frame: x y z in m, then turns in rad
+        # of a small motion of the camera in its own frame: x y z in m, then turns in rad
+        "covariance": round_to_lists(cov, 15),
         "std_m": round_to_lists(np.sqrt(np.diag(cov)[:3])),
         "std_rad": round_to_lists(np.sqrt(np.diag(cov)[3:6])),
         "point_std_m": {
@@ -156,11 +169,16 @@ def build_calibration(
             "std_m": round(compute_point_std_m(cov, distance_m), 6),
         },
         "residual": {
-            "rms_m": rms([one.away_m for one in used]),
-            "rms_rad": rms([one.away_rad for one in used]),
+            "rms_m": _compute_rms([one.away_m for one in used]),
+            "rms_rad": _compute_rms([one.away_rad for one in used]),
         },
         "num_used": len(used),
-        "num_left_out": len(judged) - len(used),
+        "num_left_out": len(residuals) - len(used),
         **more,
-        "poses": [one.plain() for one in judged],
+        "poses": [one.to_dict() for one in residuals],
     }
+
+
+def _compute_rms(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return round(float(np.sqrt(np.mean(np.square(known)))), 6) if known else None

@@ -1,7 +1,8 @@
-"""Where the camera was in each frame of real footage: from a board that lies in view, or from poses that someone else knows."""
+"""Camera poses of real footage: from a board in view, or from given poses."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,15 +15,19 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 
+MIN_CORNERS = 4
+"""Corners that determine a pose."""
+ROTATION_TOLERANCE = 1e-3
+"""Largest error of a given rotation matrix's products: matrices rounded to three digits pass."""
+
 
 @dataclass(frozen=True)
 class CameraPose:
-    """A camera in the world, which is the board's frame or that of the given poses.
+    """Pose of a camera in the world: the board's frame or that of the given poses.
 
     Attributes:
         world_from_camera: `(4, 4)`, optical convention.
-        error_px: Root mean square distance of the board's corners from where this pose puts them; 0
-            for a given pose.
+        error_px: Root mean square reprojection error of the board's corners; 0 for a given pose.
     """
 
     world_from_camera: np.ndarray
@@ -30,27 +35,105 @@ class CameraPose:
 
 
 class CameraTracker(Protocol):
-    """Says where the camera was."""
+    """Finds the pose of the camera."""
 
     def locate(self, frame: Frame) -> CameraPose:
-        """Returns the camera's pose.
+        """Return the camera's pose.
 
         Raises:
-            FrameError: nobody can tell for this frame; the message says why.
+            FrameError: this frame does not determine it; the message says why.
         """
         ...
 
 
-class BoardTracker(CameraTracker, Protocol):
-    """A tracker that finds a board, and says where its corners are."""
+class CameraTrackerSpec(Protocol):
+    """A spec in `conf/perception/camera_pose`."""
 
-    def corners(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the corners that are seen, `(n, 3)` m in the board's frame, and where, `(n, 2)` px.
+    def build(self) -> CameraTracker:
+        """Return a tracker."""
+        ...
+
+
+class BoardTracker:
+    """Finds a flat board in frames.
+
+    Args:
+        board: OpenCV's description of it.
+        detect: Returns corners and their numbers, as OpenCV gives them, in a grey picture.
+        min_corners: Corners that must be seen.
+        max_error_px: Largest reprojection error of a pose.
+    """
+
+    def __init__(
+        self,
+        board: Any,
+        detect: Callable[[np.ndarray], Sequence[Any]],
+        min_corners: int,
+        max_error_px: float,
+    ) -> None:
+        self._board, self._detect = board, detect
+        self._min_corners, self._max_error_px = min_corners, max_error_px
+
+    def find_corners(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+        """Return the corners in the board's frame, `(n, 3)` m, and in the picture, `(n, 2)` px.
 
         Raises:
-            FrameError: there are too few.
+            FrameError: too few are seen.
         """
-        ...
+        found, numbers = self._detect(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))[:2]
+        count = 0 if numbers is None else sum(len(np.reshape(one, (-1, 2))) for one in found)
+        if count < self._min_corners:
+            raise FrameError(
+                f"{frame.name}: {count} corners of the board are seen, {self._min_corners} are "
+                "needed"
+            )
+        corners_m, corners_px = self._board.matchImagePoints(found, numbers)
+        return corners_m.reshape(-1, 3).astype(float), corners_px.reshape(-1, 2).astype(float)
+
+    def locate(self, frame: Frame) -> CameraPose:
+        """Return the camera's pose in the board's frame.
+
+        Raises:
+            FrameError: too few corners are seen, or they fit no pose.
+        """
+        corners_m, corners_px = self.find_corners(frame)
+        matrix, distortion = np.asarray(frame.camera_matrix, float), frame.distortion
+        done, turn, shift = cv2.solvePnP(
+            corners_m, corners_px, matrix, distortion, flags=cv2.SOLVEPNP_SQPNP
+        )
+        if not done:
+            raise FrameError(f"{frame.name}: the board's corners fit no pose of the camera")
+        turn, shift = cv2.solvePnPRefineLM(corners_m, corners_px, matrix, distortion, turn, shift)
+        projected, _ = cv2.projectPoints(corners_m, turn, shift, matrix, distortion)
+        error_px = float(np.sqrt(((projected[:, 0] - corners_px) ** 2).sum(-1).mean()))
+        if error_px > self._max_error_px:
+            raise FrameError(
+                f"{frame.name}: the board's corners miss by {error_px:.1f} px, "
+                f"{self._max_error_px:g} are allowed"
+            )
+        rotation = np.asarray(cv2.Rodrigues(turn)[0])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ np.ravel(shift)
+        return CameraPose(pose, error_px)
+
+
+class GivenPoseTracker:
+    """Looks poses up by the frame's stem; without a table, takes each frame's own pose."""
+
+    def __init__(self, poses: dict[str, np.ndarray] | None) -> None:
+        self._poses = poses
+
+    def locate(self, frame: Frame) -> CameraPose:
+        """Return the camera's pose.
+
+        Raises:
+            FrameError: none is given for this frame.
+        """
+        stem = Path(frame.name).name
+        pose = frame.base_from_camera if self._poses is None else self._poses.get(stem)
+        if pose is None:
+            raise FrameError(f"{frame.name}: no pose of the camera is given for '{stem}'")
+        return CameraPose(np.asarray(pose, float), 0.0)
 
 
 @spec
@@ -76,24 +159,20 @@ class Charuco:
     max_error_px: float
 
     def check(self) -> None:
-        _check(self.dictionary, self.min_corners)
+        _check_board(self.dictionary, self.min_corners)
         if not 0 < self.marker_m < self.square_m:
             raise ConfigError(
                 f"board: expected 0 < marker_m < square_m, got {self.marker_m} and {self.square_m}"
             )
 
     def build(self) -> BoardTracker:
-        """Returns a tracker."""
+        """Return a tracker."""
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         board = cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.square_m, self.marker_m, markers
         )
-        detector = cv2.aruco.CharucoDetector(board)
-
-        def corners(gray: np.ndarray) -> tuple[Any, Any]:
-            return detector.detectBoard(gray)[:2]
-
-        return _BoardTracker(board, corners, self.min_corners, self.max_error_px)
+        detect = cv2.aruco.CharucoDetector(board).detectBoard
+        return BoardTracker(board, detect, self.min_corners, self.max_error_px)
 
 
 @spec
@@ -119,20 +198,16 @@ class TagGrid:
     max_error_px: float
 
     def check(self) -> None:
-        _check(self.dictionary, self.min_corners)
+        _check_board(self.dictionary, self.min_corners)
 
     def build(self) -> BoardTracker:
-        """Returns a tracker."""
+        """Return a tracker."""
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         board = cv2.aruco.GridBoard((self.columns, self.rows), self.marker_m, self.gap_m, markers)
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        detector = cv2.aruco.ArucoDetector(markers, parameters)
-
-        def corners(gray: np.ndarray) -> tuple[Any, Any]:
-            return detector.detectMarkers(gray)[:2]
-
-        return _BoardTracker(board, corners, self.min_corners, self.max_error_px)
+        detect = cv2.aruco.ArucoDetector(markers, parameters).detectMarkers
+        return BoardTracker(board, detect, self.min_corners, self.max_error_px)
 
 
 @spec
@@ -147,91 +222,43 @@ class GivenPoses:
     poses: str | None
 
     def build(self) -> CameraTracker:
-        """Returns a tracker.
+        """Return a tracker.
 
         Raises:
             ConfigError: the file cannot be read.
         """
         if self.poses is None:
-            return _GivenTracker(None)
+            return GivenPoseTracker(None)
         try:
-            told = yaml.safe_load(Path(self.poses).read_text())
-            poses = {str(stem): np.asarray(pose, float) for stem, pose in told.items()}
+            table = yaml.safe_load(Path(self.poses).read_text())
+            poses = {str(stem): np.asarray(pose, float) for stem, pose in table.items()}
         except (OSError, yaml.YAMLError, AttributeError, ValueError, TypeError) as error:
             raise ConfigError(
-                f"camera_pose.poses={self.poses}: expected YAML of '<stem>: 4 x 4 numbers' ({error})"
+                f"camera_pose.poses={self.poses}: expected YAML of '<stem>: 4 x 4 numbers' "
+                f"({error})"
             ) from error
         if wrong := [stem for stem, pose in poses.items() if not _is_pose(pose)]:
             raise ConfigError(
                 f"camera_pose.poses={self.poses}: '{wrong[0]}' is no rigid 4 x 4 transform"
             )
-        return _GivenTracker(poses)
+        return GivenPoseTracker(poses)
 
 
-class _BoardTracker:
-    def __init__(self, board: Any, corners: Any, min_corners: int, max_error_px: float) -> None:
-        self._board, self._corners, self._min_corners, self._max_error_px = (
-            board,
-            corners,
-            min_corners,
-            max_error_px,
-        )
-
-    def corners(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        found, numbers = self._corners(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))
-        count = 0 if numbers is None else sum(len(np.reshape(one, (-1, 2))) for one in found)
-        if count < self._min_corners:
-            raise FrameError(
-                f"{frame.name}: {count} corners of the board are seen, {self._min_corners} are needed"
-            )
-        there, seen = self._board.matchImagePoints(found, numbers)
-        return there.reshape(-1, 3).astype(float), seen.reshape(-1, 2).astype(float)
-
-    def locate(self, frame: Frame) -> CameraPose:
-        there, seen = self.corners(frame)
-        matrix = np.asarray(frame.camera_matrix, float)
-        done, turn, shift = cv2.solvePnP(
-            there, seen, matrix, frame.distortion, flags=cv2.SOLVEPNP_SQPNP
-        )
-        if not done:
-            raise FrameError(f"{frame.name}: the board's corners fit no pose of the camera")
-        turn, shift = cv2.solvePnPRefineLM(there, seen, matrix, frame.distortion, turn, shift)
-        again, _ = cv2.projectPoints(there, turn, shift, matrix, frame.distortion)
-        error_px = float(np.sqrt(((again[:, 0] - seen) ** 2).sum(-1).mean()))
-        if error_px > self._max_error_px:
-            raise FrameError(
-                f"{frame.name}: the board's corners miss by {error_px:.1f} px, {self._max_error_px:g} are allowed"
-            )
-        rotation = np.asarray(cv2.Rodrigues(turn)[0])
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ np.ravel(shift)
-        return CameraPose(pose, error_px)
-
-
-class _GivenTracker:
-    def __init__(self, poses: dict[str, np.ndarray] | None) -> None:
-        self._poses = poses
-
-    def locate(self, frame: Frame) -> CameraPose:
-        stem = Path(frame.name).name
-        pose = frame.base_from_camera if self._poses is None else self._poses.get(stem)
-        if pose is None:
-            raise FrameError(f"{frame.name}: no pose of the camera is given for '{stem}'")
-        return CameraPose(np.asarray(pose, float), 0.0)
-
-
-def _check(dictionary: str, min_corners: int) -> None:
+def _check_board(dictionary: str, min_corners: int) -> None:
     if not dictionary.startswith("DICT_") or not hasattr(cv2.aruco, dictionary):
         known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
         raise ConfigError(
             f"board.dictionary: OpenCV has no '{dictionary}'; choices: {', '.join(known)}"
         )
-    if min_corners < 4:
-        raise ConfigError(f"board.min_corners: a pose needs 4 corners or more, got {min_corners}")
+    if min_corners < MIN_CORNERS:
+        raise ConfigError(
+            f"board.min_corners: a pose needs {MIN_CORNERS} corners or more, got {min_corners}"
+        )
 
 
 def _is_pose(pose: np.ndarray) -> bool:
-    rigid = pose.shape == (4, 4) and np.allclose(
-        pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3
-    )
-    return bool(rigid and np.linalg.det(pose[:3, :3]) > 0 and np.allclose(pose[3], [0, 0, 0, 1]))
+    if pose.shape != (4, 4) or not np.allclose(pose[3], [0, 0, 0, 1]):
+        return False
+    rotation = pose[:3, :3]
+    is_orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE)
+    return bool(is_orthonormal and np.linalg.det(rotation) > 0)

@@ -11,8 +11,8 @@ from brokk_rl.sim import scene
 from brokk_rl.spec import spec
 from tasks.advice import AdviceConfig
 from tasks.classical import ClassicalConfig
-from tasks.control import ActionMapping, ObservationNoise, PhaseSwitch
-from tasks.noise import MeasuredNoise
+from tasks.control import ActionMapping, PhaseSwitch
+from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.process import ToolPoseOptions, ToolPoseProcess
 from tasks.reward import RewardTerm
 from tasks.starts import ArmStarts, CandidateTargets, Uniform, draw_starts
@@ -22,7 +22,7 @@ DOWN_RAD = math.pi / 2
 
 @spec
 class BoreholeRanges:
-    """Where the borehole may be; uniform ranges (lowest, highest).
+    """Ranges of the borehole; uniform (lowest, highest).
 
     Attributes:
         distance_m: Horizontal distance of the rim's centre from the slew axis.
@@ -43,7 +43,7 @@ class BoreholeRanges:
 
 @spec
 class InsertionCriteria:
-    """When the chisel counts as inserted.
+    """Criteria of an inserted chisel.
 
     Attributes:
         strict_depth_m: Depth of the tip below the rim, inside the hole.
@@ -104,7 +104,7 @@ class BoreholeInsertion:
     reward: dict[str, RewardTerm]
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
-        """Returns the task for `num_envs` environments on `device`."""
+        """Return the task for `num_envs` environments on `device`."""
         return ToolPoseProcess(
             InsertionGoal(self, machine), ToolPoseOptions.of(self), machine, num_envs, device
         )
@@ -186,7 +186,10 @@ def _measure_closeness(
     inside_m: torch.Tensor,
     depth_m: float,
 ) -> torch.Tensor:
-    """Returns how near an insertion is to done, 0 to 1: distance at three scales, alignment at three, depth inside the hole."""
+    """Return the closeness of an insertion, 0 to 1.
+
+    Sum of distance at three scales, alignment at three, and depth inside the hole.
+    """
     approach = sum(1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.1)) / 3
     aligned = sum(1 / (1 + lateral_m / scale) for scale in (0.1, 0.03, 0.01)) / 3
     upright = 1 / (1 + turn_rad / 0.2)

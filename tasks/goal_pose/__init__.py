@@ -1,4 +1,4 @@
-"""Moving the tool to a pose that someone asks for: a point in the open and a pitch (the paper's outlook)."""
+"""Moving the tool to a pose in the open: a point and a pitch (the paper's outlook)."""
 
 import torch
 
@@ -10,7 +10,8 @@ from brokk_rl.sim import scene
 from brokk_rl.spec import spec
 from tasks.advice import AdviceConfig
 from tasks.classical import ClassicalConfig
-from tasks.control import ActionMapping, ObservationNoise, PhaseSwitch
+from tasks.control import ActionMapping, PhaseSwitch
+from tasks.noise import ObservationNoise
 from tasks.process import ToolPoseOptions, ToolPoseProcess
 from tasks.reward import RewardTerm
 from tasks.starts import ArmStarts, CandidateTargets, Uniform, draw_starts
@@ -22,7 +23,7 @@ ground is in the way."""
 
 @spec
 class PoseRanges:
-    """Which poses are asked for; uniform ranges (lowest, highest), of which those are kept that the arm can reach.
+    """Ranges of the target poses; uniform (lowest, highest). Only reachable poses are kept.
 
     Attributes:
         distance_m: Horizontal distance of the target point from the slew axis.
@@ -47,7 +48,7 @@ class PoseRanges:
 
 @spec
 class PoseCriteria:
-    """When the pose counts as reached.
+    """Criteria of a reached pose.
 
     Attributes:
         strict_distance_m: Distance of the tool point from the target.
@@ -105,7 +106,7 @@ class GoalPose:
             )
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
-        """Returns the task for `num_envs` environments on `device`."""
+        """Return the task for `num_envs` environments on `device`."""
         return ToolPoseProcess(
             ReachingGoal(self, machine),
             ToolPoseOptions.of(self, depth_m=0.0),
@@ -168,7 +169,10 @@ class ReachingGoal:
 
 
 def _measure_closeness(distance_m: torch.Tensor, turn_rad: torch.Tensor) -> torch.Tensor:
-    """Returns how near a pose is to reached, 0 to 1: distance at three scales, pitch at three, and both together."""
+    """Return the closeness of a pose, 0 to 1.
+
+    Sum of distance at three scales, pitch at three, and both together.
+    """
     near = torch.stack([1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.05)]).mean(0)
     turned = torch.stack([1 / (1 + turn_rad / scale) for scale in (1.0, 0.3, 0.05)]).mean(0)
     return 0.5 * near + 0.2 * turned + 0.3 * near * turned

@@ -132,7 +132,7 @@ from brokk_rl import distributed
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.ppo import DevicePPO
 from rsl_rl.algorithms import PPO
-name = sys.argv[1] if sys.argv[1] == "cpu" else f"cuda:{distributed.own().local}"
+name = sys.argv[1] if sys.argv[1] == "cpu" else f"cuda:{distributed.read_rank().local}"
 with TrainingGroup(torch.device(name)) as group:
     device, index = str(group.device), group.rank.index
     numbers = {"global_rank": index, "local_rank": group.rank.local, "world_size": group.rank.count}

@@ -16,7 +16,7 @@ from diagnosis import answer as outcome
 from diagnosis import plots, report
 from diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Outcome, Selected, Where
 from diagnosis.free_runs import FreeRuns
-from diagnosis.stages import Survey, survey_gap
+from diagnosis.stages import Survey, examine_gap
 
 GAIN = Selected(
     effect="flow_gain", joints=("q4",), probability=0.97, parameters={"gain": {"q4": Estimate(0.81, (0.78, 0.84))}},
@@ -52,7 +52,7 @@ def seen(machine: Machine) -> tuple[Outcome, Survey]:
         runs(machine, 6, 1, 1.0),
     )
     thresholds = option("thresholds", "default")
-    found = survey_gap(
+    found = examine_gap(
         before,
         floor,
         after,

@@ -53,7 +53,7 @@ def test_kinds_have_their_shares_and_effects_come_round_evenly(
     }  # fmt: skip
     single = Counter(one.faults[0].effect for one in found if one.kind == "one")
     assert set(single.values()) <= {1, 2, 3} and len(single) >= 20
-    assert Counter(one.ailment.kind for one in found if one.ailment) == {
+    assert Counter(one.outside_fault.kind for one in found if one.outside_fault) == {
         "fading": 10,
         "interlock": 10,
     }
@@ -137,7 +137,7 @@ def test_labels_that_were_changed_are_not_scored(tmp_path: Path) -> None:
     assert dataset.open_labels(tmp_path)["cases"] == [{"kind": "one"}]
     path = tmp_path / dataset.LABELS_FILE
     path.write_text(path.read_text().replace('"one"', '"none"'))
-    with pytest.raises(RecordingError, match="is not what was sealed"):
+    with pytest.raises(RecordingError, match="was changed after it was sealed"):
         dataset.open_labels(tmp_path)
     with pytest.raises(StorageError, match="is sealed"):
         dataset.seal_labels(tmp_path, {"cases": []}, "salt")
@@ -164,7 +164,7 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(
         *about,
         "exam.do=score",
         f"+exam.answers.none={answers}",
-        f"exam.report={ledger}",
+        f"exam.ledger={ledger}",
         f"session.out={marks}",
     )
     assert done.code == 0, done.err

@@ -1,0 +1,261 @@
+"""Marks of answers against labels, by tables worked by hand."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
+from diagnosis.responses import Shape
+from exam import baselines, metrics, score
+from exam.oracle import JointErrors
+from exam.score import CaseScore, Claim, score_answer
+
+CLASSES = (("dead_time", "clock_offset"), ("flow_gain", "encoder_scale"))
+
+
+def label(
+    kind: str, *effects: tuple[str, str, float], outside: str | None = None
+) -> dict[str, Any]:
+    return {
+        "case": "0000",
+        "kind": kind,
+        "effects": [
+            {
+                "effect": name,
+                "joints": [joint],
+                "size": 0.5,
+                "parameters": {"number": {joint: value}},
+                "nothing": {"number": 0.0},
+            }
+            for name, joint, value in effects
+        ],
+        "outside": None if outside is None else {"ailment": outside, "joints": ["q1"], "size": 0.7},
+        "moved_rad": {"q1": 0.01, "q3": 0.002},
+    }
+
+
+def chosen(
+    effect: str,
+    joint: str = "q3",
+    probability: float = 0.9,
+    said: float = 1.0,
+    same_as: tuple[str, ...] = (),
+) -> Selected:
+    number = {"number": {joint: Estimate(said, (said - 0.196, said + 0.196))}}
+    return Selected(
+        effect=effect,
+        joints=(joint,),
+        probability=probability,
+        parameters=number,
+        gap_closed=None,
+        same_as=same_as,
+    )
+
+
+def answered(
+    *selected: Selected, verdict: str | None = None, unknown: float | None = None
+) -> Answer:
+    ranking = [Ranked(one.effect, one.joints, one.probability) for one in selected]
+    if unknown is not None:
+        ranking.append(Ranked("unknown", (), unknown))
+    return Answer(
+        verdict=verdict or ("effects" if selected else "none"),  # pyright: ignore[reportArgumentType]
+        selected=selected,
+        ranking=tuple(ranking),
+        where=Where({}, (), None),
+        gap=Gap(0.03, 0.01, 0.008, Estimate(0.9, (0.8, 0.95))),
+        next_experiment=None,
+        more={"predicted_closed": {"mean": 0.8}},
+    )
+
+
+def marked(truth: dict[str, Any], said: Answer | None, seconds: float | None = 10.0) -> CaseScore:
+    return score_answer(truth, said, CLASSES, ("frame_loss",), seconds)
+
+
+def test_a_name_of_the_class_is_right_but_not_strictly() -> None:
+    truth = label("one", ("dead_time", "q3", 1.0))
+    for said in (chosen("clock_offset"), chosen("lag", same_as=("dead_time",))):
+        found = marked(truth, answered(said))
+        assert (
+            found.first
+            and not found.first_strictly
+            and found.joints_right == (True,)
+            and found.numbers == ()
+        )
+    assert not marked(truth, answered(chosen("lag"))).first
+
+
+def test_the_most_probable_name_is_the_first_whatever_the_order() -> None:
+    said = answered(chosen("lag", probability=0.6), chosen("backlash", probability=0.8))
+    assert marked(label("one", ("backlash", "q3", 1.0)), said).first
+    assert not marked(label("one", ("lag", "q3", 1.0)), said).first
+
+
+def test_one_name_stands_for_one_effect_only() -> None:
+    truth = label("several", ("dead_time", "q3", 1.0), ("lag", "q3", 1.0))
+    found = marked(truth, answered(chosen("dead_time", same_as=("lag",))))
+    assert found.hits == (("dead_time", "dead_time"),)
+
+
+def test_intervals_and_errors_of_parameters_are_relative_to_the_size_of_the_effect() -> None:
+    (number,) = marked(label("one", ("lag", "q3", 0.8)), answered(chosen("lag", said=1.0))).numbers
+    assert number.error == pytest.approx(0.25)  # 0.2 of 0.8
+    assert not number.in_95 and not number.in_90  # 0.8 lies just outside 0.804 to 1.196
+    (number,) = marked(label("one", ("lag", "q3", 0.82)), answered(chosen("lag", said=1.0))).numbers
+    assert (
+        number.in_95 and not number.in_90
+    )  # the 90 % interval begins at 1 - 0.196 * 0.839 = 0.8355
+
+
+def test_an_effect_below_the_noise_counts_as_no_gap() -> None:
+    truth = label("faint", ("lag", "q3", 1.0))
+    assert marked(truth, answered()).claims == (Claim(1.0, True),)
+    alarm = marked(truth, answered(chosen("lag")))
+    assert alarm.truth == () and alarm.hits == () and alarm.claims == (Claim(0.9, False),)
+
+
+def test_a_missing_answer_is_wrong_everywhere() -> None:
+    found = marked(label("one", ("lag", "q3", 1.0)), None, None)
+    assert (
+        found.verdict == "failed"
+        and not found.first
+        and found.claims == ()
+        and found.unknown == 0.0
+    )
+
+
+def table() -> list[CaseScore]:
+    """Eight cases: 2 of 3 single effects right, 1 of 2 sets, 1 of 2 quiet ones, the one outside."""
+    return [
+        marked(label("one", ("lag", "q3", 1.0)), answered(chosen("lag"))),
+        marked(
+            label("one", ("lag", "q1", 1.0)), answered(chosen("lag", "q3", 0.7))
+        ),  # right effect, wrong joint
+        marked(label("one", ("creep", "q3", 1.0)), answered(chosen("backlash", probability=0.6))),
+        marked(
+            label("several", ("lag", "q3", 1.0), ("creep", "q2", 1.0)),
+            answered(chosen("lag"), chosen("creep", "q2")),
+        ),
+        marked(
+            label("several", ("lag", "q3", 1.0), ("creep", "q2", 1.0)),
+            answered(chosen("lag"), chosen("backlash")),
+        ),
+        marked(label("none"), answered()),
+        marked(label("none"), answered(chosen("lag", probability=0.5))),
+        marked(label("outside", outside="fading"), answered(verdict="unknown", unknown=0.8)),
+    ]
+
+
+def test_the_figures_of_a_table_are_those_worked_by_hand() -> None:
+    found = metrics.compute_metrics(table())
+    assert found["top1"]["value"] == pytest.approx(2 / 3) and found["top1"]["of"] == 3
+    # lag: 2 right, none missed, none wrong among the single ones: 1; creep: 1 missed: 0
+    assert found["macro_f1"]["value"] == pytest.approx(0.5)
+    # effects rightly named: lag q3, lag q1 (wrong joint), lag q3 + creep q2, lag q3
+    assert found["joints"]["value"] == pytest.approx(4 / 5)
+    assert found["exact_set"]["value"] == 0.5
+    # of the sets: 3 right, 1 wrong (backlash), 1 missed (creep)
+    assert found["set_f1"]["value"] == pytest.approx(6 / 8)
+    assert found["false_alarms"]["value"] == 0.5 and found["false_alarms"]["of"] == 2
+    assert found["unknown_recall"]["value"] == 1.0 and found["unknown_auroc"]["value"] == 1.0
+    assert found["by_effect"]["lag"] == {
+        "right": 4, "wrong": 1, "missed": 0, "precision": 0.8, "recall": 1.0, "f1": pytest.approx(8 / 9), "parameter_error": 0.0,
+    }  # fmt: skip
+    assert found["confusion"] == {"lag": {"lag": 2}, "creep": {"backlash": 1}}
+    assert found["predicted_off"]["value"] == pytest.approx(0.1)
+    assert found["seconds"] == {"median": 10.0, "most": 10.0}
+
+
+def test_calibration_error_is_that_worked_by_hand() -> None:
+    # at 0.95: 3 of 4 true, 0.2 off; at 0.65: 1 of 1 true, 0.35 off
+    claims = [Claim(0.95, True)] * 3 + [Claim(0.95, False), Claim(0.65, True)]
+    assert metrics.compute_ece(claims) == pytest.approx(0.8 * 0.2 + 0.2 * 0.35)
+    assert metrics.compute_ece([Claim(1.0, True)]) == 0.0
+
+
+def test_auroc_counts_ties_half() -> None:
+    quiet, outside = label("none"), label("outside", outside="fading")
+    marks = [marked(quiet, answered(unknown=p)) for p in (0.1, 0.4)] + [
+        marked(outside, answered(unknown=p)) for p in (0.4, 0.9)
+    ]
+    assert metrics.compute_auroc(marks) == pytest.approx(
+        3.5 / 4
+    )  # 0.4 > 0.1, 0.4 = 0.4, 0.9 > both
+    assert metrics.compute_auroc(marks[:2]) is None
+
+
+def test_the_gap_closed_is_held_against_what_the_oracle_closes() -> None:
+    truth = label("one", ("lag", "q3", 1.0))
+    marks = [
+        score_answer(truth, answered(chosen("lag")), CLASSES, (), 1.0, oracle)
+        for oracle in (1.0, 0.8, 0.01)
+    ]
+    # each closes 0.9, so 0.9 and 1.125 of it; where nothing can be closed nobody is asked
+    assert metrics.compute_closed_of_oracle(marks) == pytest.approx((0.9 + 1.125) / 2)
+    assert (
+        metrics.compute_closed_of_oracle([score_answer(truth, None, CLASSES, (), None, 0.9)]) == 0.0
+    )
+
+
+def test_intervals_hold_their_figure_and_shrink_with_the_number_of_cases() -> None:
+    few, many = metrics.compute_metrics(table()), metrics.compute_metrics(table() * 10)
+    for key in ("macro_f1", "set_f1", "ece", "unknown_auroc"):
+        low, high = few[key]["ci95"]
+        assert low <= few[key]["value"] <= high
+        assert many[key]["ci95"][1] - many[key]["ci95"][0] <= high - low + 1e-9
+    assert math.isclose(few["top1"]["ci95"][0], 0.2077, abs_tol=1e-3)  # Wilson, 2 of 3
+
+
+def test_forward_selection_takes_what_is_there_and_bic_leaves_what_does_not_pay() -> None:
+    generator, fold = np.random.default_rng(0), np.arange(600) // 100 % 2
+    form, other = generator.standard_normal((2, 600))
+    sizes = np.array([0.0, 1.0, 2.0])
+    shapes = {
+        name: [Shape(sizes, np.outer(sizes, ray))]
+        for name, ray in (("lag", form), ("creep", other))
+    }
+    errors = JointErrors(1.2 * form + 0.5 * generator.standard_normal(600), shapes, fold)
+    assert set(baselines.select_forward(errors, baselines.score_bic)) == {"lag"}
+    assert next(iter(baselines.select_forward(errors, baselines.score_held_out))) == "lag"
+    assert (
+        baselines.select_forward(
+            JointErrors(generator.standard_normal(600), shapes, fold), baselines.score_bic
+        )
+        == {}
+    )
+
+
+def test_a_number_that_all_joints_share_counts_once() -> None:
+    joints = ("q1", "q2", "q3")
+    label = {
+        "effect": "frame_loss",
+        "parameters": {"probability": dict.fromkeys(joints, 0.1)},
+        "nothing": {"probability": 0.0},
+    }
+    shared: dict[str, Any] = {"probability": dict.fromkeys(joints, Estimate(0.11, (0.09, 0.13)))}
+    own: dict[str, Any] = {
+        "probability": {
+            joint: Estimate(0.11 + 0.001 * n, (0.09, 0.13)) for n, joint in enumerate(joints)
+        }
+    }
+    counts = [
+        len(
+            score._score_parameters(
+                label,
+                Selected(
+                    effect="frame_loss",
+                    joints=joints,
+                    probability=1.0,
+                    parameters=said,
+                    gap_closed=None,
+                ),
+            )
+        )
+        for said in (shared, own)
+    ]
+    assert counts == [1, 3]

@@ -55,7 +55,7 @@ def played(
     machine: Machine,
     make: str,
     runs: list[tuple[PlantParameters, np.ndarray]],
-    ailments: Sequence[str | None] | None = None,
+    outside_faults: Sequence[str | None] | None = None,
 ) -> np.ndarray:
     """Returns the positions of several machines of one make side by side, `(T + 1, N, J)`, each under commands `(T, J)`."""
     numbers, commands = [numbers for numbers, _ in runs], np.stack([u for _, u in runs], 1)
@@ -64,7 +64,7 @@ def played(
         machine,
         make,
         numbers,
-        ailments or [None] * count,
+        outside_faults or [None] * count,
         [0] * count,
         np.full(count, 900.0),
         [False] * count,
@@ -402,11 +402,16 @@ def test_chance_alone_leaves_most_of_the_stated_floor(
     assert low_rad < np.sqrt(np.square(growth).mean() / 2.0) < high_rad
 
 
-def test_each_ailment_shows_and_a_machine_of_severity_zero_is_well(machine: Machine) -> None:
+def test_each_fault_outside_the_library_shows_and_a_machine_of_severity_zero_is_well(
+    machine: Machine,
+) -> None:
     well = clean(machine, "throttled")
     u = np.concatenate([step(machine, level, 60) for level in (0.8, 0.8, 0.8, -0.8, 0.3, -0.3)])
     u[:, 3] = np.where(u[:, Q3] > 0, 0.5, 0.0)
-    ill, kinds = well | {"stranger": size(machine, 0.0, 1.0)}, list(out_of_library_faults.KINDS)
+    ill, kinds = (
+        well | {"outside_severity": size(machine, 0.0, 1.0)},
+        list(out_of_library_faults.KINDS),
+    )
     q = played(
         machine,
         "throttled",

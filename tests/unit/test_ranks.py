@@ -88,11 +88,11 @@ def test_alone_a_group_changes_nothing() -> None:
     with TrainingGroup(torch.device("cpu")) as group:
         assert (
             not group.together
-            and group.all(3) == [3]
-            and group.from_first(4) == 4
-            and group.gathered({"a": 1}) == [{"a": 1}]
+            and group.gather(3) == [3]
+            and group.broadcast_first(4) == 4
+            and group.gather_on_first({"a": 1}) == [{"a": 1}]
         )
-        assert group.pooled({"x": 0.25, "episodes": 8.0, "fault_rate": 0.5}) == {
+        assert group.pool_statistics({"x": 0.25, "episodes": 8.0, "fault_rate": 0.5}) == {
             "x": 0.25,
             "episodes": 8.0,
             "fault_rate": 0.5,
@@ -106,7 +106,7 @@ def test_figures_of_several_weigh_by_episodes(monkeypatch: pytest.MonkeyPatch) -
         {"x": 0.0, "episodes": 1.0, "fault_rate": 0.5},
     ]
     monkeypatch.setattr(group, "all", lambda figures: parts)
-    assert group.pooled(parts[0]) == {"x": 0.75, "episodes": 4.0, "fault_rate": 0.25}
+    assert group.pool_statistics(parts[0]) == {"x": 0.75, "episodes": 4.0, "fault_rate": 0.25}
 
 
 def test_a_fingerprint_sees_the_last_bit() -> None:

@@ -138,7 +138,7 @@ def test_the_action_of_a_step_is_in_force_in_that_step(machine: Machine) -> None
 
 def results(loop: ControlLoop, policy: Any, seed: int = 7) -> dict[str, Any]:
     starts = {name: value[: loop.num_envs] for name, value in loop.starts.items()}
-    return evaluate_policy(loop, policy.build(loop, 0), starts, seed, 2)[0]
+    return evaluate_policy(loop, policy.build(loop, 0), starts, seed, 2).summary
 
 
 def test_evaluating_a_policy_twice_gives_the_same_figures(machine: Machine) -> None:
@@ -197,7 +197,8 @@ def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(
 ) -> None:
     loop = make(machine, 4, episode_s=0.5)
     starts = {name: value[:4] for name, value in loop.starts.items()}
-    _, episodes, seen = evaluate_policy(loop, ClassicalPolicy().build(loop, 0), starts, 7, 2)
+    found = evaluate_policy(loop, ClassicalPolicy().build(loop, 0), starts, 7, 2)
+    episodes, seen = found.episodes, found.observations
     assert len(episodes) == 2 and seen.shape[1] == 133
     for row, episode in enumerate(episodes):
         assert episode.q[0] == pytest.approx(starts["q"][row].numpy()) and (episode.u[0] == 0).all()

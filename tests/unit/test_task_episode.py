@@ -391,7 +391,7 @@ def test_positions_and_commands_are_scaled_by_one_factor_an_episode(machine: Mac
     stage = Stage(machine, num_envs=256, noise=noise(q_scale=0.1, u_scale=0.1))
     stage.history.q.fill_(1.0)
     stage.history.u.fill_(0.5)
-    _, q, u = stage.process._encoder.decode(stage.process.observe(stage.history)["policy"])
+    _, q, u = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
     q_factor, u_factor = q.flatten(1), u.flatten(1) / 0.5
     for factor in (q_factor, u_factor):
         middle = factor.median(1).values
@@ -406,11 +406,11 @@ def test_positions_and_commands_are_scaled_by_one_factor_an_episode(machine: Mac
 def test_without_noise_the_policy_sees_the_truth(machine: Machine) -> None:
     stage = Stage(machine, "goal_pose", num_envs=4, noise=noise())
     vector = stage.process.observe(stage.history)["policy"]
-    target, q, _ = stage.process._encoder.decode(vector)
+    target, q, _ = stage.process.control.encoder.decode(vector)
     torch.testing.assert_close(target, stage.start["target_m"], rtol=0, atol=1e-6)
     torch.testing.assert_close(q, stage.history.q, rtol=0, atol=1e-6)
     torch.testing.assert_close(
-        stage.process._encoder.decode_pitch(vector),
+        stage.process.control.encoder.decode_pitch(vector),
         stage.start["target_pitch_rad"],
         rtol=0,
         atol=1e-6,

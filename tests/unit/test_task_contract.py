@@ -1,0 +1,169 @@
+"""A task written from `brokk_rl.contracts.task` alone: it trains, and export names its limits."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import training as runs
+from composed import option
+from kinematic import Kinematic
+
+from brokk_rl.checks import check_task
+from brokk_rl.contracts.task import Transition, supports_classical_control, supports_deployment
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.modes.export import Export
+from brokk_rl.modes.train import Train
+from brokk_rl.rl.policy import ClassicalPolicy
+from brokk_rl.rl.tracking import NoTracking
+from brokk_rl.session import Session
+from brokk_rl.sim.scene import make_nominal_scenes
+
+CPU = torch.device("cpu")
+
+
+class HoldStillProcess:
+    """Keep the arm where it is; only the required part of the contract."""
+
+    reasons = ("fault", "time_limit")
+    max_episode_steps = 10
+
+    def __init__(self, machine: Machine, num_envs: int, device: torch.device) -> None:
+        self._machine = machine
+        self.num_actions = machine.num_joints
+        self.state = {
+            "steps": torch.zeros(num_envs, device=device),
+            "q": torch.zeros(num_envs, machine.num_joints, device=device),
+        }
+        self.episode = {"success_strict": torch.zeros(num_envs, device=device)}
+        self.episode |= {"moved": torch.zeros(num_envs, device=device)}
+        self._policy = torch.zeros(num_envs, machine.num_joints, device=device)
+
+    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
+        generator = torch.Generator().manual_seed(seed)
+        share = 0.4 + 0.2 * torch.rand(count, self.num_actions, generator=generator)
+        lower, upper = (
+            torch.as_tensor(bound, dtype=torch.float32)
+            for bound in (self._machine.lower, self._machine.upper)
+        )
+        return {"q": lower + share * (upper - lower), "scene": make_nominal_scenes(count)}
+
+    def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor]) -> None:
+        self.state["steps"].masked_fill_(mask, 0.0)
+        self.state["q"].copy_(torch.where(mask[:, None], start["q"], self.state["q"]))
+        for value in self.episode.values():
+            value.masked_fill_(mask, 0.0)
+
+    def command(self, action: torch.Tensor) -> torch.Tensor:
+        return action.clamp(-1.0, 1.0)
+
+    def step(self, history: Any, world: Any) -> Transition:
+        self.state["steps"] += 1
+        moved = (history.q[:, -1] - self.state["q"]).abs().sum(1)
+        timed_out = (self.state["steps"] >= self.max_episode_steps) & ~world.faults
+        self.episode["moved"].copy_(moved)
+        self.episode["success_strict"].copy_((timed_out & (moved < 0.1)).float())
+        reason = torch.where(world.faults, 0.0, torch.where(timed_out, 1.0, -1.0))
+        return Transition(
+            reward=-moved, terminated=world.faults.clone(), timed_out=timed_out, reason=reason
+        )
+
+    def observe(self, history: Any, shift_m: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        self._policy.copy_(history.q[:, -1] - self.state["q"])
+        return {"policy": self._policy}
+
+
+class HoldStill:
+    """The spec of that task."""
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> HoldStillProcess:
+        return HoldStillProcess(machine, num_envs, device)
+
+
+def make_training() -> Any:
+    training = runs.small(max_env_steps=16 * runs.STEPS * 2)
+    training.runner["obs_groups"] = {"actor": ["policy"], "critic": ["policy"]}
+    return training
+
+
+def test_the_required_contract_is_enough_for_the_checker(machine: Machine) -> None:
+    check_task(HoldStill(), machine)
+    process = HoldStill().build(machine, 1, CPU)
+    assert not supports_classical_control(process) and not supports_deployment(process)
+
+
+def test_the_shipped_tasks_offer_both_optional_contracts(machine: Machine) -> None:
+    for name in ("borehole_insertion", "goal_pose"):
+        process = option("task", name).build(machine, 1, CPU)
+        assert supports_classical_control(process) and supports_deployment(process)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda process: setattr(process, "reasons", ("time_limit",)), "expected 'fault'"),
+        (lambda process: process.state.pop("steps"), "state: expected an entry 'steps'"),
+        (lambda process: process.episode.pop("success_strict"), "expected an entry 'success_"),
+        (lambda process: setattr(process, "describe", dict), "has both methods"),
+    ],
+)
+def test_the_checker_names_what_the_framework_misses(
+    change: Any, message: str, machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = HoldStill()
+
+    def build(*args: Any) -> HoldStillProcess:
+        process = HoldStillProcess(*args)
+        change(process)
+        return process
+
+    monkeypatch.setattr(task, "build", build)
+    with pytest.raises(AssertionError, match=message):
+        check_task(task, machine)
+
+
+def test_a_task_without_optional_contracts_trains_and_is_not_exported(
+    machine: Machine, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    parts: dict[str, Any] = {
+        "session": Session(out=str(tmp_path), seed=0, device="cpu"),
+        "machine": machine,
+        "sim": Kinematic(),
+        "task": HoldStill(),
+        "actuator": option("actuator", "lag"),
+        "follower": option("follower", "none"),
+        "rl": make_training(),
+    }
+    evaluation = replace(option("evaluation", "default"), episodes=4, num_recorded=1, video=False)
+    train = Train(
+        **parts,
+        effect={},
+        tracking=NoTracking(),
+        evaluation=evaluation,
+        start_from=None,
+        resume=None,
+    )
+    with caplog.at_level(logging.INFO):
+        assert train.run() is not None
+    assert "HoldStill) has no classical controller" in caplog.text
+    assert "HoldStill) cannot be deployed, so there is no policy.onnx" in caplog.text
+    assert not (tmp_path / "policy.onnx").exists() and (tmp_path / "learning_curves.png").exists()
+    assert json.loads((tmp_path / "policy.json").read_text())["observation"] is None
+    report = json.loads((tmp_path / "evaluation.json").read_text())
+    assert report["policies"].keys() == {"trained", "untrained"} and "moved" in report
+    assert "success_paper" not in report
+
+    with pytest.raises(ConfigError, match=r"mode=export: the task .HoldStill. cannot be deployed"):
+        Export(**parts, checkpoint=str(tmp_path), num_checked=4).run()
+
+
+def test_the_classical_policy_of_a_task_without_one_is_refused(machine: Machine) -> None:
+    loop = runs.plant(machine, HoldStill()).build(CPU, 4, 8, 0)
+    with pytest.raises(ConfigError, match=r"HoldStillProcess. has no classical controller"):
+        ClassicalPolicy().build(loop, 0)
